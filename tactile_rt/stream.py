@@ -1,0 +1,303 @@
+"""The types that move through the program: few, frozen, SI.
+
+    Source --read()--> Chunk --push()--> Classifier --> Classification
+
+A `Source` hides where samples come from (simulation, serial port, CAN bus, recording).
+Everything downstream sees `Chunk`s described by one `ArraySpec`.
+
+Errors:
+
+    TactileError
+      +-- ConfigError       the user asked for something that cannot be (name, option, file)
+      +-- SourceError       a device or stream broke
+      +-- SpecMismatch      two array descriptions that must agree do not
+      +-- RecordingError    a stored stream is damaged or of another version
+      +-- ModelError        a model file is damaged or of another version
+"""
+
+import abc
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "ArraySpec",
+    "Chunk",
+    "ConfigError",
+    "EndOfStream",
+    "ModelError",
+    "RecordingError",
+    "Source",
+    "SourceError",
+    "SourceStats",
+    "SpecMismatch",
+    "TactileError",
+    "concatenate",
+]
+
+SPEC_VERSION = 1
+POSE_TOLERANCE = 1e-6  # m and quaternion units: below what anyone can mount or measure
+
+
+class TactileError(Exception):
+    """Base of all errors that a caller may want to handle; the message is one clear line."""
+
+
+class ConfigError(TactileError):
+    """The user asked for something that cannot be: the message names it and what to do."""
+
+
+class SourceError(TactileError):
+    """A device or stream broke; the message names it."""
+
+
+class SpecMismatch(TactileError):
+    """Two array descriptions that must agree differ; the message lists where."""
+
+
+class RecordingError(TactileError):
+    """A stored stream is damaged or of another version; the message names the file."""
+
+
+class ModelError(TactileError):
+    """A model file is damaged, incomplete or of another version; the message names the file."""
+
+
+class EndOfStream(Exception):
+    """The source has delivered its last sample; every later read raises it again."""
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """What a sensor array is. Hashable; travels inside recordings and models.
+
+    Attributes:
+        name: what the array is called, e.g. ``mouse-right``.
+        elements: names of the whiskers or taxels.
+        grid: (row, column) of each element on the array's topological grid, from 0.
+        positions: base point (x, y, z) of each element in the mount frame, m.
+        orientations: unit quaternion (w, x, y, z) that turns each element's own frame into the
+            mount frame.
+        channels: names of what each element measures, e.g. ``fx``.
+        units: SI unit of each channel, e.g. ``N``.
+        rate_hz: nominal sample rate, Hz.
+        frame: name of the mount frame (right-handed).
+
+    Raises:
+        ConfigError: lengths disagree, names repeat, two elements share a grid cell, a pose is not
+            finite, or the rate is not positive.
+    """
+
+    name: str
+    elements: tuple[str, ...]
+    grid: tuple[tuple[int, int], ...]
+    positions: tuple[tuple[float, float, float], ...]
+    orientations: tuple[tuple[float, float, float, float], ...]
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    rate_hz: float
+    frame: str
+
+    def __post_init__(self) -> None:
+        n = len(self.elements)
+        for what in ("grid", "positions", "orientations"):
+            if len(getattr(self, what)) != n:
+                raise ConfigError(
+                    f"array {self.name!r}: {what} has {len(getattr(self, what))} entries "
+                    f"for {n} elements"
+                )
+        if n == 0 or not self.channels:
+            raise ConfigError(f"array {self.name!r}: needs at least one element and one channel")
+        if len(self.units) != len(self.channels):
+            raise ConfigError(
+                f"array {self.name!r}: {len(self.units)} units for {len(self.channels)} channels"
+            )
+        for what in ("elements", "channels", "grid"):
+            items = getattr(self, what)
+            if len(set(items)) != len(items):
+                raise ConfigError(f"array {self.name!r}: {what} repeat")
+        if min(min(cell) for cell in self.grid) < 0:
+            raise ConfigError(f"array {self.name!r}: grid cells are counted from 0")
+        for what in ("positions", "orientations"):
+            if not np.isfinite(getattr(self, what)).all():
+                raise ConfigError(f"array {self.name!r}: {what} must be finite")
+        if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
+            raise ConfigError(f"array {self.name!r}: rate_hz must be positive, not {self.rate_hz}")
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(element, channel): the shape of one sample."""
+        return len(self.elements), len(self.channels)
+
+    @property
+    def grid_shape(self) -> tuple[int, int]:
+        """(rows, columns) of the smallest grid that holds every element."""
+        rows, columns = zip(*self.grid, strict=True)
+        return max(rows) + 1, max(columns) + 1
+
+    def differences(self, other: "ArraySpec", ignore: tuple[str, ...] = ()) -> list[str]:
+        """Say where `other` differs from this spec, one phrase each; [] when they match.
+
+        Args:
+            other: the spec to compare with.
+            ignore: attribute names not to compare (a model ignores ``name`` and ``rate_hz``).
+        """
+        found = []
+        for what in self.__dataclass_fields__:
+            mine, theirs = getattr(self, what), getattr(other, what)
+            if what in ignore or mine == theirs:
+                continue
+            if isinstance(mine, tuple) and len(mine) == len(theirs):
+                pose = what in ("positions", "orientations")
+                for at, (a, b) in enumerate(zip(mine, theirs, strict=True)):
+                    if a != b and not (pose and np.allclose(a, b, rtol=0, atol=POSE_TOLERANCE)):
+                        found.append(f"{what}[{at}] is {b!r}, not {a!r}")
+                        break
+            elif isinstance(mine, tuple):
+                found.append(f"{what}: {len(theirs)} entries, not {len(mine)}")
+            else:
+                found.append(f"{what} is {theirs!r}, not {mine!r}")
+        return found
+
+    def to_json(self) -> str:
+        """One line of JSON with a schema version, for recordings and model metadata."""
+        return msgspec.json.encode({"version": SPEC_VERSION, **msgspec.to_builtins(self)}).decode()
+
+    @classmethod
+    def from_json(cls, text: str) -> "ArraySpec":
+        """Read what `to_json` wrote.
+
+        Raises:
+            ConfigError: not JSON, a field missing or of the wrong type, or a newer version.
+        """
+        try:
+            fields: dict[str, Any] = msgspec.json.decode(text, type=dict[str, Any])
+            version = fields.pop("version", None)
+            if version != SPEC_VERSION:
+                raise ConfigError(
+                    f"array spec of version {version!r}; this release reads {SPEC_VERSION}"
+                )
+            return msgspec.convert(fields, cls)
+        except msgspec.MsgspecError as error:
+            raise ConfigError(f"not an array spec: {error}") from None
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """n >= 1 consecutive samples: the only payload that moves through the program.
+
+    Attributes:
+        seq: (n,) int64 sequence number of each sample; a gap means lost samples.
+        t_ns: (n,) int64 host CLOCK_MONOTONIC at which each sample was taken, ns.
+        values: (n, element, channel) float32, SI units.
+        valid: (n, element) bool; False where the element has no trustworthy value.
+    """
+
+    seq: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+    values: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+
+    def __post_init__(self) -> None:
+        n = len(self.seq)
+        shapes = (self.seq.shape, self.t_ns.shape, self.valid.shape)
+        if n == 0 or self.values.ndim != 3 or shapes != ((n,), (n,), self.values.shape[:2]):
+            raise ValueError(
+                f"chunk of {n} samples with t_ns {self.t_ns.shape}, values {self.values.shape}, "
+                f"valid {self.valid.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.seq)
+
+
+def concatenate(chunks: list[Chunk]) -> Chunk:
+    """Join consecutive chunks of one stream into one; the samples are copied.
+
+    Raises:
+        ValueError: no chunks.
+    """
+    return Chunk(
+        *(
+            np.concatenate([getattr(c, name) for c in chunks])
+            for name in ("seq", "t_ns", "values", "valid")
+        )
+    )
+
+
+@dataclass
+class SourceStats:
+    """Samples counted where they are lost or gained, since the source was opened.
+
+    ``sent + duplicated = delivered + corrupt + missing + dropped + duplicates`` where `sent` and
+    `duplicated` are the sender's side.
+    """
+
+    delivered: int = 0
+    corrupt: int = 0
+    missing: int = 0
+    dropped: int = 0
+    duplicates: int = 0
+
+
+@dataclass(eq=False)  # two streams of one array are two things, and can be told apart in a set
+class Source(abc.ABC):
+    """Where samples come from. Implementations give `spec`, `read` and `close`.
+
+    A source is its own context manager and iterates over its chunks until it ends.
+
+    Attributes:
+        spec: what the samples are.
+        stats: samples counted so far.
+        live: whether samples come whether or not anyone reads (a device, a real-time simulation);
+            a source that is not live waits for its reader.
+    """
+
+    live = True  # a class attribute, not a field: most implementations never change it
+
+    spec: ArraySpec
+    stats: SourceStats = field(default_factory=SourceStats, init=False)
+
+    @abc.abstractmethod
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        """Return the samples that have arrived since the last read.
+
+        Args:
+            timeout: how long to wait for the first sample, s; None waits for ever.
+
+        Returns:
+            The next samples, or None when none arrived in time.
+
+        Raises:
+            EndOfStream: the stream is over; raised at every later call too.
+            SourceError: the device broke.
+        """
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Release the device; safe to call twice. Reading afterwards raises `EndOfStream`."""
+
+    def __iter__(self) -> Iterator[Chunk]:
+        while True:
+            try:
+                chunk = self.read()
+            except EndOfStream:
+                return
+            if chunk is not None:
+                yield chunk
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
