@@ -1,0 +1,1 @@
+"""Whisker arrays, objects and sweeps simulated in MuJoCo (extra ``sim``)."""

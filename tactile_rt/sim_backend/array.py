@@ -1,0 +1,237 @@
+"""The whisker array as a MuJoCo model: tapered beams as chains of rigid links.
+
+MuJoCo works in mm, mg and ms here (so forces are mN and moments uN m): in SI the inertia of a
+link falls below the smallest that MuJoCo accepts. `read_base_loads` converts to N and N m.
+
+Each whisker is cut into equal cells. The two hinges of a joint sit at a cell's midpoint with the
+bending stiffness E I(midpoint) / cell length, which makes tip stiffness and first resonance agree
+with the Euler-Bernoulli beam to second order in the cell length.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.sim_backend.whiskers import DAMPING_RATIO, FRICTION, Whisker, rotation
+from tactile_rt.stream import ArraySpec
+
+__all__ = [
+    "CHANNELS",
+    "MOUNT",
+    "PROFILES",
+    "SAMPLE_MS",
+    "UNITS",
+    "Profile",
+    "add_whiskers",
+    "array_spec",
+    "empty_world",
+    "quaternion",
+    "read_base_loads",
+    "set_damping",
+]
+
+CHANNELS = ("fx", "fy", "fz", "mx", "my", "mz")
+UNITS = ("N", "N", "N", "N m", "N m", "N m")
+SAMPLE_MS = 1.0  # output period: 1 kHz
+WHISKER_BIT, OBJECT_BIT = 1, 2  # collision groups: whiskers touch objects, never each other
+
+
+@dataclass(frozen=True)
+class Profile:
+    """How finely an array is simulated.
+
+    Attributes:
+        links_per_mm: links per mm of arc length.
+        least_links: links of the shortest whiskers.
+        timestep_ms: physics step, ms; divides the 1 ms output period.
+    """
+
+    links_per_mm: float
+    least_links: int
+    timestep_ms: float
+
+    def links(self, whisker: Whisker) -> int:
+        """Links of one whisker."""
+        return max(self.least_links, round(whisker.length * self.links_per_mm))
+
+
+PROFILES = {
+    "realtime": Profile(0.25, 5, 0.5),
+    "dataset": Profile(0.5, 8, 0.2),
+    "accurate": Profile(1.0, 8, 0.1),
+}
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Pose of the array frame in the world: position (mm), then Rz(yaw) Ry(pitch) Rx(roll)."""
+
+    position: tuple[float, float, float]
+    roll_pitch_yaw: tuple[float, float, float]
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(3, 3) from the array frame to the world frame."""
+        roll, pitch, yaw = self.roll_pitch_yaw
+        return rotation("z", yaw) @ rotation("y", pitch) @ rotation("x", roll)
+
+
+# The pose of the published sweeps (Chung et al. 2025, code): the whiskers reach along world +x.
+MOUNT = Mount((-6.934, -11.642, -2.598), (0.0, np.radians(15.366), np.radians(-16.198)))
+
+
+def array_spec(whiskers: tuple[Whisker, ...], name: str) -> ArraySpec:
+    """Describe the base loads of an array.
+
+    Mount frame: the head frame of the morphology, x lateral (away from the head), y rostral,
+    z dorsal. Element frame: x along the whisker at its base, y towards the concave side of its
+    plane, z = x cross y. Values are the force (N) and the moment about the base point (N m) that
+    the whisker exerts on its follicle: a push on the tip along +y reads as fy > 0 and mz > 0.
+    """
+    return ArraySpec(
+        name=name,
+        elements=tuple(w.name for w in whiskers),
+        grid=tuple((w.row, w.column) for w in whiskers),
+        positions=tuple((w.base[0] * 1e-3, w.base[1] * 1e-3, w.base[2] * 1e-3) for w in whiskers),
+        orientations=tuple(quaternion(w.orientation) for w in whiskers),
+        channels=CHANNELS,
+        units=UNITS,
+        rate_hz=1e3 / SAMPLE_MS,
+        frame="head",
+    )
+
+
+def quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    """Unit quaternion (w, x, y, z), w >= 0, of a (3, 3) rotation."""
+    q = np.empty(4)
+    mujoco.mju_mat2Quat(q, np.ascontiguousarray(matrix, dtype=np.float64).ravel())
+    q = q if q[0] >= 0 else -q
+    # Rounding keeps a spec equal to itself after a trip through another machine's libm.
+    w, x, y, z = np.round(q, 9).tolist()
+    return w, x, y, z
+
+
+def empty_world(profile: Profile) -> mujoco.MjSpec:
+    """A MuJoCo world without bodies, with the solver settings that whisker contact needs."""
+    world = mujoco.MjSpec()
+    option = world.option
+    option.timestep = profile.timestep_ms
+    # Implicit in stiffness: a stable step that is long against the period of a short whisker.
+    option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
+    option.gravity = (0.0, 0.0, 0.0)  # a whisker sags by less than its own diameter
+    option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    option.impratio = 5.0  # less lets slow slip creep, at the cost of 15-40 % of the force
+    option.enableflags |= mujoco.mjtEnableBit.mjENBL_DIAGEXACT
+    default = world.default.geom
+    default.solref = (2 * profile.timestep_ms, 1.0)
+    default.solimp = (0.9, 0.99, 0.05, 0.5, 2.0)
+    default.friction = (FRICTION, 0.0, 0.0)
+    default.condim = 3
+    return world
+
+
+def add_whiskers(
+    world: mujoco.MjSpec, whiskers: tuple[Whisker, ...], profile: Profile, mount: Mount = MOUNT
+) -> None:
+    """Add an array to a world, with force and torque sensors at every whisker's base."""
+    head = world.worldbody.add_body(
+        name="head", pos=mount.position, quat=quaternion(mount.rotation)
+    )
+    for whisker in whiskers:
+        _add_whisker(world, head, whisker, profile)
+
+
+def _add_whisker(
+    world: mujoco.MjSpec, head: mujoco.MjsBody, whisker: Whisker, profile: Profile
+) -> None:
+    n = profile.links(whisker)
+    cell = whisker.length / n
+    # Nodes: the base, the n joints at the cells' midpoints, the tip.
+    s = np.concatenate([[0.0], (np.arange(n) + 0.5) * cell, [whisker.length]])
+    nodes = whisker.centreline(s)
+    middle = (s[:-1] + s[1:]) / 2
+    radii = whisker.radius(middle)
+    lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
+    masses = whisker.density(middle) * 1e-3 * np.pi * radii**2 * np.diff(s)  # mg
+    stiffness = whisker.bending_stiffness(s[1:-1]) / cell * 1e3  # uN m / rad
+    headings = np.arctan2(np.diff(nodes[:, 1]), np.diff(nodes[:, 0]))
+
+    body = head.add_body(name=whisker.name, pos=whisker.base, quat=quaternion(whisker.orientation))
+    site = body.add_site(name=whisker.name)
+    for kind, what in (
+        (mujoco.mjtSensor.mjSENS_FORCE, "force"),
+        (mujoco.mjtSensor.mjSENS_TORQUE, "torque"),
+    ):
+        world.add_sensor(
+            name=f"{what} {whisker.name}",
+            type=kind,
+            objtype=mujoco.mjtObj.mjOBJ_SITE,
+            objname=site.name,
+        )
+    heading, origin = 0.0, np.zeros(3)
+    for i in range(n + 1):
+        # Each link's frame: x along the link, z normal to the whisker's resting plane.
+        turn = headings[i] - heading
+        body = body.add_body(
+            pos=rotation("z", -heading) @ (nodes[i] - origin),
+            quat=quaternion(rotation("z", turn)),
+        )
+        heading, origin = headings[i], nodes[i]
+        if i > 0:  # the first half cell is clamped
+            for axis in ((0, 1, 0), (0, 0, 1)):
+                body.add_joint(
+                    name=f"{whisker.name} {i} {'yz'[axis[2]]}",
+                    type=mujoco.mjtJoint.mjJNT_HINGE,
+                    axis=axis,
+                    stiffness=[stiffness[i - 1], 0, 0],
+                )
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            fromto=(0, 0, 0, lengths[i], 0, 0),
+            size=(radii[i], 0, 0),
+            mass=masses[i],
+            contype=WHISKER_BIT,
+            conaffinity=0,
+            group=WHISKER_BIT,
+            rgba=(0.25, 0.2, 0.15, 1.0),
+        )
+
+
+def set_damping(model: mujoco.MjModel) -> dict[str, float]:
+    """Give every whisker Rayleigh damping at the published ratio of its first mode.
+
+    Stiffness-proportional: c = beta k with beta = 2 zeta / omega_1. The integrator itself adds
+    h k, which is taken off; where that alone is more than wanted (short whiskers, coarse steps)
+    the whisker stays over-damped.
+
+    Returns:
+        First resonance of every whisker, Hz.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    mass = np.empty((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, mass)
+    owner = [model.joint(model.dof_jntid[i]).name.split()[0] for i in range(model.nv)]
+    resonances = {}
+    for name in dict.fromkeys(owner):
+        dofs = np.flatnonzero([o == name for o in owner])
+        k = model.jnt_stiffness[model.dof_jntid[dofs]]
+        # The largest eigenvalue of K^-1 M is 1 / omega_1^2.
+        flexible = mass[np.ix_(dofs, dofs)] / np.sqrt(np.outer(k, k))
+        omega = 1 / np.sqrt(np.linalg.eigvalsh(flexible)[-1])  # rad / ms
+        beta = 2 * DAMPING_RATIO / omega
+        model.dof_damping[dofs] = max(beta - model.opt.timestep, 0.0) * k
+        resonances[name] = float(omega / (2 * np.pi) * 1e3)
+    return resonances
+
+
+def read_base_loads(sensors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Turn MuJoCo's sensor readings (..., 6 elements) into (..., element, 6) N and N m.
+
+    MuJoCo reports what the follicle exerts on the whisker, in mN and uN m; we report the reaction.
+    """
+    to_si = np.array([1e-3] * 3 + [1e-6] * 3)
+    loads: NDArray[np.float64] = -sensors.reshape(*sensors.shape[:-1], -1, 6) * to_si
+    return loads

@@ -1,0 +1,82 @@
+"""What is swept past the whiskers: a named thing made of convex pieces.
+
+`make_object` draws the n-th mug, bottle, ...; `load_object` also takes a mesh file.
+"""
+
+import difflib
+import re
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from tactile_rt.sim_backend import shapes
+from tactile_rt.stream import ConfigError
+
+MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+
+_BUILDERS: dict[str, Callable[[np.random.Generator], list[trimesh.Trimesh]]] = {
+    "bottle": shapes.bottle,
+    "bowl": shapes.bowl,
+    "cactus": shapes.cactus,
+    "car": shapes.car,
+    "chair": shapes.chair,
+    "dumbbell": shapes.dumbbell,
+    "gear": shapes.gear,
+    "ladder": shapes.ladder,
+    "lamp": shapes.lamp,
+    "mug": shapes.mug,
+    "plane": shapes.plane,
+    "table": shapes.table,
+}
+
+CATEGORIES: tuple[str, ...] = tuple(sorted(_BUILDERS))
+
+
+@dataclass(frozen=True)
+class TactileObject:
+    """A rigid thing: its bounding box centred at the origin, largest extent 1 (no unit), z up."""
+
+    name: str  # "mug-17", or the file's stem
+    category: str  # "mug", or the file's stem for a mesh file
+    pieces: tuple[trimesh.Trimesh, ...]  # convex, watertight, wound outward; union = the object
+
+
+def normalised(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]:
+    """The pieces moved and scaled together into the unit box."""
+    corners = np.vstack([piece.bounds for piece in pieces])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    centre, scale = (low + high) / 2, 1 / (high - low).max()
+    return tuple(
+        trimesh.Trimesh((piece.vertices - centre) * scale, piece.faces, process=False)
+        for piece in pieces
+    )
+
+
+def make_object(category: str, index: int) -> TactileObject:
+    """Instance `index` (0 or more) of a category: the same one every time, everywhere."""
+    if category not in _BUILDERS:
+        near = difflib.get_close_matches(category, CATEGORIES, n=1, cutoff=0.3)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        raise ConfigError(
+            f"no object called {category!r}{hint}; there are {', '.join(CATEGORIES)}, "
+            f"and mesh files ending in {', '.join(MESH_SUFFIXES)}"
+        )
+    if index < 0:
+        raise ConfigError(f"object {category}-{index}: the index must be 0 or more")
+    # crc32 because hash() of a string differs from one process to the next
+    rng = np.random.default_rng([zlib.crc32(category.encode()), index])
+    return TactileObject(f"{category}-{index}", category, normalised(_BUILDERS[category](rng)))
+
+
+def load_object(target: str) -> TactileObject:
+    """The object named "mug-17" or "mug" (the same as "mug-0"), or the one in a mesh file."""
+    if Path(target).suffix or "/" in target or "\\" in target:
+        from tactile_rt.sim_backend.meshes import load_mesh  # which imports this module
+
+        return load_mesh(Path(target))
+    match = re.fullmatch(r"(.+)-(\d+)", target)
+    return make_object(match[1], int(match[2])) if match else make_object(target, 0)

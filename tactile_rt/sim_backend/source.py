@@ -1,0 +1,157 @@
+"""The simulated array as a `Source`: object after object swept past it, without end.
+
+sim:mouse?objects=mug-50,bottle-51&seed=3&pace=fast&profile=realtime&sweeps=10
+"""
+
+import time
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS, array_spec
+from tactile_rt.sim_backend.dataset import draw_sweep
+from tactile_rt.sim_backend.objects import CATEGORIES, load_object
+from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.whiskers import mouse_whiskers
+from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source
+from tactile_rt.timebase import NS_PER_S
+
+__all__ = ["Pass", "SimOptions", "SimSource"]
+
+REST_SAMPLES = 270  # between two objects: enough for a tare
+CHUNK_SAMPLES = 9
+
+
+@dataclass(frozen=True)
+class SimOptions:
+    """What the simulated array meets.
+
+    Attributes:
+        objects: comma-separated names (``mug-50``), categories (``mug``: its first instance) or
+            mesh files (.obj, .stl, .ply, .glb), drawn in random order; empty: all categories.
+        sweeps: how many objects pass before the stream ends; 0: endless.
+        repeat: sweeps of the same object in succession.
+        seed: of the drawn objects and sweep parameters; the same seed gives the same stream.
+        profile: simulation profile, see `array.PROFILES`.
+        pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
+    """
+
+    objects: str = ""
+    sweeps: int = 0
+    repeat: int = 1
+    seed: int = 0
+    profile: str = "realtime"
+    pace: Literal["realtime", "fast"] = "realtime"
+
+    def __post_init__(self) -> None:
+        if self.profile not in PROFILES:
+            raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
+        if self.sweeps < 0 or self.repeat < 1:
+            raise ConfigError("sweeps must be 0 or more, and repeat 1 or more")
+
+
+@dataclass(frozen=True)
+class Pass:
+    """What really passed the array: the truth that a decision is scored against."""
+
+    start_ns: int
+    name: str
+    category: str
+    sweep: Sweep
+
+
+class SimSource(Source):
+    """A whisker array in MuJoCo with objects sweeping past it.
+
+    Time is simulated: it starts at the first read, and in real time the reader waits for it.
+
+    Args:
+        array: which array; ``mouse``.
+        options: what it meets.
+
+    Attributes:
+        passes: the objects that have come by so far, in order.
+        live: whether samples wait for nobody (real-time pace).
+    """
+
+    def __init__(self, array: str, options: SimOptions) -> None:
+        if array not in ("", "mouse"):
+            raise ConfigError(f"no simulated array {array!r}: there is mouse")
+        whiskers = mouse_whiskers()
+        super().__init__(array_spec(whiskers, "mouse-right"))
+        self._whiskers = whiskers
+        self._options = options
+        names = [n for n in options.objects.split(",") if n] or list(CATEGORIES)
+        self._objects = [load_object(name) for name in names]
+        self._rng = np.random.default_rng(options.seed)
+        self.live = options.pace == "realtime"
+        self.passes: list[Pass] = []
+        self._start_ns: int | None = None
+        self._rest = 0  # samples of rest still to deliver
+        self._simulation: SweepSimulation | None = None
+        self._left = 0  # samples of the sweep still to deliver
+        self._order: list[int] = []
+        self._next: Chunk | None = None  # simulated, not yet due
+        self._closed = False
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        if self._start_ns is None:
+            self._start_ns = time.monotonic_ns() if self.live else 0
+        if self._next is None:
+            self._next = self._simulate(self._start_ns)
+        chunk = self._next
+        if self.live:
+            wait = (int(chunk.t_ns[-1]) - time.monotonic_ns()) / NS_PER_S
+            if timeout is not None and wait > timeout:
+                time.sleep(max(timeout, 0))
+                return None
+            time.sleep(max(wait, 0))
+        self._next = None
+        self.stats.delivered += len(chunk)
+        return chunk
+
+    def close(self) -> None:
+        self._closed = True
+        self._simulation = self._next = None
+
+    def _simulate(self, start_ns: int) -> Chunk:
+        if self._closed:
+            raise EndOfStream
+        if self._left == 0 and self._rest == 0:
+            self._begin_sweep(start_ns)
+        if self._rest:
+            n = min(CHUNK_SAMPLES, self._rest)
+            values = np.zeros((n, *self.spec.shape), dtype=np.float32)
+            self._rest -= n
+        else:
+            assert self._simulation is not None
+            n = min(CHUNK_SAMPLES, self._left)
+            values = self._simulation.advance(n).astype(np.float32)
+            self._left -= n
+        return self._stamp(values, start_ns)
+
+    def _stamp(self, values: np.ndarray, start_ns: int) -> Chunk:
+        seq = self.stats.delivered + np.arange(len(values), dtype=np.int64)
+        period = round(SAMPLE_MS * 1e6)
+        return Chunk(
+            seq, start_ns + seq * period, values, np.ones(values.shape[:2], dtype=np.bool_)
+        )
+
+    def _begin_sweep(self, start_ns: int) -> None:
+        done = len(self.passes)
+        if self._options.sweeps and done == self._options.sweeps * self._options.repeat:
+            self._closed = True
+            raise EndOfStream
+        if not self._order:
+            order = self._rng.permutation(len(self._objects))
+            self._order = [int(i) for i in order for _ in range(self._options.repeat)]
+        target = self._objects[self._order.pop(0)]
+        sweep = draw_sweep(self._rng)
+        self._simulation = SweepSimulation(
+            self._whiskers, target, sweep, PROFILES[self._options.profile]
+        )
+        self._rest = REST_SAMPLES
+        self._left = round(self._simulation.duration_ms / SAMPLE_MS)
+        now = start_ns + round(self.stats.delivered * SAMPLE_MS * 1e6)
+        self.passes.append(Pass(now, target.name, target.category, sweep))

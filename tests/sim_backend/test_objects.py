@@ -1,0 +1,234 @@
+import functools
+import os
+import subprocess
+import sys
+import zlib
+
+import numpy as np
+import pytest
+
+pytest.importorskip("trimesh")
+
+from tactile_rt.sim_backend.objects import (
+    CATEGORIES,
+    TactileObject,
+    load_object,
+    make_object,
+    normalised,
+)
+from tactile_rt.sim_backend.solids import bar, box, rod, wall
+from tactile_rt.stream import ConfigError
+
+INDICES = (0, 1, 2, 3, 17, 1000)
+MANY = 20  # instances drawn where one in a few takes a rare option
+
+
+@functools.cache
+def drawn(category: str, index: int) -> TactileObject:
+    """make_object, drawn once for all tests that look at it."""
+    return make_object(category, index)
+
+
+def inside(thing: TactileObject, point: tuple[float, float, float]) -> bool:
+    """Whether the point is in any of the convex pieces: behind all faces of one."""
+    return any(
+        bool((((point - p.triangles[:, 0]) * p.face_normals).sum(axis=1) <= 1e-9).all())
+        for p in thing.pieces
+    )
+
+
+def digest(thing: TactileObject) -> int:
+    """A number for all the corners, to 1e-6 of the size."""
+    corners = np.vstack([p.vertices for p in thing.pieces])
+    return zlib.crc32((np.round(corners * 1e6) + 0.0).astype(np.int64).tobytes())
+
+
+def extents(thing: TactileObject) -> np.ndarray:
+    """(2, 3) lowest and highest corner of the bounding box."""
+    bounds = np.array([p.bounds for p in thing.pieces])
+    return np.array([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
+
+
+def test_there_are_a_dozen_categories_in_order() -> None:
+    assert len(CATEGORIES) == len(set(CATEGORIES)) >= 12
+    assert list(CATEGORIES) == sorted(CATEGORIES)
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_pieces_are_solid_convex_and_few(category: str) -> None:
+    for index in range(MANY):
+        thing = drawn(category, index)
+        assert len(thing.pieces) <= 24
+        for piece in thing.pieces:
+            assert piece.is_convex, thing.name
+            assert piece.is_watertight and piece.is_winding_consistent, thing.name
+            assert piece.volume > 1e-5, thing.name
+            assert len(piece.vertices) <= 48, thing.name
+            across = piece.vertices @ piece.face_normals.T
+            assert np.ptp(across, axis=0).min() >= 0.02, f"{thing.name} has a sliver"
+
+
+def test_an_object_costs_a_dozen_pieces_on_average() -> None:
+    counts = [len(drawn(c, i).pieces) for c in CATEGORIES for i in INDICES]
+    assert np.mean(counts) <= 12.5
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_it_is_centred_with_largest_extent_one(category: str) -> None:
+    for index in INDICES:
+        thing = drawn(category, index)
+        assert (thing.name, thing.category) == (f"{category}-{index}", category)
+        low, high = extents(thing)
+        np.testing.assert_allclose(low + high, 0, atol=1e-9)
+        assert (high - low).max() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_its_pieces_hang_together(category: str) -> None:
+    for index in range(MANY):
+        pieces = drawn(category, index).pieces
+        boxes = np.array([p.bounds for p in pieces])
+        reached, todo = {0}, [0]
+        while todo:  # bounding boxes that overlap: necessary, and what a misplaced part breaks
+            low, high = boxes[todo.pop()]
+            near = ((boxes[:, 0] <= high + 1e-9) & (boxes[:, 1] >= low - 1e-9)).all(axis=1)
+            new = set(np.flatnonzero(near).tolist()) - reached
+            reached |= new
+            todo += new
+        assert len(reached) == len(pieces), f"{category}-{index} is in parts"
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_much_of_it_is_where_whiskers_reach(category: str) -> None:
+    heights = np.linspace(-0.25, 0.25, 21)
+    for index in range(MANY):
+        bounds = np.array([p.bounds[:, 2] for p in drawn(category, index).pieces])
+        met = ((bounds[:, :1] <= heights) & (heights <= bounds[:, 1:])).any(axis=0)
+        assert met.mean() >= 0.3, f"{category}-{index}"
+        assert met[8:13].any(), f"{category}-{index} is missed at its middle height"
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_no_two_instances_are_equal(category: str) -> None:
+    shapes = [drawn(category, i) for i in range(MANY)]
+    assert len({digest(s) for s in shapes}) == MANY
+    # and not by a hair, nor by little on the whole: sides of the bounding box, surface
+    figures = [[*np.ptp(extents(s), axis=0), sum(p.area for p in s.pieces)] for s in shapes]
+    apart = np.abs(np.array(figures)[:, None] - np.array(figures)).max(axis=2)
+    assert apart[~np.eye(MANY, dtype=bool)].min() > 0.003
+    assert np.median(apart) > 0.05
+
+
+def test_the_same_in_another_process() -> None:
+    wanted = [digest(make_object(c, 5)) for c in CATEGORIES]
+    code = (
+        "from test_objects import digest, make_object, CATEGORIES\n"
+        "print([digest(make_object(c, 5)) for c in CATEGORIES])"
+    )
+    here = os.path.dirname(__file__)
+    root = os.path.dirname(os.path.dirname(here))
+    path = os.pathsep.join([here, root, os.environ.get("PYTHONPATH", "")])
+    got = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": path, "PYTHONHASHSEED": "12345"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert got.stdout.strip() == str(wanted)
+
+
+def test_drawing_one_leaves_the_next_unchanged() -> None:
+    before = digest(make_object("mug", 3))
+    make_object("mug", 4)
+    np.random.default_rng(0).random()
+    assert digest(make_object("mug", 3)) == before
+
+
+@pytest.mark.parametrize("index", INDICES)
+def test_hollows_stay_hollow(index: int) -> None:
+    assert not inside(drawn("bowl", index), (0, 0, 0.1))
+    assert inside(drawn("bowl", index), (0, 0, -0.5 * extent_z("bowl", index) + 0.01))
+    mug = drawn("mug", index)
+    axis = (extents(mug)[0, 0] + mug.pieces[0].extents[0] / 2 + 0.05, 0.0)
+    for z in (-0.2, 0.0, 0.2):
+        assert not inside(mug, (*axis, z))
+    assert inside(mug, (*axis, extents(mug)[0, 2] + 0.02)), "the mug has no floor"
+    gear = drawn("gear", index)
+    assert not inside(gear, (0, 0, 0)) and inside(gear, (0.3, 0, 0))
+
+
+def extent_z(category: str, index: int) -> float:
+    """Height of an instance."""
+    low, high = extents(drawn(category, index))
+    return float(high[2] - low[2])
+
+
+@pytest.mark.parametrize("index", INDICES)
+def test_there_is_air_under_tables_chairs_and_shades(index: int) -> None:
+    assert not inside(drawn("table", index), (0, 0, -0.1))
+    assert not inside(drawn("chair", index), (0, 0, -0.25))
+    shade = drawn("lamp", index)
+    assert not inside(shade, (0.12, 0, 0.2))
+    assert inside(shade, (0, 0, -0.2)), "the pole is missing"
+
+
+def test_there_is_a_gap_behind_the_handle() -> None:
+    for index in INDICES:
+        mug = drawn("mug", index)
+        row = [inside(mug, (x, 0, 0.02)) for x in np.arange(0.5, -0.5, -0.004)]
+        # from outside: handle, gap, wall, cavity, wall
+        assert (np.diff(np.array(row, int)) == 1).sum() >= 2
+
+
+def test_load_object_takes_a_name_with_or_without_an_index() -> None:
+    assert load_object("mug-17").name == "mug-17"
+    assert load_object("mug").name == "mug-0"
+    assert digest(load_object("mug")) == digest(make_object("mug", 0))
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        ("mugg", r"did you mean 'mug'\?.*bottle, bowl.*\.glb"),
+        ("Table-3", r"'Table' \(did you mean 'table'\?\)"),
+        ("qqq", r"no object called 'qqq'; there are bottle"),
+        ("mug--3", "no object called 'mug-'"),
+        ("", "no object called ''"),
+        ("cup.step", r"cup\.step.*'\.step'.*\.obj, \.stl, \.ply, \.glb"),
+        ("nowhere/cup.stl", "no such file"),
+    ],
+)
+def test_what_cannot_be_loaded_is_said_in_one_line(target: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as caught:
+        load_object(target)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_index_below_zero_is_refused() -> None:
+    with pytest.raises(ConfigError, match="0 or more"):
+        make_object("mug", -1)
+
+
+def test_normalised_keeps_proportions() -> None:
+    big = normalised([box((10, 0, 0), (4, 2, 1)), box((12.5, 0, 0), (1, 2, 1))])
+    np.testing.assert_allclose([p.extents for p in big], [[0.8, 0.4, 0.2], [0.2, 0.4, 0.2]])
+    assert [p.bounds[0, 0] for p in big] == pytest.approx([-0.5, 0.3])
+
+
+def test_a_bar_keeps_its_sides_level() -> None:
+    flat = bar((0, 0, 0), (0, 2, 0), width=0.1, height=0.3)
+    np.testing.assert_allclose(flat.extents, [0.1, 2, 0.3], atol=1e-12)
+    steep = bar((0, 0, 0), (0, 0, 2), width=0.1, height=0.3)
+    np.testing.assert_allclose(steep.extents, [0.1, 0.3, 2], atol=1e-12)
+
+
+def test_volumes_of_the_building_blocks() -> None:
+    assert rod((0, 0, 0), (1, 1, 1), 0.1, sides=48).volume == pytest.approx(
+        np.pi * 0.01 * np.sqrt(3), rel=0.01
+    )
+    staves = wall([(0.5, 0), (0.5, 1)], 0.1)
+    assert len(staves) == 8
+    outer = 24 / 2 * 0.5**2 * np.sin(2 * np.pi / 24)
+    inner = 8 / 2 * 0.4**2 * np.sin(2 * np.pi / 8)
+    assert sum(s.volume for s in staves) == pytest.approx(outer - inner)
