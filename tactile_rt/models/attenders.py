@@ -1,0 +1,152 @@
+"""Attenders: what a step's features mean in the light of the steps before it.
+
+Every attender maps features `(batch, step, feature)` to the same shape, causally, and has a
+`step` that gives the same one by one.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+HEADS = 4
+LAYERS = 8
+BLOCK = 65  # positions the table has; two tokens a step, so 32 steps
+MAX_STEPS = BLOCK // 2
+TOKENS = 2  # a step's observation, then the action token
+
+
+class NoAttender(nn.Module):
+    """Each step on its own."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        return features
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        return {}
+
+    def step(
+        self, features: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        return features, {}
+
+
+class Block(nn.Module):
+    """Pre-norm transformer layer: x + attention(norm(x)), then x + MLP(norm(x))."""
+
+    def __init__(self, width: int, dropout: float) -> None:
+        super().__init__()
+        self.norm1 = nn.LayerNorm(width)
+        self.qkv = nn.Linear(width, 3 * width)
+        self.proj = nn.Linear(width, width)
+        self.norm2 = nn.LayerNorm(width)
+        self.mlp_in = nn.Linear(width, 4 * width)
+        self.mlp_out = nn.Linear(4 * width, width)
+        self.dropout = dropout
+
+    def heads(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Queries, keys and values of tokens (batch, token, width), (batch, head, token, ·)."""
+        qkv = self.qkv(self.norm1(x)).unflatten(-1, (3, HEADS, -1))
+        q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)
+        return q, k, v
+
+    def merge(self, x: Tensor, attended: Tensor) -> Tensor:
+        """The rest of the layer, from attended (batch, head, token, ·)."""
+        x = x + self._drop(self.proj(attended.transpose(1, 2).flatten(2)))
+        hidden = F.gelu(self.mlp_in(self.norm2(x)), approximate="tanh")
+        return x + self._drop(self.mlp_out(hidden))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """All tokens at once, each attending to itself and those before it."""
+        q, k, v = self.heads(x)
+        dropout = self.dropout if self.training else 0.0
+        return self.merge(
+            x, F.scaled_dot_product_attention(q, k, v, dropout_p=dropout, is_causal=True)
+        )
+
+    def _drop(self, x: Tensor) -> Tensor:
+        return F.dropout(x, self.dropout, self.training)
+
+
+class GPT(nn.Module):
+    """Causal transformer over (observation, action token) pairs (paper, section "EAD"; GPT-2).
+
+    A learned action token follows every step's features; its outputs are the attender's.
+    """
+
+    def __init__(self, width: int, dropout: float, max_steps: int) -> None:
+        super().__init__()
+        self.max_steps = max_steps
+        self.dropout = dropout
+        self.action = nn.Parameter(torch.randn(width))
+        self.project_in = nn.Linear(width, width)
+        self.positions = nn.Parameter(torch.empty(BLOCK, width))
+        self.blocks = nn.ModuleList(Block(width, dropout) for _ in range(LAYERS))
+        self.norm = nn.LayerNorm(width)
+        self.project_out = nn.Linear(width, width, bias=False)
+        nn.init.normal_(self.positions, std=0.02)
+        std = 0.02 * math.sqrt(512 / width)  # GPT-2's at full width; narrower sums fewer terms
+        for name, module in self.named_modules():
+            if isinstance(module, nn.Linear):
+                # Every layer adds twice to the residual: keep the variance at that of one.
+                shrink = math.sqrt(2 * LAYERS) if name.endswith(("proj", "mlp_out")) else 1.0
+                nn.init.normal_(module.weight, std=std / shrink)
+                if module.bias is not None:
+                    nn.init.zeros_(module.bias)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """features (batch, step, width) -> (batch, step, width)"""
+        steps = features.shape[1]
+        if steps > self.max_steps:
+            raise ValueError(f"{steps} steps, but this attender ends at {self.max_steps}")
+        x = self._embed(features) + self.positions[: TOKENS * steps].unflatten(0, (steps, TOKENS))
+        x = F.dropout(x.flatten(1, 2), self.dropout, self.training)
+        for block in self.blocks:
+            x = block(x)
+        out: Tensor = self.project_out(self.norm(x[:, TOKENS - 1 :: TOKENS]))
+        return out
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        """Empty caches of keys and values, (batch, layer, head, step, token, width / head)."""
+        head = self.positions.shape[1] // HEADS
+        shape = (batch, LAYERS, HEADS, self.max_steps, TOKENS, head)
+        zeros = self.positions.new_zeros
+        return {"gpt_k": zeros(shape), "gpt_v": zeros(shape)}
+
+    def step(
+        self, features: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """One step. features (batch, width); index (batch,) int64, steps since the reset.
+
+        Past `max_steps` the last position is overwritten again and again: reset before.
+        """
+        index = index.clamp(max=self.max_steps - 1)
+        slots = torch.arange(self.max_steps, device=index.device)
+        here = (slots == index[:, None])[:, None, :, None, None]  # where this step's pair goes
+        # The observation sees the pairs before and itself, the action token its own pair too.
+        token = torch.arange(TOKENS * self.max_steps, device=index.device)
+        query = TOKENS * index[:, None] + torch.arange(TOKENS, device=index.device)
+        seen = (token <= query[:, :, None])[:, None]  # (batch, 1, query, token)
+        positions = self.positions[: TOKENS * self.max_steps].unflatten(0, (-1, TOKENS))
+        x = self._embed(features) + positions[index]
+        keys, values = [], []
+        for layer, block in enumerate(self.blocks):
+            assert isinstance(block, Block)
+            q, k, v = block.heads(x)
+            keys.append(torch.where(here, k[:, :, None], state["gpt_k"][:, layer]))
+            values.append(torch.where(here, v[:, :, None], state["gpt_v"][:, layer]))
+            attended = F.scaled_dot_product_attention(
+                q, keys[-1].flatten(2, 3), values[-1].flatten(2, 3), attn_mask=seen
+            )
+            x = block.merge(x, attended)
+        out = self.project_out(self.norm(x[:, TOKENS - 1]))
+        return out, {"gpt_k": torch.stack(keys, 1), "gpt_v": torch.stack(values, 1)}
+
+    def _embed(self, features: Tensor) -> Tensor:
+        """features (..., width) -> (..., token, width): the observation, then the action token."""
+        action = self.action.expand_as(features)
+        out: Tensor = self.project_in(torch.stack([features, action], dim=-2))
+        return out

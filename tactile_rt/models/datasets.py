@@ -1,0 +1,177 @@
+"""From stored sweeps to training windows: onsets as the robot will find them, noise as it will be.
+
+A window is what the classifier would feed the network: it starts where `ContactDetector` reports
+onset on the noisy signal, and carries the tare that the detector had measured by then.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tactile_rt.contact import CHANNEL_FLOOR, ContactDetector
+from tactile_rt.recording import SweepManifest, Sweeps, read_sweeps
+from tactile_rt.stream import ArraySpec, ConfigError
+
+__all__ = ["RATED_NOISE", "STEPS", "SUBSTEPS", "Onsets", "SweepSet", "find_onsets", "windows"]
+
+STEPS, SUBSTEPS = 22, 5  # 22 steps of 45 ms, each of five 9 ms samples (Chung et al. 2025)
+RATED_NOISE = {"N": 10e-6, "N m": 5e-8}  # sensor noise per sample, one standard deviation, SI
+NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0)  # of the rated noise, at which training finds onsets
+GAIN_ERROR = 0.1
+DROPOUT = 0.05  # of whole whiskers
+JITTER = 5  # samples either side of the onset
+
+
+def channel_values(spec: ArraySpec, table: dict[str, float]) -> NDArray[np.float32]:
+    """(channel,) values from a table by unit.
+
+    Raises:
+        ConfigError: a channel's unit is not in the table.
+    """
+    unknown = sorted(set(spec.units) - set(table))
+    if unknown:
+        raise ConfigError(f"channels in {', '.join(unknown)} cannot be learnt from yet")
+    return np.array([table[u] for u in spec.units], dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Onsets:
+    """Where the detector found contact in every sweep, and its baseline there.
+
+    Attributes:
+        start: (sweep,) sample of onset; -1 where none was found.
+        offset, sigma: (sweep, element, channel) tare and noise, SI.
+    """
+
+    start: NDArray[np.int64]
+    offset: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class SweepSet:
+    """One split of a sweep set, with what its windows need."""
+
+    manifest: SweepManifest
+    sweeps: Sweeps
+    noise: NDArray[np.float32]  # (channel,) rated noise per sample, SI
+    floor: NDArray[np.float32]  # (channel,) smallest sigma of the detector, SI
+
+    @classmethod
+    def read(cls, folder: Path, split: str) -> "SweepSet":
+        """Read a split.
+
+        Raises:
+            RecordingError, ConfigError: as `read_sweeps`.
+        """
+        manifest = SweepManifest.read(folder)
+        return cls(
+            manifest,
+            read_sweeps(folder, split),
+            channel_values(manifest.spec, RATED_NOISE),
+            channel_values(manifest.spec, CHANNEL_FLOOR),
+        )
+
+
+def find_onsets(values: NDArray[np.float32], floor: NDArray[np.float32]) -> Onsets:
+    """Run the contact detector over sweeps.
+
+    Args:
+        values: (sweep, sample, element, channel), noise included, SI.
+        floor: (channel,) smallest sigma of the detector, SI.
+    """
+    n, _, *shape = values.shape
+    start = np.full(n, -1, dtype=np.int64)
+    offset = np.zeros((n, *shape), dtype=np.float32)
+    sigma = np.zeros((n, *shape), dtype=np.float32)
+    valid = np.ones(shape[0], dtype=np.bool_)
+    for i, sweep in enumerate(values):
+        detector = ContactDetector((shape[0], shape[1]), floor)
+        for k, sample in enumerate(sweep):
+            if detector.update(sample, valid):
+                start[i] = k
+                break
+        offset[i], sigma[i] = detector.offset, detector.sigma
+    return Onsets(start, offset, sigma)
+
+
+def windows(
+    values: NDArray[np.float32], start: NDArray[np.int64], steps: int = STEPS
+) -> NDArray[np.float32]:
+    """Cut (sweep, step, sub-step, element, channel) windows that begin at `start` (sweep,).
+
+    A window that reaches past the sweep's end repeats its last sample.
+    """
+    samples = start[:, None] + np.arange(steps * SUBSTEPS)
+    samples = np.clip(samples, 0, values.shape[1] - 1)
+    cut = values[np.arange(len(values))[:, None], samples]
+    shaped: NDArray[np.float32] = cut.reshape(len(values), steps, SUBSTEPS, *values.shape[2:])
+    return shaped
+
+
+def _onsets_at(data: SweepSet, level: float, seed: int) -> NDArray[np.int64]:
+    rng = np.random.default_rng(seed)
+    starts = []
+    for values in np.array_split(data.sweeps.values, max(len(data.sweeps) // 256, 1)):
+        noise = rng.normal(size=values.shape).astype(np.float32) * data.noise
+        starts.append(find_onsets(values + np.float32(level) * noise, data.floor).start)
+    return np.concatenate(starts)
+
+
+class TrainingBatches:
+    """Epochs of augmented training windows, each drawn afresh from (seed, epoch).
+
+    Half of the windows are clean and half carry sensor noise of a level drawn up to the rated
+    one; every whisker's gain is off by a few percent, and some whiskers are dead.
+    """
+
+    def __init__(self, data: SweepSet, batch: int, seed: int) -> None:
+        self._data, self._batch, self._seed = data, batch, seed
+        self._starts = np.stack(
+            [_onsets_at(data, level, seed) for level in NOISE_LEVELS]
+        )  # (level, sweep)
+        # Too faint to be found at its noise level: learn it from where it is found without.
+        self._starts = np.where(self._starts < 0, self._starts[0], self._starts)
+        self._usable = np.flatnonzero(self._starts[0] >= 0)
+
+    def __len__(self) -> int:
+        return len(self._usable) // self._batch
+
+    def epoch(self, number: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Batches of samples, offset, sigma (as `InputStage` takes them) and labels (batch,)."""
+        rng = np.random.default_rng([self._seed, number])
+        order = rng.permutation(self._usable)
+        for i in range(len(self)):
+            yield self._draw(order[i * self._batch : (i + 1) * self._batch], rng)
+
+    def _draw(
+        self, at: NDArray[np.int64], rng: np.random.Generator
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        data, n = self._data, len(at)
+        elements, channels = data.manifest.spec.shape
+        level = np.where(rng.random(n) < 0.5, 0.0, rng.random(n)).astype(np.float32)
+        nearest = np.abs(level[:, None] - np.array(NOISE_LEVELS)).argmin(axis=1)
+        start = self._starts[nearest, at] + rng.integers(-JITTER, JITTER + 1, n)
+        samples = windows(data.sweeps.values[at], start)
+        gain = 1 + GAIN_ERROR * rng.normal(size=(n, 1, 1, elements, 1)).astype(np.float32)
+        alive = rng.random((n, 1, 1, elements, 1)) >= DROPOUT
+        samples = samples * (gain * alive)
+        noise = data.noise * level[:, None, None]  # (batch, 1, channel)
+        samples += noise[:, None, None] * rng.normal(size=samples.shape).astype(np.float32)
+        # The tare: a mean and a spread over the quiet samples that happened to come before.
+        quiet = rng.integers(20, 60, (n, 1, 1))
+        shape = (n, elements, channels)
+        offset = noise * rng.normal(size=shape) / np.sqrt(quiet)
+        spread = 1 + rng.normal(size=shape) / np.sqrt(2 * (quiet - 1))
+        sigma = np.maximum(noise * np.abs(spread), data.floor)
+        return (
+            torch.from_numpy(samples.astype(np.float32)),
+            torch.from_numpy(offset.astype(np.float32)),
+            torch.from_numpy(sigma.astype(np.float32)),
+            torch.from_numpy(data.sweeps.labels[at]),
+        )

@@ -1,0 +1,1 @@
+"""Encoders: frames `(batch, step, 30, 5, 7)` to features `(batch, step, feature)`."""

@@ -1,0 +1,152 @@
+"""How well does a classifier do on objects that it never saw? Accuracy with honest intervals.
+
+Predictions are (sweep, step, class) posteriors; a sweep in which no contact was detected has no
+decision, and counts as wrong everywhere.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.classifier import fuse
+from tactile_rt.models.datasets import STEPS, SweepSet, find_onsets, windows
+
+__all__ = [
+    "Interval",
+    "accuracy",
+    "accuracy_over_time",
+    "confusion",
+    "expected_calibration_error",
+    "fused_accuracy",
+    "predict",
+]
+
+Step = Callable[
+    [NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]
+]
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{100 * self.value:.1f} % [{100 * self.low:.1f}, {100 * self.high:.1f}]"
+
+
+def predict(
+    data: SweepSet, run: Step, noise_level: float = 0.0, seed: int = 0, batch: int = 64
+) -> NDArray[np.float32]:
+    """Posteriors of every sweep at every step, from where the detector finds its onset.
+
+    Args:
+        data: the sweeps.
+        run: (samples, offset, sigma) of windows to (batch, step, class) logits.
+        noise_level: white sensor noise added to every stored sample, in units of the rated noise.
+        seed: of the noise.
+        batch: windows per call of `run`.
+
+    Returns:
+        (sweep, step, class) posteriors; NaN where no contact was detected.
+    """
+    rng = np.random.default_rng(seed)
+    parts = []
+    for i in range(0, len(data.sweeps), batch):
+        values = data.sweeps.values[i : i + batch]
+        if noise_level:
+            noise = rng.normal(size=values.shape).astype(np.float32)
+            values = values + noise * data.noise * np.float32(noise_level)
+        found = find_onsets(values, data.floor)
+        logits = run(windows(values, found.start, STEPS), found.offset, found.sigma)
+        posterior = np.exp(logits - logits.max(axis=-1, keepdims=True))
+        posterior /= posterior.sum(axis=-1, keepdims=True)
+        posterior[found.start < 0] = np.nan
+        parts.append(posterior)
+    return np.concatenate(parts)
+
+
+def hits(
+    posteriors: NDArray[np.float32], labels: NDArray[np.int64], top: int = 1
+) -> NDArray[np.bool_]:
+    """(sweep,) whether the label is among the `top` most probable of (sweep, class) posteriors."""
+    decided = ~np.isnan(posteriors).any(axis=1)
+    order = np.argsort(-np.nan_to_num(posteriors), axis=1, kind="stable")[:, :top]
+    correct: NDArray[np.bool_] = decided & (order == labels[:, None]).any(axis=1)
+    return correct
+
+
+def accuracy(
+    correct: NDArray[np.bool_], objects: NDArray[np.str_], resamples: int = 2000
+) -> Interval:
+    """Accuracy with a percentile bootstrap over objects: sweeps of one object are not independent.
+
+    Args:
+        correct: (sweep,).
+        objects: (sweep,) object of each sweep.
+        resamples: bootstrap resamples.
+    """
+    _, which = np.unique(objects, return_inverse=True)
+    right = np.bincount(which, weights=correct)
+    count = np.bincount(which)
+    drawn = np.random.default_rng(0).integers(0, len(count), (resamples, len(count)))
+    means = right[drawn].sum(axis=1) / count[drawn].sum(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return Interval(float(correct.mean()), float(low), float(high))
+
+
+def accuracy_over_time(
+    posteriors: NDArray[np.float32], labels: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """(step,) top-1 accuracy if one decided at that step."""
+    return np.array([hits(posteriors[:, t], labels).mean() for t in range(posteriors.shape[1])])
+
+
+def fused_accuracy(
+    posteriors: NDArray[np.float32],
+    labels: NDArray[np.int64],
+    objects: NDArray[np.str_],
+    sweeps: int = 2,
+) -> Interval:
+    """Accuracy of decisions fused over consecutive sweeps of one object, (sweep, class) given.
+
+    An undetected sweep contributes nothing; a group of only such sweeps is wrong.
+    """
+    correct, of = [], []
+    for name in np.unique(objects):
+        mine = np.flatnonzero(objects == name)
+        for i in range(0, len(mine) - sweeps + 1, sweeps):
+            group = [posteriors[k] for k in mine[i : i + sweeps] if not np.isnan(posteriors[k, 0])]
+            of.append(name)
+            correct.append(bool(group) and int(fuse(group).argmax()) == labels[mine[0]])
+    return accuracy(np.array(correct), np.array(of))
+
+
+def confusion(
+    posteriors: NDArray[np.float32], labels: NDArray[np.int64], classes: int
+) -> NDArray[np.int64]:
+    """(true class, decided class) counts of the sweeps that were decided."""
+    decided = ~np.isnan(posteriors).any(axis=1)
+    table = np.zeros((classes, classes), dtype=np.int64)
+    np.add.at(table, (labels[decided], posteriors[decided].argmax(axis=1)), 1)
+    return table
+
+
+def expected_calibration_error(
+    posteriors: NDArray[np.float32], labels: NDArray[np.int64], bins: int = 15
+) -> float:
+    """ECE (Guo et al. 2017): mean gap between confidence and accuracy over equal-width bins."""
+    decided = ~np.isnan(posteriors).any(axis=1)
+    confidence = posteriors[decided].max(axis=1)
+    right = posteriors[decided].argmax(axis=1) == labels[decided]
+    which = np.minimum((confidence * bins).astype(int), bins - 1)
+    gaps = [
+        abs(confidence[which == b].mean() - right[which == b].mean()) * (which == b).sum()
+        for b in np.unique(which)
+    ]
+    return float(sum(gaps) / max(len(right), 1))
