@@ -172,7 +172,12 @@ def train(
             loss = anytime_loss(logits, labels, config.label_smoothing)
             optimizer.zero_grad()
             loss.backward()
-            nn.utils.clip_grad_norm_(model.parameters(), config.clip_norm)
+            norm = nn.utils.clip_grad_norm_(model.parameters(), config.clip_norm)
+            if not torch.isfinite(norm):  # clipping would turn it into silence or NaN
+                raise ModelError(
+                    f"{folder}: training diverged in epoch {epoch + 1} (gradient norm {norm}); "
+                    f"try a learning rate below {config.learning_rate:g}"
+                )
             optimizer.step()
             schedule.step()
             losses.append(loss.item())

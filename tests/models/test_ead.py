@@ -11,6 +11,7 @@ from torch.nn import functional as F
 
 from tactile_rt.models.attenders import GPT
 from tactile_rt.models.ead import EAD, EADConfig, count_parameters
+from tactile_rt.models.encoders.cells import NORM_EPSILON
 from tactile_rt.models.encoders.zhuang import GRAPH, ZhuangEncoder
 from tactile_rt.stream import ConfigError
 
@@ -150,7 +151,7 @@ def oracle(encoder: ZhuangEncoder, x: Tensor, layer_norm: bool) -> Tensor:
             if layer_norm:
                 for i, g in enumerate(gates):
                     g = (g - g.mean(1, keepdim=True)) / (
-                        g.var(1, unbiased=False, keepdim=True) + 1e-5
+                        g.var(1, unbiased=False, keepdim=True) + NORM_EPSILON
                     ).sqrt()
                     gates[i] = g * cell.gamma[i][:, None, None] + cell.beta[i][:, None, None]
             m, n_ = torch.tanh(gates[0]), F.relu(gates[1])
@@ -185,6 +186,17 @@ def test_gradients_are_those_of_the_equations(frozen):
     for a, b in zip(found, expected, strict=True):
         torch.testing.assert_close(a, b, atol=1e-10, rtol=1e-8)
     assert all(b.any() for b in expected)
+
+
+def test_silent_sites_do_not_blow_up_the_gradient():
+    """Most of a clean window is exactly zero; a norm without variance multiplies gradients."""
+    torch.manual_seed(1)
+    ead = EAD(EADConfig(7, width=1 / 32))  # as initialised: zero biases
+    x = torch.zeros(2, STEPS, 30, 5, 7)
+    x[..., 2, 3] = frames()[..., 2, 3]
+    ead(x)[:, -1].square().sum().backward()
+    worst = max(float(p.grad.norm()) for p in ead.parameters() if p.grad is not None)
+    assert 0 < worst < 100
 
 
 def test_edges():
