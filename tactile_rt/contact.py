@@ -110,7 +110,9 @@ class ContactDetector:
         return begins
 
     def _learn(self, sample: NDArray[np.float32], valid: NDArray[np.bool_]) -> None:
-        self._pending.append((np.where(valid[:, None], sample, 0.0).astype(np.float64), valid.copy()))
+        self._pending.append(
+            (np.where(valid[:, None], sample, 0.0).astype(np.float64), valid.copy())
+        )
         if len(self._pending) <= GUARD_SAMPLES:
             return
         if len(self._baseline) == BASELINE_SAMPLES:
@@ -123,9 +125,9 @@ class ContactDetector:
         self._count += is_valid
         self._sum += newest
         self._sum_of_squares += newest**2
-        if not self.ready:
-            return
         self.tared = self._count >= TARE_SAMPLES
+        if not self.tared.any():
+            return
         n = np.maximum(self._count, 2)[:, None]
         mean = self._sum / n
         variance = np.maximum(self._sum_of_squares - n * mean**2, 0.0) / (n - 1)
@@ -136,4 +138,4 @@ class ContactDetector:
         self.sigma = np.where(known, sigma, self.sigma)
         # Twenty samples underestimate an element's own noise often enough to raise false onsets:
         # for detection no element counts as quieter than the typical one.
-        self._pooled = np.maximum(self.sigma, np.median(self.sigma, axis=0))
+        self._pooled = np.maximum(self.sigma, np.median(self.sigma[self.tared], axis=0))

@@ -10,7 +10,6 @@ it was at, and so that a split can never put one object on two sides.
 
 import os
 import tempfile
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -58,21 +57,19 @@ class SweepManifest:
         """
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / MANIFEST
-        text = msgspec.json.format(msgspec.json.encode(self), indent=1)
+        text = msgspec.json.encode(self)
         if path.exists():
-            there = SweepManifest.read(folder)
-            if there != self:
-                differing = [
-                    name
-                    for name in self.__dataclass_fields__
-                    if getattr(there, name) != getattr(self, name)
-                ]
+            # Compared as JSON, which knows no tuples: a recipe may have been written with some.
+            here = msgspec.json.decode(text)
+            there = msgspec.json.decode(msgspec.json.encode(SweepManifest.read(folder)))
+            differing = [name for name in here if there[name] != here[name]]
+            if differing:
                 raise ConfigError(
                     f"{folder} holds another sweep set (other {', '.join(differing)}): "
                     "choose another folder, or repeat the options that began it"
                 )
             return
-        _write_whole(path, lambda file: file.write(text))
+        _write_whole(path, lambda file: file.write(msgspec.json.format(text, indent=1)))
 
     @classmethod
     def read(cls, folder: Path) -> "SweepManifest":
@@ -93,7 +90,7 @@ class SweepManifest:
             raise RecordingError(
                 f"{folder} is not a sweep set: no {MANIFEST} (make one with `tactile-rt sweep`)"
             ) from None
-        except msgspec.MsgspecError as error:
+        except (msgspec.MsgspecError, UnicodeDecodeError, ConfigError) as error:
             raise RecordingError(f"{path} is damaged: {error}") from None
 
 
@@ -151,6 +148,9 @@ def read_sweeps(folder: Path, split: str) -> Sweeps:
     if split not in manifest.split:
         raise ConfigError(f"no split {split!r} in {folder}: it has {', '.join(manifest.split)}")
     names = manifest.split[split]
+    if not names:
+        raise RecordingError(f"{folder}: {split!r} has no objects")
+    labels = [_label(folder, name, manifest.categories) for name in names]
     missing = [name for name in names if not has_object(folder, name)]
     if missing:
         raise RecordingError(
@@ -158,19 +158,36 @@ def read_sweeps(folder: Path, split: str) -> Sweeps:
             f"missing ({missing[0]} ...); run the same `tactile-rt sweep` again to finish it"
         )
     values = [_read_values(_object_path(folder, name), manifest.spec.shape) for name in names]
+    samples = values[0].shape[1]
+    for name, sweeps in zip(names, values, strict=True):
+        if sweeps.shape[1] != samples:
+            raise RecordingError(
+                f"{_object_path(folder, name)} holds sweeps of {sweeps.shape[1]} samples, "
+                f"not {samples} as {names[0]}"
+            )
     counts = [len(v) for v in values]
-    labels = [manifest.categories.index(name.rpartition("-")[0]) for name in names]
     return Sweeps(
         np.concatenate(values), np.repeat(np.array(labels), counts), np.repeat(names, counts)
     )
 
 
+def _label(folder: Path, name: str, categories: tuple[str, ...]) -> int:
+    category = name.rpartition("-")[0]
+    if category not in categories:
+        raise RecordingError(f"{folder / MANIFEST} is damaged: {name} is of no category it names")
+    return categories.index(category)
+
+
 def _read_values(path: Path, shape: tuple[int, int]) -> NDArray[np.float32]:
     try:
-        with np.load(path) as arrays:
+        # Opened here because numpy leaves its own file open when it is damaged.
+        with path.open("rb") as file, np.load(file) as arrays:
             values: NDArray[np.float32] = arrays["values"]
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        raise RecordingError(f"{path} is damaged ({error}): delete it and sweep again") from None
+    except MemoryError:
+        raise
+    except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file
+        reason = str(error) or type(error).__name__
+        raise RecordingError(f"{path} is damaged ({reason}): delete it and sweep again") from None
     if values.ndim != 4 or values.shape[2:] != shape:
         raise RecordingError(f"{path} holds {values.shape}, not (sweep, sample, *{shape})")
     return values
@@ -182,6 +199,7 @@ def _write_whole(path: Path, write: Any) -> None:
     try:
         with os.fdopen(handle, "wb") as file:
             write(file)
+        os.chmod(name, 0o644)  # a temporary file is its owner's alone; a set is for others too
         os.replace(name, path)
     except BaseException:
         os.unlink(name)

@@ -7,7 +7,6 @@ at run time what it was not trained on.
 import itertools
 
 import numpy as np
-from numpy.typing import NDArray
 
 from tactile_rt.stream import Chunk, concatenate
 

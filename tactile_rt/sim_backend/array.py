@@ -35,6 +35,7 @@ __all__ = [
 CHANNELS = ("fx", "fy", "fz", "mx", "my", "mz")
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
 SAMPLE_MS = 1.0  # output period: 1 kHz
+GAUSS = np.polynomial.legendre.leggauss(5)  # nodes, weights: exact to degree 9
 WHISKER_BIT, OBJECT_BIT = 1, 2  # collision groups: whiskers touch objects, never each other
 
 
@@ -154,7 +155,6 @@ def _add_whisker(
     middle = (s[:-1] + s[1:]) / 2
     radii = whisker.radius(middle)
     lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
-    masses = whisker.density(middle) * 1e-3 * np.pi * radii**2 * np.diff(s)  # mg
     stiffness = whisker.bending_stiffness(s[1:-1]) / cell * 1e3  # uN m / rad
     headings = np.arctan2(np.diff(nodes[:, 1]), np.diff(nodes[:, 0]))
 
@@ -187,16 +187,35 @@ def _add_whisker(
                     axis=axis,
                     stiffness=[stiffness[i - 1], 0, 0],
                 )
+        mass, centre, axial, transverse = _inertia(whisker, s[i], s[i + 1])
+        body.explicitinertial = True
+        body.mass = mass
+        body.ipos = (centre, 0, 0)
+        body.inertia = (axial, transverse, transverse)
         body.add_geom(
             type=mujoco.mjtGeom.mjGEOM_CAPSULE,
             fromto=(0, 0, 0, lengths[i], 0, 0),
             size=(radii[i], 0, 0),
-            mass=masses[i],
             contype=WHISKER_BIT,
             conaffinity=0,
             group=WHISKER_BIT,
             rgba=(0.25, 0.2, 0.15, 1.0),
         )
+
+
+def _inertia(whisker: Whisker, start: float, stop: float) -> tuple[float, float, float, float]:
+    """Mass (mg), centroid (mm from start), axial and transverse inertia (mg mm^2) of a link.
+
+    Of the tapered piece itself: a uniform link would have its mass too far out, and the whole
+    whisker a first resonance up to 3 % too low.
+    """
+    x, weights = (GAUSS[0] + 1) * (stop - start) / 2, GAUSS[1] * (stop - start) / 2
+    radius = whisker.radius(start + x)
+    mass = weights * whisker.density(start + x) * 1e-3 * np.pi * radius**2
+    total = float(mass.sum())
+    centre = float(mass @ x / total)
+    axial = float(mass @ radius**2 / 2)
+    return total, centre, axial, float(mass @ (radius**2 / 4 + (x - centre) ** 2))
 
 
 def set_damping(model: mujoco.MjModel) -> dict[str, float]:

@@ -18,17 +18,16 @@ from numpy.typing import NDArray
 from tactile_rt.recording import SweepManifest, has_object, split_by_object, write_object
 from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS, array_spec
 from tactile_rt.sim_backend.objects import CATEGORIES, make_object
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation
 from tactile_rt.sim_backend.whiskers import mouse_whiskers
 from tactile_rt.stream import Chunk, ConfigError
 from tactile_rt.timebase import Resampler
 
-__all__ = ["PERIOD_NS", "SweepRecipe", "draw_sweep", "make_sweeps"]
+__all__ = ["PERIOD_NS", "SweepRecipe", "make_sweeps"]
 
 PERIOD_NS = 9_000_000  # five sub-steps of 9 ms make one network step (Chung et al. 2025)
 LEAD = 24  # stored samples at rest before the simulation starts: enough for a tare
 SAMPLES = 164  # stored samples of one sweep, the lead included: 22 steps from onset and to spare
-DRAWS = 20  # tries to draw parameters with which the object meets the array at all
 
 
 @dataclass(frozen=True)
@@ -87,17 +86,6 @@ class SweepRecipe:
         )
 
 
-def draw_sweep(rng: np.random.Generator) -> Sweep:
-    """Draw the parameters of one sweep: any yaw, a spread of heights, distances and speeds."""
-    return Sweep(
-        speed_mm_s=float(rng.uniform(28, 40)),
-        yaw_deg=float(rng.uniform(0, 360)),
-        height_mm=float(rng.uniform(-8, 4)),
-        distance_mm=float(rng.uniform(5.5, 8)),
-        gap_mm=float(rng.uniform(0.5, 4)),
-    )
-
-
 def make_sweeps(
     recipe: SweepRecipe,
     folder: Path,
@@ -107,17 +95,20 @@ def make_sweeps(
     """Make a sweep set, or what is missing of it; yields each object's name as it is finished.
 
     Raises:
-        ConfigError: the folder holds another set.
+        ConfigError: no such split, or the folder holds another set.
     """
+    recipe.count(splits)  # which refuses unknown ones before anything is written
     manifest = recipe.manifest()
     manifest.write(folder)
     names = [n for s in splits for n in manifest.split[s]]
     done = [n for n in names if has_object(folder, n)]
     yield from done
     todo = [(recipe, folder, n) for n in names if n not in set(done)]
+    if not todo:
+        return
     # spawn: a forked copy of a process that runs threads (a progress bar) may hang.
     context = multiprocessing.get_context("spawn")
-    with context.Pool(min(processes or os.cpu_count() or 1, max(len(todo), 1)), _quiet) as pool:
+    with context.Pool(min(processes or os.cpu_count() or 1, len(todo)), _quiet) as pool:
         yield from pool.imap_unordered(_make_object_sweeps, todo)
 
 
@@ -134,11 +125,7 @@ def _make_object_sweeps(task: tuple[SweepRecipe, Path, str]) -> str:
     profile = PROFILES[recipe.profile]
     values, drawn = [], []
     for _ in range(recipe.sweeps):
-        for _ in range(DRAWS):
-            sweep = draw_sweep(rng)
-            simulation = SweepSimulation(mouse_whiskers(), target, sweep, profile)
-            if simulation.touches:
-                break
+        sweep, simulation = draw_simulation(rng, mouse_whiskers(), target, profile)
         values.append(_record(simulation))
         drawn.append(sweep)
     parameters = {

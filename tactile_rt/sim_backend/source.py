@@ -10,16 +10,15 @@ from typing import Literal
 import numpy as np
 
 from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS, array_spec
-from tactile_rt.sim_backend.dataset import draw_sweep
 from tactile_rt.sim_backend.objects import CATEGORIES, load_object
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation
 from tactile_rt.sim_backend.whiskers import mouse_whiskers
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source
 from tactile_rt.timebase import NS_PER_S
 
 __all__ = ["Pass", "SimOptions", "SimSource"]
 
-REST_SAMPLES = 270  # between two objects: enough for a tare
+REST_SAMPLES = 600  # between two objects: the last episode ends, contact is released, and a tare
 CHUNK_SAMPLES = 9
 
 
@@ -147,9 +146,8 @@ class SimSource(Source):
             order = self._rng.permutation(len(self._objects))
             self._order = [int(i) for i in order for _ in range(self._options.repeat)]
         target = self._objects[self._order.pop(0)]
-        sweep = draw_sweep(self._rng)
-        self._simulation = SweepSimulation(
-            self._whiskers, target, sweep, PROFILES[self._options.profile]
+        sweep, self._simulation = draw_simulation(
+            self._rng, self._whiskers, target, PROFILES[self._options.profile]
         )
         self._rest = REST_SAMPLES
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)

@@ -26,10 +26,11 @@ from tactile_rt.sim_backend.array import (
 from tactile_rt.sim_backend.objects import TactileObject
 from tactile_rt.sim_backend.whiskers import Whisker, rotation
 
-__all__ = ["Sweep", "SweepSimulation"]
+__all__ = ["Sweep", "SweepSimulation", "draw_simulation", "draw_sweep"]
 
 FAR_MM = 200.0  # where the object waits while the way to first contact is measured
 RAY_SPACING_MM = 0.25
+DRAWS = 20  # tries to draw parameters with which an object meets the array at all
 CLEAR_MM = 5.0  # how far past the last whisker a sweep goes on
 
 
@@ -97,7 +98,9 @@ class SweepSimulation:
         self.touches = way is not None
         self._start[1] -= way - sweep.gap_mm if way is not None else FAR_MM
         self.data.mocap_pos[0] = self._start
-        # The solver takes a mocap body to stand still; friction must see its surface move.
+        # The solver takes a mocap body to stand still; friction must see its surface move. The
+        # flag is set at compile time by non-zero velocities only: without it they are ignored.
+        self.model.flg_surfacevel = True
         for geom in np.flatnonzero(self.model.geom_contype == OBJECT_BIT):
             frame = self.data.geom_xmat[geom].reshape(3, 3)
             self.model.geom_surfacevel[geom, :3] = frame.T @ (self._step_mm / profile.timestep_ms)
@@ -135,6 +138,29 @@ class SweepSimulation:
         """Advance in pieces until the object has passed."""
         while self._steps_done * self.model.opt.timestep < self.duration_ms:
             yield self.advance(samples_at_once)
+
+
+def draw_sweep(rng: np.random.Generator) -> Sweep:
+    """Draw the parameters of one sweep: any yaw, a spread of heights, distances and speeds."""
+    return Sweep(
+        speed_mm_s=float(rng.uniform(28, 40)),
+        yaw_deg=float(rng.uniform(0, 360)),
+        height_mm=float(rng.uniform(-8, 4)),
+        distance_mm=float(rng.uniform(5.5, 8)),
+        gap_mm=float(rng.uniform(0.5, 4)),
+    )
+
+
+def draw_simulation(
+    rng: np.random.Generator, whiskers: tuple[Whisker, ...], target: TactileObject, profile: Profile
+) -> tuple[Sweep, SweepSimulation]:
+    """Draw sweeps until the object meets the array; give up, with a miss, after many tries."""
+    for _ in range(DRAWS):
+        sweep = draw_sweep(rng)
+        simulation = SweepSimulation(whiskers, target, sweep, profile)
+        if simulation.touches:
+            break
+    return sweep, simulation
 
 
 def _add_object(

@@ -61,8 +61,8 @@ def test_it_starts_clear_of_the_whiskers_and_meets_them_when_said(category: str)
             if data.ncon:
                 break
             way += sweep.speed_mm_s * 1e-3 * REALTIME.timestep_ms
-        # a whisker's radius and the spacing of the rays: 0.1 mm
-        assert way == pytest.approx(sweep.gap_mm, abs=0.1)
+        # early where a slanted edge meets a whisker's side before the ray through its axis
+        assert -0.2 < way - sweep.gap_mm < 0.05
 
 
 def test_only_whiskers_and_object_touch() -> None:
@@ -95,7 +95,9 @@ def test_a_sample_is_the_mean_over_its_millisecond() -> None:
     by_hand = SweepSimulation(C2, block(), sweep, profile)
     raw = np.array([d.sensordata.copy() for _, d in stepped(by_hand, sweep, 60)])
     assert len(raw) == 300 and np.abs(loads[-1]).max() > 0
-    np.testing.assert_allclose(loads, read_base_loads(raw.reshape(60, 5, 6).mean(axis=1)), atol=1e-15)
+    np.testing.assert_allclose(
+        loads, read_base_loads(raw.reshape(60, 5, 6).mean(axis=1)), atol=1e-15
+    )
 
 
 # The face that slides along the whisker is parallel to the motion and faces -x, whatever the yaw.
@@ -181,5 +183,7 @@ def test_an_object_of_several_pieces_is_felt_as_their_union() -> None:
     halves = tuple(box((x, 0, 0), (0.5, 1, 1)) for x in (-0.25, 0.25))
     sweep = Sweep(gap_mm=0.2)
     whole = SweepSimulation(C2, block(), sweep, REALTIME).advance(300)
-    cut = SweepSimulation(C2, TactileObject("halves", "halves", halves), sweep, REALTIME).advance(300)
+    cut = SweepSimulation(C2, TactileObject("halves", "halves", halves), sweep, REALTIME).advance(
+        300
+    )
     assert np.sqrt(np.mean((cut - whole) ** 2)) < 0.05 * np.sqrt(np.mean(whole**2))

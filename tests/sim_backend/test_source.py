@@ -1,0 +1,179 @@
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("trimesh")
+
+from tactile_rt.sim_backend.array import array_spec
+from tactile_rt.sim_backend.objects import CATEGORIES
+from tactile_rt.sim_backend.source import REST_SAMPLES, SimOptions, SimSource
+from tactile_rt.sim_backend.whiskers import mouse_whiskers
+from tactile_rt.stream import Chunk, ConfigError, EndOfStream, concatenate
+
+
+def fast(**options: str | int) -> SimSource:
+    """A source that does not wait for the clock."""
+    return SimSource("mouse", SimOptions(pace="fast", **options))  # type: ignore[arg-type]
+
+
+def first(source: SimSource, samples: int) -> Chunk:
+    """Read until there are at least so many samples."""
+    chunks, n = [], 0
+    while n < samples:
+        chunk = source.read()
+        assert chunk is not None
+        chunks.append(chunk)
+        n += len(chunk)
+    return concatenate(chunks)
+
+
+@pytest.fixture(scope="module")
+def two_passes() -> tuple[SimSource, Chunk]:
+    """A stream to its end, and the source that it came from."""
+    source = fast(objects="bottle-3,gear", sweeps=2, seed=4)
+    return source, concatenate(list(source))
+
+
+def test_the_same_seed_gives_the_same_stream() -> None:
+    n = REST_SAMPLES + 200
+    one, same, other = (fast(objects="mug-1,bowl-1", seed=s) for s in (3, 3, 4))
+    a, b, c = first(one, n), first(same, n), first(other, n)
+    assert np.abs(a.values).max() > 0
+    np.testing.assert_array_equal(a.values, b.values)
+    np.testing.assert_array_equal(a.t_ns, b.t_ns)
+    assert one.passes == same.passes != other.passes
+    assert not np.array_equal(a.values, c.values)
+
+
+def test_samples_are_numbered_and_a_millisecond_apart(two_passes: tuple[SimSource, Chunk]) -> None:
+    source, stream = two_passes
+    np.testing.assert_array_equal(stream.seq, np.arange(len(stream)))
+    np.testing.assert_array_equal(np.diff(stream.t_ns), 1_000_000)
+    assert stream.values.dtype == np.float32 and stream.values.shape[1:] == source.spec.shape
+    assert stream.valid.all() and np.isfinite(stream.values).all()
+    assert source.stats.delivered == len(stream)
+
+
+def test_loads_are_felt_only_while_an_object_passes(two_passes: tuple[SimSource, Chunk]) -> None:
+    source, stream = two_passes
+    assert {p.name for p in source.passes} == {"bottle-3", "gear-0"}
+    assert {p.category for p in source.passes} == {"bottle", "gear"}
+    starts = [int(np.searchsorted(stream.t_ns, p.start_ns)) for p in source.passes]
+    assert starts[0] == 0
+    for passed, start, end in zip(source.passes, starts, [*starts[1:], len(stream)], strict=True):
+        felt = np.abs(stream.values[start:end, :, :3]).max(axis=(1, 2)) > 1e-9
+        assert not felt[:REST_SAMPLES].any(), "rest comes first"
+        gap = passed.sweep.gap_mm / passed.sweep.speed_mm_s * 1e3
+        onset = int(np.argmax(felt)) - REST_SAMPLES
+        assert gap - 8 <= onset <= gap + 8  # ms
+        assert felt.sum() > 100 and not felt[-1]
+
+
+def test_it_ends_after_its_sweeps_for_good(two_passes: tuple[SimSource, Chunk]) -> None:
+    source, _ = two_passes
+    assert len(source.passes) == 2
+    for _ in range(2):
+        with pytest.raises(EndOfStream):
+            source.read()
+
+
+def test_an_object_comes_several_times_in_succession() -> None:
+    with fast(objects="bottle-1,mug-1", sweeps=2, repeat=2) as source:
+        for _ in source:
+            pass
+    names = [p.name for p in source.passes]
+    assert sorted(names) == ["bottle-1"] * 2 + ["mug-1"] * 2
+    assert names[0] == names[1] and names[2] == names[3]
+    assert len({p.sweep for p in source.passes}) == 4  # but never twice the same way
+
+
+def test_all_categories_come_when_none_is_named() -> None:
+    with fast() as source:
+        assert source.read() is not None
+        assert source.passes[0].category in CATEGORIES
+
+
+def test_it_describes_the_mouse() -> None:
+    with fast(objects="mug") as source:
+        assert source.spec == array_spec(mouse_whiskers(), "mouse-right")
+        assert source.live is False
+    with SimSource("", SimOptions(objects="mug")) as source:
+        assert source.live is True
+
+
+def test_a_closed_source_is_over() -> None:
+    source = fast(objects="mug")
+    assert source.read() is not None
+    source.close()
+    source.close()
+    for _ in range(2):
+        with pytest.raises(EndOfStream):
+            source.read()
+
+
+def reads(source: SimSource, timeout: float | None) -> Iterator[Chunk | None]:
+    """Read on and on."""
+    while True:
+        yield source.read(timeout)
+
+
+def test_in_real_time_samples_come_when_they_are_due() -> None:
+    with SimSource("mouse", SimOptions(objects="mug")) as source:
+        began = time.monotonic()
+        stream = first(source, 300 // 9 * 9)
+        took = time.monotonic() - began
+        # never early; a busy machine may be late
+        assert 0.28 < took < 10
+        assert stream.t_ns[-1] <= time.monotonic_ns()
+        assert stream.t_ns[-1] - stream.t_ns[0] == (len(stream) - 1) * 1_000_000
+
+
+def test_a_read_without_patience_gets_none_until_samples_are_due() -> None:
+    with SimSource("mouse", SimOptions(objects="mug")) as source:
+        chunks = []
+        refused = 0
+        for chunk in reads(source, 0.0):
+            if chunk is None:
+                refused += 1
+            else:
+                assert chunk.t_ns[-1] <= time.monotonic_ns()
+                chunks.append(chunk)
+            if len(chunks) == 12:  # over 100 ms
+                break
+        assert refused > 0
+        stream = concatenate(chunks)  # what was refused was not lost
+        np.testing.assert_array_equal(stream.seq, np.arange(len(stream)))
+
+
+def test_a_read_waits_no_longer_than_asked() -> None:
+    with SimSource("mouse", SimOptions(objects="mug")) as source:
+        source.read()
+        waits = []
+        for _ in range(20):
+            began = time.monotonic()
+            if source.read(0.002) is None:
+                waits.append(time.monotonic() - began)
+        assert waits and min(waits) < 0.006
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"profile": "quick"}, "no profile 'quick': there are realtime, dataset, accurate"),
+        ({"sweeps": -1}, "sweeps must be 0 or more"),
+        ({"repeat": 0}, "repeat 1 or more"),
+    ],
+)
+def test_bad_options_are_refused(options: dict[str, int], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        SimOptions(**options)  # type: ignore[arg-type]
+
+
+def test_an_unknown_array_or_object_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no simulated array 'rat': there is mouse"):
+        SimSource("rat", SimOptions())
+    with pytest.raises(ConfigError, match="no object called 'mugg'"):
+        SimSource("mouse", SimOptions(objects="bottle,mugg"))
