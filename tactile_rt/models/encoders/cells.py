@@ -17,7 +17,7 @@ from tactile_rt.models.encoders.convolution import Convolution, convolve
 
 FORGET_BIAS = 1.0
 # Where nothing is touched the gates have no variance, and the gradient through a norm grows by
-# 1 / sqrt(epsilon) with every step of the recurrence: at the usual 1e-5 it reaches 1e29 in a window.
+# 1 / sqrt(epsilon) with every step: at the usual 1e-5 it reaches 1e29 in a window of 22.
 NORM_EPSILON = 0.1
 
 
@@ -73,9 +73,7 @@ def intersect(
     """
     gates = gates.to(state.dtype)
     if gamma is not None and beta is not None:
-        normal = F.layer_norm(
-            gates.unflatten(-1, gamma.shape), gamma.shape[1:], eps=NORM_EPSILON
-        )
+        normal = F.layer_norm(gates.unflatten(-1, gamma.shape), gamma.shape[1:], eps=NORM_EPSILON)
         gates = torch.addcmul(beta, normal, gamma).flatten(-2)
     m, n, p, y = gates.chunk(4, dim=-1)
     m, n = torch.tanh(m), torch.relu(n)
