@@ -47,7 +47,7 @@ class TrainingConfig:
     width: float = 0.125
     readout: str = "mean"
     dropout: float = 0.1
-    epochs: int = 16
+    epochs: int = 14
     batch: int = 32
     learning_rate: float = 5e-3
     weight_decay: float = 1e-4

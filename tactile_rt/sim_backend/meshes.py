@@ -16,9 +16,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from tactile_rt.sim_backend.objects import MESH_SUFFIXES, TactileObject, normalised
+from tactile_rt.sim_backend.solids import TactileObject, normalised
 from tactile_rt.stream import ConfigError
 
+MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 THRESHOLD = 0.05
 MAX_PIECES = 32
 MAX_CORNERS = 48  # vertices of a piece

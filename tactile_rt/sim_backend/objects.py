@@ -6,17 +6,18 @@
 import difflib
 import re
 import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import trimesh
 
 from tactile_rt.sim_backend import shapes
+from tactile_rt.sim_backend.meshes import MESH_SUFFIXES, load_mesh
+from tactile_rt.sim_backend.solids import TactileObject, normalised
 from tactile_rt.stream import ConfigError
 
-MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
+__all__ = ["CATEGORIES", "TactileObject", "load_object", "make_object"]
 
 _BUILDERS: dict[str, Callable[[np.random.Generator], list[trimesh.Trimesh]]] = {
     "bottle": shapes.bottle,
@@ -34,26 +35,6 @@ _BUILDERS: dict[str, Callable[[np.random.Generator], list[trimesh.Trimesh]]] = {
 }
 
 CATEGORIES: tuple[str, ...] = tuple(sorted(_BUILDERS))
-
-
-@dataclass(frozen=True)
-class TactileObject:
-    """A rigid thing: its bounding box centred at the origin, largest extent 1 (no unit), z up."""
-
-    name: str  # "mug-17", or the file's stem
-    category: str  # "mug", or the file's stem for a mesh file
-    pieces: tuple[trimesh.Trimesh, ...]  # convex, watertight, wound outward; union = the object
-
-
-def normalised(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]:
-    """The pieces moved and scaled together into the unit box."""
-    corners = np.vstack([piece.bounds for piece in pieces])
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    centre, scale = (low + high) / 2, 1 / (high - low).max()
-    return tuple(
-        trimesh.Trimesh((piece.vertices - centre) * scale, piece.faces, process=False)
-        for piece in pieces
-    )
 
 
 def make_object(category: str, index: int) -> TactileObject:
@@ -75,8 +56,6 @@ def make_object(category: str, index: int) -> TactileObject:
 def load_object(target: str) -> TactileObject:
     """The object named "mug-17" or "mug" (the same as "mug-0"), or the one in a mesh file."""
     if Path(target).suffix or "/" in target or "\\" in target:
-        from tactile_rt.sim_backend.meshes import load_mesh  # which imports this module
-
         return load_mesh(Path(target))
     match = re.fullmatch(r"(.+)-(\d+)", target)
     return make_object(match[1], int(match[2])) if match else make_object(target, 0)

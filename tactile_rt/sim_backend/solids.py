@@ -1,10 +1,11 @@
-"""Convex building blocks: everything a shape is made of is the hull of a few points.
+"""A tactile object, and the convex building blocks that objects are made of.
 
 Lengths are in whatever unit the caller draws in; z is up. A block that cannot be one convex
 piece (a tube, a hollow wall) comes back as a list of pieces.
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -16,6 +17,26 @@ Profile = Sequence[tuple[float, float]]  # (radius, z) from the bottom up
 
 # A 24-sided round of 40 mm departs from the circle by 0.17 mm, below what a whisker resolves.
 ROUND = 24
+
+
+@dataclass(frozen=True)
+class TactileObject:
+    """A rigid thing: its bounding box centred at the origin, largest extent 1 (no unit), z up."""
+
+    name: str  # "mug-17", or the file's stem
+    category: str  # "mug", or the file's stem for a mesh file
+    pieces: tuple[trimesh.Trimesh, ...]  # convex, watertight, wound outward; union = the object
+
+
+def normalised(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]:
+    """The pieces moved and scaled together into the unit box."""
+    corners = np.vstack([piece.bounds for piece in pieces])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    centre, scale = (low + high) / 2, 1 / (high - low).max()
+    return tuple(
+        trimesh.Trimesh((piece.vertices - centre) * scale, piece.faces, process=False)
+        for piece in pieces
+    )
 
 
 def hull(*points: npt.ArrayLike) -> trimesh.Trimesh:

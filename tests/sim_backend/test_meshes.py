@@ -9,8 +9,8 @@ pytest.importorskip("trimesh")
 import trimesh
 
 from tactile_rt.sim_backend import meshes
-from tactile_rt.sim_backend.meshes import load_mesh
-from tactile_rt.sim_backend.objects import MESH_SUFFIXES, TactileObject, load_object, make_object
+from tactile_rt.sim_backend.meshes import MESH_SUFFIXES, load_mesh
+from tactile_rt.sim_backend.objects import TactileObject, load_object, make_object
 from tactile_rt.sim_backend.solids import box
 from tactile_rt.stream import ConfigError
 

@@ -14,9 +14,8 @@ from tactile_rt.sim_backend.objects import (
     TactileObject,
     load_object,
     make_object,
-    normalised,
 )
-from tactile_rt.sim_backend.solids import bar, box, rod, wall
+from tactile_rt.sim_backend.solids import bar, box, normalised, rod, wall
 from tactile_rt.stream import ConfigError
 
 INDICES = (0, 1, 2, 3, 17, 1000)

@@ -1,0 +1,1 @@
+"""Where figures come from: `tactile-rt bench` and `tactile-rt eval`."""

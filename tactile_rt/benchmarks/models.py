@@ -1,0 +1,28 @@
+"""Benchmark area `models`: the shipped model on a sweep set of unseen objects."""
+
+import tempfile
+from pathlib import Path
+
+from tactile_rt.benchmarks.classification import evaluate_model
+from tactile_rt.benchmarks.records import Record
+from tactile_rt.model_file import load_model, shipped_model
+from tactile_rt.sim_backend.dataset import SweepRecipe, make_sweeps
+
+__all__ = ["run"]
+
+
+def run(quick: bool) -> list[Record]:
+    """Sweep test objects of the shipped model afresh and classify them.
+
+    Quick: one sweep of each object, enough to see a broken model but not to quote; the full run
+    makes the very test set that the model's card names.
+    """
+    _, card = load_model(shipped_model())
+    made = dict(card.provenance["sweep_set"])
+    if quick:
+        made["sweeps"] = 1
+    recipe = SweepRecipe(categories=card.labels, **made)
+    with tempfile.TemporaryDirectory() as folder:
+        for _ in make_sweeps(recipe, Path(folder), splits=("test",)):
+            pass
+        return evaluate_model(shipped_model(), Path(folder))

@@ -1,0 +1,1 @@
+"""Drivers for real arrays: wire codecs, serial and CAN sources."""

@@ -1,0 +1,1 @@
+"""From trained checkpoints to files that a robot runs."""

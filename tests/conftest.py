@@ -1,0 +1,29 @@
+import os
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+# Before numpy, torch and onnxruntime start their pools: on a shared machine more threads than one
+# make small tests slower, not faster.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import pytest
+from hypothesis import settings
+
+# Helpers that several test modules share, `contract.py` for one, are imported by their bare names.
+sys.path.insert(0, str(Path(__file__).parent))
+pytest.register_assert_rewrite("contract", "tiny_model")
+
+# No deadline: another process on the machine must not fail a test. Derandomised: whoever runs the
+# tests gets the same examples, so a pass stays a pass.
+settings.register_profile("tactile_rt", deadline=None, derandomize=True)
+settings.load_profile("tactile_rt")
+
+
+@pytest.fixture
+def no_thread_left() -> Iterator[None]:
+    """Fail a test that leaves a thread behind."""
+    before = set(threading.enumerate())
+    yield
+    assert set(threading.enumerate()) <= before

@@ -1,0 +1,318 @@
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import onnxruntime
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("onnxscript")
+
+import onnx
+import torch
+
+import tactile_rt
+from tactile_rt.classifier import Classifier
+from tactile_rt.contact import CHANNEL_FLOOR
+from tactile_rt.export import onnx_step
+from tactile_rt.export.onnx_step import PARITY_BAR, export_checkpoint, export_step, parity
+from tactile_rt.model_file import ModelCard, load_model
+from tactile_rt.models.datasets import STEPS, SUBSTEPS, find_onsets, windows
+from tactile_rt.models.ead import EADConfig
+from tactile_rt.models.training import TactileClassifier
+from tactile_rt.recording import SweepManifest
+from tactile_rt.stream import ArraySpec, ModelError
+from tactile_rt.testing import cut
+
+PERIOD_NS = 9_000_000
+CATEGORIES = ("bowl", "car", "lamp", "mug")
+UNITS = ("N", "N", "N", "N m", "N m", "N m")
+TYPICAL = np.array([1e-4] * 3 + [1e-6] * 3, dtype=np.float32)  # loads of a touching whisker, SI
+SPEC = ArraySpec(
+    name="grid",
+    elements=tuple(f"{'ABCDE'[i // 6]}{i % 6}" for i in range(30)),
+    grid=tuple((i // 6, i % 6 + (i % 12 == 5)) for i in range(30)),
+    positions=tuple((0.0, 0.002 * (i % 6), 0.002 * (i // 6)) for i in range(30)),
+    orientations=((1.0, 0.0, 0.0, 0.0),) * 30,
+    channels=("fx", "fy", "fz", "mx", "my", "mz"),
+    units=UNITS,
+    rate_hz=1000.0,
+    frame="head",
+)
+# Every kind of state there is: convolutions, the transformer's cache, the running mean of logits.
+NETWORK = EADConfig(classes=len(CATEGORIES), attender="gpt", width=1 / 32, readout="mean")
+
+
+def build() -> TactileClassifier:
+    """Untrained, but with no parameter at a value that hides a mistake, such as zero."""
+    torch.manual_seed(0)
+    model = TactileClassifier(SPEC, NETWORK).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.1 * torch.randn_like(parameter)
+    return model
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """One checkpoint, exported once: the exporter takes its time."""
+    folder = tmp_path_factory.mktemp("export")
+    manifest = SweepManifest(
+        spec=SPEC,
+        period_ns=PERIOD_NS,
+        lead=24,
+        categories=CATEGORIES,
+        split={"train": ("mug-0",), "validation": ("mug-1",), "test": ("mug-2", "car-2")},
+        recipe={"seed": 5},
+    )
+    manifest.write(folder / "set")
+    model = build()
+    checkpoint = folder / "best.pt"
+    saved = {
+        "model": model.state_dict(),
+        "config": {"data": str(folder / "set"), "epochs": 0},
+        "network": asdict(NETWORK),
+        "spec": SPEC.to_json(),
+    }
+    torch.save(saved, checkpoint)
+    programs = []
+    export = torch.onnx.export
+
+    def remember(*args, **options):
+        programs.append(export(*args, **options))
+        return programs[-1]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.onnx, "export", remember)
+        card = export_checkpoint(
+            checkpoint,
+            folder / "out" / "tiny.onnx",
+            "tiny",
+            temperature=1.25,
+            figures={"validation_top1": 0.5},
+            commands=("tactile-rt train",),
+        )
+    return SimpleNamespace(
+        path=folder / "out" / "tiny.onnx",
+        card=card,
+        model=model,
+        checkpoint=checkpoint,
+        manifest=manifest,
+        proto=programs[0].model_proto,
+    )
+
+
+def metadata(path: Path) -> dict:
+    """What the file says of itself, read with nothing of ours."""
+    (entry,) = [p for p in onnx.load(path).metadata_props if p.key == "tactile_rt"]
+    return json.loads(entry.value)
+
+
+def episodes(n: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n, step, sub-step, element, channel) loads from faint to beyond belief, tare and noise."""
+    rng = np.random.default_rng(seed)
+    size = 10 ** rng.uniform(-2, 3, size=(n, 1, 1, 30, 1))
+    samples = rng.normal(size=(n, STEPS, SUBSTEPS, 30, 6)) * TYPICAL * size
+    offset = rng.normal(size=(n, 30, 6)) * TYPICAL
+    sigma = rng.uniform(0.01, 0.5, size=(n, 30, 6)) * TYPICAL
+    return tuple(a.astype(np.float32) for a in (samples, offset, sigma))
+
+
+def in_torch(model: TactileClassifier, *arrays: np.ndarray) -> np.ndarray:
+    with torch.inference_mode():
+        return model(*(torch.from_numpy(a) for a in arrays)).numpy()
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_the_file_alone_gives_the_trained_window_s_logits(
+    exported: SimpleNamespace, batch: int
+) -> None:
+    """A stream loop as a stranger would write it, from the file's metadata."""
+    card = metadata(exported.path)
+    samples, offset, sigma = episodes(batch, seed=batch)
+    expected = in_torch(exported.model, samples, offset, sigma)
+    session = onnxruntime.InferenceSession(exported.path, providers=["CPUExecutionProvider"])
+    state = {s["name"]: np.zeros((batch, *s["shape"]), s["dtype"]) for s in card["state"]}
+    outputs = ["logits", *(f"{name}_next" for name in state)]
+    assert card["steps"] == STEPS
+    for t in range(card["steps"]):
+        feed = {"samples": samples[:, t], "offset": offset, "sigma": sigma, **state}
+        logits, *following = session.run(outputs, feed)
+        state = dict(zip(state, following, strict=True))
+        assert abs(logits - expected[:, t]).max() <= 1e-5, f"step {t}"
+    assert np.ptp(expected) > 0.5, "logits that say nothing would agree in any graph"
+    assert all(np.any(value) for value in state.values()), "a state that is never written"
+
+
+def test_parity_is_measured_and_stored(exported: SimpleNamespace) -> None:
+    assert 0 < exported.card.figures["parity"] <= PARITY_BAR <= 1e-5
+    assert parity(exported.model, exported.path, episodes=2, seed=7) <= PARITY_BAR
+
+
+def test_parity_tells_another_network_from_the_file_s(exported: SimpleNamespace) -> None:
+    other = build()
+    with torch.no_grad():
+        next(other.parameters()).mul_(1.01)
+    assert parity(other, exported.path, episodes=1) > PARITY_BAR
+
+
+def test_the_metadata_says_everything_needed(exported: SimpleNamespace) -> None:
+    card = metadata(exported.path)
+    assert set(card) == set(ModelCard.__struct_fields__)
+    assert ArraySpec.from_json(card["spec"]) == SPEC
+    assert card["name"] == "tiny"
+    assert card["version"] == 1
+    assert card["period_ns"] == PERIOD_NS
+    assert (card["substeps"], card["steps"]) == (5, 22)
+    assert card["labels"] == list(CATEGORIES)
+    assert card["temperature"] == 1.25
+    assert card["floor"] == pytest.approx([CHANNEL_FLOOR[u] for u in UNITS])
+    for name in ("clip", "scale"):
+        assert card[name] == pytest.approx(getattr(exported.model.inputs, name).tolist())
+    assert card["figures"]["validation_top1"] == 0.5
+    provenance = card["provenance"]
+    assert provenance["checkpoint_sha256"] == (
+        hashlib.sha256(exported.checkpoint.read_bytes()).hexdigest()
+    )
+    assert provenance["unseen_objects"] == ["mug-2", "car-2"]
+    assert provenance["commands"] == ["tactile-rt train"]
+    assert provenance["sweep_set"] == {"seed": 5}
+    assert provenance["network"] == asdict(NETWORK)
+    assert provenance["training"]["epochs"] == 0
+    for package in ("torch", "onnx", "onnxruntime"):
+        assert provenance[package] == __import__(package).__version__
+    assert provenance["tactile_rt"] == tactile_rt.__version__
+
+
+def test_the_file_is_read_back_as_the_card_that_was_returned(exported: SimpleNamespace) -> None:
+    session, card = load_model(exported.path)
+    assert card == exported.card
+    assert [i.name for i in session.get_inputs()] == [
+        "samples", "offset", "sigma", *(s.name for s in card.state)
+    ]  # fmt: skip
+    assert [o.name for o in session.get_outputs()] == [
+        "logits", *(f"{s.name}_next" for s in card.state)
+    ]  # fmt: skip
+
+
+def test_the_graph_is_plain_and_clean(exported: SimpleNamespace) -> None:
+    proto = onnx.load(exported.path)
+    onnx.checker.check_model(proto, full_check=True)
+    assert [(o.domain, o.version) for o in proto.opset_import] == [("", onnx_step.OPSET)]
+    content = exported.path.read_bytes()
+    for trace in (b"site-packages", str(Path(tactile_rt.__file__).parent).encode()):
+        assert trace not in content, "where it was exported is nobody's business"
+
+
+def test_only_the_file_is_left_and_others_may_read_it(exported: SimpleNamespace) -> None:
+    assert [p.name for p in exported.path.parent.iterdir()] == ["tiny.onnx"]
+    assert exported.path.stat().st_mode & 0o777 == 0o644
+
+
+def test_the_robot_decides_as_training_saw_it(exported: SimpleNamespace) -> None:
+    """The live path (resampler, onset, tare, steps) against windows cut from the whole signal."""
+    rng = np.random.default_rng(3)
+    n = 60 + STEPS * SUBSTEPS + 20
+    values = rng.normal(size=(n, 30, 6)) * TYPICAL * 0.05
+    push = np.sin(np.linspace(0, 3, n - 60))[:, None, None] * TYPICAL
+    values[60:, 4:9] += push * rng.normal(size=(5, 6))
+    values = values.astype(np.float32)
+
+    onsets = find_onsets(values[None], np.array([CHANNEL_FLOOR[u] for u in UNITS], np.float32))
+    assert onsets.start[0] > 60
+    window = windows(values[None], onsets.start)
+    logits = in_torch(exported.model, window, onsets.offset, onsets.sigma)[0] / 1.25
+    expected = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
+
+    rate_hz = 1e9 / PERIOD_NS
+    live = cut(np.concatenate([values[:1], values, values[-1:]]), rate_hz, 7)  # none is lost
+    classifier = Classifier(exported.path, SPEC.__class__(**{**asdict(SPEC), "rate_hz": rate_hz}))
+    decisions = [d for chunk in live for d in classifier.push(chunk)]
+    assert [d.step for d in decisions] == list(range(1, STEPS + 1))
+    assert decisions[-1].final
+    for d, posterior in zip(decisions, expected, strict=True):
+        assert d.probabilities == pytest.approx(posterior, abs=2e-6)
+        assert d.labels == CATEGORIES
+
+
+# What goes wrong
+
+
+def replay(monkeypatch: pytest.MonkeyPatch, proto: object) -> None:
+    monkeypatch.setattr(torch.onnx, "export", lambda *_, **__: SimpleNamespace(model_proto=proto))
+
+
+def spoilt(exported: SimpleNamespace, change) -> object:
+    """The graph with the decoder's weights changed, as a broken exporter might."""
+    proto = onnx.ModelProto()
+    proto.CopyFrom(exported.proto)
+    changed = 0
+    for tensor in proto.graph.initializer:
+        values = onnx.numpy_helper.to_array(tensor)
+        if values.dtype == np.float32 and values.shape[:1] == (len(CATEGORIES),):
+            tensor.CopyFrom(onnx.numpy_helper.from_array(change(values), tensor.name))
+            changed += 1
+    assert changed
+    return proto
+
+
+@pytest.mark.parametrize(
+    ("change", "figure"), [(lambda w: w * 1.001, r"\de-0\d"), (lambda w: w * np.nan, "nan")]
+)
+def test_a_graph_that_computes_something_else_is_not_written(
+    exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change, figure
+) -> None:
+    replay(monkeypatch, spoilt(exported, change))
+    path = tmp_path / "m.onnx"
+    path.write_bytes(b"an older model")
+    with pytest.raises(ModelError, match=rf"^{path}: logits .* differ by .*{figure} .*nothing was"):
+        export_step(exported.model, exported.card, path)
+    assert [p.name for p in tmp_path.iterdir()] == ["m.onnx"]
+    assert path.read_bytes() == b"an older model"
+
+
+def test_an_exporter_that_fails_leaves_nothing(
+    exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("unsupported operator")
+
+    monkeypatch.setattr(torch.onnx, "export", fail)
+    with pytest.raises(RuntimeError, match="unsupported operator"):
+        export_step(exported.model, exported.card, tmp_path / "new" / "m.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_fills_up_leaves_nothing(
+    exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replay(monkeypatch, exported.proto)
+
+    def fail(*_: object) -> None:
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(onnx, "save", fail)
+    with pytest.raises(OSError, match="no space"):
+        export_step(exported.model, exported.card, tmp_path / "m.onnx")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match=f"no checkpoint {tmp_path}/best.pt"):
+        export_checkpoint(tmp_path / "best.pt", tmp_path / "m.onnx", "m")
+    (tmp_path / "best.pt").write_bytes(b"garbage")
+    with pytest.raises(ModelError, match=r"best\.pt"):
+        export_checkpoint(tmp_path / "best.pt", tmp_path / "m.onnx", "m")
+    assert [p.name for p in tmp_path.iterdir()] == ["best.pt"]

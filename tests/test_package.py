@@ -1,0 +1,135 @@
+"""What an installed tactile_rt looks like from outside."""
+
+import importlib
+import pkgutil
+import subprocess
+import sys
+import tomllib
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+import tactile_rt
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = Path(tactile_rt.__file__).parent
+LINKS = ("drivers", "export", "models", "sim_backend")
+# What a robot has none of.
+HEAVY = ("torch", "mujoco", "trimesh", "scipy", "onnx", "onnxscript", "sklearn", "matplotlib")
+ONBOARD = (
+    "classifier", "cli", "contact", "model_file", "recording", "session", "sources", "stream",
+    "testing", "timebase",
+)  # fmt: skip
+
+MODULES = sorted(m.name for m in pkgutil.walk_packages([str(PACKAGE)], "tactile_rt."))
+
+
+def order(name: str) -> tuple[int, str]:
+    """CONSTANTS, then Classes, then functions: how the linter sorts `__all__`."""
+    return (0 if name.isupper() else 1 if name[0].isupper() else 2), name
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_what_a_module_exports_is_there_and_sorted(name: str) -> None:
+    try:
+        module = importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] in HEAVY:
+            pytest.skip(f"{error.name} is not installed")
+        raise
+    exported = getattr(module, "__all__", [])
+    assert [n for n in exported if not hasattr(module, n)] == []
+    assert list(exported) == sorted(set(exported), key=order)
+    assert not any(n.startswith("_") for n in exported)
+    assert module.__doc__ or not exported, "a module that exports says what it is"
+
+
+def test_every_folder_of_modules_is_a_package() -> None:
+    """Tools that find packages by `__init__.py` would leave the others out of a wheel."""
+    folders = {p.parent for p in PACKAGE.rglob("*.py")}
+    assert [f for f in folders if not (f / "__init__.py").exists()] == []
+
+
+@pytest.mark.skipif((ROOT / "PKG-INFO").exists(), reason="a source archive, which has no links")
+@pytest.mark.parametrize("name", LINKS)
+def test_the_names_at_the_top_are_links_that_point_inward(name: str) -> None:
+    link = ROOT / name
+    assert link.is_symlink()
+    target = link.readlink()
+    assert not target.is_absolute(), "it would point elsewhere on another machine"
+    assert target == Path("tactile_rt") / name
+    assert link.resolve() == (ROOT / "tactile_rt" / name).resolve()
+    assert (link / "__init__.py").is_file()
+
+
+def test_it_is_typed() -> None:
+    assert (PACKAGE / "py.typed").is_file()
+
+
+def test_the_version_is_the_project_s() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert tactile_rt.__version__ == project["version"]
+
+
+def modules_after(code: str) -> set[str]:
+    """The top-level modules that a fresh interpreter has loaded after running some code."""
+    code += "\nimport sys; print('\\n'.join({m.partition('.')[0] for m in sys.modules}))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split("\n"))
+
+
+@pytest.mark.skipif(find_spec("torch") is None, reason="proves nothing where torch is missing")
+@pytest.mark.parametrize("name", ONBOARD)
+def test_what_runs_on_a_robot_needs_nothing_heavy(name: str) -> None:
+    loaded = modules_after(f"import tactile_rt.{name}")
+    assert "tactile_rt" in loaded
+    assert not loaded & set(HEAVY)
+
+
+def test_neither_does_running_a_model() -> None:
+    code = """
+import numpy as np
+from tactile_rt.classifier import Classifier
+from tactile_rt.model_file import load_model, shipped_model
+from tactile_rt.testing import cut
+spec = load_model(shipped_model())[1].array
+for chunk in cut(np.zeros((100, *spec.shape)), spec.rate_hz):
+    Classifier(shipped_model(), spec).push(chunk)
+"""
+    assert not modules_after(code) & set(HEAVY)
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["run", "--help"]])
+def test_neither_does_asking_the_command_for_help(arguments: list[str]) -> None:
+    code = f"""
+import sys
+from tactile_rt.cli import main
+sys.argv = ["tactile-rt", *{arguments!r}]
+try:
+    main()
+except SystemExit as leaving:
+    assert not leaving.code
+"""
+    loaded = modules_after(code)
+    assert not loaded & set(HEAVY)
+    assert "onnxruntime" not in loaded, "help is instant"
+
+
+def test_shipped_helpers_need_no_test_framework() -> None:
+    loaded = modules_after("import tactile_rt.testing")
+    assert not loaded & {"pytest", "_pytest", "hypothesis"}
+
+
+def test_every_error_a_user_can_make_is_one_line() -> None:
+    """No traceback, exit code 2."""
+    code = "import sys; from tactile_rt.cli import main; sys.argv[0] = 'tactile-rt'; main()"
+    done = subprocess.run(
+        [sys.executable, "-c", code, "run", "--source", "smi:mouse"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "did you mean sim:?" in done.stderr
