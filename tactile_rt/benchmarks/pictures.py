@@ -36,6 +36,8 @@ def draw_accuracy_over_time(
     axes = figure.subplots()
     for name, curve in curves.items():
         axes.plot(1e3 * step_s * np.arange(1, len(curve) + 1), 100 * curve, marker="o", label=name)
+    axes.axvspan(0, 3.5e3 * step_s, color="0.9", zorder=0)
+    axes.text(1.75e3 * step_s, 50, "on its way\nthrough\nthe network", ha="center", va="center")
     axes.set_xlabel("time since contact onset (ms)")
     axes.set_ylabel("top-1 accuracy on unseen objects (%)")
     axes.set_ylim(0, 100)

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 __all__ = ["Record", "show", "write"]
@@ -43,17 +44,15 @@ class Record:
 
 
 def show(records: list[Record], console: Console) -> None:
-    """Print records as a table."""
-    table = Table(show_lines=False)
-    table.add_column("figure", no_wrap=True)
-    table.add_column("value", justify="right", no_wrap=True)
-    table.add_column("bar", no_wrap=True)
-    table.add_column("met", no_wrap=True)
-    table.add_column("how", style="dim", overflow="fold")
+    """Print records as a table, each with how it was measured on the line below."""
+    table = Table("figure", "value", "bar", "met", leading=1)
+    for column in table.columns[1:]:
+        column.no_wrap = True
     marks = {True: "[green]yes[/]", False: "[bold red]NO[/]", None: ""}
     for r in records:
         how = "; ".join(part for part in (r.anchor, r.how) if part)
-        table.add_row(r.name, f"{r.value:.4g} {r.unit}", r.bar, marks[r.met], how)
+        figure = f"[bold]{escape(r.name)}[/]\n[dim]{escape(how)}[/]"
+        table.add_row(figure, f"{r.value:.4g} {r.unit}", r.bar, marks[r.met])
     console.print(table)
 
 
