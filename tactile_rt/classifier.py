@@ -34,7 +34,8 @@ class Classification:
         onset_ns: stream time at which contact began, ns.
         t_ns: stream time of the last resampled sample used, ns.
         step: steps since onset, counted from 1.
-        final: the episode's last step.
+        final: the episode's last step; an episode that a silence of the stream cuts short has
+            none.
         label: the most probable class.
         labels: all class names.
         probabilities: (class,) float32 posterior.
@@ -78,8 +79,7 @@ class Classifier:
         differences = self.card.array.differences(spec, ignore=ADAPTED)
         if differences:
             raise SpecMismatch(
-                f"{model} was made for array {self.card.array.name!r}, which {spec.name!r} is not: "
-                + "; ".join(differences)
+                f"{model} was made for another array than {spec.name!r}: " + "; ".join(differences)
             )
         self.detector = ContactDetector(spec.shape, np.array(self.card.floor, dtype=np.float32))
         self.tared = np.zeros(spec.shape, dtype=np.float32)

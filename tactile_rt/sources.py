@@ -33,7 +33,8 @@ def open_source(url: str) -> Source:
     except ValueError as error:
         raise ConfigError(f"source {url!r}: {error}") from None
     scheme = parts.scheme
-    pairs = parse_qsl(parts.query, keep_blank_values=True)
+    # A + is a +, as in a file's name, not the space that web forms make of it.
+    pairs = parse_qsl(parts.query.replace("+", "%2B"), keep_blank_values=True)
     fields = dict(pairs)
     if len(fields) < len(pairs):
         raise ConfigError(f"source {url!r}: an option is given twice")

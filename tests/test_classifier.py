@@ -297,7 +297,7 @@ def test_another_array_is_refused_by_where_it_differs(model: Path, change: dict,
     with pytest.raises(SpecMismatch) as caught:
         Classifier(model, replace(SPEC, name="mine", **change))
     message = str(caught.value)
-    assert message.startswith(f"{model} was made for array 'small', which 'mine' is not: {said}")
+    assert message.startswith(f"{model} was made for another array than 'mine': {said}")
 
 
 def test_a_model_of_another_array_size_names_the_counts(model: Path) -> None:

@@ -14,15 +14,16 @@ from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVC
 
 from tactile_rt.benchmarks.records import Record
+from tactile_rt.classifier import ADAPTED
 from tactile_rt.model_file import load_model
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import RATED_NOISE, SweepSet, find_onsets, windows
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import ConfigError, SpecMismatch
 
 __all__ = ["evaluate_model", "svm_accuracy"]
 
 SVM_SWEEPS = 6000  # the largest training set that an RBF SVM is fitted on
-NOISE = ", ".join(f"{v:g} {u}" for u, v in RATED_NOISE.items())
+NOISE = " and ".join(f"{1e6 * v:g} u{u}" for u, v in RATED_NOISE.items())
 
 
 def evaluate_model(
@@ -42,17 +43,33 @@ def evaluate_model(
         pictures: folder for ``confusion.png`` and ``accuracy_over_time.png``.
 
     Raises:
-        ConfigError: the model was trained on some of the test objects, or on other categories.
+        ConfigError: the model was trained on some of the test objects, or on other categories
+            or another sample period; or `accurate` tests on other objects.
+        SpecMismatch: the model was made for another array than the set's.
         ModelError, RecordingError: a file cannot be read.
     """
     run, card = _runner(model)
     test = SweepSet.read(data, "test")
     if test.manifest.categories != card.labels:
         raise ConfigError(f"{model} knows other categories than {data}")
+    differences = card.array.differences(test.manifest.spec, ignore=ADAPTED)
+    if differences:
+        raise SpecMismatch(f"{model} was made for another array: " + "; ".join(differences))
+    if test.manifest.period_ns != card.period_ns:
+        raise ConfigError(
+            f"{model} takes a sample every {card.period_ns} ns, {data} has one every "
+            f"{test.manifest.period_ns} ns"
+        )
     labels, objects = test.sweeps.labels, test.sweeps.objects
     unseen = card.provenance.get("unseen_objects")
     if unseen is not None and not set(objects.tolist()) <= set(unseen):
         raise ConfigError(f"{model} may have been trained on objects that {data} tests on")
+    # What may fail comes first, lest it fail after minutes.
+    other = SweepSet.read(accurate, "test") if accurate is not None else None
+    if other and not set(other.sweeps.objects.tolist()) <= set(objects.tolist()):
+        raise ConfigError(f"{accurate} tests on other objects than {data}")
+    if pictures is not None:
+        pictures.mkdir(parents=True, exist_ok=True)
     sample = f"{len(set(objects.tolist()))} unseen objects, {len(labels)} sweeps"
 
     clean = evaluation.predict(test, run)
@@ -62,10 +79,10 @@ def evaluate_model(
         _accuracy("top-5", clean[:, -1], labels, objects, ">= 99", sample, top=5),
         _accuracy("top-1 at step 14 of 22", clean[:, 13], labels, objects, ">= 87", sample),
     ]
-    fused = evaluation.fused_accuracy(clean[:, -1], labels, objects, 2)
-    records.append(_record("two sweeps fused", fused, ">= 97", sample))
-    fused = evaluation.fused_accuracy(clean[:, -1], labels, objects, 4)
-    records.append(_record("four sweeps fused", fused, "", sample))
+    for sweeps, count, bar in ((2, "two", ">= 97"), (4, "four", "")):
+        if np.unique(objects, return_counts=True)[1].max() >= sweeps:  # enough of one object
+            fused = evaluation.fused_accuracy(clean[:, -1], labels, objects, sweeps)
+            records.append(_record(f"{count} sweeps fused", fused, bar, sample))
     noisy = evaluation.predict(test, run, 1.0)
     how = f"{sample}; white noise {NOISE} added to every 9 ms sample, undetected sweeps count as "
     records.append(
@@ -81,14 +98,13 @@ def evaluate_model(
     records.append(Record("models.calibration error", ece, "%", "", "15 bins", sample))
     undetected = 100 * float(np.isnan(clean[:, 0, 0]).mean())
     records.append(Record("models.undetected sweeps", undetected, "%", "", "", sample))
-    if accurate is not None:
-        records += _compare_profiles(run, accurate, test, clean)
+    if other:
+        records += _compare_profiles(run, other, test, clean)
     if svm:
         records += _compare_svm(data, test, float(records[0].value))
     if pictures is not None:
         from tactile_rt.benchmarks.pictures import draw_accuracy_over_time, draw_confusion
 
-        pictures.mkdir(parents=True, exist_ok=True)
         table = evaluation.confusion(clean[:, -1], labels, len(card.labels))
         draw_confusion(table, card.labels, pictures / "confusion.png")
         curves = {
@@ -141,9 +157,8 @@ def _record(name: str, estimate: evaluation.Interval, bar: str, how: str) -> Rec
 
 
 def _compare_profiles(
-    run: evaluation.Step, accurate: Path, test: SweepSet, clean: NDArray[np.float32]
+    run: evaluation.Step, other: SweepSet, test: SweepSet, clean: NDArray[np.float32]
 ) -> list[Record]:
-    other = SweepSet.read(accurate, "test")
     # The same object's first sweeps are the same draws: compare on those that both sets have.
     mine = np.concatenate(
         [

@@ -3,12 +3,18 @@
 A user's mistake is one clear line on stderr and exit code 2; Ctrl-C leaves quietly.
 """
 
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
 
 import typer
 
 from tactile_rt import __version__
-from tactile_rt.stream import TactileError
+from tactile_rt.stream import ConfigError, TactileError
 
 __all__ = ["main"]
 
@@ -48,16 +54,55 @@ def main() -> None:
     try:
         app()
     except TactileError as error:
-        typer.secho(f"tactile-rt: {error}", err=True, fg="red")
-        sys.exit(USER_ERROR)
+        _give_up(str(error))
+    except OSError as error:  # a folder that is a file, a full disk, ...: the user's to mend
+        # Folders are made where there is none, so what exists all the same is a file.
+        why = "is not a folder" if isinstance(error, FileExistsError) else error.strerror
+        _give_up(f"cannot use {error.filename}: {why}" if error.filename else str(error))
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
 
 
+def _give_up(why: str) -> NoReturn:
+    typer.secho(f"tactile-rt: {why}", err=True, fg="red")
+    sys.exit(USER_ERROR)
+
+
+@contextmanager
+def starting() -> Iterator[None]:
+    """Let Ctrl-C end the block even where it is swallowed, as trimesh does while it is imported."""
+    asked = False
+
+    def note(number: int, frame: FrameType | None) -> None:
+        nonlocal asked
+        asked = True
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if asked:
+        raise KeyboardInterrupt
+
+
+def check_output(file: Path | None) -> None:
+    """Refuse a file that cannot be written, now rather than after minutes of work.
+
+    Raises:
+        ConfigError: it is a folder, or the folder that it goes into is not there.
+    """
+    if file is None:
+        return
+    if not file.parent.is_dir():
+        raise ConfigError(f"no folder {file.parent} to write {file.name} in")
+    if file.is_dir():
+        raise ConfigError(f"{file} is a folder: name a file to write")
+
+
 def needs(extra: str, error: ModuleNotFoundError) -> TactileError:
     """The error to raise when a command's import fails: which extra brings it."""
-    from tactile_rt.stream import ConfigError
-
     if (error.name or "").startswith("tactile_rt"):
         raise error
     return ConfigError(

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli import app, needs
+from tactile_rt.cli import app, check_output, needs
 from tactile_rt.stream import ConfigError
 
 # area: (module with `run(quick) -> list[Record]`, extra that it needs), None: no figures yet
@@ -34,8 +34,7 @@ def bench(
 
     if area is not None and area not in AREAS:
         raise ConfigError(f"no benchmark area {area!r}: there are {', '.join(AREAS)}")
-    if json and not json.parent.is_dir():  # better now than after minutes of measuring
-        raise ConfigError(f"no folder {json.parent} to write {json.name} in")
+    check_output(json)
     progress, records, without = Console(stderr=True), [], []
     for name in [area] if area else AREAS:
         there = AREAS[name]

@@ -10,12 +10,14 @@ from typing import Annotated
 
 import typer
 
-from tactile_rt.cli import app, needs
+from tactile_rt.cli import app, needs, starting
 
 Model = Annotated[
     Path | None, typer.Option(help="An .onnx model; default: the one that comes with the package.")
 ]
-Seconds = Annotated[float | None, typer.Option(min=0.001, help="Leave after so many seconds.")]
+Seconds = Annotated[
+    float | None, typer.Option(min=0.001, max=1e9, help="Leave after so many seconds.")
+]
 
 
 @contextmanager
@@ -64,7 +66,9 @@ def run(
     from tactile_rt.sources import open_source
 
     samples = printed = 0
-    with open_source(source) as opened:
+    with starting():
+        opened = open_source(source)
+    with opened:
         session = Session(opened, Classifier(model or shipped_model(), opened.spec))
         with leaving(seconds), session:
             for chunk, decisions in session:
@@ -113,7 +117,7 @@ def demo(
 
     console = Console()
     try:
-        with console.status("building the array and the objects"):
+        with starting(), console.status("building the array and the objects"):
             from tactile_rt.cli.demonstration import Demonstration
             from tactile_rt.cli.view import watch
 

@@ -7,7 +7,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tactile_rt.cli import app, needs
+from tactile_rt.cli import app, check_output, needs
+from tactile_rt.stream import ConfigError
 
 
 @app.command()
@@ -15,12 +16,14 @@ def train(
     data: Annotated[Path, typer.Argument(help="A sweep set.")],
     folder: Annotated[Path, typer.Argument(help="The run; an interrupted one goes on.")],
     attender: Annotated[str, typer.Option(help="gpt or none.")] = "none",
-    decoder: Annotated[str, typer.Option(help="linear or mlp.")] = "linear",
-    width: Annotated[float, typer.Option(help="Scales every channel count.")] = 0.125,
-    epochs: Annotated[int, typer.Option(min=1)] = 14,
-    batch: Annotated[int, typer.Option(min=1)] = 32,
-    learning_rate: Annotated[float, typer.Option()] = 5e-3,
-    seed: Annotated[int, typer.Option()] = 0,
+    decoder: Annotated[str, typer.Option(help="linear or mlp.")] = "mlp",
+    width: Annotated[
+        float, typer.Option(help="Scales every channel count; a multiple of 1/32.")
+    ] = 0.125,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the training split.")] = 14,
+    batch: Annotated[int, typer.Option(min=1, help="Sweeps per update.")] = 32,
+    learning_rate: Annotated[float, typer.Option(help="Peak, after a warm-up.")] = 5e-3,
+    seed: Annotated[int, typer.Option(help="Of weights, windows and noise.")] = 0,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
 ) -> None:
     """Train an Encoder-Attender-Decoder network on a sweep set."""
@@ -43,7 +46,10 @@ def train(
     )
     console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console) as bar:
+    # Gone when it is done or fails, and nothing in a log file: an error is one line alone.
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
         task = bar.add_task("finding onsets", total=None)
 
         def show(at: training.Progress) -> None:
@@ -76,6 +82,8 @@ def export(
         from tactile_rt.export.release import release
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
+    if model.is_dir():
+        raise ConfigError(f"{model} is a folder: name a file to write")
     console = Console(stderr=True)
     with console.status("calibrating, exporting and checking parity"):
         card = release(checkpoint, model, name or model.stem)
@@ -93,7 +101,9 @@ def evaluate(
         Path | None, typer.Option(help="The same sweeps at another profile, to compare with.")
     ] = None,
     svm: Annotated[bool, typer.Option(help="Fit an RBF SVM on the same windows too.")] = False,
-    pictures: Annotated[Path | None, typer.Option(help="Folder for confusion and curves.")] = None,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Folder for confusion.png, accuracy_over_time.png.")
+    ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
 ) -> None:
     """Measure a model on the test objects of a sweep set: accuracy, noise, fusion, calibration."""
@@ -103,6 +113,7 @@ def evaluate(
         raise needs("train", error) from None
     from tactile_rt.benchmarks.records import show, write
 
+    check_output(json)
     console = Console(stderr=True)
     with console.status("evaluating"):
         records = evaluate_model(model, data, accurate, svm, pictures)

@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tactile_rt.cli import app, needs
+from tactile_rt.cli import app, needs, starting
 
 
 @app.command()
@@ -17,7 +17,9 @@ def sweep(
     validation: Annotated[int, typer.Option(min=1, help="Of these, held out to tune on.")] = 4,
     test: Annotated[int, typer.Option(min=1, help="Of these, held out to test on.")] = 10,
     sweeps: Annotated[int, typer.Option(min=1, help="Sweeps of every object.")] = 8,
-    profile: Annotated[str, typer.Option(help="realtime, dataset or accurate.")] = "realtime",
+    profile: Annotated[
+        str, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
+    ] = "realtime",
     split: Annotated[str, typer.Option(help="Only these splits, comma-separated.")] = (
         "train,validation,test"
     ),
@@ -26,7 +28,8 @@ def sweep(
 ) -> None:
     """Sweep simulated objects past the whisker array and store what it feels."""
     try:
-        from tactile_rt.sim_backend.dataset import SweepRecipe, make_sweeps
+        with starting():
+            from tactile_rt.sim_backend.dataset import SweepRecipe, make_sweeps
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
     recipe = SweepRecipe(
@@ -43,10 +46,14 @@ def sweep(
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    splits = tuple(split.split(","))
+    splits = tuple(dict.fromkeys(s.strip() for s in split.split(",")))
+    total = recipe.count(splits)
     console = Console(stderr=True)
-    with Progress(*columns, console=console) as progress:
-        task = progress.add_task("objects", total=recipe.count(splits))
+    # Gone when it is done or fails, and nothing in a log file: an error is one line alone.
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
+        task = progress.add_task("objects", total=total)
         for name in make_sweeps(recipe, folder, processes or None, splits):
             progress.update(task, advance=1, description=name)
-    console.print(f"{folder}: {recipe.count(splits) * sweeps} sweeps at profile {profile}")
+    console.print(f"{folder}: {total * sweeps} sweeps at profile {profile}")

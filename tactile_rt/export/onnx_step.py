@@ -5,6 +5,7 @@ run the model. Before it is written, it is run against the torch window that was
 """
 
 import hashlib
+import logging
 import os
 import platform
 import tempfile
@@ -133,7 +134,9 @@ def export_step(model: TactileClassifier, card: ModelCard, path: Path) -> ModelC
     batch = torch.export.Dim("batch")
     shapes = [{0: batch} for _ in arguments]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter's own deprecations are not the user's
+        # The exporter's own deprecations, and that torchvision is missing, are not the user's.
+        warnings.simplefilter("ignore")
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         program = torch.onnx.export(
             step,
             arguments,

@@ -128,6 +128,9 @@ class TrainingBatches:
 
     Half of the windows are clean and half carry sensor noise of a level drawn up to the rated
     one; every whisker's gain is off by a few percent, and some whiskers are dead.
+
+    Raises:
+        ConfigError: not even one batch of sweeps with a touch.
     """
 
     def __init__(self, data: SweepSet, batch: int, seed: int) -> None:
@@ -138,6 +141,11 @@ class TrainingBatches:
         # Too faint to be found at its noise level: learn it from where it is found without.
         self._starts = np.where(self._starts < 0, self._starts[0], self._starts)
         self._usable = np.flatnonzero(self._starts[0] >= 0)
+        if len(self._usable) < batch:
+            raise ConfigError(
+                f"a batch of {batch} is more than the {len(self._usable)} sweeps in which a touch "
+                "was found: take a smaller batch, or make more sweeps"
+            )
 
     def __len__(self) -> int:
         return len(self._usable) // self._batch

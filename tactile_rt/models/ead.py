@@ -3,6 +3,8 @@
     normalised frames -> encoder -> attender -> decoder -> logits
     (batch, step, 30, 5, 7)   (batch, step, feature)   (batch, step, class)
 
+The 30 channels are 5 sub-steps x 6 loads, the 5 x 7 cells the whiskers' grid.
+
 `EAD.forward` takes a whole window for training; `EAD.step` takes one frame and explicit state,
 for streaming, and gives the same logits. The logits of a step use no later frame.
 """

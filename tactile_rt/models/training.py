@@ -43,7 +43,7 @@ class TrainingConfig:
 
     data: str
     attender: str = "none"
-    decoder: str = "linear"
+    decoder: str = "mlp"
     width: float = 0.125
     readout: str = "mean"
     dropout: float = 0.1
@@ -59,8 +59,10 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         for name in ("epochs", "batch", "learning_rate", "clip_norm"):
-            if getattr(self, name) <= 0:
+            if not 0 < getattr(self, name) < float("inf"):  # which NaN is not either
                 raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
+        if not 0 <= self.seed < 2**32:
+            raise ConfigError(f"seed must be 0 to {2**32 - 1}, not {self.seed}")
 
 
 class TactileClassifier(nn.Module):
@@ -129,8 +131,6 @@ def train(
     data = SweepSet.read(Path(config.data), "train")
     validation = SweepSet.read(Path(config.data), "validation")
     manifest = data.manifest
-    _begin_run(config, folder)
-
     network = EADConfig(
         classes=len(manifest.categories),
         attender=config.attender,
@@ -139,6 +139,8 @@ def train(
         readout=config.readout,
         dropout=config.dropout,
     )
+    _begin_run(config, folder)
+
     model = TactileClassifier(manifest.spec, network)
     optimizer = torch.optim.AdamW(
         model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay
@@ -156,11 +158,16 @@ def train(
     begin, best = 0, -1.0
     last = folder / "last.pt"
     if last.exists():
-        saved = torch.load(last, weights_only=False)
-        model.load_state_dict(saved["model"])
-        optimizer.load_state_dict(saved["optimizer"])
-        schedule.load_state_dict(saved["schedule"])
-        begin, best = saved["epoch"], saved["best"]
+        try:
+            saved = torch.load(last, weights_only=True)
+            model.load_state_dict(saved["model"])
+            optimizer.load_state_dict(saved["optimizer"])
+            schedule.load_state_dict(saved["schedule"])
+            begin, best = saved["epoch"], saved["best"]
+        except Exception as error:  # torch raises many unrelated types for a damaged file
+            raise ModelError(
+                f"{last} is damaged ({_reason(error)}): delete it to begin the run anew"
+            ) from None
 
     for epoch in range(begin, config.epochs):
         torch.manual_seed(config.seed * 1000 + epoch)  # dropout: a resumed epoch is the same epoch
@@ -246,16 +253,22 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
     except FileNotFoundError:
         raise ModelError(f"no checkpoint {path}") from None
     except Exception as error:  # torch raises many unrelated types for a damaged file
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ModelError(f"{path} is not a checkpoint of `tactile-rt train`: {reason}") from None
+        raise ModelError(
+            f"{path} is not a checkpoint of `tactile-rt train`: {_reason(error)}"
+        ) from None
     return model.eval(), saved
+
+
+def _reason(error: Exception) -> str:
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
 
 
 def _begin_run(config: TrainingConfig, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "config.json"
     text = msgspec.json.format(msgspec.json.encode(config), indent=1)
-    if not path.exists():
+    # Before its first epoch is finished a run has nothing to lose: correct its options and go on.
+    if not (folder / "last.pt").exists() or not path.exists():
         path.write_bytes(text)
     elif path.read_bytes() != text:
         raise ConfigError(

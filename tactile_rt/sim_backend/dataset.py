@@ -61,6 +61,8 @@ class SweepRecipe:
             )
         if self.sweeps < 1:
             raise ConfigError(f"sweeps must be at least 1, not {self.sweeps}")
+        if self.seed < 0:
+            raise ConfigError(f"seed must be 0 or more, not {self.seed}")
 
     def count(self, splits: tuple[str, ...]) -> int:
         """Objects of all categories in these splits.

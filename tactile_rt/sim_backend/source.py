@@ -5,7 +5,6 @@ sim:mouse?objects=mug-50,bottle-51&seed=3&pace=fast&profile=realtime&sweeps=10
 
 import time
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -18,8 +17,9 @@ from tactile_rt.timebase import NS_PER_S
 
 __all__ = ["Pass", "SimOptions", "SimSource"]
 
-REST_SAMPLES = 600  # between two objects: the last episode ends, contact is released, and a tare
+REST_SAMPLES = 600  # after an object its episode ends and contact is released; before one, a tare
 CHUNK_SAMPLES = 9
+PACES = ("realtime", "fast")
 
 
 @dataclass(frozen=True)
@@ -41,13 +41,17 @@ class SimOptions:
     repeat: int = 1
     seed: int = 0
     profile: str = "realtime"
-    pace: Literal["realtime", "fast"] = "realtime"
+    pace: str = "realtime"
 
     def __post_init__(self) -> None:
         if self.profile not in PROFILES:
             raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
+        if self.pace not in PACES:
+            raise ConfigError(f"no pace {self.pace!r}: there are {', '.join(PACES)}")
         if self.sweeps < 0 or self.repeat < 1:
             raise ConfigError("sweeps must be 0 or more, and repeat 1 or more")
+        if self.seed < 0:
+            raise ConfigError(f"seed must be 0 or more, not {self.seed}")
 
 
 @dataclass(frozen=True)
@@ -140,8 +144,11 @@ class SimSource(Source):
     def _begin_sweep(self, start_ns: int) -> None:
         done = len(self.passes)
         if self._options.sweeps and done == self._options.sweeps * self._options.repeat:
-            self._closed = True
-            raise EndOfStream
+            if self._simulation is None:  # has rested after the last object, too
+                self._closed = True
+                raise EndOfStream
+            self._simulation, self._rest = None, REST_SAMPLES
+            return
         if not self._order:
             order = self._rng.permutation(len(self._objects))
             self._order = [int(i) for i in order for _ in range(self._options.repeat)]

@@ -72,6 +72,14 @@ def test_loads_are_felt_only_while_an_object_passes(two_passes: tuple[SimSource,
         assert felt.sum() > 100 and not felt[-1]
 
 
+def test_it_rests_after_the_last_object_so_that_its_episode_ends(
+    two_passes: tuple[SimSource, Chunk],
+) -> None:
+    _, stream = two_passes
+    assert (stream.values[-REST_SAMPLES:] == 0).all()
+    assert stream.values[-REST_SAMPLES - 1].any()
+
+
 def test_it_ends_after_its_sweeps_for_good(two_passes: tuple[SimSource, Chunk]) -> None:
     source, _ = two_passes
     assert len(source.passes) == 2

@@ -1,0 +1,272 @@
+"""What the commands say to a user's mistake: one line on stderr, exit code 2, nothing written."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from tactile_rt.cli import starting
+
+pytest.importorskip("mujoco")
+pytest.importorskip("trimesh")
+
+import trimesh
+
+from tactile_rt.recording import write_object
+from tactile_rt.sim_backend.dataset import SweepRecipe
+
+TINY = ("--objects", 3, "--validation", 1, "--test", 1, "--sweeps", 1)
+
+
+@pytest.fixture
+def refused(call):
+    """Call with these arguments, expect one line, and return it."""
+
+    def run(*arguments):
+        code, out, err = call(*arguments)
+        assert (code, out) == (2, "")
+        assert err.startswith("tactile-rt: ")
+        assert err.count("\n") == 1, err
+        return err
+
+    return run
+
+
+@pytest.fixture
+def a_file(tmp_path):
+    path = tmp_path / "file"
+    path.write_bytes(b"here already\n")
+    return path
+
+
+@pytest.fixture
+def sweep_set(tmp_path):
+    """A sweep set of three objects a category, every sweep a touch as noise makes one."""
+    recipe, rng = SweepRecipe(objects=3, validation=1, test=1, sweeps=1), np.random.default_rng(0)
+    folder = tmp_path / "set"
+    manifest = recipe.manifest()
+    manifest.write(folder)
+    for names in manifest.split.values():
+        for name in names:
+            values = rng.normal(size=(1, 164, *manifest.spec.shape)).astype(np.float32) * 1e-4
+            values[:, : manifest.lead] = 0
+            write_object(folder, name, values, {})
+    return folder
+
+
+# ---- sweep
+
+
+def test_a_set_cannot_be_made_in_or_under_a_file(refused, a_file):
+    assert f"{a_file}: is not a folder" in refused("sweep", a_file, *TINY)
+    assert f"{a_file / 'set'}: Not a directory" in refused("sweep", a_file / "set", *TINY)
+    assert a_file.read_bytes() == b"here already\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--seed", -1), "seed must be 0 or more"),
+        (("--split", "train,tests"), "no split 'tests': there are train, validation, test"),
+        (("--profile", "fast"), "no profile 'fast': there are realtime"),
+    ],
+)
+def test_an_impossible_set_is_refused_before_anything_is_written(refused, tmp_path, options, said):
+    assert said in refused("sweep", tmp_path / "set", *TINY, *options)
+    assert not (tmp_path / "set").exists()
+
+
+def test_another_set_in_the_folder_is_one_line(refused, sweep_set):
+    assert "holds another sweep set (other recipe)" in refused(
+        "sweep", sweep_set, *TINY, "--seed", 1
+    )
+
+
+def test_a_split_named_twice_counts_once(call, sweep_set):
+    code, _, err = call("sweep", sweep_set, *TINY, "--split", "test, test")
+    assert code == 0
+    assert "12 sweeps" in err.replace("\n", " ")
+
+
+# ---- run
+
+
+def test_a_negative_seed_is_refused(refused):
+    assert "seed must be 0 or more" in refused("run", "--source", "sim:mouse?seed=-1")
+
+
+def test_a_time_beyond_every_timer_is_refused(call):
+    assert call("run", "--source", "sim:mouse", "--seconds", "1e300")[0] == 2
+
+
+def test_a_file_name_may_hold_a_plus_and_a_space(call, tmp_path):
+    path = tmp_path / "a + b.stl"
+    trimesh.creation.box((1, 1, 1)).export(path)
+    source = f"sim:mouse?objects={path}"
+    assert call("run", "--source", source, "--seconds", 0.1)[0] == 0
+
+
+def test_a_full_disk_is_one_line():
+    program = "import sys; from tactile_rt.cli import main; sys.argv[0] = 'tactile-rt'; main()"
+    source = "sim:mouse?objects=mug-50&sweeps=1&pace=fast"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", program, "run", "--source", source],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+        )
+    assert done.returncode == 2
+    assert done.stderr.splitlines() == ["tactile-rt: [Errno 28] No space left on device"]
+
+
+def test_an_interrupt_that_an_import_swallows_still_ends_the_program():
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), starting():
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+        except BaseException:  # as trimesh does around its optional imports
+            pass
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+# ---- train, export, eval
+
+
+@pytest.fixture(scope="module")
+def torch():
+    for module in ("onnx", "onnxscript", "sklearn", "matplotlib"):
+        pytest.importorskip(module)
+    return pytest.importorskip("torch")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--width", 0.1), "width is 0.1, must be a positive multiple of 1/32"),
+        (("--attender", "lstm"), "attender is 'lstm', not one of gpt, none"),
+        (("--seed", -1), "seed must be 0 to 4294967295"),
+        (("--learning-rate", "nan"), "learning_rate must be positive, not nan"),
+    ],
+)
+def test_options_that_cannot_be_trained_with_leave_no_run(
+    torch, refused, sweep_set, tmp_path, options, said
+):
+    assert said in refused("train", sweep_set, tmp_path / "run", *options)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_run_that_cannot_begin_can_be_begun_again_with_other_options(
+    torch, refused, call, sweep_set, tmp_path
+):
+    command = ("train", sweep_set, tmp_path / "run", "--width", 1 / 32, "--epochs", 1)
+    assert "a batch of 99 is more than the 12 sweeps" in refused(*command, "--batch", 99)
+    assert call(*command, "--batch", 12)[0] == 0
+    assert "another configuration" in refused(*command, "--batch", 6)
+
+
+def test_an_interrupted_run_goes_on_to_the_same_end(torch, sweep_set, tmp_path):
+    from tactile_rt.models.training import TrainingConfig, train
+
+    config = TrainingConfig(str(sweep_set), width=1 / 32, epochs=3, batch=4)
+
+    def interrupt(at):
+        if at.epoch == 1 and at.update == 5:  # in the middle of the second epoch
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config, tmp_path / "cut", interrupt)
+    begun = []
+    train(config, tmp_path / "cut", lambda at: begun.append(at.update))
+    assert begun[0] == 4, "the first epoch was kept"
+    train(config, tmp_path / "whole")
+    histories = [
+        [line.rsplit(",", 1)[0] for line in (tmp_path / run / "history.csv").read_text().split()]
+        for run in ("cut", "whole")  # all but the seconds that each epoch took
+    ]
+    assert histories[0] == histories[1]
+    assert len(histories[0]) == 4
+    ends = [torch.load(tmp_path / run / "last.pt")["model"] for run in ("cut", "whole")]
+    assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
+
+
+def test_a_run_cannot_be_made_in_a_file(torch, refused, sweep_set, a_file):
+    assert f"{a_file}: is not a folder" in refused("train", sweep_set, a_file, "--batch", 4)
+
+
+@pytest.mark.parametrize("content", [b"", b"junk\n", b"PK\x03\x04 cut short"])
+def test_a_damaged_checkpoint_is_one_line(torch, refused, sweep_set, tmp_path, content):
+    folder = tmp_path / "run"
+    command = ("train", sweep_set, folder, "--width", 1 / 32, "--epochs", 1, "--batch", 12)
+    folder.mkdir()
+    for name in ("best.pt", "last.pt"):
+        (folder / name).write_bytes(content)
+    assert "last.pt is damaged" in refused(*command)
+    model = tmp_path / "model.onnx"
+    assert "is not a checkpoint" in refused("export", folder / "best.pt", model)
+    assert not model.exists()
+
+
+def test_a_folder_is_no_model_to_write(torch, refused, tmp_path):
+    assert "is a folder" in refused("export", tmp_path / "best.pt", tmp_path)
+
+
+@pytest.fixture
+def tiny_model(torch, tmp_path, sweep_set):
+    """An untrained network for the mouse array, as a file; what is changed in its card."""
+    import msgspec
+    import onnx
+
+    from tactile_rt.export.onnx_step import export_checkpoint
+    from tactile_rt.model_file import METADATA_KEY
+    from tactile_rt.models.ead import EADConfig
+    from tactile_rt.models.training import TactileClassifier, TrainingConfig
+    from tactile_rt.recording import SweepManifest
+
+    spec = SweepManifest.read(sweep_set).spec
+    network = EADConfig(classes=12, attender="none", width=1 / 32)
+    saved = {
+        "model": TactileClassifier(spec, network).state_dict(),
+        "network": msgspec.to_builtins(network),
+        "config": msgspec.to_builtins(TrainingConfig(str(sweep_set))),
+        "spec": spec.to_json(),
+    }
+    torch.save(saved, tmp_path / "best.pt")
+    path = tmp_path / "tiny.onnx"
+    card = export_checkpoint(tmp_path / "best.pt", path, "tiny")
+
+    def write(**changes):
+        model = onnx.load(path)
+        changed = msgspec.json.encode(msgspec.structs.replace(card, **changes)).decode()
+        onnx.helper.set_model_props(model, {METADATA_KEY: changed})
+        onnx.save(model, path)
+        return path
+
+    return write
+
+
+def test_a_model_is_evaluated_only_on_what_it_was_made_for(
+    tiny_model, refused, call, sweep_set, a_file, tmp_path
+):
+    path = tiny_model()
+    assert "not a sweep set" in refused("eval", path, tmp_path / "none")
+    assert f"no folder {a_file}" in refused("eval", path, sweep_set, "--json", a_file / "a.json")
+    assert "is a folder" in refused("eval", path, sweep_set, "--json", tmp_path)
+    assert "is not a folder" in refused("eval", path, sweep_set, "--pictures", a_file)
+    assert "not a sweep set" in refused("eval", path, sweep_set, "--accurate", tmp_path / "none")
+    code, out, err = call("eval", path, sweep_set, "--pictures", tmp_path / "not" / "yet")
+    assert (code, err) == (0, "")
+    assert "nan" not in out  # one sweep of each object: there is nothing to fuse
+    assert len(list((tmp_path / "not" / "yet").iterdir())) == 2
+
+    spec = SweepRecipe().manifest().spec.to_json()
+    changed = tiny_model(spec=spec.replace('"fx"', '"gx"'))
+    assert "was made for another array: channels[0]" in refused("eval", changed, sweep_set)
+    changed = tiny_model(period_ns=1_000_000)
+    assert "a sample every 1000000 ns" in refused("eval", changed, sweep_set)
+    changed = tiny_model(provenance={"unseen_objects": ["mug-2"]})
+    assert "may have been trained on objects" in refused("eval", changed, sweep_set)
