@@ -157,7 +157,7 @@ class TestSimulation:
             ("sim:rat", "no simulated array 'rat': there is mouse"),
             ("sim:mouse?sede=1", "did you mean seed?"),
             ("sim:mouse?seed=one", "at `$.seed`"),
-            ("sim:mouse?pace=slow", "at `$.pace`"),
+            ("sim:mouse?pace=slow", "no pace 'slow': there are realtime, fast"),
             ("sim:mouse?profile=quick", "no profile 'quick': there are realtime"),
             ("sim:mouse?sweeps=-1", "sweeps must be 0 or more"),
             ("sim:mouse?repeat=0", "repeat 1 or more"),
