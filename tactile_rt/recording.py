@@ -21,7 +21,15 @@ from numpy.typing import NDArray
 
 from tactile_rt.stream import ArraySpec, ConfigError, RecordingError
 
-__all__ = ["SPLITS", "SweepManifest", "Sweeps", "has_object", "read_sweeps", "write_object"]
+__all__ = [
+    "SPLITS",
+    "SweepManifest",
+    "Sweeps",
+    "has_object",
+    "read_sweeps",
+    "split_by_object",
+    "write_object",
+]
 
 SET_VERSION = 1
 MANIFEST = "manifest.json"

@@ -9,20 +9,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
-from sklearn.svm import SVC
 
 from tactile_rt.benchmarks.records import Record
 from tactile_rt.classifier import ADAPTED
 from tactile_rt.model_file import load_model
 from tactile_rt.models import evaluation
-from tactile_rt.models.datasets import RATED_NOISE, SweepSet, find_onsets, windows
+from tactile_rt.models.datasets import RATED_NOISE, SweepSet
 from tactile_rt.stream import ConfigError, SpecMismatch
 
-__all__ = ["evaluate_model", "svm_accuracy"]
+__all__ = ["evaluate_model"]
 
-SVM_SWEEPS = 6000  # the largest training set that an RBF SVM is fitted on
 NOISE = " and ".join(f"{1e6 * v:g} u{u}" for u, v in RATED_NOISE.items())
 
 
@@ -101,7 +97,9 @@ def evaluate_model(
     if other:
         records += _compare_profiles(run, other, test, clean)
     if svm:
-        records += _compare_svm(data, test, float(records[0].value))
+        from tactile_rt.benchmarks.svm import compare_svm
+
+        records += compare_svm(data, test, float(records[0].value))
     if pictures is not None:
         from tactile_rt.benchmarks.pictures import draw_accuracy_over_time, draw_confusion
 
@@ -177,36 +175,3 @@ def _compare_profiles(
         _record(f"top-1 at the {profile} profile", at_profile, "", how),
         Record(f"models.points lost at the {profile} profile", lost, "points", "<= 4", "", how),
     ]
-
-
-def _compare_svm(data: Path, test: SweepSet, network: float) -> list[Record]:
-    svm = 100 * svm_accuracy(SweepSet.read(data, "train"), test)
-    how = "same onsets, tare, clipping and signed log; 22 steps of mean load, standardised, C = 10"
-    return [
-        Record("models.RBF SVM top-1", svm, "%", "", "the same test sweeps", how),
-        Record("models.points above the SVM", network - svm, "points", ">= 3", "", how),
-    ]
-
-
-def svm_accuracy(train: SweepSet, test: SweepSet) -> float:
-    """Top-1 of an RBF SVM on the windows that the network sees; undetected sweeps are wrong."""
-
-    def features(data: SweepSet) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        found = find_onsets(data.sweeps.values, data.floor)
-        cut = windows(data.sweeps.values, found.start) - found.offset[:, None, None]
-        cut = np.clip(cut, -clip, clip)
-        cut = np.sign(cut) * np.log1p(np.abs(cut) / scale)
-        return cut.mean(axis=2).reshape(len(cut), -1), found.start >= 0
-
-    from tactile_rt.models.datasets import channel_values
-    from tactile_rt.models.training import CLIP, SCALE
-
-    spec = train.manifest.spec
-    clip, scale = channel_values(spec, CLIP), channel_values(spec, SCALE)
-    x, usable = features(train)
-    chosen = np.flatnonzero(usable)[:SVM_SWEEPS]
-    machine = make_pipeline(StandardScaler(), SVC(C=10.0, gamma="scale"))
-    machine.fit(x[chosen], train.sweeps.labels[chosen])
-    x, usable = features(test)
-    right = (machine.predict(x) == test.sweeps.labels) & usable
-    return float(right.mean())

@@ -17,7 +17,17 @@ from tactile_rt.contact import CHANNEL_FLOOR, ContactDetector
 from tactile_rt.recording import SweepManifest, Sweeps, read_sweeps
 from tactile_rt.stream import ArraySpec, ConfigError
 
-__all__ = ["RATED_NOISE", "STEPS", "SUBSTEPS", "Onsets", "SweepSet", "find_onsets", "windows"]
+__all__ = [
+    "RATED_NOISE",
+    "STEPS",
+    "SUBSTEPS",
+    "Onsets",
+    "SweepSet",
+    "TrainingBatches",
+    "channel_values",
+    "find_onsets",
+    "windows",
+]
 
 STEPS, SUBSTEPS = 22, 5  # 22 steps of 45 ms, each of five 9 ms samples (Chung et al. 2025)
 RATED_NOISE = {"N": 10e-6, "N m": 5e-8}  # sensor noise per sample, one standard deviation, SI

@@ -20,6 +20,7 @@ __all__ = [
     "confusion",
     "expected_calibration_error",
     "fused_accuracy",
+    "hits",
     "predict",
 ]
 
