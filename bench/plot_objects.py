@@ -1,4 +1,4 @@
-"""Draw docs/objects.png: four instances of every category, to see that each is what it says.
+"""Draw docs/objects.png: three instances of every category, to see that each is what it says.
 
 Orthographic view from above and to one side, z-buffered here because a painter's sort
 (matplotlib's) tears pieces that touch. Run: python bench/plot_objects.py [--out FILE]
@@ -15,13 +15,13 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from tactile_rt.sim_backend.objects import CATEGORIES, TactileObject, make_object
+from tactile_rt.sim_backend.objects import CATEGORIES, WITHHELD, TactileObject, make_object
 
 Floats = npt.NDArray[np.float64]
 
-INSTANCES, ACROSS = 4, 2  # instances a category, categories a row
+INSTANCES, ACROSS = 3, 4  # instances a category, categories a row
 PIXELS, FINE = 170, 3  # side of a picture, and how many times finer it is drawn before averaging
-SPAN = 1.3  # width of a picture in object sizes
+SPAN = 1.38  # width of a picture in object sizes
 LIGHT = np.array([0.35, 0.45, 0.82])  # in view axes: right, up, toward the viewer
 
 
@@ -74,18 +74,20 @@ def render(thing: TactileObject, yaw: float, pitch: float) -> Floats:
 
 def sheet(out: Path) -> None:
     """Write the contact sheet."""
-    rows = -(-len(CATEGORIES) // ACROSS)
+    kinds = [(c, c) for c in CATEGORIES] + [(c, f"{c} (withheld)") for c in WITHHELD]
+    rows = -(-len(kinds) // ACROSS)
     figure, panels = plt.subplots(
-        rows, ACROSS, figsize=(ACROSS * INSTANCES * 1.55, rows * 1.85), dpi=110
+        rows, ACROSS, figsize=(ACROSS * INSTANCES * 1.3, rows * 1.6), dpi=110
     )
-    for panel, category in zip(panels.T.flat, CATEGORIES, strict=True):
+    for panel in panels.flat:
+        panel.axis("off")
+    for panel, (category, title) in zip(panels.T.flat, kinds, strict=False):
         pictures = [
             render(make_object(category, i), np.radians(-58 + 8 * i), np.radians(24))
             for i in range(INSTANCES)
         ]
         panel.imshow(np.hstack(pictures), cmap="gray", vmin=0, vmax=1)
-        panel.set_title(category, fontsize=13, loc="left")
-        panel.axis("off")
+        panel.set_title(title, fontsize=13, loc="left")
     figure.tight_layout()
     figure.savefig(out)
     Image.open(out).convert("L").save(out, optimize=True)  # half the size without colour

@@ -12,38 +12,64 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from tactile_rt.sim_backend import shapes
 from tactile_rt.sim_backend.meshes import MESH_SUFFIXES, load_mesh
+from tactile_rt.sim_backend.shapes import furniture, outdoors, tools, vehicles, vessels
 from tactile_rt.sim_backend.solids import TactileObject, normalised
 from tactile_rt.stream import ConfigError
 
-__all__ = ["CATEGORIES", "TactileObject", "load_object", "make_object"]
+__all__ = ["CATEGORIES", "WITHHELD", "TactileObject", "load_object", "make_object"]
 
-_BUILDERS: dict[str, Callable[[np.random.Generator], list[trimesh.Trimesh]]] = {
-    "bottle": shapes.bottle,
-    "bowl": shapes.bowl,
-    "cactus": shapes.cactus,
-    "car": shapes.car,
-    "chair": shapes.chair,
-    "dumbbell": shapes.dumbbell,
-    "gear": shapes.gear,
-    "ladder": shapes.ladder,
-    "lamp": shapes.lamp,
-    "mug": shapes.mug,
-    "plane": shapes.plane,
-    "table": shapes.table,
+_Builder = Callable[[np.random.Generator], list[trimesh.Trimesh]]
+
+_KNOWN: dict[str, _Builder] = {
+    "beehive": outdoors.beehive,
+    "birdcage": tools.birdcage,
+    "bottle": vessels.bottle,
+    "bowl": vessels.bowl,
+    "cactus": outdoors.cactus,
+    "car": vehicles.car,
+    "castle": outdoors.castle,
+    "chair": furniture.chair,
+    "dumbbell": tools.dumbbell,
+    "gear": tools.gear,
+    "grapes": outdoors.grapes,
+    "hourglass": tools.hourglass,
+    "house": outdoors.house,
+    "jack": tools.jack,
+    "ladder": furniture.ladder,
+    "lamp": furniture.lamp,
+    "mug": vessels.mug,
+    "mushroom": outdoors.mushroom,
+    "pagoda": outdoors.pagoda,
+    "plane": vehicles.plane,
+    "pumpkin": outdoors.pumpkin,
+    "snowman": outdoors.snowman,
+    "spring": tools.spring,
+    "table": furniture.table,
 }
 
-CATEGORIES: tuple[str, ...] = tuple(sorted(_BUILDERS))
+# each a neighbour of a category that is trained: of lamp, chair, mug, car
+_UNKNOWN: dict[str, _Builder] = {
+    "goblet": vessels.goblet,
+    "stool": furniture.stool,
+    "teapot": vessels.teapot,
+    "truck": vehicles.truck,
+}
+
+_BUILDERS = _KNOWN | _UNKNOWN
+
+CATEGORIES: tuple[str, ...] = tuple(sorted(_KNOWN))  # for training
+WITHHELD: tuple[str, ...] = tuple(sorted(_UNKNOWN))  # never trained: what is new to a classifier
 
 
 def make_object(category: str, index: int) -> TactileObject:
     """Instance `index` (0 or more) of a category: the same one every time, everywhere."""
     if category not in _BUILDERS:
-        near = difflib.get_close_matches(category, CATEGORIES, n=1, cutoff=0.3)
+        near = difflib.get_close_matches(category, _BUILDERS, n=1, cutoff=0.3)
         hint = f" (did you mean {near[0]!r}?)" if near else ""
         raise ConfigError(
-            f"no object called {category!r}{hint}; there are {', '.join(CATEGORIES)}, "
+            f"no object called {category!r}{hint}; there are {', '.join(CATEGORIES)}; "
+            f"{', '.join(WITHHELD)} (withheld from training); "
             f"and mesh files ending in {', '.join(MESH_SUFFIXES)}"
         )
     if index < 0:
