@@ -154,7 +154,7 @@ class TestSimulation:
     @pytest.mark.parametrize(
         ("url", "said"),
         [
-            ("sim:rat", "no simulated array 'rat': there is mouse"),
+            ("sim:cat", "no simulated array 'cat'"),
             ("sim:mouse?sede=1", "did you mean seed?"),
             ("sim:mouse?seed=one", "at `$.seed`"),
             ("sim:mouse?pace=slow", "no pace 'slow': there are realtime, fast"),

@@ -8,13 +8,15 @@ bending stiffness E I(midpoint) / cell length, which makes tip stiffness and fir
 with the Euler-Bernoulli beam to second order in the cell length.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.whiskers import DAMPING_RATIO, FRICTION, Whisker, rotation
+from tactile_rt.sim_backend.arrays import MOUNT, Mount
+from tactile_rt.sim_backend.whiskers import DAMPING_RATIO, Whisker, rotation
 from tactile_rt.stream import ArraySpec
 
 __all__ = [
@@ -23,6 +25,7 @@ __all__ = [
     "PROFILES",
     "SAMPLE_MS",
     "UNITS",
+    "Mount",
     "Profile",
     "add_whiskers",
     "array_spec",
@@ -38,6 +41,17 @@ SAMPLE_MS = 1.0  # output period: 1 kHz
 GAUSS = np.polynomial.legendre.leggauss(5)  # nodes, weights: exact to degree 9
 WHISKER_BIT, OBJECT_BIT = 1, 2  # collision groups: whiskers touch objects, never each other
 
+# Contact is a soft layer on both surfaces that whiskers sink through by most of it under a usual
+# load, so that on the mean they bend where the hard surfaces would bend them. Its impedance rises
+# from next to nothing. Were it hard at its outside, a light tip would leave it after every touch,
+# fall back by a whole time step's bend, and strike: forces a hundredfold too large.
+IMPEDANCE = (0.2, 0.99)  # at the outside of the layer, and deep in it
+STIFFEST_AT = 1.2  # depth at which it is all there, in thicknesses of both layers
+
+# MuJoCo would print and write MUJOCO_LOG.TXT where the user works; `SweepSimulation.advance`
+# looks at the counters instead.
+mujoco.set_mju_user_warning(lambda message: None)
+
 
 @dataclass(frozen=True)
 class Profile:
@@ -47,11 +61,14 @@ class Profile:
         links_per_mm: links per mm of arc length.
         least_links: links of the shortest whiskers.
         timestep_ms: physics step, ms; divides the 1 ms output period.
+        layer_mm: thickness of the soft layer on each of two touching surfaces, mm: thin for the
+            right moments at a light touch, thick against chatter at a coarse step.
     """
 
     links_per_mm: float
     least_links: int
     timestep_ms: float
+    layer_mm: float = 0.02
 
     def links(self, whisker: Whisker) -> int:
         """Links of one whisker."""
@@ -59,28 +76,10 @@ class Profile:
 
 
 PROFILES = {
-    "realtime": Profile(0.25, 5, 0.5),
-    "dataset": Profile(0.5, 8, 0.2),
-    "accurate": Profile(1.0, 8, 0.1),
+    "realtime": Profile(0.25, 5, 0.5, 0.05),
+    "dataset": Profile(0.5, 8, 0.2, 0.02),
+    "accurate": Profile(1.0, 8, 0.1, 0.01),
 }
-
-
-@dataclass(frozen=True)
-class Mount:
-    """Pose of the array frame in the world: position (mm), then Rz(yaw) Ry(pitch) Rx(roll)."""
-
-    position: tuple[float, float, float]
-    roll_pitch_yaw: tuple[float, float, float]
-
-    @property
-    def rotation(self) -> NDArray[np.float64]:
-        """(3, 3) from the array frame to the world frame."""
-        roll, pitch, yaw = self.roll_pitch_yaw
-        return rotation("z", yaw) @ rotation("y", pitch) @ rotation("x", roll)
-
-
-# The pose of the published sweeps (Chung et al. 2025, code): the whiskers reach along world +x.
-MOUNT = Mount((-6.934, -11.642, -2.598), (0.0, np.radians(15.366), np.radians(-16.198)))
 
 
 def array_spec(whiskers: tuple[Whisker, ...], name: str) -> ArraySpec:
@@ -127,21 +126,33 @@ def empty_world(profile: Profile) -> mujoco.MjSpec:
     option.enableflags |= mujoco.mjtEnableBit.mjENBL_DIAGEXACT
     default = world.default.geom
     default.solref = (2 * profile.timestep_ms, 1.0)
-    default.solimp = (0.9, 0.99, 0.05, 0.5, 2.0)
-    default.friction = (FRICTION, 0.0, 0.0)
+    default.solimp = (*IMPEDANCE, STIFFEST_AT * 2 * profile.layer_mm, 0.5, 2.0)
+    default.margin = profile.layer_mm
+    default.friction = (0.0, 0.0, 0.0)  # of whatever a whisker touches: the whisker's own counts
     default.condim = 3
     return world
 
 
 def add_whiskers(
-    world: mujoco.MjSpec, whiskers: tuple[Whisker, ...], profile: Profile, mount: Mount = MOUNT
-) -> None:
-    """Add an array to a world, with force and torque sensors at every whisker's base."""
-    head = world.worldbody.add_body(
-        name="head", pos=mount.position, quat=quaternion(mount.rotation)
-    )
+    world: mujoco.MjSpec,
+    whiskers: tuple[Whisker, ...],
+    profile: Profile,
+    mount: Mount = MOUNT,
+    head: str = "head",
+) -> mujoco.MjsBody:
+    """Add an array to a world, with force and torque sensors at every whisker's base.
+
+    Args:
+        world: what to add to.
+        whiskers: the array; names of all whiskers in one world differ.
+        profile: how finely to cut them.
+        mount: pose of the head.
+        head: name of the head's body, which is returned.
+    """
+    body = world.worldbody.add_body(name=head, pos=mount.position, quat=quaternion(mount.rotation))
     for whisker in whiskers:
-        _add_whisker(world, head, whisker, profile)
+        _add_whisker(world, body, whisker, profile)
+    return body
 
 
 def _add_whisker(
@@ -198,6 +209,7 @@ def _add_whisker(
             size=(radii[i], 0, 0),
             contype=WHISKER_BIT,
             conaffinity=0,
+            friction=(whisker.friction, 0.0, 0.0),
             group=WHISKER_BIT,
             rgba=(0.25, 0.2, 0.15, 1.0),
         )
@@ -218,29 +230,35 @@ def _inertia(whisker: Whisker, start: float, stop: float) -> tuple[float, float,
     return total, centre, axial, float(mass @ (radius**2 / 4 + (x - centre) ** 2))
 
 
-def set_damping(model: mujoco.MjModel) -> dict[str, float]:
-    """Give every whisker Rayleigh damping at the published ratio of its first mode.
+def set_damping(model: mujoco.MjModel, whiskers: Iterable[Whisker] = ()) -> dict[str, float]:
+    """Give every whisker Rayleigh damping at the damping ratio of its first mode.
 
     Stiffness-proportional: c = beta k with beta = 2 zeta / omega_1. The integrator itself adds
     h k, which is taken off; where that alone is more than wanted (short whiskers, coarse steps)
     the whisker stays over-damped.
 
+    Args:
+        model: the array, compiled.
+        whiskers: where the damping ratios are from; of whiskers not among them, the published one.
+
     Returns:
         First resonance of every whisker, Hz.
     """
+    ratios = {w.name: w.damping_ratio for w in whiskers}
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     mass = np.empty((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
-    owner = [model.joint(model.dof_jntid[i]).name.split()[0] for i in range(model.nv)]
+    stiffness = model.jnt_stiffness[model.dof_jntid]
+    owner = np.array([model.joint(j).name.split()[0] for j in model.dof_jntid])
     resonances = {}
-    for name in dict.fromkeys(owner):
-        dofs = np.flatnonzero([o == name for o in owner])
-        k = model.jnt_stiffness[model.dof_jntid[dofs]]
+    for name in dict.fromkeys(owner[stiffness > 0].tolist()):
+        dofs = np.flatnonzero((owner == name) & (stiffness > 0))
+        k = stiffness[dofs]
         # The largest eigenvalue of K^-1 M is 1 / omega_1^2.
         flexible = mass[np.ix_(dofs, dofs)] / np.sqrt(np.outer(k, k))
         omega = 1 / np.sqrt(np.linalg.eigvalsh(flexible)[-1])  # rad / ms
-        beta = 2 * DAMPING_RATIO / omega
+        beta = 2 * ratios.get(name, DAMPING_RATIO) / omega
         model.dof_damping[dofs] = max(beta - model.opt.timestep, 0.0) * k
         resonances[name] = float(omega / (2 * np.pi) * 1e3)
     return resonances

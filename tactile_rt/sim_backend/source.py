@@ -1,6 +1,7 @@
 """The simulated array as a `Source`: object after object swept past it, without end.
 
 sim:mouse?objects=mug-50,bottle-51&seed=3&pace=fast&profile=realtime&sweeps=10
+sim:mouse?noise_force=1e-5&noise_moment=5e-8&latency_ms=2&drop_probability=0.01
 """
 
 import time
@@ -9,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS, array_spec
+from tactile_rt.sim_backend.arrays import load_array
 from tactile_rt.sim_backend.objects import CATEGORIES, load_object
+from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation
-from tactile_rt.sim_backend.whiskers import mouse_whiskers
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source
 from tactile_rt.timebase import NS_PER_S
 
@@ -23,15 +25,18 @@ PACES = ("realtime", "fast")
 
 
 @dataclass(frozen=True)
-class SimOptions:
-    """What the simulated array meets.
+class SimOptions(SensorModel):
+    """What the simulated array meets, and what its sensors make of it.
+
+    The fields of `SensorModel` are options too; left out, the sensors are perfect.
 
     Attributes:
         objects: comma-separated names (``mug-50``), categories (``mug``: its first instance) or
             mesh files (.obj, .stl, .ply, .glb), drawn in random order; empty: all categories.
         sweeps: how many objects pass before the stream ends; 0: endless.
         repeat: sweeps of the same object in succession.
-        seed: of the drawn objects and sweep parameters; the same seed gives the same stream.
+        seed: of the drawn objects, sweep parameters and sensor imperfections; the same seed gives
+            the same stream, and the same objects and sweeps whatever the sensors.
         profile: simulation profile, see `array.PROFILES`.
         pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
     """
@@ -44,6 +49,7 @@ class SimOptions:
     pace: str = "realtime"
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.profile not in PROFILES:
             raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
         if self.pace not in PACES:
@@ -68,9 +74,11 @@ class SimSource(Source):
     """A whisker array in MuJoCo with objects sweeping past it.
 
     Time is simulated: it starts at the first read, and in real time the reader waits for it.
+    Samples that the sensors drop count as missing.
 
     Args:
-        array: which array; ``mouse``.
+        array: which array, see `arrays.load_array`: ``mouse`` (also if empty), ``rat-left``, a
+            .csv or .toml file.
         options: what it meets.
 
     Attributes:
@@ -79,18 +87,18 @@ class SimSource(Source):
     """
 
     def __init__(self, array: str, options: SimOptions) -> None:
-        if array not in ("", "mouse"):
-            raise ConfigError(f"no simulated array {array!r}: there is mouse")
-        whiskers = mouse_whiskers()
-        super().__init__(array_spec(whiskers, "mouse-right"))
-        self._whiskers = whiskers
+        made = load_array(array or "mouse")
+        super().__init__(array_spec(made.whiskers, made.name))
+        self._array = made
         self._options = options
         names = [n for n in options.objects.split(",") if n] or list(CATEGORIES)
         self._objects = [load_object(name) for name in names]
         self._rng = np.random.default_rng(options.seed)
+        self._sensor = Sensor(options, self.spec, options.seed)
         self.live = options.pace == "realtime"
         self.passes: list[Pass] = []
         self._start_ns: int | None = None
+        self._sent = 0  # samples simulated so far
         self._rest = 0  # samples of rest still to deliver
         self._simulation: SweepSimulation | None = None
         self._left = 0  # samples of the sweep still to deliver
@@ -101,8 +109,9 @@ class SimSource(Source):
     def read(self, timeout: float | None = None) -> Chunk | None:
         if self._start_ns is None:
             self._start_ns = time.monotonic_ns() if self.live else 0
-        if self._next is None:
-            self._next = self._simulate(self._start_ns)
+        while self._next is None:  # all of a chunk may be dropped
+            self._next = self._sensor.push(self._simulate(self._start_ns))
+            self.stats.missing = self._sensor.dropped
         chunk = self._next
         if self.live:
             wait = (int(chunk.t_ns[-1]) - time.monotonic_ns()) / NS_PER_S
@@ -135,7 +144,8 @@ class SimSource(Source):
         return self._stamp(values, start_ns)
 
     def _stamp(self, values: np.ndarray, start_ns: int) -> Chunk:
-        seq = self.stats.delivered + np.arange(len(values), dtype=np.int64)
+        seq = self._sent + np.arange(len(values), dtype=np.int64)
+        self._sent += len(values)
         period = round(SAMPLE_MS * 1e6)
         return Chunk(
             seq, start_ns + seq * period, values, np.ones(values.shape[:2], dtype=np.bool_)
@@ -154,9 +164,9 @@ class SimSource(Source):
             self._order = [int(i) for i in order for _ in range(self._options.repeat)]
         target = self._objects[self._order.pop(0)]
         sweep, self._simulation = draw_simulation(
-            self._rng, self._whiskers, target, PROFILES[self._options.profile]
+            self._rng, self._array, target, PROFILES[self._options.profile]
         )
         self._rest = REST_SAMPLES
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)
-        now = start_ns + round(self.stats.delivered * SAMPLE_MS * 1e6)
+        now = start_ns + round(self._sent * SAMPLE_MS * 1e6)
         self.passes.append(Pass(now, target.name, target.category, sweep))

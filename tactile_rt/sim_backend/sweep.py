@@ -1,17 +1,19 @@
 """An object swept past the array: the world, the motion, the base loads at 1 kHz.
 
 World frame: z up, x away from the head, y rostral; its origin is where the published sweeps have
-it (see `array.MOUNT`). The object moves along -y, as things do past a head that moves forward.
+it (see `arrays.MOUNT`). The object moves along -y, as things do past a head that moves forward.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+import trimesh
 from mujoco import rollout
 from numpy.typing import NDArray
 
+from tactile_rt.sim_backend.approach import centrelines, way_to_contact, within_reach
 from tactile_rt.sim_backend.array import (
     OBJECT_BIT,
     SAMPLE_MS,
@@ -23,15 +25,19 @@ from tactile_rt.sim_backend.array import (
     read_base_loads,
     set_damping,
 )
+from tactile_rt.sim_backend.arrays import WhiskerArray
+from tactile_rt.sim_backend.head import add_head
 from tactile_rt.sim_backend.objects import TactileObject
-from tactile_rt.sim_backend.whiskers import Whisker, rotation
+from tactile_rt.sim_backend.whiskers import rotation
+from tactile_rt.stream import SourceError
 
 __all__ = ["Sweep", "SweepSimulation", "draw_simulation", "draw_sweep"]
 
-FAR_MM = 200.0  # where the object waits while the way to first contact is measured
-RAY_SPACING_MM = 0.25
+FAR_MM = 200.0  # where the object is when the way to first contact is measured
 DRAWS = 20  # tries to draw parameters with which an object meets the array at all
 CLEAR_MM = 5.0  # how far past the last whisker a sweep goes on
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -44,7 +50,7 @@ class Sweep:
         yaw_deg: rotation of the object about z, degrees.
         height_mm: z of the object's centre in the world frame, mm.
         distance_mm: from the mean of the whiskers' base points to the object's nearest face,
-            along world x, mm; below 5.5 the stiff rostral whiskers jam.
+            along world x, mm; below 5.5 the stiff rostral whiskers of a mouse jam.
         gap_mm: how far before first contact the object starts, mm.
     """
 
@@ -59,11 +65,16 @@ class Sweep:
 class SweepSimulation:
     """One sweep, simulated on demand: `advance` steps it, `loads` runs it to its end.
 
+    Whiskers do not touch each other, so those that the object passes by stay at rest and are not
+    simulated, nor are pieces of the object that no whisker could reach.
+
     Args:
-        whiskers: the array.
+        array: the whiskers; a tuple of arrays for several animals in one world (`arrays.place`).
+            The object passes on the side to which most of the whiskers reach.
         target: the object.
         sweep: how it moves.
         profile: how finely to simulate.
+        whole: simulate everything all the same: the loads are those, and a picture is complete.
 
     Attributes:
         touches: False when the object passes without meeting any resting whisker.
@@ -72,32 +83,49 @@ class SweepSimulation:
 
     def __init__(
         self,
-        whiskers: tuple[Whisker, ...],
+        array: WhiskerArray | tuple[WhiskerArray, ...],
         target: TactileObject,
         sweep: Sweep,
         profile: Profile,
+        whole: bool = False,
     ) -> None:
-        world = empty_world(profile)
-        add_whiskers(world, whiskers, profile)
+        animals = array if isinstance(array, tuple) else (array,)
+        whiskers = [w for animal in animals for w in animal.whiskers]
+        lines = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
         turn = rotation("z", np.radians(sweep.yaw_deg))
-        _add_object(world, target, sweep.size_mm, turn)
-        self.model = world.compile()
-        set_damping(self.model)
-        self.data = mujoco.MjData(self.model)
-        mujoco.mj_kinematics(self.model, self.data)
+        shape = [piece.vertices * sweep.size_mm @ turn.T for piece in target.pieces]
+        start = _beside(lines, np.concatenate(shape), sweep)
+        pieces = [
+            trimesh.Trimesh(points + start, piece.faces, process=False)
+            for points, piece in zip(shape, target.pieces, strict=True)
+        ]
+        way, met = way_to_contact(whiskers, lines, pieces)
+        self.touches = bool(np.isfinite(way))
+        if not self.touches:
+            front = min(points[:, 1].min() for points in shape)
+            way = FAR_MM + front - max(line[:, 1].max() for line in lines)
+        start[1] += sweep.gap_mm - way
+        self._simulated = np.flatnonzero(met | whole)
+        self._elements = len(whiskers)
 
-        points = np.concatenate([p.vertices for p in target.pieces]) * sweep.size_mm @ turn.T
-        face = np.mean([self.data.body(w.name).xpos[0] for w in whiskers])
-        self._start = np.array(
-            [face + sweep.distance_mm - points[:, 0].min(), FAR_MM, sweep.height_mm]
-        )
+        world = empty_world(profile)
+        names = {whiskers[i].name for i in self._simulated}
+        for animal in animals:
+            some = tuple(w for w in animal.whiskers if w.name in names)
+            head = add_whiskers(world, some, profile, animal.mount, f"head {animal.name}")
+            if animal.head is not None:
+                add_head(world, head, animal.head)
+        touched = [lines[i] for i in self._simulated]
+        lengths = [whiskers[i].length for i in self._simulated]
+        kept = range(len(pieces)) if whole else within_reach(touched, lengths, pieces)
+        _add_object(world, [target.pieces[i] for i in kept], sweep.size_mm, turn)
+        self.model = world.compile()
+        set_damping(self.model, whiskers)
+        self.data = mujoco.MjData(self.model)
+        self._start = start
         self._step_mm = np.array([0.0, -sweep.speed_mm_s * 1e-3 * profile.timestep_ms, 0.0])
-        self.data.mocap_pos[0] = self._start
-        mujoco.mj_forward(self.model, self.data)
-        way = _way_to_contact(self.model, self.data)
-        self.touches = way is not None
-        self._start[1] -= way - sweep.gap_mm if way is not None else FAR_MM
-        self.data.mocap_pos[0] = self._start
+        self.data.mocap_pos[0] = start
+        mujoco.mj_kinematics(self.model, self.data)
         # The solver takes a mocap body to stand still; friction must see its surface move. The
         # flag is set at compile time by non-zero velocities only: without it they are ignored.
         self.model.flg_surfacevel = True
@@ -106,20 +134,28 @@ class SweepSimulation:
             self.model.geom_surfacevel[geom, :3] = frame.T @ (self._step_mm / profile.timestep_ms)
         mujoco.mj_forward(self.model, self.data)
 
-        rear = self._start[1] + points[:, 1].max()
-        last = self.data.geom_xpos[self.model.geom_contype == WHISKER_BIT, 1].min()
+        rear = start[1] + max(points[:, 1].max() for points in shape)
+        last = min(line[:, 1].min() for line in lines)
         self.duration_ms = float((rear - last + CLEAR_MM) / (sweep.speed_mm_s * 1e-3))
         self._steps_per_sample = round(SAMPLE_MS / profile.timestep_ms)
         self._steps_done = 0
 
-    def advance(self, samples: int) -> NDArray[np.float64]:
+    def advance(self, samples: int) -> Floats:
         """Simulate the next samples of 1 ms.
 
         Returns:
             (samples, element, 6) base loads, N and N m, each the mean over its millisecond.
+
+        Raises:
+            SourceError: the simulation has become unstable: whiskers too stiff for the profile
+                jam against the object.
         """
         steps = samples * self._steps_per_sample
         when = self._steps_done + np.arange(1, steps + 1)
+        self._steps_done += steps
+        loads = np.zeros((samples, self._elements, 6))
+        if not len(self._simulated):
+            return loads
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         state = np.empty(mujoco.mj_stateSize(self.model, spec))
         mujoco.mj_getState(self.model, self.data, state, spec)
@@ -131,13 +167,29 @@ class SweepSimulation:
             control_spec=int(mujoco.mjtState.mjSTATE_MOCAP_POS),
             initial_warmstart=self.data.qacc_warmstart.copy()[None],
         )
-        self._steps_done += steps
-        return read_base_loads(sensors[0].reshape(samples, self._steps_per_sample, -1).mean(axis=1))
+        if any(self.data.warning[kind].number for kind in UNSTABLE):
+            raise SourceError(
+                "the simulation has become unstable: a whisker jams that is too stiff for this "
+                "profile; sweep at a larger distance, or at a finer profile"
+            )
+        sampled = sensors[0].reshape(samples, self._steps_per_sample, -1).mean(axis=1)
+        loads[:, self._simulated] = read_base_loads(sampled)
+        return loads
 
-    def loads(self, samples_at_once: int = 50) -> Iterator[NDArray[np.float64]]:
+    def loads(self, samples_at_once: int = 50) -> Iterator[Floats]:
         """Advance in pieces until the object has passed."""
         while self._steps_done * self.model.opt.timestep < self.duration_ms:
             yield self.advance(samples_at_once)
+
+
+UNSTABLE = tuple(
+    int(kind)
+    for kind in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+    )
+)
 
 
 def draw_sweep(rng: np.random.Generator) -> Sweep:
@@ -152,22 +204,33 @@ def draw_sweep(rng: np.random.Generator) -> Sweep:
 
 
 def draw_simulation(
-    rng: np.random.Generator, whiskers: tuple[Whisker, ...], target: TactileObject, profile: Profile
+    rng: np.random.Generator, array: WhiskerArray, target: TactileObject, profile: Profile
 ) -> tuple[Sweep, SweepSimulation]:
     """Draw sweeps until the object meets the array; give up, with a miss, after many tries."""
     for _ in range(DRAWS):
         sweep = draw_sweep(rng)
-        simulation = SweepSimulation(whiskers, target, sweep, profile)
+        simulation = SweepSimulation(array, target, sweep, profile)
         if simulation.touches:
             break
     return sweep, simulation
 
 
+def _beside(lines: Sequence[Floats], shape: Floats, sweep: Sweep) -> Floats:
+    """Where the object's centre is far up the y axis, mm, on the side that whiskers reach to."""
+    bases = np.array([line[0, 0] for line in lines])
+    outward = np.array([line[-1, 0] for line in lines]) > bases
+    right = 2 * outward.sum() >= len(lines)
+    face = bases[outward == right].mean()
+    nearest = shape[:, 0].min() if right else shape[:, 0].max()
+    x = face + (sweep.distance_mm if right else -sweep.distance_mm) - nearest
+    return np.array([x, FAR_MM, sweep.height_mm])
+
+
 def _add_object(
-    world: mujoco.MjSpec, target: TactileObject, size_mm: float, turn: NDArray[np.float64]
+    world: mujoco.MjSpec, pieces: Sequence[trimesh.Trimesh], size_mm: float, turn: Floats
 ) -> None:
     body = world.worldbody.add_body(name="object", mocap=True, quat=quaternion(turn))
-    for i, piece in enumerate(target.pieces):
+    for i, piece in enumerate(pieces):
         world.add_mesh(
             name=f"piece {i}",
             uservert=(piece.vertices * size_mm).astype(np.float32).ravel(),
@@ -181,20 +244,3 @@ def _add_object(
             group=OBJECT_BIT,
             rgba=(0.75, 0.55, 0.3, 1.0),
         )
-
-
-def _way_to_contact(model: mujoco.MjModel, data: mujoco.MjData) -> float | None:
-    """How far the object can move along -y before it meets a resting whisker, mm."""
-    group = np.zeros(6, dtype=np.uint8)
-    group[OBJECT_BIT] = 1
-    hit, normal = np.zeros(1, dtype=np.int32), np.zeros(3)
-    nearest = np.inf
-    for geom in np.flatnonzero(model.geom_contype == WHISKER_BIT):
-        radius, half = model.geom_size[geom, :2]
-        along = data.geom_xmat[geom].reshape(3, 3)[:, 2]
-        for at in np.linspace(-half, half, max(2, round(2 * half / RAY_SPACING_MM) + 1)):
-            point = data.geom_xpos[geom] + at * along
-            d = mujoco.mj_ray(model, data, point, [0.0, 1.0, 0.0], group, 1, -1, hit, normal)
-            if d >= 0:
-                nearest = min(nearest, d - radius)
-    return float(nearest) if np.isfinite(nearest) else None

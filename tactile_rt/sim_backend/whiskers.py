@@ -1,22 +1,64 @@
-"""Whisker morphology: the published measurements and the geometry that follows from them.
+"""Whiskers: the geometry and the material of one, and the animals' published measurements.
 
 Lengths in mm and angles in rad here, as the field publishes them; `array.py` converts.
 """
 
 import csv
+import math
+import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["YOUNG_MODULUS_PA", "Whisker", "mouse_whiskers", "rotation"]
+from tactile_rt.stream import ConfigError
+
+__all__ = [
+    "DAMPING_RATIO",
+    "DENSITY_BASE",
+    "DENSITY_TIP",
+    "FRICTION",
+    "OPTIONAL",
+    "REQUIRED",
+    "YOUNG_MODULUS_PA",
+    "Whisker",
+    "keratin_radii",
+    "mouse_whiskers",
+    "rat_whiskers",
+    "rotation",
+]
 
 YOUNG_MODULUS_PA = 5e9  # Zweifel et al. (2021), PNAS 118(27)
 DENSITY_BASE, DENSITY_TIP = 1260.0, 1690.0  # kg/m^3, Belli et al. (2017)
 DAMPING_RATIO = 0.32  # of the first mode, Zweifel et al. (2021)
 FRICTION = 0.5
 THINNEST_TIP_MM = 0.0015
+STRAIGHT = 1e-9  # curvature times length below which arc and chord agree to the last digit
+SLENDER = 10.0  # least length in base radii for which beam theory holds
+
+# Columns of a table of whiskers, one whisker a row, and the fields that they fill.
+REQUIRED = (
+    *("whisker", "row", "col", "arc_length_mm", "curvature_a_per_mm"),
+    *("base_x_mm", "base_y_mm", "base_z_mm"),
+    *("base_theta_rad", "base_phi_rad", "base_zeta_rad"),
+)
+OPTIONAL = {
+    "base_radius_mm": "base_radius",
+    "tip_radius_mm": "tip_radius",
+    "young_modulus_pa": "young_modulus",
+    "density_base_kg_m3": "density_base",
+    "density_tip_kg_m3": "density_tip",
+    "damping_ratio": "damping_ratio",
+    "friction": "friction",
+}
+NOT_NEGATIVE = ("damping_ratio", "friction")
+POSITIVE = {"arc_length_mm": "length"} | {
+    column: field for column, field in OPTIONAL.items() if field not in NOT_NEGATIVE
+}
+NAME = re.compile(r"[\w.+-]+")  # MuJoCo's names are cut at spaces and joined by slashes
+TAKEN = ("world", "head", "object")  # bodies that share a model with the whiskers
 
 
 @dataclass(frozen=True)
@@ -24,12 +66,21 @@ class Whisker:
     """One whisker: a tapered, planar, parabolic beam on its base point.
 
     Attributes:
-        name: row letter and column, e.g. ``C2``.
+        name: what it is called, without spaces, e.g. ``C2``: row letter and column.
         row, column: place on the grid, counted from 0 (row A, column 0).
         length: arc length S, mm.
-        curvature: a of y = a x^2 in the whisker's plane, 1/mm.
+        curvature: a of y = a x^2 in the whisker's plane, 1/mm; 0 is straight, and a negative one
+            curves towards -y.
         base: base point in the array frame, mm.
         angles: base angles (theta, phi, zeta): azimuth, elevation, torsion, rad.
+        base_radius, tip_radius: of the cone, mm; equal for a cylinder, never thicker at the tip.
+        young_modulus: E, Pa.
+        density_base, density_tip: mass density at either end, kg/m^3.
+        damping_ratio: of the first mode.
+        friction: Coulomb coefficient of the surface.
+
+    Raises:
+        ConfigError: a value that no whisker can have.
     """
 
     name: str
@@ -39,32 +90,120 @@ class Whisker:
     curvature: float
     base: tuple[float, float, float]
     angles: tuple[float, float, float]
+    base_radius: float
+    tip_radius: float
+    young_modulus: float = YOUNG_MODULUS_PA
+    density_base: float = DENSITY_BASE
+    density_tip: float = DENSITY_TIP
+    damping_ratio: float = DAMPING_RATIO
+    friction: float = FRICTION
+
+    def __post_init__(self) -> None:
+        who = f"whisker {self.name}"
+        if not NAME.fullmatch(self.name) or self.name in TAKEN:
+            raise ConfigError(
+                f"whisker {self.name!r}: a name is letters, digits, '.', '-', '+' and '_', and "
+                f"none of {', '.join(TAKEN)}"
+            )
+        if self.row < 0 or self.column < 0:
+            raise ConfigError(f"{who}: row and column are counted from 0")
+        for what in (self.base, self.angles, (self.curvature,)):
+            if not all(map(math.isfinite, what)):
+                raise ConfigError(f"{who}: base, angles and curvature must be finite")
+        # Named as the columns of a table are, which say the unit, too.
+        for column, name in POSITIVE.items():
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"{who}: {column} must be positive, not {getattr(self, name):g}")
+        for name in NOT_NEGATIVE:
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ConfigError(f"{who}: {name} must be 0 or more, not {getattr(self, name):g}")
+        if self.tip_radius > self.base_radius:
+            raise ConfigError(
+                f"{who}: tip_radius_mm {self.tip_radius:g} exceeds base_radius_mm "
+                f"{self.base_radius:g}; a whisker is nowhere thicker than at its base"
+            )
+        if self.length < SLENDER * self.base_radius:
+            raise ConfigError(
+                f"{who}: arc_length_mm {self.length:g} is less than {SLENDER:g} times "
+                f"base_radius_mm {self.base_radius:g}; a whisker is slender (both are in mm)"
+            )
+
+    @classmethod
+    def from_columns(cls, values: Mapping[str, object]) -> "Whisker":
+        """Make a whisker from a row of a table: texts or numbers by `REQUIRED` and `OPTIONAL`.
+
+        Rows are counted from 1 there, as in the field's tables. An optional value that is absent
+        or empty is keratin's; a radius or density given for the base alone holds to the tip.
+
+        Raises:
+            ConfigError: a value is missing, not a number, or none that a whisker can have.
+        """
+        given = {k: v for k, v in values.items() if v is not None and v != ""}
+        missing = [column for column in REQUIRED if column not in given]
+        if missing:
+            raise ConfigError(f"no {missing[0]}; give it a value")
+        name = given["whisker"]
+        if not isinstance(name, str):
+            raise ConfigError(f"whisker is a name, in quotes, not {name!r}")
+        row, column = _whole(given, "row", 1) - 1, _whole(given, "col", 0)
+        length = _number(given, "arc_length_mm")
+        fields = {field: _number(given, at) for at, field in OPTIONAL.items() if at in given}
+        for base, tip in (
+            ("base_radius_mm", "tip_radius_mm"),
+            ("density_base_kg_m3", "density_tip_kg_m3"),
+        ):
+            if base in given:
+                fields.setdefault(OPTIONAL[tip], fields[OPTIONAL[base]])
+            elif tip in given:
+                raise ConfigError(f"{tip} is given without {base}; give that, too")
+        if "base_radius" not in fields:
+            radii = keratin_radii(length, row, column)
+            fields["base_radius"], fields["tip_radius"] = radii
+        return cls(
+            name=name.strip(),
+            row=row,
+            column=column,
+            length=length,
+            curvature=_number(given, "curvature_a_per_mm"),
+            base=(
+                _number(given, "base_x_mm"),
+                _number(given, "base_y_mm"),
+                _number(given, "base_z_mm"),
+            ),
+            angles=(
+                _number(given, "base_theta_rad"),
+                _number(given, "base_phi_rad"),
+                _number(given, "base_zeta_rad"),
+            ),
+            **fields,
+        )
 
     def radius(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Radius (mm) at arc length s (mm): linear from base to tip (Belli et al. 2017)."""
-        row, column = self.row + 1, self.column
-        base = (0.041 + 0.002 * self.length + 0.011 * row - 0.0039 * column) / 2
-        slope = 0.0012 + 0.00017 * row - 0.000066 * column + 0.00011 * column**2
-        tip = max((base - slope * self.length) / 2, THINNEST_TIP_MM)
+        """Radius (mm) at arc length s (mm): linear from base to tip."""
+        base, tip = self.base_radius, self.tip_radius
         return base + (tip - base) * np.asarray(s) / self.length
 
     def density(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Mass density (kg/m^3) at arc length s (mm)."""
-        return DENSITY_BASE + (DENSITY_TIP - DENSITY_BASE) * np.asarray(s) / self.length
+        """Mass density (kg/m^3) at arc length s (mm): linear from base to tip."""
+        base, tip = self.density_base, self.density_tip
+        return base + (tip - base) * np.asarray(s) / self.length
 
     def bending_stiffness(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """E I (N mm^2) at arc length s (mm), I = pi r^4 / 4."""
-        return YOUNG_MODULUS_PA * 1e-6 * np.pi * self.radius(s) ** 4 / 4
+        return self.young_modulus * 1e-6 * np.pi * self.radius(s) ** 4 / 4
 
     def centreline(self, s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Points (len(s), 3) at arc lengths s (mm) in the whisker frame, mm.
 
-        The whisker leaves its base along +x and curves towards +y.
+        The whisker leaves its base along +x and curves towards +y (-y if negatively curved).
         """
         a = self.curvature
-        x = np.linspace(0.0, self.length, 2001)
-        arc = x * np.sqrt(1 + (2 * a * x) ** 2) / 2 + np.arcsinh(2 * a * x) / (4 * a)
-        at = np.interp(s, arc, x)
+        if abs(a) * self.length < STRAIGHT:
+            at = np.clip(np.asarray(s, dtype=np.float64), 0.0, self.length)
+        else:
+            x = np.linspace(0.0, self.length, 2001)
+            arc = x * np.sqrt(1 + (2 * a * x) ** 2) / 2 + np.arcsinh(2 * a * x) / (4 * a)
+            at = np.interp(s, arc, x)
         return np.stack([at, a * at**2, np.zeros_like(at)], axis=-1)
 
     @property
@@ -86,23 +225,47 @@ def rotation(axis: str, angle: float) -> NDArray[np.float64]:
     return matrix
 
 
+def keratin_radii(length: float, row: int, column: int) -> tuple[float, float]:
+    """Base and tip radius (mm) of a rat's or mouse's whisker (Belli et al. 2017).
+
+    Regressions on arc length (mm) and place on the grid (row and column from 0). The tip is half
+    as thick as the radius slope leaves it, and at least `THINNEST_TIP_MM`, as in the published
+    simulator: short rostral whiskers would otherwise end before their tip.
+    """
+    base = (0.041 + 0.002 * length + 0.011 * (row + 1) - 0.0039 * column) / 2
+    slope = 0.0012 + 0.00017 * (row + 1) - 0.000066 * column + 0.00011 * column**2
+    return base, max((base - slope * length) / 2, THINNEST_TIP_MM)
+
+
 def mouse_whiskers() -> tuple[Whisker, ...]:
     """The 30 right-side mystacial whiskers of the mouse (Bresee et al. 2023)."""
-    text = resources.files(__package__).joinpath("data/mouse.csv").read_text(encoding="utf-8")
+    return _measured("mouse.csv")
+
+
+def rat_whiskers() -> tuple[Whisker, ...]:
+    """The 30 right-side mystacial whiskers of the rat (Belli et al. 2017, 2018)."""
+    return _measured("rat.csv")
+
+
+def _measured(file: str) -> tuple[Whisker, ...]:
+    text = resources.files(__package__).joinpath("data", file).read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if not line.startswith("#")]
-    return tuple(
-        Whisker(
-            name=row["whisker"],
-            row=int(row["row"]) - 1,
-            column=int(row["col"]),
-            length=float(row["arc_length_mm"]),
-            curvature=float(row["curvature_a_per_mm"]),
-            base=(float(row["base_x_mm"]), float(row["base_y_mm"]), float(row["base_z_mm"])),
-            angles=(
-                float(row["base_theta_rad"]),
-                float(row["base_phi_rad"]),
-                float(row["base_zeta_rad"]),
-            ),
-        )
-        for row in csv.DictReader(lines)
-    )
+    return tuple(Whisker.from_columns(row) for row in csv.DictReader(lines))
+
+
+def _number(values: Mapping[str, object], column: str) -> float:
+    value = values[column]
+    try:
+        number = float(value) if isinstance(value, str | int | float) else math.nan
+    except (ValueError, OverflowError):
+        raise ConfigError(f"{column} is not a number: {value!r}") from None
+    if isinstance(value, bool) or not math.isfinite(number):
+        raise ConfigError(f"{column} is not a finite number: {value!r}")
+    return number
+
+
+def _whole(values: Mapping[str, object], column: str, least: int) -> int:
+    number = _number(values, column)
+    if not number.is_integer() or number < least:
+        raise ConfigError(f"{column} must be a whole number from {least}, not {values[column]!r}")
+    return int(number)

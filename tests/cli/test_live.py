@@ -19,7 +19,7 @@ from tactile_rt.stream import Chunk
 pytest.importorskip("mujoco")
 
 from tactile_rt.cli.demonstration import Demonstration
-from tactile_rt.cli.view import draw, watch
+from tactile_rt.cli.demonstration_view import draw, watch
 
 ONE_MUG = "sim:mouse?objects=mug-50&sweeps=1&pace=fast"
 ENDLESS = "sim:mouse?objects=mug-50"
@@ -143,7 +143,7 @@ def test_a_model_that_cannot_be_used_is_one_line(call, bad_models, wrong, said, 
     [
         ("simm:mouse", "did you mean sim:?"),
         ("nonsense", "unknown source"),
-        ("sim:rat", "no simulated array 'rat'"),
+        ("sim:cat", "no simulated array 'cat'"),
         ("sim:mouse?object=mug", "did you mean objects?"),
         ("sim:mouse?objects=mugg", "did you mean 'mug'?"),
         ("sim:mouse?sweeps=many", "sweeps"),

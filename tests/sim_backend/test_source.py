@@ -9,12 +9,13 @@ pytest.importorskip("trimesh")
 
 from tactile_rt.sim_backend.array import array_spec
 from tactile_rt.sim_backend.objects import CATEGORIES
-from tactile_rt.sim_backend.source import REST_SAMPLES, SimOptions, SimSource
+from tactile_rt.sim_backend.source import CHUNK_SAMPLES, REST_SAMPLES, SimOptions, SimSource
 from tactile_rt.sim_backend.whiskers import mouse_whiskers
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream, concatenate
+from tactile_rt.sources import open_source
+from tactile_rt.stream import Chunk, ConfigError, EndOfStream, SourceStats, concatenate
 
 
-def fast(**options: str | int) -> SimSource:
+def fast(**options: str | float) -> SimSource:
     """A source that does not wait for the clock."""
     return SimSource("mouse", SimOptions(pace="fast", **options))  # type: ignore[arg-type]
 
@@ -104,6 +105,37 @@ def test_all_categories_come_when_none_is_named() -> None:
         assert source.passes[0].category in CATEGORIES
 
 
+def test_its_url_takes_the_sensor_model() -> None:
+    url = "sim:mouse?objects=mug&pace=fast&noise_force=1e-5&noise_moment=5e-8&latency_ms=2.5"
+    with open_source(url) as source:
+        noisy = first(source, REST_SAMPLES)
+    np.testing.assert_array_equal(noisy.t_ns, noisy.seq * 1_000_000 + 2_500_000)
+    noise = noisy.values.reshape(len(noisy), -1, 2, 3).std(axis=(0, 1, 3))
+    np.testing.assert_allclose(noise, [1e-5, 5e-8], rtol=0.02)
+
+
+def test_dropped_samples_are_missing_and_everything_else_comes_as_it_would(
+    two_passes: tuple[SimSource, Chunk],
+) -> None:
+    source, clean = two_passes
+    # So many that whole chunks of nine go missing now and then.
+    with fast(objects="bottle-3,gear", sweeps=2, seed=4, drop_probability=0.7) as poor:
+        left = concatenate(list(poor))
+    assert poor.stats == SourceStats(delivered=len(left), missing=len(clean) - len(left))
+    assert poor.stats.missing / len(clean) == pytest.approx(0.7, abs=0.05)
+    assert np.diff(left.seq // CHUNK_SAMPLES).max() > 1
+    for part in ("seq", "t_ns", "values", "valid"):
+        np.testing.assert_array_equal(getattr(left, part), getattr(clean, part)[left.seq])
+    assert poor.passes == source.passes
+
+
+def test_in_real_time_latency_is_waited_for() -> None:
+    with SimSource("mouse", SimOptions(objects="mug", latency_ms=40, jitter_ms=1)) as source:
+        for _ in range(5):
+            chunk = source.read()
+            assert chunk is not None and chunk.t_ns[-1] <= time.monotonic_ns()
+
+
 def test_it_describes_the_mouse() -> None:
     with fast(objects="mug") as source:
         assert source.spec == array_spec(mouse_whiskers(), "mouse-right")
@@ -173,6 +205,7 @@ def test_a_read_waits_no_longer_than_asked() -> None:
         ({"profile": "quick"}, "no profile 'quick': there are realtime, dataset, accurate"),
         ({"sweeps": -1}, "sweeps must be 0 or more"),
         ({"repeat": 0}, "repeat 1 or more"),
+        ({"noise_force": -1.0}, "noise_force must be 0 or more, not -1.0"),
     ],
 )
 def test_bad_options_are_refused(options: dict[str, int], said: str) -> None:
@@ -181,7 +214,7 @@ def test_bad_options_are_refused(options: dict[str, int], said: str) -> None:
 
 
 def test_an_unknown_array_or_object_is_refused() -> None:
-    with pytest.raises(ConfigError, match="no simulated array 'rat': there is mouse"):
-        SimSource("rat", SimOptions())
+    with pytest.raises(ConfigError, match="no simulated array 'mose': did you mean mouse"):
+        SimSource("mose", SimOptions())
     with pytest.raises(ConfigError, match="no object called 'mugg'"):
         SimSource("mouse", SimOptions(objects="bottle,mugg"))

@@ -1,10 +1,24 @@
+import csv
+from dataclasses import replace
+from importlib import resources
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.sim_backend.whiskers import Whisker, mouse_whiskers, rotation
+from tactile_rt.sim_backend.whiskers import (
+    OPTIONAL,
+    REQUIRED,
+    Whisker,
+    keratin_radii,
+    mouse_whiskers,
+    rat_whiskers,
+    rotation,
+)
+from tactile_rt.stream import ConfigError
 
 WHISKERS = {w.name: w for w in mouse_whiskers()}
 every = pytest.mark.parametrize("whisker", WHISKERS.values(), ids=WHISKERS)
@@ -93,3 +107,127 @@ def test_density_and_stiffness() -> None:
     np.testing.assert_allclose(c2.density(ends), [1260, 1690])
     inertia = np.pi / 64 * np.array([96.730e-3, 17.560e-3]) ** 4  # mm^4
     np.testing.assert_allclose(c2.bending_stiffness(ends), 5e3 * inertia, rtol=1e-3)  # N mm^2
+
+
+def test_keratin_is_what_the_published_simulator_assumes() -> None:
+    for w in WHISKERS.values():
+        assert (w.young_modulus, w.damping_ratio, w.friction) == (5e9, 0.32, 0.5)
+
+
+def test_the_rat_has_thirty_whiskers_without_e0_and_with_e6() -> None:
+    rat = {w.name: w for w in rat_whiskers()}
+    assert len(rat) == 30 and "E0" not in rat and "E6" in rat
+    assert all(w.name == "ABCDE"[w.row] + str(w.column) for w in rat.values())
+    assert rat["C0"].length == 52.8 and rat["D6"].angles == (1.7802, -0.26529, 1.0734)
+    # the floor of the tip's radius binds on 21 of them
+    assert sum(w.tip_radius == 0.0015 for w in rat.values()) == 21
+    # by hand, um
+    ends = 2e3 * rat["A0"].radius(np.array([0.0, 39.9]))
+    np.testing.assert_allclose(ends, [131.8, 11.237], atol=0.01)
+
+
+@pytest.mark.parametrize("animal", ["mouse", "rat"])
+def test_every_number_of_the_tables_is_used_once(animal: str) -> None:
+    text = resources.files("tactile_rt.sim_backend").joinpath(f"data/{animal}.csv").read_text()
+    rows = list(csv.reader(line for line in text.splitlines() if not line.startswith("#")))
+    assert tuple(rows[0]) == REQUIRED
+    made = mouse_whiskers() if animal == "mouse" else rat_whiskers()
+    for w, (name, row, column, *numbers) in zip(made, rows[1:], strict=True):
+        assert (w.name, w.row, w.column) == (name, int(row) - 1, int(column))
+        assert (w.length, w.curvature, *w.base, *w.angles) == tuple(map(float, numbers))
+
+
+STRAIGHT = replace(WHISKERS["C2"], curvature=0.0)
+
+
+def test_a_straight_whisker_is_straight() -> None:
+    s = np.linspace(0, STRAIGHT.length, 7)
+    np.testing.assert_array_equal(STRAIGHT.centreline(s), np.outer(s, [1, 0, 0]))
+
+
+@pytest.mark.parametrize("a", [1e-300, 1e-17, 1e-12, 6e-11, 7e-11, 1e-8, 1e-4, 0.02, 0.05])
+@pytest.mark.parametrize("length", [1.0, 15.0, 200.0])
+def test_a_centreline_of_any_curvature(a: float, length: float) -> None:
+    whisker = replace(STRAIGHT, curvature=a, length=length)
+    s = np.linspace(0, length, 9)
+    points = whisker.centreline(s)
+    for at, (x, y, z) in zip(s, points, strict=True):
+        arc = quad(lambda u: np.sqrt(1 + (2 * a * u) ** 2), 0, x, epsabs=1e-12, epsrel=1e-12)[0]
+        assert arc == pytest.approx(at, rel=2e-7, abs=1e-12 + length * 2e-6 * min(1, a * length))
+        assert y == pytest.approx(a * x**2, rel=1e-12) and z == 0
+    other = replace(whisker, curvature=-a).centreline(s)
+    np.testing.assert_array_equal(other, points * [1, -1, 1])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"name": ""}, "letters, digits"),
+        ({"name": "C 2"}, "letters, digits"),
+        ({"name": "a/b"}, "letters, digits"),
+        ({"name": "head"}, "none of world, head, object"),
+        ({"row": -1}, "counted from 0"),
+        ({"length": 0.0}, "C2: arc_length_mm must be positive, not 0"),
+        ({"length": float("inf")}, "arc_length_mm must be positive, not inf"),
+        ({"young_modulus": -5e9}, "young_modulus_pa must be positive, not -5e"),
+        ({"young_modulus": float("nan")}, "young_modulus_pa must be positive, not nan"),
+        ({"density_tip": 0}, "density_tip_kg_m3 must be positive"),
+        ({"tip_radius": 0.0}, "tip_radius_mm must be positive"),
+        ({"tip_radius": 0.2}, "tip_radius_mm 0.2 exceeds base_radius_mm 0.04"),
+        ({"base_radius": 48.365}, "is less than 10 times base_radius_mm 48.365"),
+        ({"damping_ratio": -0.1}, "damping_ratio must be 0 or more"),
+        ({"friction": float("nan")}, "friction must be 0 or more, not nan"),
+        ({"curvature": float("nan")}, "must be finite"),
+        ({"base": (0.0, float("inf"), 0.0)}, "must be finite"),
+        ({"angles": (0.0, float("nan"), 0.0)}, "must be finite"),
+    ],
+)
+def test_what_no_whisker_can_be_is_refused(wrong: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        replace(WHISKERS["C2"], **wrong)
+
+
+def test_without_damping_friction_or_taper_it_is_still_a_whisker() -> None:
+    plain = replace(STRAIGHT, damping_ratio=0.0, friction=0.0, tip_radius=STRAIGHT.base_radius)
+    np.testing.assert_array_equal(plain.radius(np.array([0.0, 5.0])), plain.base_radius)
+
+
+ROW: dict[str, object] = dict.fromkeys(REQUIRED, 1) | {"whisker": "B1", "arc_length_mm": "30"}
+
+
+def test_a_row_of_a_table_is_a_whisker() -> None:
+    every_field = {name: 0.01 * (9 - i) for i, name in enumerate(OPTIONAL)}
+    made = Whisker.from_columns(ROW | every_field)
+    assert (made.name, made.row, made.column, made.length) == ("B1", 0, 1, 30.0)
+    for column, name in OPTIONAL.items():
+        assert getattr(made, name) == every_field[column]
+
+
+def test_what_a_row_leaves_out_is_keratin_or_goes_on_to_the_tip() -> None:
+    made = Whisker.from_columns(ROW | {"friction": ""})
+    assert (made.base_radius, made.tip_radius) == keratin_radii(30.0, 0, 1)
+    assert (made.density_base, made.density_tip, made.friction) == (1260, 1690, 0.5)
+    made = Whisker.from_columns(ROW | {"base_radius_mm": "0.2", "density_base_kg_m3": 1100})
+    assert made.base_radius == made.tip_radius == 0.2
+    assert made.density_base == made.density_tip == 1100
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"col": None}, "no col; give it a value"),
+        ({"arc_length_mm": ""}, "no arc_length_mm"),
+        ({"arc_length_mm": "3O"}, "arc_length_mm is not a number: '3O'"),
+        ({"arc_length_mm": True}, "arc_length_mm is not a finite number: True"),
+        ({"base_phi_rad": "nan"}, "base_phi_rad is not a finite number: 'nan'"),
+        ({"base_phi_rad": 10**400}, "base_phi_rad is not a number"),
+        ({"base_phi_rad": [1]}, "base_phi_rad is not a finite number"),
+        ({"whisker": 3}, "in quotes, not 3"),
+        ({"row": 0}, "row must be a whole number from 1, not 0"),
+        ({"col": "1.5"}, "col must be a whole number from 0, not '1.5'"),
+        ({"tip_radius_mm": 0.1}, "tip_radius_mm is given without base_radius_mm"),
+    ],
+)
+def test_a_mistake_in_a_row_is_named(wrong: dict[str, object], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        Whisker.from_columns(ROW | wrong)

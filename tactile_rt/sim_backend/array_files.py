@@ -1,0 +1,210 @@
+"""Arrays from files: a table of whiskers in CSV, or in TOML with a mount, a head and defaults.
+
+Both have the columns of ``data/mouse.csv`` and may add those of `whiskers.OPTIONAL`; see
+``docs/arrays/robot.toml`` and ``robot.csv`` for one array in both. In TOML::
+
+    name = "robot"             # the file's name if left out
+    head = "head.stl"          # in the head's frame, mm; its path is relative to this file
+    mirror = true              # adds the left side
+    [mount]                    # if left out: unturned, the mean base point at the world's origin
+    position_mm = [0.0, 0.0, 0.0]
+    roll_pitch_yaw_rad = [0.0, 0.0, 0.0]
+    [defaults]                 # of every whisker
+    young_modulus_pa = 2.9e9
+    [[whisker]]
+    whisker = "A0"
+    ...
+
+or, for several animals in one world, ``[[animal]]`` tables with ``array = "rat-both"`` (a name
+or a file) and a ``mount`` of their own.
+"""
+
+import csv
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tactile_rt.sim_backend.arrays import (
+    ARRAY_FILES,
+    HEAD_FILES,
+    Mount,
+    Point,
+    WhiskerArray,
+    both_sides,
+    centred_mount,
+    load_array,
+    place,
+)
+from tactile_rt.sim_backend.whiskers import OPTIONAL, REQUIRED, Whisker
+from tactile_rt.stream import ConfigError
+
+__all__ = ["read_animals"]
+
+COLUMNS = (*REQUIRED, *OPTIONAL)
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+class _Mount(msgspec.Struct, forbid_unknown_fields=True):
+    position_mm: Point = ORIGIN
+    roll_pitch_yaw_rad: Point = ORIGIN
+
+
+class _Animal(msgspec.Struct, forbid_unknown_fields=True):
+    array: str
+    mount: _Mount | None = None
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    name: str = ""
+    head: str = ""
+    mirror: bool = False
+    mount: _Mount | None = None
+    defaults: dict[str, Any] = {}
+    whisker: list[dict[str, Any]] = []
+    animal: list[_Animal] = []
+
+
+def read_animals(path: Path) -> tuple[WhiskerArray, ...]:
+    """Read the array, or the several animals, of a .csv or .toml file.
+
+    Raises:
+        ConfigError: one line that names the file, the line or whisker, the column, and what to do.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    if path.suffix.lower() == ".csv":
+        whiskers = _csv_whiskers(path, text)
+        return (WhiskerArray(path.stem, whiskers, centred_mount(whiskers)),)
+    return _toml_animals(path, text)
+
+
+def _csv_whiskers(path: Path, text: str) -> tuple[Whisker, ...]:
+    lines = [
+        (number, [cell.strip() for cell in next(csv.reader([line]))])
+        for number, line in enumerate(text.splitlines(), start=1)
+        if line.strip(" ,") and not line.startswith("#")  # spreadsheets keep empty rows as commas
+    ]
+    if not lines:
+        raise ConfigError(f"{path}: is empty; its first line names the columns")
+    (number, header), *rows = lines
+    where = f"{path}, line {number}"
+    if len(header) == 1 and ";" in header[0]:
+        raise ConfigError(f"{where}: columns are separated by semicolons; use commas")
+    _known(where, header)
+    for column in REQUIRED:
+        if column not in header:
+            raise ConfigError(f"{where}: no column {column}; add it")
+    if len(set(header)) < len(header):
+        twice = next(c for i, c in enumerate(header) if c in header[:i])
+        raise ConfigError(f"{where}: column {twice} is there twice; remove one")
+    whiskers = []
+    for number, cells in rows:
+        where = f"{path}, line {number}"
+        if len(cells) != len(header):
+            raise ConfigError(f"{where}: {len(cells)} values for {len(header)} columns")
+        values = dict(zip(header, cells, strict=True))
+        whiskers.append((where, _whisker(where, values)))
+    return _distinct(path, whiskers)
+
+
+def _toml_animals(path: Path, text: str) -> tuple[WhiskerArray, ...]:
+    try:
+        file = msgspec.toml.decode(text, type=_File)
+    except msgspec.MsgspecError as error:
+        message = str(error)
+        if unknown := re.search(r"unknown field `(.*?)`", message):
+            fields = [f for struct in (_File, _Mount, _Animal) for f in struct.__struct_fields__]
+            message += _hint(unknown[1], fields)
+        raise ConfigError(f"{path}: {message}") from None
+    if bool(file.animal) == bool(file.whisker):
+        raise ConfigError(f"{path}: needs [[whisker]] tables or [[animal]] tables, one of the two")
+    if file.animal:
+        if file.name or file.head or file.mirror or file.mount or file.defaults:
+            raise ConfigError(
+                f"{path}: beside [[animal]] tables there is nothing else; name, head, mirror, "
+                f"mount and defaults belong in the file of an array"
+            )
+        return place([_animal(path, animal) for animal in file.animal])
+    _known(f"{path}, defaults", file.defaults)
+    whiskers = []
+    for number, values in enumerate(file.whisker, start=1):
+        where = f"{path}, whisker {number}"
+        if isinstance(values.get("whisker"), str):
+            where += f" ({values['whisker']})"
+        _known(where, values)
+        whiskers.append((where, _whisker(where, file.defaults | values)))
+    made = _distinct(path, whiskers)
+    mount = _mount(path, file.mount) if file.mount else centred_mount(made)
+    name = file.name or path.stem
+    array = WhiskerArray(name, made, mount, _head(path, file.head))
+    return (both_sides(array, name) if file.mirror else array,)
+
+
+def _animal(path: Path, animal: _Animal) -> WhiskerArray:
+    name = animal.array
+    if Path(name).suffix.lower() in ARRAY_FILES:
+        if (path.parent / name).resolve() == path.resolve():
+            raise ConfigError(f"{path}: an animal's array is another file, not this one")
+        name = str(path.parent / name)
+    array = load_array(name)
+    return replace(array, mount=_mount(path, animal.mount)) if animal.mount else array
+
+
+def _head(path: Path, name: str) -> Path | None:
+    if not name:
+        return None
+    head = path.parent / name
+    if head.suffix.lower() not in HEAD_FILES:
+        raise ConfigError(f"{path}: head {name!r} must be one of {', '.join(HEAD_FILES)}, in mm")
+    if not head.is_file():
+        raise ConfigError(f"{path}: head {name!r}: no such file in {path.parent}")
+    return head
+
+
+def _mount(path: Path, mount: _Mount) -> Mount:
+    try:
+        return Mount(mount.position_mm, mount.roll_pitch_yaw_rad)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def _whisker(where: str, values: Mapping[str, object]) -> Whisker:
+    try:
+        return Whisker.from_columns(values)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
+def _distinct(path: Path, whiskers: list[tuple[str, Whisker]]) -> tuple[Whisker, ...]:
+    if not whiskers:
+        raise ConfigError(f"{path}: has no whiskers; give at least one")
+    first: dict[object, str] = {}
+    for where, w in whiskers:
+        cell = f"row {w.row + 1}, col {w.column}"
+        for key in (f"whisker {w.name}", cell):
+            if key in first:
+                raise ConfigError(f"{where}: {key} is taken already ({first[key]}); change one")
+            first[key] = where.removeprefix(f"{path}, ")
+    return tuple(w for _, w in whiskers)
+
+
+def _known(where: str, given: Iterable[str]) -> None:
+    for column in given:
+        if column not in COLUMNS:
+            raise ConfigError(f"{where}: unknown column {column!r}{_hint(column, COLUMNS)}")
+
+
+def _hint(name: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f"; did you mean {near[0]}?" if near else f"; there are {', '.join(known)}"

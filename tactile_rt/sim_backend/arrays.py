@@ -1,0 +1,235 @@
+"""Whisker arrays: which whiskers stand where, on which heads.
+
+Lengths in mm and angles in rad, as in `whiskers.py`. The frame of a head is x lateral (to the
+animal's right), y rostral, z dorsal; the left side of an animal is its right side mirrored in x.
+"""
+
+import difflib
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.sim_backend.whiskers import Whisker, mouse_whiskers, rat_whiskers, rotation
+from tactile_rt.stream import ConfigError
+
+__all__ = [
+    "ANIMALS",
+    "MOUNT",
+    "Mount",
+    "WhiskerArray",
+    "both_sides",
+    "centred_mount",
+    "load_animals",
+    "load_array",
+    "mirrored",
+    "place",
+]
+
+ANIMALS: dict[str, Callable[[], tuple[Whisker, ...]]] = {
+    "mouse": mouse_whiskers,
+    "rat": rat_whiskers,
+}
+SIDES = ("right", "left", "both")
+ARRAY_FILES = (".csv", ".toml")
+HEAD_FILES = (".obj", ".ply", ".stl")  # not .glb, which is in m and y-up by its standard
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Mount:
+    """Pose of the array frame in the world: position (mm), then Rz(yaw) Ry(pitch) Rx(roll)."""
+
+    position: Point
+    roll_pitch_yaw: Point
+
+    def __post_init__(self) -> None:
+        if not all(map(math.isfinite, (*self.position, *self.roll_pitch_yaw))):
+            raise ConfigError("a mount's position and angles must be finite")
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(3, 3) from the array frame to the world frame."""
+        roll, pitch, yaw = self.roll_pitch_yaw
+        return rotation("z", yaw) @ rotation("y", pitch) @ rotation("x", roll)
+
+    def mirrored(self) -> "Mount":
+        """The pose seen in a mirror in world x."""
+        x, y, z = self.position
+        roll, pitch, yaw = self.roll_pitch_yaw
+        return Mount((-x, y, z), (roll, -pitch, -yaw))
+
+
+# The pose of the published sweeps (Chung et al. 2025, code): the whiskers reach along world +x.
+MOUNT = Mount(
+    (-6.934, -11.642, -2.598), (0.0, float(np.radians(15.366)), float(np.radians(-16.198)))
+)
+
+
+@dataclass(frozen=True)
+class WhiskerArray:
+    """Whiskers on one head.
+
+    Attributes:
+        name: what the array is called, e.g. ``mouse-right``.
+        whiskers: in the frame of the head, mm and rad.
+        mount: pose of the head in the world.
+        head: mesh file of the head, in its frame and in mm; None: no head is drawn.
+
+    Raises:
+        ConfigError: no whiskers, or two of one name or in one cell of the grid.
+    """
+
+    name: str
+    whiskers: tuple[Whisker, ...]
+    mount: Mount = MOUNT
+    head: Path | None = None
+
+    def __post_init__(self) -> None:
+        if not self.whiskers:
+            raise ConfigError(f"array {self.name}: has no whiskers; give at least one")
+        names: dict[object, str] = {}
+        for w in self.whiskers:
+            for key, what in ((w.name, "name"), ((w.row, w.column), "cell of the grid")):
+                if key in names:
+                    raise ConfigError(
+                        f"array {self.name}: whiskers {names[key]} and {w.name} have the same "
+                        f"{what}; give each its own"
+                    )
+                names[key] = w.name
+
+
+def load_array(name: str) -> WhiskerArray:
+    """The array of a name: ``mouse``, ``rat``, ``mouse-left``, ``rat-both`` ... or a file's.
+
+    ``mouse`` is ``mouse-right``. An animal's left side alone is mounted as its right side's mirror
+    image, whiskers reaching along world -x, so that a mirrored sweep gives mirrored loads; both
+    sides stand on one head, mounted as for the right side alone. The rat's pose in the published
+    sweeps is not known: its head is turned as the mouse's and placed so that the mean of its base
+    points is where the mouse's is.
+
+    Args:
+        name: of an animal and side, or a path to a .csv or .toml file (see `array_files`).
+
+    Raises:
+        ConfigError: no such array, or a file with a mistake.
+    """
+    if Path(name).suffix.lower() in ARRAY_FILES:
+        arrays = load_animals(name)
+        if len(arrays) > 1:
+            raise ConfigError(f"{name}: holds {len(arrays)} animals where one array is wanted")
+        return arrays[0]
+    animal, _, side = name.partition("-")
+    known = [*ANIMALS, *(f"{a}-{s}" for a in ANIMALS for s in SIDES)]
+    if name not in known:
+        near = difflib.get_close_matches(name, known, 1)
+        raise ConfigError(
+            f"no simulated array {name!r}: "
+            + (f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}")
+            + " (or give a .csv or .toml file)"
+        )
+    side = side or "right"
+    whiskers = ANIMALS[animal]()
+    right = WhiskerArray(f"{animal}-right", whiskers, _animal_mount(whiskers))
+    if side == "left":
+        left = tuple(mirrored(w) for w in whiskers)
+        return WhiskerArray(f"{animal}-left", left, right.mount.mirrored())
+    return right if side == "right" else both_sides(right, f"{animal}-both")
+
+
+def load_animals(name: str) -> tuple[WhiskerArray, ...]:
+    """The arrays that share one world: one by its name, or all that a .toml file places in it.
+
+    Raises:
+        ConfigError: no such array, or a file with a mistake.
+    """
+    path = Path(name)
+    if path.suffix.lower() not in ARRAY_FILES:
+        return (load_array(name),)
+    from tactile_rt.sim_backend.array_files import read_animals  # which reads into these types
+
+    return read_animals(path)
+
+
+def mirrored(whisker: Whisker) -> Whisker:
+    """The whisker on the other side of the head: its points are reflected in x.
+
+    It is as curved, and its frame is a right-handed one again: x along the whisker and y towards
+    its concave side are the reflected axes, z = x cross y is against the reflected one (which
+    makes the base angles -theta, phi, -zeta). So mirrored contact gives the same fx, fy and mz,
+    and fz, mx and my of the opposite sign.
+    """
+    x, y, z = whisker.base
+    theta, phi, zeta = whisker.angles
+    return replace(whisker, base=(-x, y, z), angles=(-theta, phi, -zeta))
+
+
+def both_sides(right: WhiskerArray, name: str) -> WhiskerArray:
+    """An array and its mirror image on one head: ``R.C2`` and ``L.C2``.
+
+    The grid is the face as one sees it who looks the animal in the eyes: the right side keeps
+    its cells, on the beholder's left, and the left side mirrors them on his right, so that the
+    most rostral columns meet in the middle (5 x 14 for mouse and rat).
+    """
+    columns = 2 * max(w.column for w in right.whiskers) + 1
+    left = (
+        replace(mirrored(w), name=f"L.{w.name}", column=columns - w.column) for w in right.whiskers
+    )
+    kept = (replace(w, name=f"R.{w.name}") for w in right.whiskers)
+    return replace(right, name=name, whiskers=(*kept, *left))
+
+
+def place(
+    arrays: Sequence[WhiskerArray], mounts: Sequence[Mount] | None = None
+) -> tuple[WhiskerArray, ...]:
+    """Several animals in one world: element names and grid cells made distinct.
+
+    The k-th animal's whiskers are called ``k.C2`` or ``k.R.C2`` (k from 1), and its rows of the
+    grid follow below those of the animals before it. A single animal keeps its names.
+
+    Args:
+        arrays: the animals.
+        mounts: pose of each head in the world; None: every animal's own.
+
+    Raises:
+        ConfigError: not as many mounts as arrays, or two in the same pose.
+    """
+    if mounts is not None:
+        if len(mounts) != len(arrays):
+            raise ConfigError(f"{len(mounts)} mounts for {len(arrays)} animals; give each its own")
+        arrays = [replace(a, mount=m) for a, m in zip(arrays, mounts, strict=True)]
+    if len(arrays) == 1:
+        return (arrays[0],)
+    for k, array in enumerate(arrays):
+        if array.mount in [a.mount for a in arrays[:k]]:
+            raise ConfigError(f"animal {k + 1} ({array.name}) stands in another; move its mount")
+    placed, above = [], 0
+    for k, array in enumerate(arrays, start=1):
+        whiskers = tuple(
+            replace(w, name=f"{k}.{w.name}", row=w.row + above) for w in array.whiskers
+        )
+        placed.append(replace(array, name=f"{k}.{array.name}", whiskers=whiskers))
+        above = max(w.row for w in whiskers) + 1
+    return tuple(placed)
+
+
+def centred_mount(
+    whiskers: Sequence[Whisker],
+    centre: Point = (0.0, 0.0, 0.0),
+    roll_pitch_yaw: Point = (0.0, 0.0, 0.0),
+) -> Mount:
+    """The mount that brings the mean of the base points to a point of the world (mm)."""
+    turned = Mount((0.0, 0.0, 0.0), roll_pitch_yaw).rotation
+    x, y, z = (centre - turned @ np.mean([w.base for w in whiskers], axis=0)).tolist()
+    return Mount((x, y, z), roll_pitch_yaw)
+
+
+def _animal_mount(whiskers: tuple[Whisker, ...]) -> Mount:
+    mouse = mouse_whiskers()
+    if whiskers == mouse:
+        return MOUNT
+    middle = MOUNT.position + MOUNT.rotation @ np.mean([w.base for w in mouse], axis=0)
+    return centred_mount(whiskers, tuple(middle), MOUNT.roll_pitch_yaw)

@@ -1,0 +1,123 @@
+"""Domain randomisation: an array that differs from the one that was asked for, as robots do.
+
+Half-ranges of uniform distributions (Tobin et al. 2017), not standard deviations: no draw ever
+leaves the range that was stated, so no whisker in a million comes out unphysical.
+"""
+
+import math
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.sim_backend.arrays import Mount, WhiskerArray
+from tactile_rt.sim_backend.whiskers import Whisker
+from tactile_rt.stream import ConfigError
+
+__all__ = ["Randomisation"]
+
+MATERIAL = ("young_modulus", "density", "damping_ratio", "friction")
+SHAPE = ("length", "radius", "curvature")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Randomisation:
+    """By how much an array may differ from its description; 0 switches a quantity off.
+
+    Each value is the half-range of a uniform distribution: relative (0.1 is +-10 %) for material
+    and shape, in degrees or mm for poses. The material is drawn once for all whiskers, which are
+    made of the same stuff, and so is the mount; the geometry is drawn for each whisker. Names and
+    grid never change.
+
+    Attributes:
+        young_modulus, density, damping_ratio, friction: of the material, relative.
+        length, radius, curvature: of each whisker, relative; both radii by one factor, and
+            density at base and tip too.
+        angles_deg: of each of a whisker's base angles (theta, phi, zeta).
+        base_mm: of each coordinate of a whisker's base point.
+        mount_mm: of each coordinate of the mount's position.
+        mount_deg: of the mount's roll, pitch and yaw.
+
+    Raises:
+        ConfigError: a negative or infinite value, or a relative one of 1 or more.
+    """
+
+    young_modulus: float = 0.0
+    density: float = 0.0
+    damping_ratio: float = 0.0
+    friction: float = 0.0
+    length: float = 0.0
+    radius: float = 0.0
+    curvature: float = 0.0
+    angles_deg: float = 0.0
+    base_mm: float = 0.0
+    mount_mm: float = 0.0
+    mount_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in (f.name for f in fields(self)):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ConfigError(f"{name} must be 0 or more, not {value}")
+            if name in (*MATERIAL, *SHAPE) and value >= 1:
+                raise ConfigError(f"{name} is relative and must be less than 1, not {value}")
+
+    def draw(self, rng: np.random.Generator, array: WhiskerArray) -> WhiskerArray:
+        """An array like this one, drawn; the very same object when everything is off.
+
+        Go on describing the stream by the array that was asked for (`array_spec`): a robot does
+        not know by how much its own differs. The draws come from a child of `rng`, so that what
+        else is drawn from it is the same with and without randomisation; and what one quantity
+        draws does not depend on the others.
+
+        Raises:
+            ConfigError: a whisker comes out too thick for its length, which takes both a stubby
+                whisker and wide ranges.
+        """
+        child = rng.spawn(1)[0]
+        if self == Randomisation():
+            return array
+        material = _around_one(child, [getattr(self, name) for name in MATERIAL])
+        position, turn = child.uniform(-1, 1, (2, 3))
+        mount = Mount(
+            _moved(array.mount.position, self.mount_mm * position),
+            _moved(array.mount.roll_pitch_yaw, math.radians(self.mount_deg) * turn),
+        )
+        whiskers = tuple(self._whisker(child, whisker, material) for whisker in array.whiskers)
+        return replace(array, whiskers=whiskers, mount=mount)
+
+    def _whisker(
+        self, rng: np.random.Generator, whisker: Whisker, material: list[float]
+    ) -> Whisker:
+        young_modulus, density, damping_ratio, friction = material
+        length, radius, curvature = _around_one(rng, [getattr(self, name) for name in SHAPE])
+        angles, base = rng.uniform(-1, 1, (2, 3))
+        return replace(
+            whisker,
+            young_modulus=whisker.young_modulus * young_modulus,
+            density_base=whisker.density_base * density,
+            density_tip=whisker.density_tip * density,
+            damping_ratio=whisker.damping_ratio * damping_ratio,
+            friction=whisker.friction * friction,
+            length=whisker.length * length,
+            base_radius=whisker.base_radius * radius,
+            tip_radius=whisker.tip_radius * radius,
+            curvature=whisker.curvature * curvature,
+            angles=_moved(whisker.angles, math.radians(self.angles_deg) * angles),
+            base=_moved(whisker.base, self.base_mm * base),
+        )
+
+
+def _around_one(rng: np.random.Generator, half_ranges: list[float]) -> list[float]:
+    """Factors, each drawn from 1 +- its half-range."""
+    factors: list[float] = (
+        1 + np.array(half_ranges) * rng.uniform(-1, 1, len(half_ranges))
+    ).tolist()
+    return factors
+
+
+def _moved(
+    point: tuple[float, float, float], by: NDArray[np.float64]
+) -> tuple[float, float, float]:
+    x, y, z = (np.array(point) + by).tolist()
+    return x, y, z
