@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from tactile_rt.cli.demonstration import Demonstration
-from tactile_rt.cli.view import WIDTH, draw
+from tactile_rt.cli.demonstration_view import WIDTH, draw
 from tactile_rt.model_file import shipped_model
 
 # The moment: so many objects have passed, and the next is so many steps under way and well felt.

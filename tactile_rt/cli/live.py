@@ -119,7 +119,7 @@ def demo(
     try:
         with starting(), console.status("building the array and the objects"):
             from tactile_rt.cli.demonstration import Demonstration
-            from tactile_rt.cli.view import watch
+            from tactile_rt.cli.demonstration_view import watch
 
             demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast)
     except ModuleNotFoundError as error:

@@ -1,164 +1,147 @@
-"""The terminal view of the demonstration: 80 columns, 22 lines, understood at a glance.
+"""`tactile-rt view`: a sweep as a picture, as a video, or in a window."""
 
-Every coloured cell sets its own background and text colour, and bars are of middle brightness, so
-that the view reads alike on dark and on light terminals; no meaning hangs on colour alone.
-"""
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-import time
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-import numpy as np
-from rich.columns import Columns
-from rich.console import Console, Group, RenderableType
-from rich.live import Live
-from rich.panel import Panel
-from rich.text import Text
+from tactile_rt.cli import app, check_output, needs, starting
+from tactile_rt.stream import ConfigError
 
-from tactile_rt.cli.demonstration import Demonstration, Outcome
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
-__all__ = ["draw", "watch"]
-
-WIDTH = 80
-HEIGHT = 15  # of the upper panels
-REFRESH_S = 1 / 15  # seldom enough that drawing costs the stream nothing
-
-# Lower limit of |F| (uN) and (background, text): matplotlib's inferno, whose lightness rises
-# evenly, from a grey for "untouched".
-LEVELS: tuple[tuple[float, str, str], ...] = (
-    (0, "#3b3f4c", "#a4a9b8"),
-    (1, "#420a68", "#ffffff"),
-    (3, "#6a176e", "#ffffff"),
-    (10, "#932667", "#ffffff"),
-    (30, "#bc3754", "#ffffff"),
-    (100, "#dd513a", "#ffffff"),
-    (300, "#f37819", "#000000"),
-    (1000, "#fca50a", "#000000"),
-)
-CELL = 4  # columns of the terminal, and one between cells
-BAR = 18
-GREEN, RED, GREY = "#2f9e62", "#d64545", "#8a8fa3"
+PICTURE_MS = 4  # between the samples of a picture's traces
+FPS = {".mp4": 25, ".gif": 20}
+WIDTH = {".gif": 800}  # of GIFs, which do not compress well; of all else 1280
 
 
-def watch(demo: Demonstration, console: Console) -> None:
-    """Run the demonstration and redraw as it goes."""
-    with Live(console=console, auto_refresh=False) as live:
-        due = 0.0
-        try:
-            for _ in demo.run():
-                if time.monotonic() >= due:
-                    live.update(draw(demo), refresh=True)
-                    due = time.monotonic() + REFRESH_S
-        finally:
-            live.update(draw(demo), refresh=True)
+@app.command()
+def view(
+    target: Annotated[str, typer.Argument(help="What is swept past: mug-17, or a mesh file.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(help=".png or .jpg: a picture; .mp4 or .gif: a video. Default: a window."),
+    ] = None,
+    camera: Annotated[str, typer.Option(help="front, side, top or oblique.")] = "oblique",
+    orthographic: Annotated[
+        bool, typer.Option("--orthographic", help="Without perspective.")
+    ] = False,
+    at: Annotated[
+        float | None, typer.Option(help="Moment of a picture, ms. Default: of the most force.")
+    ] = None,
+    slow: Annotated[
+        float, typer.Option(min=1, max=40, help="How much slower than real a video is.")
+    ] = 10.0,
+    pixels: Annotated[
+        int | None, typer.Option(min=320, max=3840, help="Width. Default: 1280, of a GIF 800.")
+    ] = None,
+    array: Annotated[str, typer.Option(help="mouse, rat, rat-left, ..., or a file.")] = "mouse",
+    size: Annotated[float, typer.Option(min=1, max=1e3, help="Largest extent, mm.")] = 40.0,
+    speed: Annotated[float, typer.Option(min=1, max=1e3, help="Of the object, mm/s.")] = 34.0,
+    yaw: Annotated[float, typer.Option(help="Turn of the object about z, degrees.")] = 0.0,
+    height: Annotated[float, typer.Option(help="Of the object's centre, mm.")] = -2.0,
+    distance: Annotated[
+        float, typer.Option(help="From the whiskers' bases to the object, mm.")
+    ] = 6.5,
+    profile: Annotated[
+        str, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
+    ] = "dataset",
+) -> None:
+    """Show a sweep: the scene with force arrows, the map of forces, their traces.
 
+    Without --out it opens a window, where there is a display: the mouse turns
+    and zooms, the space bar stops the time, the arrow keys step it.
+    """
+    check_output(out)
+    try:
+        with starting():
+            from tactile_rt.sim_backend.array import PROFILES, array_spec
+            from tactile_rt.sim_backend.arrays import load_animals
+            from tactile_rt.sim_backend.objects import load_object
+            from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+            from tactile_rt.sim_backend.views.camera import VIEWS
+            from tactile_rt.sim_backend.views.film import Film, camera_of
+            from tactile_rt.sim_backend.views.footage import record
+            from tactile_rt.sim_backend.views.scale import ForceScale
+            from tactile_rt.sim_backend.views.window import check_display, show
+            from tactile_rt.sim_backend.views.writing import (
+                IMAGES,
+                check_suffix,
+                write_image,
+                write_video,
+            )
+    except ModuleNotFoundError as error:
+        raise needs("sim,view", error) from None
+    except (AttributeError, RuntimeError) as error:  # as mujoco does where it finds no such driver
+        if "MUJOCO_GL" not in os.environ:
+            raise
+        raise ConfigError(f"MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; unset it") from None
+    suffix = check_suffix(out) if out else ""
+    if at is not None and suffix not in IMAGES:
+        raise ConfigError("--at is the moment of a picture: give --out a .png or .jpg")
+    if not out:
+        check_display()
+    if camera not in VIEWS:
+        raise ConfigError(f"no camera {camera!r}: there are {', '.join(VIEWS)}")
+    if profile not in PROFILES:
+        raise ConfigError(f"no profile {profile!r}: there are {', '.join(PROFILES)}")
 
-def draw(demo: Demonstration) -> RenderableType:
-    """The view at this moment."""
-    what = "objects that the model has never met" if demo.unseen else "objects"
-    title = Text.assemble((" tactile_rt", "bold"), f"  30 simulated whiskers feel {what}")
-    half = WIDTH // 2
-    forces = Panel(
-        _forces(demo), title="force at each whisker's base", padding=0, width=half, height=HEIGHT
+    animals, thing = load_animals(array), load_object(target)
+    whiskers = tuple(w for animal in animals for w in animal.whiskers)
+    spec = array_spec(whiskers, " and ".join(animal.name for animal in animals))
+    sweep = Sweep(
+        size_mm=size, speed_mm_s=speed, yaw_deg=yaw, height_mm=height, distance_mm=distance
     )
-    guess = Panel(_guess(demo), title="what is it?", width=half, height=HEIGHT)
-    score = Panel(_score(demo), title="score", subtitle="Ctrl-C leaves", width=WIDTH)
-    return Group(title, Columns([forces, guess], padding=0), score)
+    simulation = SweepSimulation(animals, thing, sweep, PROFILES[profile], whole=True)
+    if at is not None and not 0 <= at <= simulation.duration_ms:
+        raise ConfigError(f"--at {at:g}: the sweep lasts {simulation.duration_ms:.0f} ms")
+    console = Console(stderr=True)
+    if not simulation.touches:
+        console.print(f"{thing.name} passes without touching: change --height or --distance")
+    fps = FPS.get(suffix, 25)
+    period = PICTURE_MS if suffix in IMAGES else max(1, round(1000 / (fps * slow)))
+    with _progress(console, "simulating") as done:
+        footage = record(simulation, spec, period, done)
+    if not out:
+        seen = camera_of(footage, camera, orthographic)
+        show(footage, seen, ForceScale.fitting(footage.forces, seen.extent_mm), slow)
+        return
+
+    projection = "orthographic" if orthographic else "perspective"
+    detail = f"{camera} view, {projection} · {thing.name} moves from nose to ear"
+    if suffix in FPS:
+        detail += f" · {fps * period / 1000:.2g} x real speed"
+    title = (
+        f"{thing.name[:40]}, {size:g} mm large, sweeps past the {len(whiskers)} whiskers "
+        f"of {spec.name[:40]} at {speed:g} mm/s"
+    )
+    width = pixels or WIDTH.get(suffix, 1280)
+    with Film(footage, camera, orthographic, title, detail, width) as film:
+        if suffix in IMAGES:
+            write_image(out, film.picture(footage.strongest if at is None else footage.at(at)))
+            return
+        with _progress(console, "drawing") as done:
+
+            def frames() -> Iterator["NDArray[np.uint8]"]:
+                for k, picture in enumerate(film):
+                    yield picture
+                    done((k + 1) / len(footage))
+
+            write_video(out, frames(), fps, film.picture(footage.strongest))
 
 
-def _level(force_un: float) -> tuple[str, str]:
-    """(background, text) of a force in uN."""
-    _, background, text = [level for level in LEVELS if force_un >= level[0]][-1]
-    return background, text
-
-
-def _forces(demo: Demonstration) -> Text:
-    """The array as a heat map: rows from the top of the face down, columns from rear to nose."""
-    spec = demo.classifier.card.array
-    newtons = [i for i, unit in enumerate(spec.units) if unit == "N"]
-    force_un = 1e6 * np.linalg.norm(demo.classifier.tared[:, newtons], axis=1)  # (element,)
-    at = {cell: float(force_un[i]) for i, cell in enumerate(spec.grid)}
-    names = dict(zip(spec.grid, spec.elements, strict=True))
-    rows, columns = spec.grid_shape
-    header = "".join(f"{c:>3}".ljust(CELL + 1) for c in range(columns))
-    text = Text(f"   {header}\n", no_wrap=True)
-    for row in range(rows):
-        numbers, lower = Text(f" {names[row, 0][0]} "), Text("   ")
-        for column in range(columns):
-            force = at.get((row, column))
-            if force is None:
-                numbers.append(" " * (CELL + 1))
-                lower.append(" " * (CELL + 1))
-                continue
-            background, colour = _level(force)
-            shown = f"{force:.0f}" if force < 9999.5 else f"{force / 1000:.0f}k"
-            numbers.append(f"{shown:>3}".ljust(CELL), f"{colour} on {background}").append(" ")
-            lower.append("▀" * CELL, background).append(" ")  # half a line, the rest is a gap
-        text.append_text(numbers).append("\n").append_text(lower).append("\n")
-    text.append("   rear     A top, E bottom      nose\n", GREY)
-    text.append(" µN", GREY)
-    for lowest, background, colour in LEVELS:
-        text.append(f" {f'≥{lowest:g}' if lowest else '<1'}", f"{colour} on {background}")
-    return text
-
-
-def _guess(demo: Demonstration) -> Text:
-    """What is passing, what the model makes of it, and whether that is right."""
-    detector = demo.classifier.detector
-    if not detector.ready:
-        contact = Text("○ measuring at rest")
-    elif detector.contact:
-        contact = Text("● touching", "bold")
-    else:
-        contact = Text("○ nothing touched")
-    text = Text(no_wrap=True, overflow="ellipsis")
-    text.append("whiskers  ").append_text(contact).append("\n")
-    if demo.decision is None or demo.target is None:
-        return text.append("\nwaiting for the first object", GREY)
-    truth, decision, steps = demo.target.category, demo.decision, demo.classifier.card.steps
-    text.append("object    ").append(truth, f"bold {GREEN}").append(f"  ({demo.target.name})\n")
-    text.append(f"step      {decision.step:>2}/{steps} ")
-    text.append("━" * round(BAR * decision.step / steps) + "\n", GREY)
-    text.append("\nthe model's five best guesses\n", GREY)
-    top = decision.top(5)
-    for label, probability in top:
-        style = GREEN if label == truth else GREY
-        text.append(f"{label[:9]:<10}", f"bold {style}" if label == truth else "")
-        text.append(f"{'█' * round(BAR * probability):<{BAR}}", style)
-        text.append(f" {100 * probability:3.0f} %\n")
-    text.append("\n" * (6 - len(top)))
-    right = decision.label == truth
-    if decision.final:
-        verdict = "✓ RIGHT" if right else f"✗ WRONG, it is a {truth}"
-    else:
-        verdict = "✓ right so far" if right else "✗ not right yet"
-    return text.append(verdict + "\n", f"bold {GREEN if right else RED}")
-
-
-def _score(demo: Demonstration) -> Text:
-    """The figures since the start."""
-    card, done = demo.classifier.card, len(demo.outcomes)
-    text = Text(no_wrap=True, overflow="ellipsis")
-    text.append("objects  ")
-    if done:
-        text.append(f"{demo.right} of {done} right, {100 * demo.right / done:.0f} %", "bold")
-    else:
-        text.append("none has passed yet")
-    text.append(f"  (blind guessing: {100 / len(card.labels):.0f} %)\n", GREY)
-    text.append("latest   ").append_text(_latest(demo.outcomes)).append("\n")
-    text.append("latency  ")
-    if done:
-        text.append(f"p50 {demo.latency_ms(50):.2f} ms, p99 {demo.latency_ms(99):.2f} ms a step")
-        budget = card.substeps * card.period_ns / 1e6
-        text.append(f"  (a step is {budget:.0f} ms of touch)", GREY)
-    text.append(f"\nspeed    {demo.real_time_factor:.2f} x real time")
-    text.append(f"  ({demo.simulated_s:.0f} s simulated, {demo.dropped} samples dropped)", GREY)
-    return text
-
-
-def _latest(outcomes: list[Outcome]) -> Text:
-    """The newest outcomes, newest first, as many as fit."""
-    text = Text()
-    for outcome in reversed(outcomes[-8:]):
-        said = "" if outcome.right else f" (said {outcome.said or 'nothing'})"
-        text.append("✓ " if outcome.right else "✗ ", GREEN if outcome.right else RED)
-        text.append(f"{outcome.category}{said}  ")
-    return text
+@contextmanager
+def _progress(console: Console, what: str) -> Iterator[Callable[[float], None]]:
+    """A bar that is gone when it is done or fails: an error is one line alone."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    hidden = not console.is_terminal
+    with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
+        task = progress.add_task(what, total=1.0)
+        yield lambda done: progress.update(task, completed=done)

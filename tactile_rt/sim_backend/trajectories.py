@@ -1,0 +1,278 @@
+"""How whiskers move: regular whisking, or a recorded trajectory.
+
+The base of a whisker turns in azimuth (theta, protraction), elevation (phi) and torsion (zeta);
+the last two follow the first with a slope that differs from row to row.
+"""
+
+import csv
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from tactile_rt.sim_backend.whiskers import Whisker
+from tactile_rt.stream import ConfigError
+
+__all__ = [
+    "ANGLES",
+    "ELEVATION_SLOPES",
+    "TORSION_SLOPES",
+    "Recorded",
+    "Trajectory",
+    "Whisk",
+    "base_angles",
+    "mirror",
+    "read_trajectory",
+]
+
+# d phi / d theta and d zeta / d theta of rows A-E (Knutsen et al. 2008, J. Neurophysiol.)
+ELEVATION_SLOPES = (0.398, 0.591, 0.578, 0.393, 0.217)
+TORSION_SLOPES = (-0.9, -0.284, 0.243, 0.449, 0.744)
+ANGLES = ("theta", "phi", "zeta")
+COLUMN = re.compile(r"(theta|phi|zeta)_deg(?:_(.+))?")
+LARGEST_DEG = 120.0  # beyond it is an absolute angle or another unit, not a whisk
+
+
+class Trajectory(Protocol):
+    """Anything that says how the bases turn."""
+
+    @property
+    def duration_s(self) -> float:
+        """How long it lasts, s."""
+
+    def offsets(
+        self, t_s: NDArray[np.float64], whiskers: tuple[Whisker, ...]
+    ) -> NDArray[np.float64]:
+        """Turn from the resting angles, (len(t_s), whisker, 3) rad, at times from 0 on.
+
+        Protraction, elevation and torsion; positive protraction is rostral on both sides. It
+        stands still at time 0 and before.
+        """
+
+
+@dataclass(frozen=True)
+class Whisk:
+    """Regular whisking: every cycle protracts and retracts smoothly, rows coupled as in the rat.
+
+    Attributes:
+        frequency_hz: cycles per second.
+        protraction_deg, retraction_deg: furthest forward and backward of rest, degrees.
+        asymmetry: fraction of a cycle spent protracting; 0.5 is a sinusoid.
+        phase_deg: of the cycle at time 0, degrees; 0 is fully retracted.
+        column_lag_deg: by how much each column lags behind the one caudal to it, degrees.
+        ramp_s: whisking begins at rest and is whole after this time, s.
+        duration_s: s.
+
+    Raises:
+        ConfigError: a value out of range.
+    """
+
+    frequency_hz: float = 8.0
+    protraction_deg: float = 35.0
+    retraction_deg: float = 10.0
+    asymmetry: float = 0.5
+    phase_deg: float = 0.0
+    column_lag_deg: float = 0.0
+    ramp_s: float = 0.1
+    duration_s: float = 1.5
+
+    def __post_init__(self) -> None:
+        limits = {
+            "frequency_hz": (0.0, 50.0),
+            "protraction_deg": (-LARGEST_DEG, LARGEST_DEG),
+            "retraction_deg": (-LARGEST_DEG, LARGEST_DEG),
+            "asymmetry": (0.3, 0.7),  # where the phase below still runs forward
+            "phase_deg": (-360.0, 360.0),
+            "column_lag_deg": (-360.0, 360.0),
+            "ramp_s": (0.01, 60.0),
+            "duration_s": (0.01, 600.0),
+        }
+        for name, (low, high) in limits.items():
+            if not low <= getattr(self, name) <= high:
+                raise ConfigError(
+                    f"whisk: {name} must be {low:g} to {high:g}, not {getattr(self, name):g}"
+                )
+
+    def offsets(
+        self, t_s: NDArray[np.float64], whiskers: tuple[Whisker, ...]
+    ) -> NDArray[np.float64]:
+        """See `Trajectory`."""
+        t = np.maximum(np.asarray(t_s, dtype=np.float64), 0.0)[:, None]
+        start = self.phase_deg - self.column_lag_deg * np.array([w.column for w in whiskers])
+        turn = 2 * np.pi * (self.frequency_hz * t + start / 360)
+        # A warped phase, pi (full protraction) at the wanted fraction of the cycle.
+        peak = 2 * np.pi * self.asymmetry
+        phase = turn - (peak - np.pi) / (1 - np.cos(peak)) * (1 - np.cos(turn))
+        middle = (self.protraction_deg - self.retraction_deg) / 2
+        amplitude = (self.protraction_deg + self.retraction_deg) / 2
+        theta = np.radians(middle - amplitude * np.cos(phase)) * _ramp(t / self.ramp_s)
+        return _coupled(theta, whiskers)
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recorded trajectory, interpolated by a cubic spline: see `read_trajectory`.
+
+    Attributes:
+        times_s: (sample,) from 0 on, s.
+        turns: (sample, whisker, 3) turn from the resting angles, rad.
+        names: whiskers of `turns`.
+        ramp_s: motion grows from the first sample's posture to the recorded one in this time.
+    """
+
+    times_s: NDArray[np.float64]
+    turns: NDArray[np.float64]
+    names: tuple[str, ...]
+    ramp_s: float = 0.1
+
+    @property
+    def duration_s(self) -> float:
+        """How long it lasts, s."""
+        return float(self.times_s[-1])
+
+    def offsets(
+        self, t_s: NDArray[np.float64], whiskers: tuple[Whisker, ...]
+    ) -> NDArray[np.float64]:
+        """See `Trajectory`. The last posture is kept after the end."""
+        at = [self.names.index(w.name) for w in whiskers]
+        t = np.clip(np.asarray(t_s, dtype=np.float64), 0.0, self.duration_s)
+        moved = CubicSpline(self.times_s, self.turns - self.turns[0])(t)
+        turns: NDArray[np.float64] = self.turns[0] + moved * _ramp(t / self.ramp_s)[:, None, None]
+        return turns[:, at]
+
+
+def _ramp(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """From 0 (x <= 0) to 1 (x >= 1), its first two derivatives continuous."""
+    x = np.clip(x, 0.0, 1.0)
+    return x**3 * (10 - 15 * x + 6 * x**2)
+
+
+def _coupled(theta: NDArray[np.float64], whiskers: tuple[Whisker, ...]) -> NDArray[np.float64]:
+    """(n, whisker, 3): protraction with the elevation and torsion of each whisker's row."""
+    slopes = np.array([[1.0, *_slopes(w.row)] for w in whiskers])
+    turns: NDArray[np.float64] = theta[:, :, None] * slopes
+    return turns
+
+
+def _slopes(row: int) -> tuple[float, float]:
+    # A robot may have more rows than an animal: they protract, no more.
+    known = row < len(ELEVATION_SLOPES)
+    return (ELEVATION_SLOPES[row], TORSION_SLOPES[row]) if known else (0.0, 0.0)
+
+
+def read_trajectory(path: Path, whiskers: tuple[Whisker, ...], ramp_s: float = 0.1) -> Recorded:
+    """Read a recorded trajectory of base angles.
+
+    The file has a header and one line for each time: ``time_s``, then turns from rest in degrees,
+    protraction being rostral: ``theta_deg`` of all whiskers, ``theta_deg_C`` of a row,
+    ``theta_deg_C2`` of one whisker; the most specific column counts. ``phi_deg`` and ``zeta_deg``
+    likewise; without them elevation and torsion follow theta (Knutsen et al. 2008).
+
+    Raises:
+        ConfigError: what is wrong in which file, line and column.
+    """
+    columns, rows, lines = _read_table(path)
+    if columns[0] != "time_s":
+        raise ConfigError(f"{path}, line 1: the first column must be time_s, not {columns[0]!r}")
+    names = {w.name for w in whiskers}
+    letters = {_letter(w.row) for w in whiskers}
+    found: dict[tuple[str, str], int] = {}
+    for i, column in enumerate(columns[1:], start=1):
+        match = COLUMN.fullmatch(column)
+        target = (match[2] or "") if match else ""
+        if match is None or (target and target not in names | letters):
+            raise ConfigError(
+                f"{path}, line 1: column {column!r} is none of theta_deg, phi_deg, zeta_deg, or "
+                "these with _ and the letter of a row or the name of a whisker of the array"
+            )
+        if (match[1], target) in found:
+            raise ConfigError(f"{path}, line 1: column {column!r} is there twice")
+        found[match[1], target] = i
+    times = rows[:, 0]
+    if len(times) < 4:
+        raise ConfigError(f"{path}: {len(times)} samples; a cubic spline needs at least 4")
+    if (late := np.flatnonzero(np.diff(times) <= 0)).size:
+        raise ConfigError(f"{path}, line {lines[late[0] + 1]}: time_s does not increase")
+    if (far := np.argwhere(np.abs(rows[:, 1:]) > LARGEST_DEG)).size:
+        raise ConfigError(
+            f"{path}, line {lines[far[0, 0]]}: {columns[far[0, 1] + 1]} is beyond "
+            f"{LARGEST_DEG:g} degrees; it is the turn from rest that is wanted"
+        )
+    turns = np.empty((len(times), len(whiskers), 3))
+    for k, whisker in enumerate(whiskers):
+        for j, angle in enumerate(ANGLES):
+            keys = [(angle, target) for target in (whisker.name, _letter(whisker.row), "")]
+            at = next((found[key] for key in keys if key in found), None)
+            if at is not None:
+                turns[:, k, j] = np.radians(rows[:, at])
+            elif angle == "theta":
+                raise ConfigError(f"{path}: no theta_deg for whisker {whisker.name}")
+            else:
+                turns[:, k, j] = turns[:, k, 0] * _slopes(whisker.row)[j - 1]
+    return Recorded(times - times[0], turns, tuple(w.name for w in whiskers), ramp_s)
+
+
+def _letter(row: int) -> str:
+    return chr(ord("A") + row)
+
+
+def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], list[int]]:
+    """Header, numbers (line, column) and line numbers of a CSV file; # begins a comment line."""
+    rows: list[list[float]] = []
+    lines: list[int] = []
+    columns: list[str] = []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file)
+            for cells in reader:
+                where = f"{path}, line {reader.line_num}"
+                if not "".join(cells).strip() or cells[0].startswith("#"):
+                    continue
+                if not columns:
+                    columns = [cell.strip() for cell in cells]
+                    continue
+                if len(cells) != len(columns):
+                    raise ConfigError(f"{where}: {len(cells)} values for {len(columns)} columns")
+                rows.append([])
+                lines.append(reader.line_num)
+                for column, cell in zip(columns, cells, strict=True):
+                    rows[-1].append(_number(cell, f"{where}, column {column}"))
+    except (UnicodeDecodeError, csv.Error):
+        raise ConfigError(f"{path}: not a CSV file of text; export it again") from None
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    if not rows:
+        raise ConfigError(f"{path}: holds no samples; it needs a header and lines of numbers")
+    return columns, np.array(rows), lines
+
+
+def _number(cell: str, where: str) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        value = float("nan")
+    if not np.isfinite(value):
+        raise ConfigError(f"{where}: {cell.strip()!r} is not a finite number")
+    return value
+
+
+def base_angles(
+    trajectory: Trajectory, t_s: NDArray[np.float64], whiskers: tuple[Whisker, ...]
+) -> NDArray[np.float64]:
+    """Base angles theta, phi, zeta in the morphology's convention, (len(t_s), whisker, 3) rad.
+
+    On the left side, where azimuth and torsion are mirrored, protraction lowers theta.
+    """
+    resting = np.array([w.angles for w in whiskers])
+    angles: NDArray[np.float64] = resting + mirror(whiskers) * trajectory.offsets(t_s, whiskers)
+    return angles
+
+
+def mirror(whiskers: tuple[Whisker, ...]) -> NDArray[np.float64]:
+    """(whisker, 3) signs of theta, phi and zeta for a rostral turn: by the side of the base."""
+    sides = [-1.0 if w.base[0] < 0 else 1.0 for w in whiskers]
+    return np.array([(side, 1.0, side) for side in sides])

@@ -1,0 +1,110 @@
+"""A simulation as it went: the loads, and its states at even intervals, to draw pictures from."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.sim_backend.array import SAMPLE_MS
+from tactile_rt.stream import ArraySpec
+
+__all__ = ["Footage", "Simulation", "record"]
+
+# What places everything: joint angles, and the poses of the bodies that are moved.
+_STATE = int(
+    mujoco.mjtState.mjSTATE_QPOS
+    | mujoco.mjtState.mjSTATE_MOCAP_POS
+    | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+)
+
+
+class Simulation(Protocol):
+    """What can be recorded, e.g. a `SweepSimulation`."""
+
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    duration_ms: float
+
+    def advance(self, samples: int) -> NDArray[np.float64]:
+        """Simulate the next samples of 1 ms: (samples, element, 6) base loads, N and N m."""
+
+
+@dataclass(frozen=True)
+class Footage:
+    """A recorded simulation.
+
+    Attributes:
+        model: of the simulation.
+        spec: the array.
+        period_ms: between frames.
+        loads: (frame, element, 6) base loads, N and N m, each the mean over the period before.
+        states: (frame, n) places of everything at the end of each period.
+    """
+
+    model: mujoco.MjModel
+    spec: ArraySpec
+    period_ms: float
+    loads: NDArray[np.float64]
+    states: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.loads)
+
+    @property
+    def times_ms(self) -> NDArray[np.float64]:
+        """(frame,) end of each period, ms since the start."""
+        return self.period_ms * np.arange(1, len(self) + 1, dtype=np.float64)
+
+    @property
+    def forces(self) -> NDArray[np.float64]:
+        """(frame, element) size of the force on each base, N."""
+        size: NDArray[np.float64] = np.sqrt((self.loads[..., :3] ** 2).sum(axis=2))
+        return size
+
+    @property
+    def strongest(self) -> int:
+        """The frame in which the forces add up to most; the middle one if there are none."""
+        total = self.forces.sum(axis=1)
+        return int(total.argmax()) if total.any() else len(self) // 2
+
+    def at(self, ms: float) -> int:
+        """The frame nearest to a time, ms since the start."""
+        return int(np.clip(round(ms / self.period_ms) - 1, 0, len(self) - 1))
+
+    def restore(self, frame: int, data: mujoco.MjData) -> None:
+        """Place everything in `data`, of this model or a copy of it, as it was."""
+        mujoco.mj_setState(self.model, data, self.states[frame], _STATE)
+        mujoco.mj_kinematics(self.model, data)
+
+
+def _ignore(done: float) -> None:
+    pass
+
+
+def record(
+    simulation: Simulation,
+    spec: ArraySpec,
+    period_ms: int = 4,
+    progress: Callable[[float], None] = _ignore,
+) -> Footage:
+    """Run a simulation to its end.
+
+    Args:
+        simulation: fresh or advanced; it goes on from where it is. All whiskers of the array
+            must be in it: a `SweepSimulation` is to be made with `whole=True`.
+        spec: its array.
+        period_ms: between frames, whole ms.
+        progress: called with the share that is done, 0 to 1.
+    """
+    frames = max(1, int(np.ceil(simulation.duration_ms / period_ms)))
+    samples = round(period_ms / SAMPLE_MS)
+    loads = np.empty((frames, len(spec.elements), 6))
+    states = np.empty((frames, mujoco.mj_stateSize(simulation.model, _STATE)))
+    for k in range(frames):
+        loads[k] = simulation.advance(samples).mean(axis=0)
+        mujoco.mj_getState(simulation.model, simulation.data, states[k], _STATE)
+        progress((k + 1) / frames)
+    return Footage(simulation.model, spec, samples * SAMPLE_MS, loads, states)

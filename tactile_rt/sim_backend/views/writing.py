@@ -1,0 +1,101 @@
+"""Pictures and videos as files, complete or not at all."""
+
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from tactile_rt.stream import ConfigError
+
+__all__ = ["IMAGES", "VIDEOS", "check_suffix", "write_image", "write_video"]
+
+IMAGES = (".png", ".jpg")
+VIDEOS = (".mp4", ".gif")
+QUALITY = "20"  # of H.264, constant rate factor: 18 is as the eye sees it, 23 the usual
+COLOURS = 255  # of a GIF
+PAPER = 247  # all three above: meant to be white
+
+Pixels = NDArray[np.uint8]
+
+
+def check_suffix(path: Path) -> str:
+    """The kind of file that a name asks for: one of `IMAGES` and `VIDEOS`.
+
+    Raises:
+        ConfigError: of another kind.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in IMAGES + VIDEOS:
+        raise ConfigError(
+            f"{path}: give a name that ends in {', '.join(IMAGES)} for a picture, "
+            f"or {', '.join(VIDEOS)} for a video"
+        )
+    return suffix
+
+
+def write_image(path: Path, pixels: Pixels) -> None:
+    """Write a picture (height, width, 3) RGB as .png or .jpg."""
+    with _whole(path) as partial:
+        Image.fromarray(pixels).save(partial, optimize=True)
+
+
+def write_video(path: Path, frames: Iterable[Pixels], fps: int, sample: Pixels) -> None:
+    """Write pictures (height, width, 3) RGB, all of one even size, as .mp4 (H.264) or .gif.
+
+    Args:
+        path: the file.
+        frames: the pictures.
+        fps: pictures a second. A GIF counts time in 10 ms: 25, 20 and 10 are exact.
+        sample: one that has the colours of them all; a GIF, which loops, gets its palette from it.
+    """
+    with _whole(path) as partial:
+        if path.suffix.lower() == ".gif":
+            _write_gif(partial, frames, fps, sample)
+        else:
+            _write_mp4(partial, frames, fps)
+
+
+def _write_mp4(path: Path, frames: Iterable[Pixels], fps: int) -> None:
+    with av.open(str(path), "w", options={"movflags": "+faststart"}) as file:
+        stream = file.add_stream("libx264", rate=fps, options={"crf": QUALITY})
+        stream.pix_fmt = "yuv420p"  # what every player plays
+        for k, pixels in enumerate(frames):
+            if k == 0:
+                stream.height, stream.width = pixels.shape[:2]
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
+            file.mux(stream.encode(picture))
+        file.mux(stream.encode())
+
+
+def _write_gif(path: Path, frames: Iterable[Pixels], fps: int, sample: Pixels) -> None:
+    palette = Image.fromarray(sample).quantize(COLOURS)
+    colours = np.array(palette.getpalette()).reshape(-1, 3)
+    colours[(colours > PAPER).all(axis=1)] = 255  # paper is white, not nearly so
+    palette.putpalette(colours.ravel().tolist())
+    # No dithering: its noise differs from frame to frame and does not pack.
+    indexed = (
+        Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in frames
+    )
+    first = next(indexed)
+    first.save(path, save_all=True, append_images=indexed, duration=round(1000 / fps), loop=0)
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """A name to write to; the file appears under its own name when it is complete."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix.lower())
+    os.close(handle)
+    partial = Path(name)
+    try:
+        yield partial
+        partial.chmod(0o644)  # a temporary file is its owner's alone
+        os.replace(partial, path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise

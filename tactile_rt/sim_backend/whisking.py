@@ -1,0 +1,169 @@
+"""Active whisking: how the whiskers' bases turn, and what the array feels while they do.
+
+The base angles are prescribed, not driven: each base has three hinges of an inertia that nothing
+on the whisker can move, and every physics step is given the acceleration that takes it along the
+trajectory. So the bases have a velocity, which friction and the whiskers' own inertia need and
+which a body that is merely placed (a mocap body) would not have.
+"""
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.sim_backend.array import (
+    OBJECT_BIT,
+    SAMPLE_MS,
+    WHISKER_BIT,
+    Profile,
+    add_whiskers,
+    empty_world,
+    read_base_loads,
+    set_damping,
+)
+from tactile_rt.sim_backend.arrays import Mount
+from tactile_rt.sim_backend.trajectories import ANGLES, Trajectory, mirror
+from tactile_rt.sim_backend.whiskers import Whisker, rotation
+from tactile_rt.stream import ConfigError
+
+__all__ = ["HEAD", "WhiskSimulation"]
+
+# Head of the published whisking simulations (Chung et al. 2025, code): nose 15 degrees up about
+# the lateral axis. The world's origin is that of the array: x to the right, y rostral, z up.
+HEAD = Mount((0.0, 0.0, 0.0), (0.0, float(np.radians(15.0)), 0.0))
+# mg mm^2; a whisker has 10 at most. From 1e8 on the solver converges badly.
+BASE_INERTIA = 1e6
+# Of the solver. Its usual 1e-8 counts in the bases' inertia and is met before a contact is solved.
+TOLERANCE = 1e-16
+
+
+class WhiskSimulation:
+    """An array that whisks, alone or against an object that stands still.
+
+    Args:
+        whiskers: the array.
+        trajectory: how the bases turn.
+        profile: how finely to simulate.
+        pieces: (points, 3) corners of the convex pieces of an object, mm, in the world frame.
+        mount: pose of the head frame in the world.
+
+    Attributes:
+        samples: of 1 ms, that the trajectory lasts.
+
+    Raises:
+        ConfigError: a whisker begins inside the object.
+    """
+
+    def __init__(
+        self,
+        whiskers: tuple[Whisker, ...],
+        trajectory: Trajectory,
+        profile: Profile,
+        pieces: tuple[NDArray[np.float64], ...] = (),
+        mount: Mount = HEAD,
+    ) -> None:
+        world = empty_world(profile)
+        add_whiskers(world, whiskers, profile, mount)
+        clamped = world.compile()
+        set_damping(clamped)  # by the resonance of the whisker on a base that stands still
+        for whisker in whiskers:
+            _add_base_joints(world, whisker)
+        _add_object(world, pieces)
+        self.model = world.compile()
+        self.data = mujoco.MjData(self.model)
+        joints = [self.model.joint(f"{w.name} {a}") for w in whiskers for a in ANGLES]
+        self._dofs = np.array([j.dofadr[0] for j in joints])
+        self._positions = np.array([j.qposadr[0] for j in joints])
+        bending = np.setdiff1d(np.arange(self.model.nv), self._dofs)
+        self.model.dof_damping[bending] = clamped.dof_damping
+        # Compiled without it: the solver's tolerance is relative to the mean inertia found then.
+        self.model.opt.tolerance = TOLERANCE
+        self.model.dof_armature[self._dofs] = BASE_INERTIA
+        self._count = len(whiskers)
+        self._owner = _owners(self.model, whiskers)
+
+        self._steps_per_sample = round(SAMPLE_MS / profile.timestep_ms)
+        self.samples = int(trajectory.duration_s * 1e3 / SAMPLE_MS + 1e-6)
+        # The step before the first, and the one after the last, for their accelerations.
+        steps = np.arange(-1, self.samples * self._steps_per_sample + 2)
+        times = steps.astype(np.float64) * (profile.timestep_ms * 1e-3)
+        turns = trajectory.offsets(times, whiskers) * mirror(whiskers)
+        self._turns = turns.reshape(len(times), -1)
+        self._step = 0
+        self._prescribe()
+        mujoco.mj_forward(self.model, self.data)
+        if (touched := self._touched()).any():
+            names = ", ".join(w.name for w, hit in zip(whiskers, touched, strict=True) if hit)
+            raise ConfigError(f"{names} begin inside the object: move it away from the array")
+
+    def advance(self, samples: int) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Simulate the next samples of 1 ms, fewer where the trajectory ends.
+
+        Returns:
+            (samples, element, 6) base loads, N and N m, each the mean over its millisecond, in
+            the element's own frame, which turns with its base; and (samples, element) whether it
+            touched the object.
+        """
+        samples = min(samples, self.samples - self._step // self._steps_per_sample)
+        sensors = np.zeros((samples, self.model.nsensordata))
+        touch = np.zeros((samples, self._count), dtype=np.bool_)
+        for i in range(samples):
+            for _ in range(self._steps_per_sample):
+                self._prescribe()
+                mujoco.mj_step(self.model, self.data)
+                self._step += 1
+                sensors[i] += self.data.sensordata
+                touch[i] |= self._touched()
+        return read_base_loads(sensors / self._steps_per_sample), touch
+
+    def _prescribe(self) -> None:
+        """Put the bases where they belong, with the force that takes them a step further."""
+        h = self.model.opt.timestep
+        before, now, after = self._turns[self._step : self._step + 3]  # it begins one step before 0
+        self.data.qpos[self._positions] = now
+        self.data.qvel[self._dofs] = (now - before) / h
+        # The integrator's own second difference: v += h a, then q += h v.
+        self.data.qfrc_applied[self._dofs] = BASE_INERTIA * (after - 2 * now + before) / h**2
+
+    def _touched(self) -> NDArray[np.bool_]:
+        touched = np.zeros(self._count + 1, dtype=np.bool_)  # the last: the object itself
+        if self.data.ncon:
+            touched[self._owner[self.data.contact.geom]] = True
+        return touched[:-1]
+
+
+def _add_base_joints(world: mujoco.MjSpec, whisker: Whisker) -> None:
+    """Hinges for theta, phi and zeta on a whisker's base.
+
+    With A = Rz(theta - pi/2), B = Ry(-phi) and C = Rx(zeta + pi/2), turning the angles in ABC is
+    the same as turning ABC itself about these axes, one after the other, in the whisker's frame.
+    """
+    *_, zeta = whisker.angles
+    c = rotation("x", zeta + np.pi / 2)
+    axes = (whisker.orientation[2], -c[1], np.array([1.0, 0.0, 0.0]))
+    for angle, axis in zip(ANGLES, axes, strict=True):
+        world.body(whisker.name).add_joint(
+            name=f"{whisker.name} {angle}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis
+        )
+
+
+def _add_object(world: mujoco.MjSpec, pieces: tuple[NDArray[np.float64], ...]) -> None:
+    for i, points in enumerate(pieces):
+        world.add_mesh(name=f"piece {i}", uservert=points.astype(np.float32).ravel())
+        world.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=f"piece {i}",
+            contype=OBJECT_BIT,
+            conaffinity=WHISKER_BIT,
+            group=OBJECT_BIT,
+            rgba=(0.75, 0.55, 0.3, 1.0),
+        )
+
+
+def _owners(model: mujoco.MjModel, whiskers: tuple[Whisker, ...]) -> NDArray[np.int64]:
+    """Index of the whisker that each geom belongs to; -1 for the object."""
+    names = {w.name: i for i, w in enumerate(whiskers)}
+    owner = np.full(model.nbody, -1, dtype=np.int64)
+    for body in range(1, model.nbody):  # parents come before their children
+        owner[body] = names.get(model.body(body).name, owner[model.body_parentid[body]])
+    found: NDArray[np.int64] = owner[model.geom_bodyid]
+    return found

@@ -1,0 +1,113 @@
+"""`tactile-rt whisk`: the files that it writes, and what it says to mistakes."""
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("trimesh")
+
+ROBOT = """whisker,row,col,arc_length_mm,curvature_a_per_mm,base_x_mm,base_y_mm,base_z_mm,\
+base_theta_rad,base_phi_rad,base_zeta_rad,base_radius_mm,tip_radius_mm
+top,1,0,20,0.005,3.7,-2,1,1.2,0.2,0.5,0.06,0.03
+low,2,0,20,0.005,3.7,-2,-1,1.2,-0.1,0.5,0.06,0.03
+"""
+
+
+@pytest.fixture
+def refused(call):
+    """Call with these arguments, expect one line, and return it."""
+
+    def run(*arguments):
+        code, out, err = call(*arguments)
+        assert (code, out) == (2, "")
+        assert err.startswith("tactile-rt: ")
+        assert err.count("\n") == 1, err
+        return err
+
+    return run
+
+
+@pytest.fixture
+def robot(tmp_path):
+    """Two whiskers: quick to simulate."""
+    path = tmp_path / "robot.csv"
+    path.write_text(ROBOT)
+    return path
+
+
+def test_a_stimulus_is_written_with_its_parameters(call, tmp_path, robot):
+    out = tmp_path / "out.npz"
+    code, _, err = call(
+        *("whisk", out, "--array", robot, "--stimulus", "concave-close,convex-close"),
+        *("--profile", "realtime", "--protraction", 45, "--duration", 1.3, "--radius", 70),
+    )
+    assert code == 0, err
+    assert "first contact at" in err
+    with np.load(out) as arrays:
+        assert arrays["values"].shape == (2, 110, 2, 6)
+        assert np.abs(arrays["values"]).max() > 1e-6
+        assert arrays["angles"].shape == (1300, 2, 3)
+        resting = arrays["angles"][0]
+        np.testing.assert_allclose(resting, [[1.2, 0.2, 0.5], [1.2, -0.1, 0.5]])
+        most = np.degrees(arrays["angles"][:, 0, 0].max() - 1.2)
+        assert most == pytest.approx(45, abs=0.1)
+    described = json.loads(out.with_suffix(".json").read_text())
+    assert described["stimuli"] == ["concave-close", "convex-close"]
+    assert described["approximate"] is True
+    assert described["parameters"]["convex-close"]["radius_mm"] == 70
+    assert described["parameters"]["concave-close"]["facet_error_mm"] < 0.1
+    assert described["trajectory"]["protraction_deg"] == 45
+    assert described["profile"]["name"] == "realtime"
+
+
+def test_an_object_and_a_recorded_trajectory(call, tmp_path, robot):
+    t = np.arange(0, 1.4, 0.01)
+    path = tmp_path / "angles.csv"
+    lines = [f"{a},{20 - 20 * np.cos(2 * np.pi * 2 * a)}" for a in t]
+    path.write_text("\n".join(["time_s,theta_deg", *lines]))
+    out = tmp_path / "mug.npz"
+    code, _, err = call(
+        *("whisk", out, "--array", robot, "--object", "mug-3", "--position", "22,8,0"),
+        *("--size", 14, "--trajectory", path, "--profile", "realtime"),
+    )
+    assert code == 0, err
+    described = json.loads(out.with_suffix(".json").read_text())
+    assert described["stimuli"] == ["mug-3"]
+    assert described["parameters"]["mug-3"] == {
+        "position_mm": [22.0, 8.0, 0.0],
+        "size_mm": 14.0,
+        "yaw_deg": 0.0,
+    }
+    assert described["trajectory"]["file"] == "angles.csv"
+    assert len(described["trajectory"]["sha256"]) == 64
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("out.txt",), "name a file that ends in .npz"),
+        (("none/out.npz",), "no folder none"),
+        (("out.npz", "--stimulus", "convex"), "no stimulus 'convex': there are convex-close"),
+        (("out.npz", "--stimulus", "all", "--object", "mug"), "exclude each other"),
+        (("out.npz", "--object", "mugg"), "no object called 'mugg'"),
+        (("out.npz", "--object", "mug", "--size", "-3"), "--size must be above 0"),
+        (("out.npz", "--object", "mug", "--position", "1,2"), "--position is three numbers"),
+        (("out.npz", "--step", "a"), "--step is three numbers"),
+        (("out.npz", "--profile", "best"), "no profile 'best'"),
+        (("out.npz", "--array", "cat"), "'cat'"),
+        (("out.npz", "--frequency", "-1"), "frequency_hz must be"),
+        (("out.npz", "--trajectory", "none.csv"), "none.csv: no such file"),
+        (("out.npz", "--array", "robot.csv", "--duration", "0.4"), "the trajectory must last"),
+        (("out.npz", "--array", "robot.csv", "--object", "mug", "--position", "99,0,0",
+          "--duration", "0.1"), "mug-0: no whisker touches it"),
+        (("out.npz", "--array", "robot.csv", "--object", "mug", "--position", "12,0,0"),
+         "begin inside the object"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_one_line_and_leave_nothing(refused, tmp_path, robot, monkeypatch, arguments,
+                                                 said):  # fmt: skip
+    monkeypatch.chdir(tmp_path)
+    assert said in refused("whisk", *arguments)
+    assert [p.name for p in tmp_path.iterdir()] == ["robot.csv"]

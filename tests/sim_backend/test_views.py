@@ -1,0 +1,417 @@
+"""Views of a simulation, checked in the pixels: projections, arrows, the map, files."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("trimesh")
+pytest.importorskip("matplotlib")
+pytest.importorskip("av")
+
+import av
+import mujoco
+from matplotlib.figure import Figure
+from PIL import Image
+
+from tactile_rt.sim_backend.array import OBJECT_BIT, PROFILES, WHISKER_BIT, array_spec
+from tactile_rt.sim_backend.arrays import load_array
+from tactile_rt.sim_backend.objects import make_object
+from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.views.camera import VIEWS, Camera, framing
+from tactile_rt.sim_backend.views.film import Film, camera_of
+from tactile_rt.sim_backend.views.footage import Footage, record
+from tactile_rt.sim_backend.views.panels import ForceMap, rostral_sign
+from tactile_rt.sim_backend.views.scale import ForceScale, round_number
+from tactile_rt.sim_backend.views.stage import Stage
+from tactile_rt.sim_backend.views.window import _Player, check_display
+from tactile_rt.sim_backend.views.writing import check_suffix, write_image, write_video
+from tactile_rt.sim_backend.whiskers import mouse_whiskers
+from tactile_rt.stream import ArraySpec, ConfigError
+
+SCALE = ForceScale(1.0, 10.0)
+SIDE = 200  # pixels of a test picture
+
+
+def sweep_simulation():
+    sweep = Sweep(size_mm=20, speed_mm_s=150)
+    target, profile = make_object("mug", 1), PROFILES["realtime"]
+    return SweepSimulation(load_array("mouse"), target, sweep, profile, whole=True)
+
+
+@pytest.fixture(scope="module")
+def footage():
+    return record(sweep_simulation(), array_spec(mouse_whiskers(), "mouse-right"), 10)
+
+
+def still(geoms="", site="", load=(0, 0, 0, 0, 0, 0)):
+    """One frame of one whisker at the origin, too small to be seen, and these geoms."""
+    model = mujoco.MjModel.from_xml_string(f"""
+        <mujoco><worldbody>{geoms}
+          <body name="w" {site}><site name="w"/>
+            <geom type="capsule" fromto="0 0 0 .01 0 0" size=".001" contype="{WHISKER_BIT}"/>
+          </body>
+        </worldbody></mujoco>""")
+    spec = ArraySpec(
+        name="one", elements=("w",), grid=((0, 0),), positions=((0.0, 0.0, 0.0),),
+        orientations=((1.0, 0.0, 0.0, 0.0),), channels=("fx", "fy", "fz", "mx", "my", "mz"),
+        units=("N",) * 3 + ("N m",) * 3, rate_hz=1000.0, frame="head",
+    )  # fmt: skip
+    return Footage(model, spec, 1.0, np.array([[load]], dtype=float), np.zeros((1, 0)))
+
+
+def thing(kind, size, pos, more=""):
+    return f'<geom type="{kind}" size="{size}" pos="{pos}" contype="{OBJECT_BIT}" {more}/>'
+
+
+def photograph(recorded, camera, frame=0):
+    """(height, width, 3) picture, or skip where nothing can be drawn."""
+    try:
+        with Stage(recorded, camera, SCALE, SIDE, SIDE) as stage:
+            return stage.picture(frame)
+    except ConfigError as error:
+        if "no OpenGL" in str(error):
+            pytest.skip(str(error))
+        raise
+
+
+def bluish(picture):
+    """(height, width) where an object is: half of it, as it is drawn as glass."""
+    return picture[..., 2].astype(int) - picture[..., 0] > 5
+
+
+def extent_of(mask):
+    """(width, height) in pixels."""
+    return int(mask.any(axis=0).sum()), int(mask.any(axis=1).sum())
+
+
+# ---- projections
+
+AHEAD = Camera(0.0, 0.0, (0.0, 0.0, 0.0), 40.0)  # looks along +x, y to the left, z up
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("depth", [-12, 0, 30])
+def test_size_over_depth_is_that_of_the_projection(orthographic, depth):
+    camera = Camera(0.0, 0.0, (0, 0, 0), 40.0, orthographic)
+    plate = thing("box", ".01 4 6", f"{depth} 0 0")
+    width, height = extent_of(bluish(photograph(still(plate), camera)))
+    eye = 20 / np.tan(np.radians(35 / 2))
+    shrink = 1.0 if orthographic else eye / (eye + depth)
+    assert width == pytest.approx(8 * SIDE / 40 * shrink, abs=1.5)
+    assert height == pytest.approx(12 * SIDE / 40 * shrink, abs=1.5)
+
+
+def test_parallel_edges_stay_parallel_only_without_perspective():
+    beam = thing("box", "14 .01 3", "0 0 0", 'euler="0 0 35"')  # recedes to the left
+    heights = {}
+    for orthographic in (False, True):
+        camera = Camera(0.0, 0.0, (0, 0, 0), 40.0, orthographic)
+        mask = bluish(photograph(still(beam), camera))
+        columns = np.flatnonzero(mask.any(axis=0))
+        heights[orthographic] = [int(mask[:, columns[i]].sum()) for i in (2, -3)]
+    far, near = heights[True]
+    assert far == pytest.approx(near, abs=1)
+    far, near = heights[False]
+    assert near > 1.2 * far
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("view", VIEWS)
+def test_the_axes_of_a_camera_are_those_of_its_picture(view, orthographic):
+    azimuth, elevation = VIEWS[view]
+    camera = Camera(azimuth, elevation, (3.0, -5.0, 2.0), 40.0, orthographic)
+    place = np.array(camera.lookat) + 9 * camera.right + 4 * camera.up
+    ball = thing("sphere", "1", " ".join(map(str, place)))
+    rows, columns = np.nonzero(bluish(photograph(still(ball), camera)))
+    assert columns.mean() == pytest.approx(SIDE / 2 + 9 * SIDE / 40, abs=1)
+    assert rows.mean() == pytest.approx(SIDE / 2 - 4 * SIDE / 40, abs=1)
+
+
+def test_named_views_are_what_they_are_called():
+    right = {view: Camera(*VIEWS[view], (0, 0, 0), 1.0).right for view in VIEWS}
+    np.testing.assert_allclose(right["side"], (0, 1, 0), atol=1e-12)  # nose on the right
+    np.testing.assert_allclose(right["front"], (-1, 0, 0), atol=1e-12)  # face to face
+    np.testing.assert_allclose(right["top"], (1, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(Camera(*VIEWS["top"], (0, 0, 0), 1).up, (0, 1, 0), atol=1e-12)
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("left", [False, True])
+def test_a_named_view_shows_all_that_it_frames(view, left):
+    points = np.random.default_rng(3).normal(size=(50, 3)) * (9, 2, 5) + (40, -7, 1)
+    camera = framing(view, points, True, aspect=2.0, left=left)
+    from_middle = points - camera.lookat
+    assert np.abs(from_middle @ camera.right).max() < camera.extent_mm * 2.0 / 2
+    assert np.abs(from_middle @ camera.up).max() < camera.extent_mm / 2
+    assert Camera(camera.azimuth, camera.elevation, (0, 0, 0), 1).forward[0] == pytest.approx(
+        (-1) ** left * Camera(*VIEWS[view], (0, 0, 0), 1).forward[0]
+    )
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"extent_mm": 0.0}, "extent of 0.0 mm"),
+        ({"elevation": 91.0}, "elevation must be from -90 to 90"),
+        ({"fovy_deg": 180.0}, "field of view"),
+        ({"lookat": (0.0, np.nan, 0.0)}, "three numbers"),
+    ],
+)
+def test_an_impossible_camera_is_refused(change, said):
+    with pytest.raises(ConfigError, match=said):
+        Camera(**{"azimuth": 0.0, "elevation": 0.0, "lookat": (0, 0, 0), "extent_mm": 1.0} | change)
+
+
+def test_an_unknown_view_is_refused():
+    with pytest.raises(ConfigError, match="no camera 'above': there are front, side, top, oblique"):
+        framing("above", np.zeros((1, 3)))
+
+
+# ---- the scene
+
+
+def test_drawing_changes_neither_the_model_nor_the_loads(footage):
+    plain, drawn = sweep_simulation(), sweep_simulation()
+    before = {name: getattr(drawn.model, name).copy() for name in ("geom_size", "geom_rgba")}
+    drawn.duration_ms = 40.0
+    half = record(drawn, footage.spec, 40)
+    photograph(half, camera_of(half, "side"))
+    for name, array in before.items():
+        np.testing.assert_array_equal(getattr(drawn.model, name), array)
+    plain.advance(40)
+    np.testing.assert_array_equal(drawn.advance(40), plain.advance(40))
+
+
+def test_a_force_is_an_arrow_from_the_base_as_long_as_its_scale_says():
+    # y of the element frame is -x of the world: half the scale's force points left, from above
+    recorded = still(site='pos="6 2 0" euler="0 0 90"', load=(0, 0.5e-3, 0, 0, 0, 0))
+    picture = photograph(recorded, Camera(*VIEWS["top"], (0, 0, 0), 40.0, orthographic=True))
+    rows, columns = np.nonzero((picture < 240).any(axis=2))
+    pixel = SIDE / 40
+    assert columns.min() == pytest.approx(SIDE / 2 + (6 - 0.5 * SCALE.arrow_mm) * pixel, abs=2)
+    assert columns.max() == pytest.approx(SIDE / 2 + 6 * pixel, abs=3)  # the dot on the base
+    assert rows.mean() == pytest.approx(SIDE / 2 - 2 * pixel, abs=1)
+
+
+def test_no_force_is_no_arrow():
+    picture = photograph(still(), AHEAD)
+    width, height = extent_of((picture < 240).any(axis=2))
+    assert 0 < width <= 5
+    assert 0 < height <= 5
+
+
+def test_a_whisker_shows_through_what_hides_it():
+    post = '<geom type="capsule" fromto="0 0 -5 0 0 5" size=".4" contype="1"/>'
+    lone = still()
+    model = mujoco.MjModel.from_xml_string(f"""
+        <mujoco><worldbody>{thing("box", ".1 15 15", "-8 0 0")}
+          <body name="w"><site name="w"/>{post}</body></worldbody></mujoco>""")
+    picture = photograph(Footage(model, lone.spec, 1.0, lone.loads, lone.states), AHEAD)
+    hidden, beside = picture[SIDE // 2 - 10, SIDE // 2], picture[SIDE // 2 - 10, SIDE // 2 + 30]
+    assert int(beside.min()) - int(hidden.min()) > 20
+    assert (picture[2, 2] == 255).all()  # paper
+
+
+def test_without_a_way_to_draw_it_is_one_line(monkeypatch):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("MUJOCO_GL", "glfw")
+    with pytest.raises(ConfigError, match="no OpenGL to draw with") as refused:
+        Stage(still(), AHEAD, SCALE, 64, 64)
+    assert "\n" not in str(refused.value)
+
+
+# ---- recording and scale
+
+
+def test_frames_are_means_of_the_simulations_loads(footage):
+    loads = sweep_simulation().advance(10 * len(footage))
+    means = loads.reshape(len(footage), 10, *loads.shape[1:]).mean(axis=1)
+    np.testing.assert_allclose(footage.loads, means, atol=1e-15)
+    assert footage.times_ms[-1] >= sweep_simulation().duration_ms
+    total = np.linalg.norm(means[..., :3], axis=2).sum(axis=1)
+    assert footage.strongest == total.argmax()
+    assert [footage.at(ms) for ms in (0, 10, 21, 1e9)] == [0, 0, 1, len(footage) - 1]
+
+
+def test_states_are_those_at_the_end_of_their_frames(footage):
+    simulation = sweep_simulation()
+    simulation.advance(30)
+    data = mujoco.MjData(footage.model)
+    footage.restore(2, data)
+    np.testing.assert_array_equal(data.qpos, simulation.data.qpos)
+    np.testing.assert_array_equal(data.mocap_pos, simulation.data.mocap_pos)
+
+
+@pytest.mark.parametrize(("value", "round_"), [(0.16, 0.2), (13, 10), (0.004, 0.005), (0, 1)])
+def test_scales_are_in_round_numbers(value, round_):
+    assert round_number(value) == pytest.approx(round_)
+
+
+def test_a_scale_fits_the_forces_but_not_a_rare_snap():
+    forces = np.full((200, 30), 0.2e-3)
+    forces[7, 3] = 9e-3
+    scale = ForceScale.fitting(forces, 40.0)
+    assert 0.1 <= scale.top_mn <= 0.3
+    assert scale.length(scale.top_mn) == scale.arrow_mm
+    assert scale.length(9.0) <= 2 * scale.arrow_mm
+    assert scale.colour(0.0) == scale.colour(1e-9) != scale.colour(scale.top_mn)
+
+
+# ---- the map and the whole picture
+
+
+def arrow_in(force_map, element):
+    """(2,) where the arrow of an element points, rightward and upward, as drawn."""
+    tail, tip = np.array(force_map._arrows[element]._posA_posB)
+    return (tip - tail) / np.linalg.norm(tip - tail) * (1, -1)  # rows are counted downward
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("name", ["mouse", "mouse-left", "rat"])
+@pytest.mark.parametrize(
+    ("head_force", "points"), [((0, 1, 0), (1, 0)), ((0, 0, 1), (0, 1)), ((0, -1, -1), (-1, -1))]
+)
+def test_the_map_points_where_the_force_goes_on_the_head(name, mirrored, head_force, points):
+    array = load_array(name)
+    figure = Figure(figsize=(4, 3))
+    spec = array_spec(array.whiskers, name)
+    force_map = ForceMap(figure, (0, 0, 1, 1), spec, SCALE, mirrored)
+    loads = np.zeros((len(spec.elements), 6))
+    for i, whisker in enumerate(array.whiskers):
+        loads[i, :3] = whisker.orientation.T @ np.array(head_force) * 1e-3
+    force_map.show(loads)
+    wanted = np.array(points) * (-1 if mirrored else 1, 1) / np.linalg.norm(points)
+    for i in (0, len(spec.elements) // 2, -1):
+        np.testing.assert_allclose(arrow_in(force_map, i), wanted, atol=0.05)
+
+
+def test_only_touched_cells_change(footage):
+    figure = Figure(figsize=(4, 3))
+    force_map = ForceMap(figure, (0, 0, 1, 1), footage.spec, SCALE)
+    loads = np.zeros((30, 6))
+    assert force_map.show(loads) == []
+    loads[12, 0] = 1e-3
+    changed = force_map.show(loads)
+    assert len(changed) == 3
+    assert changed[2].get_text() == footage.spec.elements[12]
+    assert changed[0].get_facecolor() == pytest.approx(SCALE.colour(1.0), abs=1e-6)
+
+
+def test_columns_of_a_face_go_to_the_nose_from_both_sides():
+    both = load_array("mouse-both")
+    signs = rostral_sign(array_spec(both.whiskers, both.name))
+    assert [signs[i] for i, w in enumerate(both.whiskers) if w.name[0] == "R"] == [1] * 30
+    assert [signs[i] for i, w in enumerate(both.whiskers) if w.name[0] == "L"] == [-1] * 30
+
+
+@pytest.fixture(scope="module")
+def film(footage):
+    try:
+        with Film(footage, "oblique", title="a title", pixels=320) as opened:
+            yield opened
+    except ConfigError as error:
+        pytest.skip(str(error))
+
+
+def test_a_picture_depends_on_its_frame_alone(film, footage):
+    early, late = 1, footage.strongest
+    first = film.picture(early)
+    assert first.shape == (180, 320, 3)
+    other = film.picture(late)
+    assert (other != first).any()
+    np.testing.assert_array_equal(film.picture(early), first)  # nothing of another stays behind
+
+
+# ---- files
+
+FRAMES = [np.full((96, 128, 3), level, dtype=np.uint8) for level in range(40, 250, 30)]
+
+
+def test_an_mp4_has_its_frames_size_and_rate(tmp_path):
+    path = tmp_path / "a.mp4"
+    write_video(path, iter(FRAMES), 25, FRAMES[0])
+    with av.open(str(path)) as file:
+        stream = file.streams.video[0]
+        assert (stream.width, stream.height, stream.average_rate) == (128, 96, 25)
+        assert stream.codec_context.name == "h264"
+        assert stream.codec_context.pix_fmt == "yuv420p"
+        read = [frame.to_ndarray(format="rgb24") for frame in file.decode(video=0)]
+    assert len(read) == len(FRAMES)
+    for got, wanted in zip(read, FRAMES, strict=True):
+        assert abs(got.astype(int) - wanted).mean() < 4
+
+
+def test_a_gif_has_its_frames_and_white_paper(tmp_path):
+    path = tmp_path / "a.gif"
+    frames = [frame.copy() for frame in FRAMES]
+    for frame in frames:
+        frame[:10] = 255
+    write_video(path, iter(frames), 20, np.concatenate(frames))
+    with Image.open(path) as image:
+        assert (image.n_frames, image.size) == (len(FRAMES), (128, 96))
+        assert image.info["loop"] == 0
+        for k, wanted in enumerate(frames):
+            image.seek(k)
+            assert image.info["duration"] == 50
+            got = np.asarray(image.convert("RGB"))
+            assert (got[:10] == 255).all()
+            assert abs(got[10:].astype(int) - wanted[10:]).max() <= 3
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".gif"])
+def test_a_video_that_fails_leaves_what_was_there(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"before")
+
+    def frames():
+        yield from FRAMES[:2]
+        raise RuntimeError("no more")
+
+    with pytest.raises(RuntimeError, match="no more"):
+        write_video(path, frames(), 25, FRAMES[0])
+    assert path.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg"])
+def test_an_image_is_what_was_drawn(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    write_image(path, FRAMES[3])
+    with Image.open(path) as image:
+        assert abs(np.asarray(image).astype(int) - FRAMES[3]).max() <= (
+            3 if suffix == ".jpg" else 0
+        )
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_other_files_are_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"ends in \.png, \.jpg for a picture"):
+        check_suffix(tmp_path / "a.avi")
+    assert check_suffix(tmp_path / "a.MP4") == ".mp4"
+
+
+# ---- the window
+
+
+@pytest.mark.parametrize("display", [None, ":4242"])
+def test_a_window_needs_a_display(monkeypatch, display):
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    if display:
+        monkeypatch.setenv("DISPLAY", display)
+    with pytest.raises(ConfigError, match="write a picture or video with --out"):
+        check_display()
+
+
+def test_the_player_runs_stops_and_steps():
+    player = _Player(frames=10, period_s=0.5)
+    assert [player.frame(now) for now in (100.0, 100.6, 104.1, 105.2)] == [0, 1, 8, 0]
+    player.key(32)
+    assert player.frame(190.0) == 0
+    player.key(263)
+    player.key(263)
+    assert player.frame(191.0) == 8
+    player.key(262)
+    player.key(32)
+    assert player.frame(191.5) == 0
