@@ -62,7 +62,7 @@ def view(
     check_output(out)
     try:
         with starting():
-            from tactile_rt.sim_backend.array import PROFILES, array_spec
+            from tactile_rt.sim_backend.array import PROFILES, world_spec
             from tactile_rt.sim_backend.arrays import load_animals
             from tactile_rt.sim_backend.objects import load_object
             from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
@@ -94,8 +94,7 @@ def view(
         raise ConfigError(f"no profile {profile!r}: there are {', '.join(PROFILES)}")
 
     animals, thing = load_animals(array), load_object(target)
-    whiskers = tuple(w for animal in animals for w in animal.whiskers)
-    spec = array_spec(whiskers, " and ".join(animal.name for animal in animals))
+    spec = world_spec(animals)
     sweep = Sweep(
         size_mm=size, speed_mm_s=speed, yaw_deg=yaw, height_mm=height, distance_mm=distance
     )
@@ -119,7 +118,7 @@ def view(
     if suffix in FPS:
         detail += f" · {fps * period / 1000:.2g} x real speed"
     title = (
-        f"{thing.name[:40]}, {size:g} mm large, sweeps past the {len(whiskers)} whiskers "
+        f"{thing.name[:40]}, {size:g} mm large, sweeps past the {len(spec.elements)} whiskers "
         f"of {spec.name[:40]} at {speed:g} mm/s"
     )
     width = pixels or WIDTH.get(suffix, 1280)

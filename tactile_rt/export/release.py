@@ -30,7 +30,8 @@ def release(checkpoint: Path, path: Path, name: str) -> ModelCard:
     labels = np.tile(validation.sweeps.labels, 2)
     temperature = fit_temperature(posteriors[:, -1], labels)
     recipe = validation.manifest.recipe
-    sweep = " ".join(f"--{k} {v}" for k, v in recipe.items())
+    # Sets of version 1 had no recipe by name.
+    sweep = f" --recipe {recipe['name']}" if "name" in recipe else ""
     options = " ".join(
         f"--{k.replace('_', '-')} {config[k]}"
         for k in ("attender", "decoder", "width", "epochs", "batch", "learning_rate", "seed")
@@ -42,7 +43,7 @@ def release(checkpoint: Path, path: Path, name: str) -> ModelCard:
         temperature=temperature,
         figures={k: v for k, v in saved["metrics"].items() if k.startswith("validation")},
         commands=(
-            f"tactile-rt sweep {config['data']} {sweep}",
+            f"tactile-rt sweep {config['data']}{sweep}",
             f"tactile-rt train {config['data']} {checkpoint.parent} {options}",
             f"tactile-rt export {checkpoint} {path.name} --name {name}",
         ),

@@ -17,6 +17,7 @@ __all__ = [
     "Interval",
     "accuracy",
     "accuracy_over_time",
+    "auroc",
     "confusion",
     "expected_calibration_error",
     "fused_accuracy",
@@ -80,6 +81,18 @@ def hits(
     order = np.argsort(-np.nan_to_num(posteriors), axis=1, kind="stable")[:, :top]
     correct: NDArray[np.bool_] = decided & (order == labels[:, None]).any(axis=1)
     return correct
+
+
+def auroc(known: NDArray[np.float32], unknown: NDArray[np.float32]) -> float:
+    """Chance that a sweep of a known category scores higher than one of an unknown category.
+
+    Args:
+        known, unknown: (sweep,) scores; NaN, where no contact was detected, is the lowest.
+    """
+    low, high = np.nan_to_num(unknown, nan=-np.inf), np.nan_to_num(known, nan=-np.inf)
+    order = np.sort(low)
+    below, ties = np.searchsorted(order, high), np.searchsorted(order, high, side="right")
+    return float((below + ties).mean() / (2 * len(low)))
 
 
 def accuracy(

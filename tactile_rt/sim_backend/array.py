@@ -8,14 +8,14 @@ bending stiffness E I(midpoint) / cell length, which makes tip stiffness and fir
 with the Euler-Bernoulli beam to second order in the cell length.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays import MOUNT, Mount
+from tactile_rt.sim_backend.arrays import MOUNT, Mount, WhiskerArray
 from tactile_rt.sim_backend.whiskers import DAMPING_RATIO, Whisker, rotation
 from tactile_rt.stream import ArraySpec
 
@@ -33,6 +33,7 @@ __all__ = [
     "quaternion",
     "read_base_loads",
     "set_damping",
+    "world_spec",
 ]
 
 CHANNELS = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -103,6 +104,37 @@ def array_spec(whiskers: tuple[Whisker, ...], name: str) -> ArraySpec:
     )
 
 
+def world_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
+    """Describe the base loads of all arrays in one world, the element frames as in `array_spec`.
+
+    Of one array this is its `array_spec`; several have the world for their mount frame.
+    """
+    if len(animals) == 1:
+        return array_spec(animals[0].whiskers, animals[0].name)
+    head_specs = [array_spec(a.whiskers, a.name) for a in animals]
+    turns = [a.mount.rotation for a in animals]
+    places = [
+        (turn @ np.array(w.base) + np.array(a.mount.position)) * 1e-3
+        for a, turn in zip(animals, turns, strict=True)
+        for w in a.whiskers
+    ]
+    return ArraySpec(
+        name=" and ".join(a.name for a in animals),
+        elements=tuple(e for spec in head_specs for e in spec.elements),
+        grid=tuple(cell for spec in head_specs for cell in spec.grid),
+        positions=tuple((float(x), float(y), float(z)) for x, y, z in places),
+        orientations=tuple(
+            quaternion(turn @ w.orientation)
+            for a, turn in zip(animals, turns, strict=True)
+            for w in a.whiskers
+        ),
+        channels=CHANNELS,
+        units=UNITS,
+        rate_hz=1e3 / SAMPLE_MS,
+        frame="world",
+    )
+
+
 def quaternion(matrix: NDArray[np.float64]) -> tuple[float, float, float, float]:
     """Unit quaternion (w, x, y, z), w >= 0, of a (3, 3) rotation."""
     q = np.empty(4)
@@ -166,7 +198,7 @@ def _add_whisker(
     middle = (s[:-1] + s[1:]) / 2
     radii = whisker.radius(middle)
     lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
-    stiffness = whisker.bending_stiffness(s[1:-1]) / cell * 1e3  # uN m / rad
+    stiffness = [_joint_stiffness(whisker, i * cell, (i + 1) * cell) for i in range(n)]
     headings = np.arctan2(np.diff(nodes[:, 1]), np.diff(nodes[:, 0]))
 
     body = head.add_body(name=whisker.name, pos=whisker.base, quat=quaternion(whisker.orientation))
@@ -213,6 +245,18 @@ def _add_whisker(
             group=WHISKER_BIT,
             rgba=(0.25, 0.2, 0.15, 1.0),
         )
+
+
+def _joint_stiffness(whisker: Whisker, start: float, stop: float) -> float:
+    """Stiffness (uN m / rad) of the joint in the middle of a cell.
+
+    The cell adds to the bend of a tip under a force what the beam's own piece adds, the integral of
+    (L - s)^2 / E I: towards a thin tip that is more than its middle's E I would give.
+    """
+    s, weights = start + (GAUSS[0] + 1) * (stop - start) / 2, GAUSS[1] * (stop - start) / 2
+    lever = whisker.length - s
+    bend = float(weights @ (lever**2 / whisker.bending_stiffness(s)))  # 1/N
+    return (whisker.length - (start + stop) / 2) ** 2 / bend * 1e3
 
 
 def _inertia(whisker: Whisker, start: float, stop: float) -> tuple[float, float, float, float]:

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS, array_spec
-from tactile_rt.sim_backend.arrays import load_array
+from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS, world_spec
+from tactile_rt.sim_backend.arrays import load_animals
 from tactile_rt.sim_backend.objects import CATEGORIES, load_object
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation
@@ -77,7 +77,7 @@ class SimSource(Source):
     Samples that the sensors drop count as missing.
 
     Args:
-        array: which array, see `arrays.load_array`: ``mouse`` (also if empty), ``rat-left``, a
+        array: which array, see `arrays.load_animals`: ``mouse`` (also if empty), ``rat-left``, a
             .csv or .toml file.
         options: what it meets.
 
@@ -87,9 +87,8 @@ class SimSource(Source):
     """
 
     def __init__(self, array: str, options: SimOptions) -> None:
-        made = load_array(array or "mouse")
-        super().__init__(array_spec(made.whiskers, made.name))
-        self._array = made
+        self._animals = load_animals(array or "mouse")
+        super().__init__(world_spec(self._animals))
         self._options = options
         names = [n for n in options.objects.split(",") if n] or list(CATEGORIES)
         self._objects = [load_object(name) for name in names]
@@ -164,7 +163,7 @@ class SimSource(Source):
             self._order = [int(i) for i in order for _ in range(self._options.repeat)]
         target = self._objects[self._order.pop(0)]
         sweep, self._simulation = draw_simulation(
-            self._rng, self._array, target, PROFILES[self._options.profile]
+            self._rng, self._animals, target, PROFILES[self._options.profile]
         )
         self._rest = REST_SAMPLES
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)

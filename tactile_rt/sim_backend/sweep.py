@@ -204,7 +204,10 @@ def draw_sweep(rng: np.random.Generator) -> Sweep:
 
 
 def draw_simulation(
-    rng: np.random.Generator, array: WhiskerArray, target: TactileObject, profile: Profile
+    rng: np.random.Generator,
+    array: WhiskerArray | tuple[WhiskerArray, ...],
+    target: TactileObject,
+    profile: Profile,
 ) -> tuple[Sweep, SweepSimulation]:
     """Draw sweeps until the object meets the array; give up, with a miss, after many tries."""
     for _ in range(DRAWS):

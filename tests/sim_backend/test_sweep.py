@@ -12,7 +12,14 @@ import mujoco
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.sim_backend.array import MOUNT, OBJECT_BIT, PROFILES, WHISKER_BIT, read_base_loads
+from tactile_rt.sim_backend.array import (
+    MOUNT,
+    OBJECT_BIT,
+    PROFILES,
+    WHISKER_BIT,
+    read_base_loads,
+    world_spec,
+)
 from tactile_rt.sim_backend.arrays import WhiskerArray, load_array, place
 from tactile_rt.sim_backend.objects import CATEGORIES, TactileObject, load_object, make_object
 from tactile_rt.sim_backend.solids import box
@@ -257,3 +264,16 @@ def test_a_simulation_that_has_become_unstable_says_so() -> None:
     with pytest.raises(SourceError, match="unstable"):
         simulation.advance(20)
     assert not Path("MUJOCO_LOG.TXT").exists()
+
+
+def test_a_world_of_two_animals_has_one_spec() -> None:
+    mirrored = load_array("mouse-left")
+    spec = world_spec(place((ALL, mirrored)))
+    assert spec.frame == "world" and spec.shape == (60, 6)
+    assert spec.elements[0].startswith("1.") and spec.elements[30].startswith("2.")
+    # world x is what the two heads are mirror images in
+    right, left = np.array(spec.positions[:30]), np.array(spec.positions[30:])
+    np.testing.assert_allclose(left, right * [-1, 1, 1], atol=1e-12)
+    turn = Rotation.from_quat(spec.orientations[2], scalar_first=True).as_matrix()
+    np.testing.assert_allclose(turn, MOUNT.rotation @ ALL.whiskers[2].orientation, atol=1e-8)
+    assert world_spec((ALL,)).frame == "head"
