@@ -1,12 +1,14 @@
 """Benchmark area `models`: the shipped model on a sweep set of unseen objects."""
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 from tactile_rt.benchmarks.classification import evaluate_model
 from tactile_rt.benchmarks.records import Record
 from tactile_rt.model_file import load_model, shipped_model
-from tactile_rt.sim_backend.dataset import SweepRecipe, make_sweeps
+from tactile_rt.sim_backend.dataset import make_sweeps
+from tactile_rt.sim_backend.recipe_files import recipe_of_set
 
 __all__ = ["run"]
 
@@ -18,10 +20,9 @@ def run(quick: bool) -> list[Record]:
     makes the very test set that the model's card names.
     """
     _, card = load_model(shipped_model())
-    made = dict(card.provenance["sweep_set"])
+    recipe = recipe_of_set(card.provenance["sweep_set"], card.labels)
     if quick:
-        made["sweeps"] = 1
-    recipe = SweepRecipe(categories=card.labels, **made)
+        recipe = replace(recipe, sweeps=replace(recipe.sweeps, draws=1))
     with tempfile.TemporaryDirectory() as folder:
         for _ in make_sweeps(recipe, Path(folder), splits=("test",)):
             pass

@@ -78,7 +78,7 @@ class Profile:
 
 PROFILES = {
     "realtime": Profile(0.25, 5, 0.5, 0.05),
-    "dataset": Profile(0.5, 8, 0.2, 0.02),
+    "dataset": Profile(0.5, 8, 0.25, 0.025),
     "accurate": Profile(1.0, 8, 0.1, 0.01),
 }
 
