@@ -1,19 +1,23 @@
 """Streams at rest: a sweep set is a folder of arrays for training and evaluation.
 
-    sets/mouse12/
+    sets/mouse24/
         manifest.json      what the set is: array, period, categories, split by object, recipe
         mug-17.npz         every sweep of one object
+        skipped.json       objects that could not be made, and why
+        SHA256SUMS         of all these, once the set is finished: `sha256sum -c` reads it too
 
-One file per object, written whole or not at all, so that an interrupted run loses only the object
-it was at, and so that a split can never put one object on two sides.
+One file per object, written whole or not at all, so that no half-written one is ever read, and so
+that a split can never put one object on two sides. The archive's own checksums tell a damaged
+file at every reading.
 """
 
 import os
 import tempfile
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import msgspec
 import numpy as np
@@ -23,17 +27,25 @@ from tactile_rt.stream import ArraySpec, ConfigError, RecordingError
 
 __all__ = [
     "SPLITS",
+    "WITHHELD",
     "SweepManifest",
     "Sweeps",
     "has_object",
+    "object_path",
+    "read_object",
+    "read_skipped",
     "read_sweeps",
     "split_by_object",
     "write_object",
+    "write_skipped",
+    "write_whole",
 ]
 
-SET_VERSION = 1
-MANIFEST = "manifest.json"
+SET_VERSION = 2
+READABLE = (1, 2)  # version 1 knew neither withheld categories nor objects out of files
+MANIFEST, SKIPPED = "manifest.json", "skipped.json"
 SPLITS = ("train", "validation", "test")
+WITHHELD = "withheld"  # a further split: categories that training never sees, labelled -1
 
 
 @dataclass(frozen=True)
@@ -45,8 +57,12 @@ class SweepManifest:
         period_ns: sample period of the stored arrays, ns.
         lead: samples at the start of every sweep before the object can touch.
         categories: class names; a label is an index into them.
-        split: object names per split, each name ``category-index``.
+        split: object names per split, each name ``category-index`` unless `category_of` has it.
         recipe: what made the set (profile, seed, sweeps per object ...), for provenance.
+        withheld: categories of the split "withheld".
+        category_of: category of objects whose name does not tell it.
+        versions: of what made the set (mujoco, numpy, ...).
+        settings: of the simulation profile.
     """
 
     spec: ArraySpec
@@ -56,6 +72,41 @@ class SweepManifest:
     split: dict[str, tuple[str, ...]]
     recipe: dict[str, Any] = field(default_factory=dict)
     version: int = SET_VERSION
+    withheld: tuple[str, ...] = ()
+    category_of: dict[str, str] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+    settings: dict[str, float] = field(default_factory=dict)
+
+    def names(self, splits: Sequence[str] = ()) -> list[str]:
+        """Object names of these splits, or of all.
+
+        Raises:
+            ConfigError: no such split.
+        """
+        for split in splits:
+            if split not in self.split:
+                raise ConfigError(f"no split {split!r}: there are {', '.join(self.split)}")
+        return [name for split in dict.fromkeys(splits or self.split) for name in self.split[split]]
+
+    def category(self, name: str) -> str:
+        """The category of an object.
+
+        Raises:
+            RecordingError: it is of none that the set names.
+        """
+        category = self.category_of.get(name) or name.rpartition("-")[0]
+        if category not in self.categories and category not in self.withheld:
+            raise RecordingError(f"{MANIFEST} is damaged: {name} is of no category it names")
+        return category
+
+    def label(self, name: str) -> int:
+        """The label of an object: -1 if its category is withheld from training.
+
+        Raises:
+            RecordingError: as `category`.
+        """
+        category = self.category(name)
+        return self.categories.index(category) if category in self.categories else -1
 
     def write(self, folder: Path) -> None:
         """Write into a folder, or check that the set already there is this very one.
@@ -70,14 +121,19 @@ class SweepManifest:
             # Compared as JSON, which knows no tuples: a recipe may have been written with some.
             here = msgspec.json.decode(text)
             there = msgspec.json.decode(msgspec.json.encode(SweepManifest.read(folder)))
-            differing = [name for name in here if there[name] != here[name]]
+            if there["version"] != SET_VERSION:
+                raise ConfigError(
+                    f"{folder} holds a sweep set of version {there['version']}, which can be read "
+                    "but not gone on with: choose another folder"
+                )
+            differing = _differing(here, there)
             if differing:
                 raise ConfigError(
                     f"{folder} holds another sweep set (other {', '.join(differing)}): "
                     "choose another folder, or repeat the options that began it"
                 )
             return
-        _write_whole(path, lambda file: file.write(msgspec.json.format(text, indent=1)))
+        write_whole(path, lambda file: file.write(msgspec.json.format(text, indent=1)))
 
     @classmethod
     def read(cls, folder: Path) -> "SweepManifest":
@@ -89,9 +145,10 @@ class SweepManifest:
         path = folder / MANIFEST
         try:
             raw = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
-            if raw.get("version") != SET_VERSION:
+            if raw.get("version") not in READABLE:
                 raise RecordingError(
-                    f"{path} is of version {raw.get('version')!r}; this release reads {SET_VERSION}"
+                    f"{path} is of version {raw.get('version')!r}; this release reads "
+                    + " and ".join(map(str, READABLE))
                 )
             return msgspec.convert(raw, cls)
         except OSError:
@@ -102,13 +159,25 @@ class SweepManifest:
             raise RecordingError(f"{path} is damaged: {error}") from None
 
 
+def _differing(here: dict[str, Any], there: dict[str, Any], prefix: str = "") -> list[str]:
+    """Which keys differ, those of tables by their full name."""
+    found = []
+    for key in dict.fromkeys([*here, *there]):
+        mine, theirs = here.get(key), there.get(key)
+        if isinstance(mine, dict) and isinstance(theirs, dict) and key not in ("spec", "split"):
+            found += _differing(mine, theirs, f"{prefix}{key}.")
+        elif mine != theirs:
+            found.append(f"{prefix}{key}")
+    return found
+
+
 @dataclass(frozen=True)
 class Sweeps:
     """Sweeps in memory.
 
     Attributes:
         values: (sweep, sample, element, channel) float32, SI, on the set's period.
-        labels: (sweep,) int64 index into the manifest's categories.
+        labels: (sweep,) int64 index into the manifest's categories; -1: withheld from training.
         objects: (sweep,) str object name; sweeps of one object share it.
     """
 
@@ -120,13 +189,14 @@ class Sweeps:
         return len(self.labels)
 
 
-def _object_path(folder: Path, name: str) -> Path:
+def object_path(folder: Path, name: str) -> Path:
+    """The file of one object's sweeps."""
     return folder / f"{name}.npz"
 
 
 def has_object(folder: Path, name: str) -> bool:
     """Whether an object's sweeps have been written (whole, by construction)."""
-    return _object_path(folder, name).exists()
+    return object_path(folder, name).exists()
 
 
 def write_object(
@@ -141,11 +211,11 @@ def write_object(
         parameters: (sweep,) arrays that describe each sweep, stored beside the values.
     """
     arrays: dict[str, Any] = {"values": values.astype(np.float32), **parameters}
-    _write_whole(_object_path(folder, name), lambda file: np.savez(file, **arrays))
+    write_whole(object_path(folder, name), lambda file: np.savez(file, **arrays))
 
 
 def read_sweeps(folder: Path, split: str) -> Sweeps:
-    """Read all sweeps of one split.
+    """Read all sweeps of one split; objects that were skipped are not among them.
 
     Raises:
         RecordingError: no such set, an object is missing (the run that makes it was interrupted)
@@ -153,56 +223,118 @@ def read_sweeps(folder: Path, split: str) -> Sweeps:
         ConfigError: no such split.
     """
     manifest = SweepManifest.read(folder)
-    if split not in manifest.split:
-        raise ConfigError(f"no split {split!r} in {folder}: it has {', '.join(manifest.split)}")
-    names = manifest.split[split]
-    if not names:
-        raise RecordingError(f"{folder}: {split!r} has no objects")
-    labels = [_label(folder, name, manifest.categories) for name in names]
+    names = _names_of(folder, manifest, split)
+    labels = [manifest.label(name) for name in names]
     missing = [name for name in names if not has_object(folder, name)]
     if missing:
         raise RecordingError(
             f"{folder} is unfinished: {len(missing)} of {len(names)} objects of {split!r} are "
             f"missing ({missing[0]} ...); run the same `tactile-rt sweep` again to finish it"
         )
-    values = [_read_values(_object_path(folder, name), manifest.spec.shape) for name in names]
-    samples = values[0].shape[1]
-    for name, sweeps in zip(names, values, strict=True):
-        if sweeps.shape[1] != samples:
+    shapes = [_stored_shape(object_path(folder, name), manifest.spec.shape) for name in names]
+    samples = shapes[0][1]
+    for name, shape in zip(names, shapes, strict=True):
+        if shape[1] != samples:
             raise RecordingError(
-                f"{_object_path(folder, name)} holds sweeps of {sweeps.shape[1]} samples, "
+                f"{object_path(folder, name)} holds sweeps of {shape[1]} samples, "
                 f"not {samples} as {names[0]}"
             )
-    counts = [len(v) for v in values]
-    return Sweeps(
-        np.concatenate(values), np.repeat(np.array(labels), counts), np.repeat(names, counts)
-    )
+    counts = [shape[0] for shape in shapes]
+    # Filled in place: a large set fits into memory once, not twice.
+    values = np.empty((sum(counts), *shapes[0][1:]), dtype=np.float32)
+    at = 0
+    for name, count in zip(names, counts, strict=True):
+        values[at : at + count] = _read_arrays(object_path(folder, name), "values")["values"]
+        at += count
+    return Sweeps(values, np.repeat(np.array(labels), counts), np.repeat(names, counts))
 
 
-def _label(folder: Path, name: str, categories: tuple[str, ...]) -> int:
-    category = name.rpartition("-")[0]
-    if category not in categories:
-        raise RecordingError(f"{folder / MANIFEST} is damaged: {name} is of no category it names")
-    return categories.index(category)
+def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str, NDArray[Any]]]:
+    """All sweeps of one object.
+
+    Returns:
+        (sweep, sample, element, channel) values, SI, and the (sweep,) arrays that describe each.
+
+    Raises:
+        RecordingError: the file is damaged.
+    """
+    path = object_path(folder, name)
+    arrays = _read_arrays(path)
+    if "values" not in arrays:
+        raise _damaged(path, KeyError("no values"))
+    return arrays.pop("values"), arrays
 
 
-def _read_values(path: Path, shape: tuple[int, int]) -> NDArray[np.float32]:
+def _names_of(folder: Path, manifest: SweepManifest, split: str) -> list[str]:
+    if split not in manifest.split:
+        raise ConfigError(f"no split {split!r} in {folder}: it has {', '.join(manifest.split)}")
+    skipped = read_skipped(folder)
+    names = [name for name in manifest.split[split] if name not in skipped]
+    if not names:
+        raise RecordingError(f"{folder}: {split!r} has no objects")
+    return names
+
+
+def _stored_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
+    """The shape of an object's values, without reading them."""
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open("values.npy") as member:
+            version = np.lib.format.read_magic(member)
+            read = {(1, 0): np.lib.format.read_array_header_1_0}[version]
+            stored, _, dtype = read(member)
+        if dtype != np.float32:
+            raise ValueError(f"values of type {dtype}")
+    except MemoryError:
+        raise
+    except Exception as error:
+        raise _damaged(path, error) from None
+    if len(stored) != 4 or stored[2:] != shape:
+        raise RecordingError(f"{path} holds {stored}, not (sweep, sample, *{shape})")
+    return tuple(stored)
+
+
+def _read_arrays(path: Path, *keys: str) -> dict[str, NDArray[Any]]:
     try:
         # Opened here because numpy leaves its own file open when it is damaged.
         with path.open("rb") as file, np.load(file) as arrays:
-            values: NDArray[np.float32] = arrays["values"]
+            return {key: arrays[key] for key in keys or arrays.files}
     except MemoryError:
         raise
     except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file
-        reason = str(error) or type(error).__name__
-        raise RecordingError(f"{path} is damaged ({reason}): delete it and sweep again") from None
-    if values.ndim != 4 or values.shape[2:] != shape:
-        raise RecordingError(f"{path} holds {values.shape}, not (sweep, sample, *{shape})")
-    return values
+        raise _damaged(path, error) from None
 
 
-def _write_whole(path: Path, write: Any) -> None:
-    """Let `write(file)` fill a file that appears under its name only when complete."""
+def _damaged(path: Path, error: Exception) -> RecordingError:
+    reason = str(error) or type(error).__name__
+    return RecordingError(f"{path} is damaged ({reason}): delete it and sweep again")
+
+
+def read_skipped(folder: Path) -> dict[str, str]:
+    """Objects that could not be made, and why; none if the set does not list any.
+
+    Raises:
+        RecordingError: the list is damaged.
+    """
+    path = folder / SKIPPED
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=dict[str, str])
+    except FileNotFoundError:
+        return {}
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path} is damaged: {error}") from None
+
+
+def write_skipped(folder: Path, skipped: dict[str, str]) -> None:
+    """Replace the list of objects that could not be made."""
+    text = msgspec.json.format(msgspec.json.encode(dict(sorted(skipped.items()))), indent=1)
+    write_whole(folder / SKIPPED, lambda file: file.write(text))
+
+
+def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
+    """Let `write(file)` fill a file that appears under its name only when complete.
+
+    Until then it is hidden: ``.NAME.XXXXXXXX`` in the same folder.
+    """
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:

@@ -15,9 +15,12 @@ from tactile_rt.recording import (
     SPLITS,
     SweepManifest,
     has_object,
+    read_object,
+    read_skipped,
     read_sweeps,
     split_by_object,
     write_object,
+    write_skipped,
 )
 from tactile_rt.stream import ConfigError, RecordingError
 from tactile_rt.testing import small_spec
@@ -62,6 +65,9 @@ def test_what_is_written_is_read(folder: Path) -> None:
     assert train.objects.tolist() == ["bowl-0", "mug-0", "mug-0"]
     assert train.values.dtype == np.float32
     assert np.array_equal(train.values[:1], sweeps_of("bowl-0", 1))
+    values, parameters = read_object(folder, "bowl-1")
+    assert np.array_equal(values, sweeps_of("bowl-1", 3))
+    assert {key: value.tolist() for key, value in parameters.items()} == {"speed": [0, 1, 2]}
     assert np.array_equal(train.values[1:], sweeps_of("mug-0", 2))
     assert read_sweeps(folder, "test").labels.tolist() == [1] * 4
     with np.load(folder / "mug-1.npz") as arrays:
@@ -152,7 +158,9 @@ def test_a_recipe_that_json_spells_differently_is_still_the_same(tmp_path: Path)
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"recipe": {"seed": 4, "profile": "realtime"}}, "recipe"),
+        ({"recipe": {"seed": 4, "profile": "realtime"}}, "recipe.seed"),
+        ({"recipe": {"seed": 3, "profile": "realtime", "sensor": {"gain": 0.1}}}, "recipe.sensor"),
+        ({"versions": {"mujoco": "3.9"}}, "versions.mujoco"),
         ({"lead": 5, "period_ns": 1}, "period_ns, lead"),
         ({"categories": ("bowl", "cup")}, "categories"),
         ({"split": {**MANIFEST.split, "train": ("bowl-0",)}}, "split"),
@@ -188,8 +196,8 @@ def manifest_with(**fields: object) -> bytes:
         (b"{", "is damaged"),
         (b"[]", "is damaged"),
         (b'{"version": "\xff"}', "is damaged"),
-        (b"{}", "is of version None; this release reads 1"),
-        (manifest_with(version=2), "is of version 2; this release reads 1"),
+        (b"{}", "is of version None; this release reads 1 and 2"),
+        (manifest_with(version=3), "is of version 3; this release reads 1 and 2"),
         (manifest_with(lead="four"), r"is damaged: .*\$.lead"),
         (manifest_with(spec={}), r"is damaged: .*\$.spec"),
         (
@@ -290,6 +298,69 @@ def test_an_object_of_another_array_or_length_is_refused(folder: Path) -> None:
         read_sweeps(folder, "train")
 
 
+def test_a_cut_parameter_is_named_too(folder: Path) -> None:
+    assert read_object(folder, "mug-1")[1]["speed"].tolist() == [0, 1, 2, 3]
+    spoil(folder / "mug-1.npz", "cut")
+    with pytest.raises(RecordingError, match=r"mug-1\.npz is damaged"):
+        read_object(folder, "mug-1")
+
+
+# Sets of version 1
+
+
+def test_a_set_of_version_1_is_read_but_not_gone_on_with(folder: Path) -> None:
+    """As the first release wrote it."""
+    new = ("withheld", "category_of", "versions", "settings")
+    old = {k: v for k, v in msgspec.to_builtins(MANIFEST).items() if k not in new}
+    (folder / "manifest.json").write_bytes(msgspec.json.encode({**old, "version": 1}))
+    assert read_sweeps(folder, "train").labels.tolist() == [0, 1, 1]
+    with pytest.raises(ConfigError, match="of version 1, which can be read but not gone on with"):
+        MANIFEST.write(folder)
+
+
+# Objects that are withheld, skipped, or have a name of their own
+
+
+def test_withheld_categories_have_no_label(tmp_path: Path) -> None:
+    split = {**MANIFEST.split, "withheld": ("spoon-0", "spoon-1")}
+    replace(MANIFEST, split=split, withheld=("spoon",)).write(tmp_path)
+    for name in ("spoon-0", "spoon-1", "mug-1"):
+        write_object(tmp_path, name, sweeps_of(name), {})
+    assert read_sweeps(tmp_path, "withheld").labels.tolist() == [-1] * 4
+    assert read_sweeps(tmp_path, "test").labels.tolist() == [1, 1]
+
+
+def test_an_objects_category_may_be_told_apart_from_its_name(tmp_path: Path) -> None:
+    split = {"train": ("02876657-1a-f0", "mug-0")}
+    manifest = replace(MANIFEST, split=split, category_of={"02876657-1a-f0": "bowl"})
+    manifest.write(tmp_path)
+    for name in split["train"]:
+        write_object(tmp_path, name, sweeps_of(name, 1), {})
+    assert read_sweeps(tmp_path, "train").labels.tolist() == [0, 1]
+    assert SweepManifest.read(tmp_path).category("02876657-1a-f0") == "bowl"
+
+
+def test_skipped_objects_are_not_missed(folder: Path) -> None:
+    (folder / "mug-0.npz").unlink()
+    assert read_skipped(folder) == {}
+    write_skipped(folder, {"mug-0": "no volume"})
+    assert read_skipped(folder) == {"mug-0": "no volume"}
+    assert read_sweeps(folder, "train").objects.tolist() == ["bowl-0"]
+    write_skipped(folder, {"mug-0": "no volume", "bowl-0": "no volume"})
+    with pytest.raises(RecordingError, match="'train' has no objects"):
+        read_sweeps(folder, "train")
+    (folder / "skipped.json").write_text("{")
+    with pytest.raises(RecordingError, match=r"skipped\.json is damaged"):
+        read_sweeps(folder, "train")
+
+
+def test_names_are_those_of_the_splits_asked_for() -> None:
+    assert MANIFEST.names() == NAMES
+    assert MANIFEST.names(["test", "test"]) == ["mug-1"]
+    with pytest.raises(ConfigError, match="no split 'tests': there are train, validation, test"):
+        MANIFEST.names(["tests"])
+
+
 # Splitting
 
 
@@ -319,7 +390,7 @@ def test_more_test_objects_never_come_from_validation_to_training() -> None:
 def test_the_temporary_file_is_hidden_and_in_the_same_folder(tmp_path: Path) -> None:
     """The same file system, or the final rename could not be atomic; hidden from `*.npz`."""
     seen = []
-    recording._write_whole(tmp_path / "a.npz", lambda file: seen.append(file.name))
+    recording.write_whole(tmp_path / "a.npz", lambda file: seen.append(file.name))
     (handle,) = seen
     assert isinstance(handle, int)
     assert listing(tmp_path) == ["a.npz"]

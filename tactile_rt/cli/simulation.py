@@ -1,7 +1,8 @@
 """`tactile-rt sweep`: make a sweep set in simulation."""
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -9,51 +10,119 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from tactile_rt.cli import app, needs, starting
 
+if TYPE_CHECKING:
+    from tactile_rt.sim_backend.recipes import SweepRecipe
+
 
 @app.command()
 def sweep(
     folder: Annotated[Path, typer.Argument(help="Where the set goes; an unfinished one goes on.")],
-    objects: Annotated[int, typer.Option(min=3, help="Objects of every category.")] = 60,
-    validation: Annotated[int, typer.Option(min=1, help="Of these, held out to tune on.")] = 4,
-    test: Annotated[int, typer.Option(min=1, help="Of these, held out to test on.")] = 10,
-    sweeps: Annotated[int, typer.Option(min=1, help="Sweeps of every object.")] = 8,
+    recipe: Annotated[
+        str | None,
+        typer.Option(
+            help="What to make: default24, mouse12, paper-lowvar-highfi, paper-highvar-lowfi, or "
+            "a TOML file. Without it the folder's own, or else default24."
+        ),
+    ] = None,
+    objects: Annotated[int | None, typer.Option(help="Objects of every category.")] = None,
+    validation: Annotated[float | None, typer.Option(help="Of these, held out to tune on.")] = None,
+    test: Annotated[float | None, typer.Option(help="Of these, held out to test on.")] = None,
+    sweeps: Annotated[int | None, typer.Option(help="Sweeps drawn of every object.")] = None,
     profile: Annotated[
-        str, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
-    ] = "realtime",
-    split: Annotated[str, typer.Option(help="Only these splits, comma-separated.")] = (
-        "train,validation,test"
-    ),
-    seed: Annotated[int, typer.Option(help="Of the drawn sweep parameters.")] = 0,
-    processes: Annotated[int, typer.Option(min=0, help="0: one per core.")] = 0,
+        str | None, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Of the drawn sweep parameters.")] = None,
+    split: Annotated[
+        str | None, typer.Option(help="Only these splits, comma-separated: test,withheld.")
+    ] = None,
+    processes: Annotated[int, typer.Option(min=0, help="At a time; 0: one per core.")] = 0,
+    engine: Annotated[str, typer.Option(help="processes, or ray for a cluster.")] = "processes",
+    address: Annotated[
+        str | None, typer.Option(help="Of the Ray cluster; without it this machine's, or a new one")
+    ] = None,
+    card: Annotated[
+        bool,
+        typer.Option("--card", help="When all is made, describe the set: README.md with pictures."),
+    ] = False,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Make nothing: check the set's checksums.")
+    ] = False,
 ) -> None:
     """Sweep simulated objects past the whisker array and store what it feels."""
+    console = Console(stderr=True, soft_wrap=True)
+    if verify:
+        from tactile_rt.sim_backend.sums import check_sums
+
+        console.print(f"{folder}: {check_sums(folder)} files are as they were written")
+        return
     try:
         with starting():
-            from tactile_rt.sim_backend.dataset import SweepRecipe, make_sweeps
+            from tactile_rt.sim_backend.dataset import describe_set, make_sweeps
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
-    recipe = SweepRecipe(
-        objects=objects,
-        validation=validation,
-        test=test,
-        sweeps=sweeps,
-        profile=profile,
-        seed=seed,
+    chosen = _override(
+        _recipe(folder, recipe),
+        {"per_category": objects, "validation": validation, "test": test},
+        {"draws": sweeps},
+        {"profile": profile, "seed": seed},
     )
+    splits = tuple(dict.fromkeys(s.strip() for s in split.split(","))) if split else ()
+    total = len(describe_set(chosen).names(splits))
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    splits = tuple(dict.fromkeys(s.strip() for s in split.split(",")))
-    total = recipe.count(splits)
-    console = Console(stderr=True)
     # Gone when it is done or fails, and nothing in a log file: an error is one line alone.
     with Progress(
         *columns, console=console, transient=True, disable=not console.is_terminal
     ) as progress:
         task = progress.add_task("objects", total=total)
-        for name in make_sweeps(recipe, folder, processes or None, splits):
+        for name in make_sweeps(chosen, folder, processes or None, splits, engine, address):
             progress.update(task, advance=1, description=name)
-    console.print(f"{folder}: {total * sweeps} sweeps at profile {profile}")
+    made = total * len(chosen.sweeps)
+    console.print(f"{folder}: {made} sweeps at profile {chosen.profile}")
+    if card:
+        _write_card(folder)
+        console.print(f"{folder / 'README.md'} describes them")
+
+
+def _write_card(folder: Path) -> None:
+    try:
+        import matplotlib  # noqa: F401
+        import sklearn  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    from tactile_rt.sim_backend.card import write_card
+
+    write_card(folder)
+
+
+def _recipe(folder: Path, name: str | None) -> "SweepRecipe":
+    from tactile_rt.recording import SweepManifest
+    from tactile_rt.sim_backend.recipe_files import DEFAULT_RECIPE, read_recipe, recipe_of_set
+
+    if name is None and (folder / "manifest.json").exists():
+        manifest = SweepManifest.read(folder)
+        return recipe_of_set(manifest.recipe, manifest.categories)
+    return read_recipe(name or DEFAULT_RECIPE)
+
+
+def _override(
+    recipe: "SweepRecipe",
+    objects: dict[str, object],
+    sweeps: dict[str, object],
+    top: dict[str, object],
+) -> "SweepRecipe":
+    """The recipe with the options that were given."""
+
+    def given(options: dict[str, object]) -> dict[str, Any]:
+        return {name: value for name, value in options.items() if value is not None}
+
+    return replace(
+        recipe,
+        objects=replace(recipe.objects, **given(objects)),
+        sweeps=replace(recipe.sweeps, **given(sweeps)),
+        **given(top),
+    )

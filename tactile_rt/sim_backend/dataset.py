@@ -1,157 +1,260 @@
-"""Sweep sets: many objects, each swept past the array several times with drawn parameters.
+"""Making a sweep set: many objects, each swept past the array several times with drawn parameters.
 
-Every object is an independent task with its own seed, so a set does not depend on the number of
-processes, on their order, or on how often the run was interrupted.
+Every sweep depends on its recipe, object and index alone, so a set does not depend on who makes
+it, in which order, or how often that was interrupted. An object is one task: its finished sweeps
+go to a journal at once, and become its file when all are there.
 """
 
-import multiprocessing
+import hashlib
 import os
-import signal
-import zlib
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.recording import SweepManifest, has_object, split_by_object, write_object
+from tactile_rt import __version__
+from tactile_rt.recording import (
+    SweepManifest,
+    has_object,
+    read_skipped,
+    write_object,
+    write_skipped,
+)
 from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS, array_spec
-from tactile_rt.sim_backend.objects import CATEGORIES, make_object
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation
-from tactile_rt.sim_backend.whiskers import mouse_whiskers
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.sim_backend.arrays import load_array
+from tactile_rt.sim_backend.engines import ENGINES, run_processes, run_ray
+from tactile_rt.sim_backend.journal import Journal, SweepRecord, remove_leftovers
+from tactile_rt.sim_backend.objects import TactileObject
+from tactile_rt.sim_backend.recipe_objects import MeshObjects, ShapeObjects, choose_objects
+from tactile_rt.sim_backend.recipe_tables import misnamed
+from tactile_rt.sim_backend.recipes import SHAPES, SweepRecipe
+from tactile_rt.sim_backend.sensor import Sensor, SensorModel
+from tactile_rt.sim_backend.sums import write_sums
+from tactile_rt.sim_backend.sweep import SweepSimulation
+from tactile_rt.stream import Chunk, ConfigError, SourceError, TactileError
 from tactile_rt.timebase import Resampler
 
-__all__ = ["PERIOD_NS", "SweepRecipe", "make_sweeps"]
+__all__ = ["describe_set", "fingerprint", "make_sweeps", "simulate_sweep"]
 
-PERIOD_NS = 9_000_000  # five sub-steps of 9 ms make one network step (Chung et al. 2025)
-LEAD = 24  # stored samples at rest before the simulation starts: enough for a tare
-SAMPLES = 164  # stored samples of one sweep, the lead included: 22 steps from onset and to spare
+# Of a sweep's parameters; the others are numbers.
+KINDS: dict[str, type] = {"draw": np.int64, "touches": np.bool_, "unstable": np.bool_}
+RANDOMISATION, SENSOR = 1, 2  # streams of random numbers beside that of the sweep's parameters
+SPARE = 2  # stored samples simulated beyond the last, which the resampler's kernel needs
+DRAWS = 20  # tries to draw parameters with which an object meets the array at all
 
 
-@dataclass(frozen=True)
-class SweepRecipe:
-    """How a sweep set is made.
+def describe_set(recipe: SweepRecipe) -> SweepManifest:
+    """The set that a recipe makes.
 
-    Attributes:
-        categories: class names, each known to `make_object`.
-        objects: instances of every category.
-        validation, test: how many of them are held out, by object.
-        sweeps: sweeps of every object.
-        profile: simulation profile, see `array.PROFILES`.
-        seed: of the drawn parameters.
+    Raises:
+        ConfigError: objects or array are not there, or cannot be split as the recipe says.
     """
-
-    categories: tuple[str, ...] = CATEGORIES
-    objects: int = 60
-    validation: int = 4
-    test: int = 10
-    sweeps: int = 8
-    profile: str = "realtime"
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.profile not in PROFILES:
-            raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
-        if min(self.objects - self.validation - self.test, self.validation, self.test) < 1:
-            raise ConfigError(
-                f"{self.objects} objects cannot be split with {self.validation} for validation "
-                f"and {self.test} for test: each side needs at least one"
-            )
-        if self.sweeps < 1:
-            raise ConfigError(f"sweeps must be at least 1, not {self.sweeps}")
-        if self.seed < 0:
-            raise ConfigError(f"seed must be 0 or more, not {self.seed}")
-
-    def count(self, splits: tuple[str, ...]) -> int:
-        """Objects of all categories in these splits.
-
-        Raises:
-            ConfigError: no such split.
-        """
-        split = self.manifest().split
-        unknown = [s for s in splits if s not in split]
-        if unknown:
-            raise ConfigError(f"no split {unknown[0]!r}: there are {', '.join(split)}")
-        return sum(len(split[s]) for s in splits)
-
-    def manifest(self) -> SweepManifest:
-        """The set that this recipe makes."""
-        return SweepManifest(
-            spec=array_spec(mouse_whiskers(), "mouse-right"),
-            period_ns=PERIOD_NS,
-            lead=LEAD,
-            categories=self.categories,
-            split=split_by_object(self.categories, self.objects, self.validation, self.test),
-            recipe={k: v for k, v in asdict(self).items() if k != "categories"},
-        )
+    objects, array = choose_objects(recipe.objects), load_array(recipe.array)
+    morphology = repr((array.whiskers, array.mount))
+    # Said in full: a later release may know more categories.
+    chosen = replace(recipe.objects, categories=objects.categories, withheld=objects.withheld)
+    of_meshes = () if recipe.objects.source == SHAPES else ("coacd",)
+    packages = ("mujoco", "numpy", "scipy", "trimesh", *of_meshes)
+    return SweepManifest(
+        spec=array_spec(array.whiskers, array.name),
+        period_ns=recipe.period_ns,
+        lead=recipe.lead,
+        categories=objects.categories,
+        split=objects.split,
+        recipe=replace(recipe, objects=chosen).to_dict(),
+        withheld=objects.withheld,
+        category_of=objects.category_of,
+        versions={
+            "tactile_rt": __version__,
+            **{p: version(p) for p in packages},
+            "whiskers": hashlib.sha256(morphology.encode()).hexdigest()[:16],
+        },
+        settings=asdict(PROFILES[recipe.profile]),
+    )
 
 
 def make_sweeps(
     recipe: SweepRecipe,
     folder: Path,
     processes: int | None = None,
-    splits: tuple[str, ...] = ("train", "validation", "test"),
+    splits: Sequence[str] = (),
+    engine: str = "processes",
+    address: str | None = None,
 ) -> Iterator[str]:
     """Make a sweep set, or what is missing of it; yields each object's name as it is finished.
 
+    Args:
+        recipe: what to make.
+        folder: where; on a cluster, a file system that all of its machines share.
+        processes: how many at a time; None: one per core.
+        splits: only these; none for all.
+        engine: "processes" of this machine, or "ray".
+        address: of the Ray cluster, see `engines.run_ray`.
+
     Raises:
-        ConfigError: no such split, or the folder holds another set.
+        ConfigError: no such split or engine, or the folder holds another set.
+        TactileError: an object kills every process that tries to make it.
     """
-    recipe.count(splits)  # which refuses unknown ones before anything is written
-    manifest = recipe.manifest()
+    if engine not in ENGINES:
+        raise ConfigError(misnamed("engine", engine, ENGINES))
+    manifest = describe_set(recipe)
+    names = manifest.names(splits)  # which refuses unknown ones before anything is written
     manifest.write(folder)
-    names = [n for s in splits for n in manifest.split[s]]
-    done = [n for n in names if has_object(folder, n)]
+    remove_leftovers(folder)
+    skipped = read_skipped(folder)
+    if broken := choose_objects(recipe.objects).skipped:
+        skipped = broken | skipped
+        write_skipped(folder, skipped)
+    done = [n for n in names if n in skipped or has_object(folder, n)]
     yield from done
-    todo = [(recipe, folder, n) for n in names if n not in set(done)]
-    if not todo:
-        return
-    # spawn: a forked copy of a process that runs threads (a progress bar) may hang.
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(min(processes or os.cpu_count() or 1, len(todo)), _quiet) as pool:
-        yield from pool.imap_unordered(_make_object_sweeps, todo)
+    missing = set(names) - set(done)
+    todo = [n for n in names if n in missing]
+    work = _Work(recipe, folder.resolve())
+    if engine == "ray":
+        outcomes = run_ray(work, todo, processes, address)
+    else:
+        outcomes = run_processes(work, todo, processes or os.cpu_count() or 1)
+    for name, failure in outcomes:
+        if failure is not None:
+            if recipe.objects.source == SHAPES:  # there are no broken ones among them
+                raise TactileError(f"{name} cannot be made: {failure}")
+            skipped[name] = failure
+            write_skipped(folder, skipped)
+        yield name
+    write_sums(folder)
 
 
-def _quiet() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to handle
+@dataclass(frozen=True)
+class _Work:
+    """Makes all sweeps of the object that it is called with; why it cannot, if so."""
+
+    recipe: SweepRecipe
+    folder: Path
+
+    def __call__(self, name: str) -> str | None:
+        if not self.folder.is_dir():
+            raise ConfigError(
+                f"{self.folder} is not there on every machine: a cluster needs a shared file system"
+            )
+        with Journal(self.folder, name) as journal:
+            if not has_object(self.folder, name):  # as another run may have, while we waited
+                try:
+                    target = self._objects.load(name)
+                except ConfigError as error:
+                    journal.remove()
+                    return str(error)
+                for index in range(len(self.recipe.sweeps)):
+                    if index not in journal.records:
+                        journal.append(index, simulate_sweep(self.recipe, target, index))
+                _write(self.folder, name, journal, target)
+            journal.remove()
+        return None
+
+    @cached_property
+    def _objects(self) -> ShapeObjects | MeshObjects:
+        return choose_objects(self.recipe.objects)
 
 
-def _make_object_sweeps(task: tuple[SweepRecipe, Path, str]) -> str:
-    recipe, folder, name = task
-    category, _, index = name.rpartition("-")
-    # Seeded by the object alone: the paired set of another profile draws the same sweeps.
-    rng = np.random.default_rng([recipe.seed, zlib.crc32(category.encode()), int(index)])
-    target = make_object(category, int(index))
-    profile = PROFILES[recipe.profile]
-    values, drawn = [], []
-    for _ in range(recipe.sweeps):
-        sweep, simulation = draw_simulation(rng, mouse_whiskers(), target, profile)
-        values.append(_record(simulation))
-        drawn.append(sweep)
-    parameters = {
-        f.name: np.array([getattr(s, f.name) for s in drawn], dtype=np.float64)
-        for f in fields(Sweep)
+def _write(folder: Path, name: str, journal: Journal, target: TactileObject) -> None:
+    records = [journal.records[i] for i in sorted(journal.records)]
+    parameters: dict[str, NDArray[Any]] = {
+        # The type is said: it must not depend on whether a record came out of the journal.
+        key: np.array([r.parameters[key] for r in records], dtype=KINDS.get(key, np.float64))
+        for key in records[0].parameters
     }
-    write_object(folder, name, np.stack(values), parameters)
-    return name
+    parameters["geometry"] = np.repeat(fingerprint(target), len(records))
+    write_object(folder, name, np.stack([r.values for r in records]), parameters)
 
 
-def _record(simulation: SweepSimulation) -> NDArray[np.float32]:
-    """(SAMPLES, element, channel): a lead at rest, then the sweep, through the resampler.
+def fingerprint(target: TactileObject) -> str:
+    """A hash of an object's convex pieces: what was swept, whatever it was made from."""
+    digest = hashlib.sha256()
+    for piece in target.pieces:
+        digest.update(np.asarray(piece.vertices, dtype="<f8").tobytes())
+        digest.update(np.asarray(piece.faces, dtype="<i8").tobytes())
+    return digest.hexdigest()[:16]
 
-    At rest the whiskers carry no load at all, so the lead needs no simulation.
+
+def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> SweepRecord:
+    """Make one sweep of a set, by itself.
+
+    A drawn sweep that misses the array or turns unstable is drawn again, up to 20 times; one of a
+    grid stays.
+
+    Args:
+        recipe: the set.
+        target: the object.
+        index: which of the object's sweeps.
+
+    Returns:
+        (sample, element, channel) values, SI, and the parameters of `sweep.Sweep` with `draw`, the
+        sweep's number among those of its combination, `touches`, 0 when it misses the array, and
+        `unstable`, 1 when it could not be simulated at this profile: its values are 0 then.
     """
-    per_output = PERIOD_NS / (SAMPLE_MS * 1e6)
-    lead = round(LEAD * per_output)
-    total = round((SAMPLES + 2) * per_output)
-    loads = simulation.advance(total - lead)
-    values = np.concatenate([np.zeros((lead, *loads.shape[1:])), loads]).astype(np.float32)
+    rng, profile = recipe.rng(target.name, index), PROFILES[recipe.profile]
+    ideal = load_array(recipe.array)
+    array = recipe.randomisation.draw(recipe.rng(target.name, index, RANDOMISATION), ideal)
+    for _ in range(1 if recipe.sweeps.is_grid else DRAWS):
+        sweep = recipe.sweeps.draw(rng, index)
+        simulation = SweepSimulation(array, target, sweep, profile)
+        chunk = _with_lead(recipe, simulation) if simulation.touches else None
+        if chunk is not None:
+            break
+    parameters = {
+        **asdict(sweep),
+        "draw": recipe.sweeps.draw_index(index),
+        "touches": float(simulation.touches),
+        "unstable": float(simulation.touches and chunk is None),
+    }
+    if chunk is None:
+        chunk = _chunk(recipe, np.zeros((0, len(ideal.whiskers), 6)))
+    if recipe.sensor != SensorModel():
+        # The description stays the ideal array's: a robot does not know by how much it differs.
+        spec = array_spec(ideal.whiskers, ideal.name)
+        sensor = Sensor(recipe.sensor, spec, recipe.key(target.name, index, SENSOR))
+        chunk = sensor.push(chunk) or chunk
+    return SweepRecord(_resampled(recipe, chunk), parameters)
+
+
+def _with_lead(recipe: SweepRecipe, simulation: SweepSimulation) -> Chunk | None:
+    """A lead at rest, then the sweep, at the simulator's own rate; None: it went unstable."""
+    lead, total = _lengths(recipe)
+    try:
+        return _chunk(recipe, simulation.advance(total - lead))
+    except SourceError:
+        return None
+
+
+def _lengths(recipe: SweepRecipe) -> tuple[int, int]:
+    """Samples of the lead, and of lead and sweep, at the simulator's own rate."""
+    per_output = recipe.period_ms / SAMPLE_MS
+    # One more, for the first output's kernel: it is centred one period after the first input.
+    return round((recipe.lead + 1) * per_output), round((recipe.samples + SPARE) * per_output)
+
+
+def _chunk(recipe: SweepRecipe, loads: NDArray[np.float64]) -> Chunk:
+    """Loads (sample, element, channel) after a lead at rest, and rest after them if they end early.
+
+    At rest the whiskers carry no load at all, so it needs no simulation.
+    """
+    lead, total = _lengths(recipe)
+    values = np.zeros((total, *loads.shape[1:]), dtype=np.float32)
+    values[lead : lead + len(loads)] = loads
     seq = np.arange(total, dtype=np.int64)
-    chunk = Chunk(
-        seq, seq * round(SAMPLE_MS * 1e6), values, np.ones(values.shape[:2], dtype=np.bool_)
-    )
-    resampled = Resampler(PERIOD_NS, 1e3 / SAMPLE_MS).push(chunk)
-    assert resampled is not None
-    return resampled.values[:SAMPLES]
+    t_ns = seq * round(SAMPLE_MS * 1e6)
+    return Chunk(seq, t_ns, values, np.ones(values.shape[:2], dtype=np.bool_))
+
+
+def _resampled(recipe: SweepRecipe, chunk: Chunk) -> NDArray[np.float32]:
+    """(sample, element, channel): what the live stream's own resampler makes of it."""
+    outputs = Resampler(recipe.period_ns, 1e3 / SAMPLE_MS).push(chunk)
+    values = np.zeros((recipe.samples, *chunk.values.shape[1:]), dtype=np.float32)
+    if outputs is not None:  # fewer where the last samples were dropped
+        n = min(len(outputs), recipe.samples)
+        values[:n] = outputs.values[:n]
+    return values

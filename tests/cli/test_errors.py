@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,9 +17,17 @@ pytest.importorskip("trimesh")
 import trimesh
 
 from tactile_rt.recording import write_object
-from tactile_rt.sim_backend.dataset import SweepRecipe
+from tactile_rt.sim_backend.dataset import describe_set
+from tactile_rt.sim_backend.recipe_files import read_recipe
 
-TINY = ("--objects", 3, "--validation", 1, "--test", 1, "--sweeps", 1)
+TINY = ("--recipe", "mouse12", "--objects", 3, "--validation", 1, "--test", 1, "--sweeps", 1)
+
+
+def tiny_recipe():
+    """What `TINY` says."""
+    recipe = read_recipe("mouse12")
+    objects = replace(recipe.objects, per_category=3, validation=1, test=1)
+    return replace(recipe, objects=objects, sweeps=replace(recipe.sweeps, draws=1))
 
 
 @pytest.fixture
@@ -45,9 +54,8 @@ def a_file(tmp_path):
 @pytest.fixture
 def sweep_set(tmp_path):
     """A sweep set of three objects a category, every sweep a touch as noise makes one."""
-    recipe, rng = SweepRecipe(objects=3, validation=1, test=1, sweeps=1), np.random.default_rng(0)
-    folder = tmp_path / "set"
-    manifest = recipe.manifest()
+    folder, rng = tmp_path / "set", np.random.default_rng(0)
+    manifest = describe_set(tiny_recipe())
     manifest.write(folder)
     for names in manifest.split.values():
         for name in names:
@@ -80,7 +88,7 @@ def test_an_impossible_set_is_refused_before_anything_is_written(refused, tmp_pa
 
 
 def test_another_set_in_the_folder_is_one_line(refused, sweep_set):
-    assert "holds another sweep set (other recipe)" in refused(
+    assert "holds another sweep set (other recipe.seed)" in refused(
         "sweep", sweep_set, *TINY, "--seed", 1
     )
 
@@ -263,7 +271,7 @@ def test_a_model_is_evaluated_only_on_what_it_was_made_for(
     assert "nan" not in out  # one sweep of each object: there is nothing to fuse
     assert len(list((tmp_path / "not" / "yet").iterdir())) == 2
 
-    spec = SweepRecipe().manifest().spec.to_json()
+    spec = describe_set(tiny_recipe()).spec.to_json()
     changed = tiny_model(spec=spec.replace('"fx"', '"gx"'))
     assert "was made for another array: channels[0]" in refused("eval", changed, sweep_set)
     changed = tiny_model(period_ns=1_000_000)

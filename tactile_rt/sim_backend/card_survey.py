@@ -1,0 +1,176 @@
+"""What is in a sweep set, counted and measured: the numbers of its card.
+
+One object is read at a time, so that the set may be larger than the memory.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.recording import SweepManifest, has_object, read_object, read_skipped
+from tactile_rt.sim_backend.separability import (
+    Features,
+    Separability,
+    check_separability,
+    window_features,
+)
+from tactile_rt.stream import ArraySpec, RecordingError
+
+__all__ = ["Card", "survey"]
+
+TOUCH_N = 1e-6  # a whisker is touched when its force exceeds this, and twice the lead's largest
+DECADES = (-7, 1)  # of the force histogram, N
+BINS_A_DECADE = 5
+PUBLISHED_CLIP = {"N": 1.0, "N m": 1e-2}  # Chung et al. (2025)
+NETWORK_CLIP = {"N": 5e-3, "N m": 5e-6}  # this package's networks
+
+
+@dataclass
+class Card:
+    """What was counted in a set.
+
+    Attributes:
+        sweeps, objects: counts per split and category.
+        skipped: objects that could not be made, and why.
+        parameters: least, mean and greatest value of each sweep parameter.
+        force_edges: (bin + 1,) of the histogram of the largest force of every touched whisker in
+            every sweep, N.
+        force_counts: (bin,).
+        median_force: of these, N.
+        coverage: share of the sweeps in which each whisker is touched, by name.
+        whiskers_touched: mean number of whiskers touched by a sweep that touches.
+        samples: values of one channel of one element at one time, in all sweeps.
+        clips: how many of them exceed a limit, by limit.
+        largest: the largest force, N, and where it occurs.
+        without_touch: sweeps in which nothing is felt.
+        misses: sweeps known to pass beside the array.
+        unstable: sweeps that could not be simulated at the set's profile, and are empty.
+        not_finite: sweeps with a value that is no number.
+        separability: support vector machines on few classes, see `separability`.
+    """
+
+    sweeps: dict[str, dict[str, int]] = field(default_factory=dict)
+    objects: dict[str, dict[str, int]] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+    parameters: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    force_edges: list[float] = field(default_factory=list)
+    force_counts: list[int] = field(default_factory=list)
+    median_force: float = 0.0
+    coverage: dict[str, float] = field(default_factory=dict)
+    whiskers_touched: float = 0.0
+    samples: int = 0
+    clips: dict[str, int] = field(default_factory=dict)
+    largest: tuple[float, str] = (0.0, "")
+    without_touch: int = 0
+    misses: int = 0
+    unstable: int = 0
+    not_finite: int = 0
+    separability: list[Separability] = field(default_factory=list)
+
+
+@dataclass
+class _Findings:
+    """What is gathered from one object after the other."""
+
+    # (element,) of every sweep: the largest force, N; 0 where it is not touched.
+    peaks: list[NDArray[np.float32]] = field(default_factory=list)
+    parameters: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
+    # Of the sweeps with a touch, of the splits that a machine is trained and tested on.
+    features: dict[str, list[NDArray[np.float32]]] = field(
+        default_factory=lambda: {"train": [], "test": []}
+    )
+    categories: dict[str, list[str]] = field(default_factory=lambda: {"train": [], "test": []})
+    examples: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # (sample, element) N
+
+
+def survey(folder: Path) -> tuple[Card, dict[str, NDArray[np.float32]]]:
+    """Measure a set: the objects that are there.
+
+    Returns:
+        The card, and the force (sample, element), N, of one sweep of some categories.
+
+    Raises:
+        RecordingError: no such set, nothing in it, or an object is damaged.
+    """
+    manifest = SweepManifest.read(folder)
+    card, found = Card(skipped=read_skipped(folder)), _Findings()
+    for split, names in manifest.split.items():
+        for name in names:
+            if has_object(folder, name):
+                _take(card, found, manifest, folder, split, name)
+    if not found.peaks:
+        raise RecordingError(f"{folder} has no sweeps yet: there is nothing to write a card of")
+    _summarise(card, found, manifest.spec)
+    train, test = (
+        Features(np.array(found.features[s]), np.array(found.categories[s]))
+        for s in ("train", "test")
+    )
+    if len(train.categories) and len(test.categories):
+        card.separability = check_separability(train, test)
+    return card, found.examples
+
+
+def _take(
+    card: Card, found: _Findings, manifest: SweepManifest, folder: Path, split: str, name: str
+) -> None:
+    """Add one object's sweeps."""
+    values, parameters = read_object(folder, name)
+    category, units = manifest.category(name), manifest.spec.units
+    for counts, n in ((card.objects, 1), (card.sweeps, len(values))):
+        counts.setdefault(split, {}).setdefault(category, 0)
+        counts[split][category] += n
+    for key, drawn in parameters.items():
+        if drawn.dtype.kind == "U":  # a name, which has no range
+            continue
+        found.parameters.setdefault(key, []).append(drawn)
+    card.misses += int((parameters.get("touches", np.array(True)) == 0).sum())
+    card.unstable += int(parameters.get("unstable", np.array(False)).sum())
+    card.samples += values.size
+    for label, limits in (("published", PUBLISHED_CLIP), ("networks", NETWORK_CLIP)):
+        for unit in dict.fromkeys(units):
+            beyond = np.abs(values[..., _of(units, unit)]) > limits[unit]
+            key = f"{limits[unit]:g} {unit} ({label})"
+            card.clips[key] = card.clips.get(key, 0) + int(beyond.sum())
+    for index, sweep in enumerate(values):
+        if not np.isfinite(sweep).all():
+            card.not_finite += 1
+            continue
+        force = np.linalg.norm(sweep[..., _of(units, "N")], axis=2)  # (sample, element)
+        noise = force[: manifest.lead].max(initial=0.0)
+        threshold = max(TOUCH_N, float(2 * noise))
+        peak = force.max(axis=0)
+        found.peaks.append(np.where(peak > threshold, peak, np.float32(0)))
+        if peak.max() > card.largest[0]:
+            card.largest = (float(peak.max()), f"{name}, sweep {index}")
+        if not (peak > threshold).any():
+            card.without_touch += 1
+            continue
+        found.examples.setdefault(category, force)
+        if split in found.features:
+            start = int(np.argmax((force > threshold).any(axis=1)))
+            period_ms = manifest.period_ns * 1e-6
+            found.features[split].append(window_features(sweep, start, period_ms, units))
+            found.categories[split].append(category)
+
+
+def _of(units: tuple[str, ...], unit: str) -> list[int]:
+    return [i for i, u in enumerate(units) if u == unit]
+
+
+def _summarise(card: Card, found: _Findings, spec: ArraySpec) -> None:
+    for key, drawn in found.parameters.items():
+        all_of_it = np.concatenate(drawn)
+        least, mean, greatest = all_of_it.min(), all_of_it.mean(), all_of_it.max()
+        card.parameters[key] = (float(least), float(mean), float(greatest))
+    peaks = np.stack(found.peaks)  # (sweep, element), 0 where untouched
+    touched = peaks > 0
+    edges = np.logspace(*DECADES, (DECADES[1] - DECADES[0]) * BINS_A_DECADE + 1)
+    card.force_edges = edges.tolist()
+    card.force_counts = np.histogram(peaks[touched], edges)[0].tolist()
+    card.median_force = float(np.median(peaks[touched])) if touched.any() else 0.0
+    card.coverage = dict(zip(spec.elements, touched.mean(axis=0).tolist(), strict=True))
+    touching = touched.any(axis=1)
+    card.whiskers_touched = float(touched[touching].sum(axis=1).mean()) if touching.any() else 0.0

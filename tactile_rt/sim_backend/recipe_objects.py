@@ -1,0 +1,189 @@
+"""The objects of a recipe: their names, their split, and each by its name."""
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tactile_rt.recording import SPLITS, WITHHELD, split_by_object
+from tactile_rt.sim_backend import objects as shapes
+from tactile_rt.sim_backend.objects import TactileObject, load_object
+from tactile_rt.sim_backend.recipe_tables import misnamed
+from tactile_rt.sim_backend.recipes import SHAPES, ObjectChoice
+from tactile_rt.stream import ConfigError
+
+if TYPE_CHECKING:
+    from tactile_rt.sim_backend.object_sets import ObjectSet
+
+__all__ = ["MeshObjects", "ShapeObjects", "choose_objects"]
+
+PER_WITHHELD = 12
+
+
+@dataclass(frozen=True)
+class ShapeObjects:
+    """Parametric objects.
+
+    Raises:
+        ConfigError: a category does not exist, or has too few objects for the split.
+    """
+
+    choice: ObjectChoice
+
+    @cached_property
+    def categories(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of their labels."""
+        _check(self.choice.categories, (*shapes.CATEGORIES, *shapes.WITHHELD))
+        known = (c for c in shapes.CATEGORIES if c not in self.choice.withheld)
+        return self.choice.categories or tuple(known)
+
+    @cached_property
+    def withheld(self) -> tuple[str, ...]:
+        """Names of the categories that training never sees."""
+        _check(self.choice.withheld, (*shapes.CATEGORIES, *shapes.WITHHELD))
+        return self.choice.withheld or (shapes.WITHHELD if self.choice.per_withheld else ())
+
+    @cached_property
+    def split(self) -> dict[str, tuple[str, ...]]:
+        """Object names per split."""
+        choice = self.choice
+        validation, test = int(choice.validation), int(choice.test)
+        if choice.per_category - validation - test < 1:
+            raise ConfigError(
+                f"{choice.per_category} objects cannot be split with {validation} for validation "
+                f"and {test} for test: each side needs at least one"
+            )
+        split = split_by_object(self.categories, choice.per_category, validation, test)
+        if self.withheld:
+            count = choice.per_withheld or PER_WITHHELD
+            split[WITHHELD] = tuple(f"{c}-{i}" for i in range(count) for c in self.withheld)
+        return split
+
+    @property
+    def category_of(self) -> dict[str, str]:
+        """Nothing: the names tell."""
+        return {}
+
+    @property
+    def skipped(self) -> dict[str, str]:
+        """Nothing: all of them can be made."""
+        return {}
+
+    def load(self, name: str) -> TactileObject:
+        """An object by its name."""
+        return load_object(name)
+
+
+@dataclass(frozen=True)
+class MeshObjects:
+    """Objects out of a folder of meshes, see `object_sets`.
+
+    Which of them are held out depends on their names alone, so that a folder that grows moves few
+    from one side to the other.
+
+    Raises:
+        ConfigError: no such folder, a category is not in it, or has too few objects for the split.
+    """
+
+    choice: ObjectChoice
+
+    @cached_property
+    def _set(self) -> "ObjectSet":
+        from tactile_rt.sim_backend.object_sets import open_objects  # CoACD is slow to import
+
+        return open_objects(Path(self.choice.source))
+
+    @cached_property
+    def _names(self) -> dict[str, str]:
+        """The folder's name of every object, by a name that a file can have."""
+        names = {name.replace("/", "-"): name for name in self._set.names}
+        if len(names) < len(self._set.names):
+            raise ConfigError(f"{self.choice.source}: two objects differ by / and - alone")
+        return names
+
+    @cached_property
+    def _by_category(self) -> dict[str, list[str]]:
+        found: dict[str, list[str]] = {}
+        # A mixed order that is the same on every machine.
+        for name in sorted(self._names, key=lambda n: (zlib.crc32(n.encode()), n)):
+            found.setdefault(self._set.categories[self._names[name]], []).append(name)
+        return found
+
+    @cached_property
+    def categories(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of their labels."""
+        known = tuple(sorted(self._by_category))
+        _check(self.choice.categories, known)
+        return self.choice.categories or tuple(c for c in known if c not in self.withheld)
+
+    @cached_property
+    def withheld(self) -> tuple[str, ...]:
+        """Names of the categories that training never sees."""
+        _check(self.choice.withheld, tuple(sorted(self._by_category)))
+        return self.choice.withheld
+
+    @cached_property
+    def split(self) -> dict[str, tuple[str, ...]]:
+        """Object names per split."""
+        sides: dict[str, list[str]] = {split: [] for split in SPLITS}
+        for category in self.categories:
+            names = self._by_category[category][: self.choice.per_category or None]
+            validation, test = (
+                _count(n, len(names)) for n in (self.choice.validation, self.choice.test)
+            )
+            train = len(names) - validation - test
+            if train < 1:
+                raise ConfigError(
+                    f"{self.choice.source}: {category} has {len(names)} objects, too few to hold "
+                    f"out {validation} for validation and {test} for test: leave it out of "
+                    "objects.categories, or hold out fewer"
+                )
+            ends = (0, train, train + validation, len(names))
+            for side, (start, stop) in zip(SPLITS, pairwise(ends), strict=True):
+                sides[side] += names[start:stop]
+        split = {key: tuple(names) for key, names in sides.items()}
+        if self.withheld:
+            count = self.choice.per_withheld or None
+            split[WITHHELD] = tuple(n for c in self.withheld for n in self._by_category[c][:count])
+        return split
+
+    @property
+    def category_of(self) -> dict[str, str]:
+        """Category of every object."""
+        return {
+            name: self._set.categories[self._names[name]]
+            for names in self.split.values()
+            for name in names
+        }
+
+    @property
+    def skipped(self) -> dict[str, str]:
+        """What of the folder cannot be used, and why, as far as a look at it tells."""
+        return dict(self._set.skipped)
+
+    def load(self, name: str) -> TactileObject:
+        """An object by its name.
+
+        Raises:
+            ConfigError: its mesh is broken.
+        """
+        return self._set.load(self._names[name])
+
+
+def choose_objects(choice: ObjectChoice) -> ShapeObjects | MeshObjects:
+    """What a recipe's choice of objects comes to."""
+    return ShapeObjects(choice) if choice.source == SHAPES else MeshObjects(choice)
+
+
+def _count(wanted: float, of: int) -> int:
+    """So many, or such a fraction: at least one, if any."""
+    return max(1, round(wanted * of)) if 0 < wanted < 1 else int(wanted)
+
+
+def _check(names: Sequence[str], known: Sequence[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise ConfigError(misnamed("category", name, known))

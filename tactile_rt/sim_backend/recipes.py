@@ -1,0 +1,291 @@
+"""What a sweep set is: its objects and their split, and how each is swept past the array.
+
+`recipe_files` reads them, by name or from TOML:
+
+    name = "mine"
+    array = "mouse"
+    profile = "realtime"
+    seed = 0
+    period_ms = 9             # of the stored samples; 1 keeps the simulator's own 1 kHz
+    [objects]
+    from = "shapes"           # the parametric ones, or a folder of meshes
+    per_category = 60
+    [sweeps]
+    draws = 12                # for every combination of the `each` values
+    height_mm = { each = [-5, 0] }
+    speed_mm_s = { between = [28, 40] }
+    size_mm = 40
+
+Every sweep is drawn from (seed, object, sweep index) alone, so that any one of them can be made
+again by itself, and a set at another profile holds the very same sweeps (but for the few that
+one of the profiles cannot simulate, which are drawn again).
+"""
+
+import zlib
+from dataclasses import asdict, dataclass, fields
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS
+from tactile_rt.sim_backend.randomisation import Randomisation
+from tactile_rt.sim_backend.recipe_tables import misnamed
+from tactile_rt.sim_backend.sensor import SensorModel
+from tactile_rt.sim_backend.sweep import Sweep
+from tactile_rt.stream import ConfigError
+
+__all__ = [
+    "PARAMETERS",
+    "SHAPES",
+    "Between",
+    "Choice",
+    "Each",
+    "ObjectChoice",
+    "SweepChoice",
+    "SweepRecipe",
+]
+
+SHAPES = "shapes"
+PERFECT, UNVARIED = SensorModel(), Randomisation()
+POSITIVE = ("size_mm", "speed_mm_s")  # of the sweep's parameters; a gap may also be 0
+
+
+@dataclass(frozen=True)
+class Between:
+    """Drawn evenly from an interval, afresh for every sweep."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Each:
+    """Every one of these values, with every one of the other parameters'."""
+
+    values: tuple[float, ...]
+
+
+Choice = float | Between | Each
+
+
+@dataclass(frozen=True)
+class ObjectChoice:
+    """Which objects, and who is held out.
+
+    Attributes:
+        source: "shapes" (the parametric ones) or a folder of meshes.
+        categories: class names; empty: all that there are.
+        withheld: categories of the extra split "withheld", which is for open-set tests: their
+            objects are in no other split. Empty: none, or `objects.WITHHELD` if `per_withheld`
+            asks for some.
+        per_category: objects of every category; 0: all that the folder has.
+        validation, test: how many of every category are held out; below 1 a fraction.
+        per_withheld: objects of every withheld category; 0: 12, or all that the folder has.
+    """
+
+    source: str = SHAPES
+    categories: tuple[str, ...] = ()
+    withheld: tuple[str, ...] = ()
+    per_category: int = 60
+    validation: float = 4
+    test: float = 12
+    per_withheld: int = 0
+
+
+@dataclass(frozen=True)
+class SweepChoice:
+    """How every object is swept: see `sweep.Sweep` for the parameters.
+
+    Attributes:
+        draws: sweeps of every combination of the `Each` values.
+        held_out_draws: as many more, marked by a `draw` of `draws` and above.
+    """
+
+    size_mm: Choice = 40.0
+    speed_mm_s: Choice = 34.0
+    yaw_deg: Choice = 0.0
+    height_mm: Choice = -2.0
+    distance_mm: Choice = 6.5
+    gap_mm: Choice = 2.0
+    draws: int = 1
+    held_out_draws: int = 0
+
+    def combinations(self) -> list[dict[str, float]]:
+        """The `Each` values, in every combination; the last parameter varies fastest."""
+        each = {n: c.values for n in PARAMETERS if isinstance(c := getattr(self, n), Each)}
+        return [dict(zip(each, values, strict=True)) for values in product(*each.values())]
+
+    def __len__(self) -> int:
+        return len(self.combinations()) * (self.draws + self.held_out_draws)
+
+    @property
+    def is_grid(self) -> bool:
+        """Whether a sweep that misses the array stays: a grid is to have all its points."""
+        return any(isinstance(getattr(self, n), Each) for n in PARAMETERS)
+
+    def draw_index(self, index: int) -> int:
+        """Which draw of its combination sweep `index` of an object is, from 0."""
+        return index % (self.draws + self.held_out_draws)
+
+    def draw(self, rng: np.random.Generator, index: int) -> Sweep:
+        """Draw the parameters of sweep `index`."""
+        values = self.combinations()[index // (self.draws + self.held_out_draws)]
+        for name in PARAMETERS:
+            choice = getattr(self, name)
+            if isinstance(choice, Between):
+                values[name] = float(rng.uniform(choice.low, choice.high))
+            elif not isinstance(choice, Each):
+                values[name] = float(choice)
+        return Sweep(**values)
+
+
+PARAMETERS = tuple(f.name for f in fields(SweepChoice) if not f.name.endswith("draws"))
+
+
+@dataclass(frozen=True)
+class SweepRecipe:
+    """How a sweep set is made.
+
+    Attributes:
+        name: what the set is called.
+        array: which whiskers, see `arrays.load_array`.
+        profile: simulation profile, see `array.PROFILES`.
+        seed: of the drawn parameters.
+        period_ms: of the stored samples, ms.
+        lead_ms: at rest, before the simulation starts, ms: enough for a tare.
+        length_ms: of one sweep, the lead included, ms.
+        objects: what is swept.
+        sweeps: how it is swept.
+        sensor: what the sensors make of the loads; perfect ones unless it says otherwise.
+        randomisation: how the array of each sweep differs from its description; not at all unless
+            it says so.
+
+    Raises:
+        ConfigError: values that cannot be, or contradict each other.
+    """
+
+    name: str = "unnamed"
+    array: str = "mouse"
+    profile: str = "realtime"
+    seed: int = 0
+    period_ms: float = 9.0  # five of them make one network step (Chung et al. 2025)
+    lead_ms: float = 216.0
+    length_ms: float = 1476.0  # 22 network steps from onset and to spare
+    objects: ObjectChoice = ObjectChoice()
+    sweeps: SweepChoice = SweepChoice()
+    sensor: SensorModel = PERFECT
+    randomisation: Randomisation = UNVARIED
+
+    def __post_init__(self) -> None:
+        _check_recipe(self)
+
+    @property
+    def period_ns(self) -> int:
+        """Period of the stored samples, ns."""
+        return round(self.period_ms * 1e6)
+
+    @property
+    def lead(self) -> int:
+        """Stored samples before the object can touch."""
+        return round(self.lead_ms / self.period_ms)
+
+    @property
+    def samples(self) -> int:
+        """Stored samples of one sweep."""
+        return round(self.length_ms / self.period_ms)
+
+    def rng(self, name: str, index: int, stream: int = 0) -> np.random.Generator:
+        """The random numbers of sweep `index` of an object, see `key`."""
+        return np.random.default_rng(self.key(name, index, stream))
+
+    def key(self, name: str, index: int, stream: int = 0) -> list[int]:
+        """What the random numbers of a sweep are seeded with.
+
+        Args:
+            name: the object.
+            index: the sweep.
+            stream: 0 for the sweep's parameters; others are for what may be added to them, so
+                that a sensor model changes no sweep.
+        """
+        # crc32 because hash() of a string differs from one process to the next
+        return [self.seed, zlib.crc32(name.encode()), index, *([stream] if stream else [])]
+
+    def to_dict(self) -> dict[str, Any]:
+        """As a recipe file has it; `recipe_files.recipe_from_dict` takes it back."""
+        objects = {
+            key: list(value) if isinstance(value, tuple) else value
+            for key, value in asdict(self.objects).items()
+        }
+        sweeps = {name: _written(getattr(self.sweeps, name)) for name in PARAMETERS}
+        return {
+            **{f.name: getattr(self, f.name) for f in fields(self)},
+            "objects": {"from": objects.pop("source"), **objects},
+            "sweeps": {
+                "draws": self.sweeps.draws,
+                "held_out_draws": self.sweeps.held_out_draws,
+                **sweeps,
+            },
+            "sensor": _differing_from_default(self.sensor),
+            "randomisation": _differing_from_default(self.randomisation),
+        }
+
+
+def _differing_from_default(settings: SensorModel | Randomisation) -> dict[str, float]:
+    default = type(settings)()
+    return {k: v for k, v in asdict(settings).items() if v != getattr(default, k)}
+
+
+def _written(choice: Choice) -> Any:
+    if isinstance(choice, Between):
+        return {"between": [choice.low, choice.high]}
+    return {"each": list(choice.values)} if isinstance(choice, Each) else choice
+
+
+def _check_recipe(recipe: SweepRecipe) -> None:
+    if recipe.profile not in PROFILES:
+        raise ConfigError(misnamed("profile", recipe.profile, tuple(PROFILES)))
+    if recipe.seed < 0:
+        raise ConfigError(f"seed must be 0 or more, not {recipe.seed}")
+    if recipe.period_ms < SAMPLE_MS:
+        raise ConfigError(
+            f"period_ms must be {SAMPLE_MS:g} or more, the simulator's own, not {recipe.period_ms}"
+        )
+    if not 0 <= recipe.lead < recipe.samples:
+        raise ConfigError(
+            f"length_ms ({recipe.length_ms:g}) must exceed lead_ms ({recipe.lead_ms:g}), which "
+            "must be 0 or more"
+        )
+    sweeps, objects = recipe.sweeps, recipe.objects
+    if sweeps.draws < 1:
+        raise ConfigError(f"sweeps.draws must be at least 1, not {sweeps.draws}")
+    if sweeps.held_out_draws < 0:
+        raise ConfigError(f"sweeps.held_out_draws must be 0 or more, not {sweeps.held_out_draws}")
+    for name in PARAMETERS:
+        choice = getattr(sweeps, name)
+        if isinstance(choice, Between) and choice.low > choice.high:
+            raise ConfigError(
+                f"sweeps.{name}: between has its lower end first, not {choice.low:g}, "
+                f"{choice.high:g}"
+            )
+        lowest = _lowest(choice)
+        if (name in POSITIVE and lowest <= 0) or (name == "gap_mm" and lowest < 0):
+            least = "0 or more" if name == "gap_mm" else "positive"
+            raise ConfigError(f"sweeps.{name} must be {least}, not {lowest:g}")
+    both = sorted(set(objects.categories) & set(objects.withheld))
+    if both:
+        raise ConfigError(f"objects.withheld: {both[0]!r} is also one of the categories")
+    whole = objects.source == SHAPES
+    if objects.per_withheld < 0:
+        raise ConfigError(f"objects.per_withheld must be 0 or more, not {objects.per_withheld}")
+    for name in ("per_category", "validation", "test"):
+        value = getattr(objects, name)
+        if value < 0 or (whole and value < 1) or (value >= 1 and value != int(value)):
+            kinds = "a whole number" if whole else "a whole number, or a fraction below 1"
+            raise ConfigError(f"objects.{name} must be {kinds}, at least 1, not {value:g}")
+
+
+def _lowest(choice: Choice) -> float:
+    if isinstance(choice, Between):
+        return choice.low
+    return min(choice.values) if isinstance(choice, Each) else choice

@@ -1,0 +1,92 @@
+"""`tactile-rt sweep`: what its options come to."""
+
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("trimesh")
+
+from tactile_rt.recording import SweepManifest
+from tactile_rt.sim_backend.recipe_files import recipe_of_set
+
+TINY = """
+name = "tiny"
+lead_ms = 45
+length_ms = 180
+[objects]
+categories = ["mug"]
+per_category = 3
+validation = 1
+test = 1
+[sweeps]
+draws = 2
+yaw_deg = { between = [0, 360] }
+gap_mm = 0.5
+"""
+
+
+@pytest.fixture
+def recipe(tmp_path):
+    path = tmp_path / "tiny.toml"
+    path.write_text(TINY)
+    return path
+
+
+def made(folder):
+    manifest = SweepManifest.read(folder)
+    return recipe_of_set(manifest.recipe, manifest.categories)
+
+
+def test_a_set_is_made_gone_on_with_described_and_checked(call, recipe, tmp_path):
+    folder = tmp_path / "set"
+    options = ("--seed", 3, "--sweeps", 1, "--processes", 1)
+    code, out, err = call("sweep", folder, "--recipe", recipe, *options, "--split", "test")
+    assert (code, out) == (0, "")
+    assert "1 sweeps at profile realtime" in err
+    assert sorted(p.stem for p in folder.glob("*.npz")) == ["mug-2"]
+    assert (made(folder).name, made(folder).seed, len(made(folder).sweeps)) == ("tiny", 3, 1)
+
+    code, _, err = call("sweep", folder, "--processes", 1)  # goes on as it was begun
+    assert code == 0
+    assert "3 sweeps" in err
+    assert sorted(p.stem for p in folder.glob("*.npz")) == ["mug-0", "mug-1", "mug-2"]
+    code, _, err = call("sweep", folder, "--verify")
+    assert (code, "4 files are as they were written" in err) == (0, True)
+
+    pytest.importorskip("matplotlib")
+    pytest.importorskip("sklearn")
+    assert call("sweep", folder, "--card")[0] == 0
+    assert "3 simulated sweeps of 3 objects" in (folder / "README.md").read_text()
+    (folder / "mug-1.npz").write_bytes(b"")
+    code, _, err = call("sweep", folder, "--verify")
+    assert code == 2
+    assert "missing or damaged: mug-1.npz" in err.replace("\n", " ")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--recipe", "tiny"), "no recipe 'tiny': there are default24,"),
+        (("--recipe", "none.toml"), "cannot read recipe none.toml"),
+        (("--objects", 2), "2 objects cannot be split with 4 for validation and 12 for test"),
+        (("--sweeps", 0), "sweeps.draws must be at least 1, not 0"),
+        (("--validation", 0), "objects.validation must be a whole number"),
+        (("--engine", "spark"), "no engine 'spark': there are processes, ray"),
+        (("--verify",), "has no SHA256SUMS"),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_nothing(call, tmp_path, monkeypatch, options, said):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = call("sweep", tmp_path / "set", *options)
+    assert (code, out) == (2, "")
+    assert err.startswith("tactile-rt: ")
+    assert err.count("\n") == 1
+    assert said in err
+    assert not (tmp_path / "set").exists()
+
+
+def test_another_profile_of_a_set_goes_elsewhere(call, recipe, tmp_path):
+    folder = tmp_path / "set"
+    assert call("sweep", folder, "--recipe", recipe, "--split", "test", "--processes", 1)[0] == 0
+    code, _, err = call("sweep", folder, "--profile", "accurate")
+    assert code == 2
+    assert "holds another sweep set (other recipe.profile, " in err
