@@ -15,7 +15,12 @@ import numpy as np
 import numpy.typing as npt
 from PIL import Image
 
-from tactile_rt.sim_backend.objects import CATEGORIES, WITHHELD, TactileObject, make_object
+from tactile_rt.sim_backend.objects.catalogue import (
+    CATEGORIES,
+    WITHHELD,
+    TactileObject,
+    make_object,
+)
 
 Floats = npt.NDArray[np.float64]
 

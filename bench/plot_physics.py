@@ -28,7 +28,7 @@ from tactile_rt.benchmarks import sim
 from tactile_rt.benchmarks.beams import beams, flat, measure
 from tactile_rt.benchmarks.pegs import PEG_RADIUS_MM, Press, press, press_states, presses
 from tactile_rt.benchmarks.reference_model import reference_cost
-from tactile_rt.sim_backend.array import PROFILES
+from tactile_rt.sim_backend.world import PROFILES
 
 DOCS = Path(__file__).parents[1] / "docs"
 INK, BLUE, ORANGE, GREY = "#20262e", "#1f6fb2", "#d95f0e", "#9aa3ad"

@@ -12,15 +12,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from tactile_rt.sim_backend.array import PROFILES, array_spec
-from tactile_rt.sim_backend.arrays import load_array
-from tactile_rt.sim_backend.objects import make_object
+from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
 from tactile_rt.sim_backend.views.camera import Camera
 from tactile_rt.sim_backend.views.footage import record
 from tactile_rt.sim_backend.views.panels import INK, QUIET, ForceMap, draw_scale, draw_traces
 from tactile_rt.sim_backend.views.scale import ForceScale
 from tactile_rt.sim_backend.views.stage import Stage
+from tactile_rt.sim_backend.world import PROFILES, array_spec
 
 TARGET, PROFILE = ("mug", 1), "dataset"
 SWEEP = Sweep(size_mm=28, yaw_deg=120)

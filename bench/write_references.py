@@ -13,7 +13,7 @@ import beams as theory
 
 from tactile_rt.benchmarks.beams import GRAVITY, flat
 from tactile_rt.benchmarks.pegs import PEG_RADIUS_MM
-from tactile_rt.sim_backend.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
 
 DATA = Path(__file__).parents[1] / "tactile_rt" / "benchmarks" / "data"
 BENDS = {"straight": 1, "convex": -1, "concave": 1}  # and the side that the peg comes from

@@ -11,7 +11,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.array import (
+from tactile_rt.sim_backend.arrays.whiskers import Whisker, mouse_whiskers
+from tactile_rt.sim_backend.world import (
     Mount,
     Profile,
     add_whiskers,
@@ -19,7 +20,6 @@ from tactile_rt.sim_backend.array import (
     read_base_loads,
     set_damping,
 )
-from tactile_rt.sim_backend.whiskers import Whisker, mouse_whiskers
 
 __all__ = ["GRAVITY", "ORIGIN", "Beam", "BeamErrors", "beams", "flat", "measure", "ring"]
 

@@ -9,7 +9,12 @@ import numpy as np
 from tactile_rt.benchmarks.beams import BeamErrors, beams, flat, measure
 from tactile_rt.benchmarks.pegs import SLIDE_MM_S, press, presses
 from tactile_rt.benchmarks.records import Record
-from tactile_rt.sim_backend.array import (
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
+from tactile_rt.sim_backend.arrays.whiskers import FRICTION, mouse_whiskers
+from tactile_rt.sim_backend.objects.catalogue import TactileObject
+from tactile_rt.sim_backend.objects.solids import box
+from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.world import (
     MOUNT,
     PROFILES,
     Profile,
@@ -18,11 +23,6 @@ from tactile_rt.sim_backend.array import (
     read_base_loads,
     set_damping,
 )
-from tactile_rt.sim_backend.arrays import WhiskerArray
-from tactile_rt.sim_backend.objects import TactileObject
-from tactile_rt.sim_backend.solids import box
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
-from tactile_rt.sim_backend.whiskers import FRICTION, mouse_whiskers
 
 __all__ = ["FINE", "HEARD_HZ", "drift", "mechanics"]
 

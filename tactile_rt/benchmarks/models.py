@@ -7,8 +7,8 @@ from pathlib import Path
 from tactile_rt.benchmarks.classification import evaluate_model
 from tactile_rt.benchmarks.records import Record
 from tactile_rt.model_file import load_model, shipped_model
-from tactile_rt.sim_backend.dataset import make_sweeps
-from tactile_rt.sim_backend.recipe_files import recipe_of_set
+from tactile_rt.sim_backend.datasets.dataset import make_sweeps
+from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 
 __all__ = ["run"]
 

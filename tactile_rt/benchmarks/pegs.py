@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.benchmarks.beams import ORIGIN, flat
-from tactile_rt.sim_backend.array import (
+from tactile_rt.sim_backend.world import (
     OBJECT_BIT,
     WHISKER_BIT,
     Profile,

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from tactile_rt.benchmarks.mechanics import mechanics
 from tactile_rt.benchmarks.records import Record
 from tactile_rt.benchmarks.reference_model import PROTOTYPE_CPU_S, reference_cost
-from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS, Profile
-from tactile_rt.sim_backend.arrays import load_array
-from tactile_rt.sim_backend.objects import TactileObject, load_object
+from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
 from tactile_rt.sim_backend.source import REST_SAMPLES
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile
 
 __all__ = ["BULLET_CPU_S", "SWEEPS", "TRUTH", "SweepErrors", "compare", "cost", "run", "simulate"]
 

@@ -11,7 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tactile_rt.cli import app, needs, starting
 
 if TYPE_CHECKING:
-    from tactile_rt.sim_backend.recipes import SweepRecipe
+    from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 
 
 @app.command()
@@ -51,13 +51,13 @@ def sweep(
     """Sweep simulated objects past the whisker array and store what it feels."""
     console = Console(stderr=True, soft_wrap=True)
     if verify:
-        from tactile_rt.sim_backend.sums import check_sums
+        from tactile_rt.sim_backend.datasets.sums import check_sums
 
         console.print(f"{folder}: {check_sums(folder)} files are as they were written")
         return
     try:
         with starting():
-            from tactile_rt.sim_backend.dataset import describe_set, make_sweeps
+            from tactile_rt.sim_backend.datasets.dataset import describe_set, make_sweeps
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
     chosen = _override(
@@ -94,14 +94,18 @@ def _write_card(folder: Path) -> None:
         import sklearn  # noqa: F401
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
-    from tactile_rt.sim_backend.card import write_card
+    from tactile_rt.sim_backend.datasets.card import write_card
 
     write_card(folder)
 
 
 def _recipe(folder: Path, name: str | None) -> "SweepRecipe":
     from tactile_rt.recording import SweepManifest
-    from tactile_rt.sim_backend.recipe_files import DEFAULT_RECIPE, read_recipe, recipe_of_set
+    from tactile_rt.sim_backend.datasets.recipe_files import (
+        DEFAULT_RECIPE,
+        read_recipe,
+        recipe_of_set,
+    )
 
     if name is None and (folder / "manifest.json").exists():
         manifest = SweepManifest.read(folder)

@@ -62,9 +62,8 @@ def view(
     check_output(out)
     try:
         with starting():
-            from tactile_rt.sim_backend.array import PROFILES, world_spec
-            from tactile_rt.sim_backend.arrays import load_animals
-            from tactile_rt.sim_backend.objects import load_object
+            from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+            from tactile_rt.sim_backend.objects.catalogue import load_object
             from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
             from tactile_rt.sim_backend.views.camera import VIEWS
             from tactile_rt.sim_backend.views.film import Film, camera_of
@@ -77,6 +76,7 @@ def view(
                 write_image,
                 write_video,
             )
+            from tactile_rt.sim_backend.world import PROFILES, world_spec
     except ModuleNotFoundError as error:
         raise needs("sim,view", error) from None
     except (AttributeError, RuntimeError) as error:  # as mujoco does where it finds no such driver

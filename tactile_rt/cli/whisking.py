@@ -58,13 +58,13 @@ def whisk(
         with starting():
             import numpy as np
 
-            from tactile_rt.sim_backend.array import PROFILES, array_spec
-            from tactile_rt.sim_backend.arrays import load_array
-            from tactile_rt.sim_backend.objects import load_object
+            from tactile_rt.sim_backend.arrays.whisker_array import load_array
+            from tactile_rt.sim_backend.arrays.whiskers import rotation
+            from tactile_rt.sim_backend.objects.catalogue import load_object
             from tactile_rt.sim_backend.stimuli import STIMULI, Surface, whisk_against, write_input
             from tactile_rt.sim_backend.trajectories import Whisk, base_angles, read_trajectory
-            from tactile_rt.sim_backend.whiskers import rotation
             from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
+            from tactile_rt.sim_backend.world import PROFILES, array_spec
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
     if profile not in PROFILES:

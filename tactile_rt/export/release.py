@@ -1,6 +1,7 @@
 """A checkpoint made ready for robots: calibrated on validation sweeps, exported, described."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +31,6 @@ def release(checkpoint: Path, path: Path, name: str) -> ModelCard:
     labels = np.tile(validation.sweeps.labels, 2)
     temperature = fit_temperature(posteriors[:, -1], labels)
     recipe = validation.manifest.recipe
-    # Sets of version 1 had no recipe by name.
-    sweep = f" --recipe {recipe['name']}" if "name" in recipe else ""
     options = " ".join(
         f"--{k.replace('_', '-')} {config[k]}"
         for k in ("attender", "decoder", "width", "epochs", "batch", "learning_rate", "seed")
@@ -43,11 +42,26 @@ def release(checkpoint: Path, path: Path, name: str) -> ModelCard:
         temperature=temperature,
         figures={k: v for k, v in saved["metrics"].items() if k.startswith("validation")},
         commands=(
-            f"tactile-rt sweep {config['data']}{sweep}",
+            f"tactile-rt sweep {config['data']} {_sweep_options(recipe)}",
             f"tactile-rt train {config['data']} {checkpoint.parent} {options}",
             f"tactile-rt export {checkpoint} {path.name} --name {name}",
         ),
     )
+
+
+def _sweep_options(recipe: dict[str, Any]) -> str:
+    """The options of `tactile-rt sweep` that make a set of this recipe again."""
+    options = recipe
+    if isinstance(recipe.get("objects"), dict):  # since version 2 of the manifest
+        objects = recipe["objects"]
+        options = {
+            "recipe": recipe["name"],
+            "objects": objects["per_category"],
+            **{side: f"{objects[side]:g}" for side in ("validation", "test")},
+            "sweeps": recipe["sweeps"]["draws"],
+            **{key: recipe[key] for key in ("profile", "seed")},
+        }
+    return " ".join(f"--{key} {value}" for key, value in options.items())
 
 
 def fit_temperature(posteriors: NDArray[np.float32], labels: NDArray[np.int64]) -> float:

@@ -10,8 +10,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays import Mount
-from tactile_rt.sim_backend.whiskers import Whisker
+from tactile_rt.sim_backend.arrays.whisker_array import Mount
+from tactile_rt.sim_backend.arrays.whiskers import Whisker
 
 __all__ = ["centrelines", "way_to_contact", "within_reach"]
 

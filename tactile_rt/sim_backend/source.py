@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS, world_spec
-from tactile_rt.sim_backend.arrays import load_animals
-from tactile_rt.sim_backend.objects import CATEGORIES, load_object
+from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, load_object
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, world_spec
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source
 from tactile_rt.timebase import NS_PER_S
 

@@ -25,9 +25,9 @@ from numpy.typing import NDArray
 
 from tactile_rt import __version__
 from tactile_rt.recording import write_whole
-from tactile_rt.sim_backend.array import SAMPLE_MS
-from tactile_rt.sim_backend.whiskers import rotation
+from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.whisking import WhiskSimulation
+from tactile_rt.sim_backend.world import SAMPLE_MS
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 from tactile_rt.timebase import Resampler
 

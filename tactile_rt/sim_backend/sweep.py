@@ -14,7 +14,11 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.approach import centrelines, way_to_contact, within_reach
-from tactile_rt.sim_backend.array import (
+from tactile_rt.sim_backend.arrays.head import add_head
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
+from tactile_rt.sim_backend.arrays.whiskers import rotation
+from tactile_rt.sim_backend.objects.catalogue import TactileObject
+from tactile_rt.sim_backend.world import (
     OBJECT_BIT,
     SAMPLE_MS,
     WHISKER_BIT,
@@ -25,10 +29,6 @@ from tactile_rt.sim_backend.array import (
     read_base_loads,
     set_damping,
 )
-from tactile_rt.sim_backend.arrays import WhiskerArray
-from tactile_rt.sim_backend.head import add_head
-from tactile_rt.sim_backend.objects import TactileObject
-from tactile_rt.sim_backend.whiskers import rotation
 from tactile_rt.stream import SourceError
 
 __all__ = ["Sweep", "SweepSimulation", "draw_simulation", "draw_sweep"]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from tactile_rt.sim_backend.whiskers import Whisker
+from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.stream import ConfigError
 
 __all__ = [

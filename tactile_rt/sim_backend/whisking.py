@@ -10,7 +10,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.array import (
+from tactile_rt.sim_backend.arrays.whisker_array import Mount
+from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
+from tactile_rt.sim_backend.trajectories import ANGLES, Trajectory, mirror
+from tactile_rt.sim_backend.world import (
     OBJECT_BIT,
     SAMPLE_MS,
     WHISKER_BIT,
@@ -20,9 +23,6 @@ from tactile_rt.sim_backend.array import (
     read_base_loads,
     set_damping,
 )
-from tactile_rt.sim_backend.arrays import Mount
-from tactile_rt.sim_backend.trajectories import ANGLES, Trajectory, mirror
-from tactile_rt.sim_backend.whiskers import Whisker, rotation
 from tactile_rt.stream import ConfigError
 
 __all__ = ["HEAD", "WhiskSimulation"]

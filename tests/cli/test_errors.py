@@ -17,8 +17,8 @@ pytest.importorskip("trimesh")
 import trimesh
 
 from tactile_rt.recording import write_object
-from tactile_rt.sim_backend.dataset import describe_set
-from tactile_rt.sim_backend.recipe_files import read_recipe
+from tactile_rt.sim_backend.datasets.dataset import describe_set
+from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 
 TINY = ("--recipe", "mouse12", "--objects", 3, "--validation", 1, "--test", 1, "--sweeps", 1)
 

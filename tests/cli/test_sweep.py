@@ -6,7 +6,7 @@ pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
 from tactile_rt.recording import SweepManifest
-from tactile_rt.sim_backend.recipe_files import recipe_of_set
+from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 
 TINY = """
 name = "tiny"

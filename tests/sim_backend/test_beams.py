@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 
 from tactile_rt.benchmarks.beams import GRAVITY, ORIGIN, beams, flat, measure, ring
-from tactile_rt.sim_backend.array import (
+from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.world import (
     PROFILES,
     Profile,
     add_whiskers,
     empty_world,
     set_damping,
 )
-from tactile_rt.sim_backend.whiskers import mouse_whiskers
 
 Floats = NDArray[np.float64]
 

@@ -12,10 +12,14 @@ pytest.importorskip("sklearn")
 from matplotlib.image import imread
 
 from tactile_rt.recording import SweepManifest, write_object, write_skipped
-from tactile_rt.sim_backend import separability
-from tactile_rt.sim_backend.card import write_card
-from tactile_rt.sim_backend.card_survey import survey
-from tactile_rt.sim_backend.separability import Features, check_separability, window_features
+from tactile_rt.sim_backend.datasets import separability
+from tactile_rt.sim_backend.datasets.card import write_card
+from tactile_rt.sim_backend.datasets.card_survey import survey
+from tactile_rt.sim_backend.datasets.separability import (
+    Features,
+    check_separability,
+    window_features,
+)
 from tactile_rt.stream import RecordingError
 from tactile_rt.testing import small_spec
 

@@ -15,7 +15,7 @@ from tactile_rt.benchmarks.beams import flat
 from tactile_rt.benchmarks.pegs import PEG_RADIUS_MM, Press, press, presses
 from tactile_rt.benchmarks.reference_model import reference_cost
 from tactile_rt.benchmarks.sim import SweepErrors, compare, run
-from tactile_rt.sim_backend.array import PROFILES
+from tactile_rt.sim_backend.world import PROFILES
 
 CASES = {
     f"{p.whisker} {p.bend} {p.place} {p.depth} {p.friction:+}".replace("+0.0", "0"): p

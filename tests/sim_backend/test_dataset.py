@@ -21,23 +21,28 @@ from tactile_rt.recording import (
     read_object,
     read_sweeps,
 )
-from tactile_rt.sim_backend import dataset
-from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS, UNITS
-from tactile_rt.sim_backend.arrays import load_array
-from tactile_rt.sim_backend.dataset import describe_set, fingerprint, make_sweeps, simulate_sweep
-from tactile_rt.sim_backend.objects import load_object, make_object
-from tactile_rt.sim_backend.randomisation import Randomisation
-from tactile_rt.sim_backend.recipe_files import read_recipe, recipe_of_set
-from tactile_rt.sim_backend.recipes import (
+from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.datasets import dataset
+from tactile_rt.sim_backend.datasets.dataset import (
+    describe_set,
+    fingerprint,
+    make_sweeps,
+    simulate_sweep,
+)
+from tactile_rt.sim_backend.datasets.recipe_files import read_recipe, recipe_of_set
+from tactile_rt.sim_backend.datasets.recipes import (
     Between,
     Each,
     ObjectChoice,
     SweepChoice,
     SweepRecipe,
 )
+from tactile_rt.sim_backend.datasets.sums import check_sums
+from tactile_rt.sim_backend.objects.catalogue import load_object, make_object
+from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import SensorModel
-from tactile_rt.sim_backend.sums import check_sums
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, UNITS
 from tactile_rt.stream import ConfigError, RecordingError, SourceError, TactileError
 from tactile_rt.testing import cut
 from tactile_rt.timebase import Resampler
@@ -319,7 +324,7 @@ def test_one_split_alone_is_what_the_whole_set_has_of_it(finished: Path, tmp_pat
 
 
 def test_a_finished_set_starts_no_process(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tactile_rt.sim_backend import engines
+    from tactile_rt.sim_backend.datasets import engines
 
     monkeypatch.setattr(engines, "_start", None)
     before = files(finished)
@@ -441,8 +446,8 @@ def test_a_set_without_sums_says_so(copied: Path) -> None:
 MAIN = """
 import sys
 from pathlib import Path
-from tactile_rt.sim_backend.dataset import make_sweeps
-from tactile_rt.sim_backend.recipe_files import recipe_of_set
+from tactile_rt.sim_backend.datasets.dataset import make_sweeps
+from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 import msgspec
 if __name__ == "__main__":
     folder, recipe, engine = sys.argv[1:]

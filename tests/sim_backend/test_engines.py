@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from frail_work import FrailWork
 
-from tactile_rt.sim_backend import engines
-from tactile_rt.sim_backend.engines import DIED, run_processes, run_ray
+from tactile_rt.sim_backend.datasets import engines
+from tactile_rt.sim_backend.datasets.engines import DIED, run_processes, run_ray
 from tactile_rt.stream import ConfigError
 
 
@@ -84,7 +84,7 @@ def test_no_process_outlives_a_parent_that_was_killed(tmp_path: Path) -> None:
         if __name__ == "__main__":
             sys.path.insert(0, {str(Path(__file__).parents[1])!r})
             from frail_work import FrailWork
-            from tactile_rt.sim_backend.engines import run_processes
+            from tactile_rt.sim_backend.datasets.engines import run_processes
             list(run_processes(FrailWork(Path({str(tmp_path)!r})), ["sleeps-60"], 1))
         """)
     (tmp_path / "main.py").write_text(program)

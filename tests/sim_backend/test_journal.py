@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.sim_backend.journal import Journal, SweepRecord, remove_leftovers
+from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove_leftovers
 
 
 def record(k: int) -> SweepRecord:

@@ -8,10 +8,10 @@ pytest.importorskip("trimesh")
 
 import trimesh
 
-from tactile_rt.sim_backend import meshes
-from tactile_rt.sim_backend.meshes import MESH_SUFFIXES, load_mesh
-from tactile_rt.sim_backend.objects import TactileObject, load_object, make_object
-from tactile_rt.sim_backend.solids import box
+from tactile_rt.sim_backend.objects import meshes
+from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object, make_object
+from tactile_rt.sim_backend.objects.meshes import MESH_SUFFIXES, load_mesh
+from tactile_rt.sim_backend.objects.solids import box
 from tactile_rt.stream import ConfigError
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])

@@ -9,14 +9,14 @@ import pytest
 
 pytest.importorskip("trimesh")
 
-from tactile_rt.sim_backend.objects import (
+from tactile_rt.sim_backend.objects.catalogue import (
     CATEGORIES,
     WITHHELD,
     TactileObject,
     load_object,
     make_object,
 )
-from tactile_rt.sim_backend.solids import bar, box, normalised, rod, wall
+from tactile_rt.sim_backend.objects.solids import bar, box, normalised, rod, wall
 from tactile_rt.stream import ConfigError
 
 KINDS = CATEGORIES + WITHHELD

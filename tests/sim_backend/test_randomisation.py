@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy import stats
 
-from tactile_rt.sim_backend.arrays import MOUNT, WhiskerArray
+from tactile_rt.sim_backend.arrays.whisker_array import MOUNT, WhiskerArray
+from tactile_rt.sim_backend.arrays.whiskers import Whisker, mouse_whiskers, rat_whiskers
 from tactile_rt.sim_backend.randomisation import Randomisation
-from tactile_rt.sim_backend.whiskers import Whisker, mouse_whiskers, rat_whiskers
 from tactile_rt.stream import ConfigError
 
 MOUSE = WhiskerArray("mouse-right", mouse_whiskers(), MOUNT, Path("head.stl"))

@@ -13,22 +13,22 @@ pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
 from tactile_rt.recording import WITHHELD
-from tactile_rt.sim_backend import objects
-from tactile_rt.sim_backend.dataset import describe_set
-from tactile_rt.sim_backend.recipe_files import (
+from tactile_rt.sim_backend.datasets.dataset import describe_set
+from tactile_rt.sim_backend.datasets.recipe_files import (
     read_recipe,
     recipe_from_dict,
     recipe_of_set,
     shipped_recipes,
 )
-from tactile_rt.sim_backend.recipe_objects import choose_objects
-from tactile_rt.sim_backend.recipes import (
+from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
+from tactile_rt.sim_backend.datasets.recipes import (
     Between,
     Each,
     ObjectChoice,
     SweepChoice,
     SweepRecipe,
 )
+from tactile_rt.sim_backend.objects import catalogue as objects
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.stream import ConfigError
 
@@ -310,7 +310,7 @@ class FakeFolder:
 def folder(monkeypatch: pytest.MonkeyPatch):
     def use(sizes: dict[str, int]) -> None:
         module = SimpleNamespace(open_objects=lambda path: FakeFolder(sizes))
-        monkeypatch.setitem(sys.modules, "tactile_rt.sim_backend.object_sets", module)
+        monkeypatch.setitem(sys.modules, "tactile_rt.sim_backend.objects.object_sets", module)
 
     return use
 

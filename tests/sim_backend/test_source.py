@@ -7,10 +7,10 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
-from tactile_rt.sim_backend.array import array_spec
-from tactile_rt.sim_backend.objects import CATEGORIES
+from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
 from tactile_rt.sim_backend.source import CHUNK_SAMPLES, REST_SAMPLES, SimOptions, SimSource
-from tactile_rt.sim_backend.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.world import array_spec
 from tactile_rt.sources import open_source
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, SourceStats, concatenate
 

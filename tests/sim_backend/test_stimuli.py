@@ -10,7 +10,7 @@ pytest.importorskip("mujoco")
 
 import mujoco
 
-from tactile_rt.sim_backend.array import OBJECT_BIT, PROFILES, array_spec
+from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
 from tactile_rt.sim_backend.stimuli import (
     PERIOD_NS,
     STIMULI,
@@ -21,8 +21,8 @@ from tactile_rt.sim_backend.stimuli import (
     write_input,
 )
 from tactile_rt.sim_backend.trajectories import Whisk
-from tactile_rt.sim_backend.whiskers import mouse_whiskers
 from tactile_rt.sim_backend.whisking import WhiskSimulation
+from tactile_rt.sim_backend.world import OBJECT_BIT, PROFILES, array_spec
 from tactile_rt.stream import ConfigError
 
 MOUSE = {w.name: w for w in mouse_whiskers()}

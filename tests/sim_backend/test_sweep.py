@@ -12,7 +12,17 @@ import mujoco
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.sim_backend.array import (
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray, load_array, place
+from tactile_rt.sim_backend.arrays.whiskers import Whisker
+from tactile_rt.sim_backend.objects.catalogue import (
+    CATEGORIES,
+    TactileObject,
+    load_object,
+    make_object,
+)
+from tactile_rt.sim_backend.objects.solids import box
+from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.world import (
     MOUNT,
     OBJECT_BIT,
     PROFILES,
@@ -20,11 +30,6 @@ from tactile_rt.sim_backend.array import (
     read_base_loads,
     world_spec,
 )
-from tactile_rt.sim_backend.arrays import WhiskerArray, load_array, place
-from tactile_rt.sim_backend.objects import CATEGORIES, TactileObject, load_object, make_object
-from tactile_rt.sim_backend.solids import box
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
-from tactile_rt.sim_backend.whiskers import Whisker
 from tactile_rt.stream import SourceError
 
 ALL = load_array("mouse")

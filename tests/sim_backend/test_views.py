@@ -13,9 +13,9 @@ import mujoco
 from matplotlib.figure import Figure
 from PIL import Image
 
-from tactile_rt.sim_backend.array import OBJECT_BIT, PROFILES, WHISKER_BIT, array_spec
-from tactile_rt.sim_backend.arrays import load_array
-from tactile_rt.sim_backend.objects import make_object
+from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
 from tactile_rt.sim_backend.views.camera import VIEWS, Camera, framing
 from tactile_rt.sim_backend.views.film import Film, camera_of
@@ -25,7 +25,7 @@ from tactile_rt.sim_backend.views.scale import ForceScale, round_number
 from tactile_rt.sim_backend.views.stage import Stage
 from tactile_rt.sim_backend.views.window import _Player, check_display
 from tactile_rt.sim_backend.views.writing import check_suffix, write_image, write_video
-from tactile_rt.sim_backend.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.world import OBJECT_BIT, PROFILES, WHISKER_BIT, array_spec
 from tactile_rt.stream import ArraySpec, ConfigError
 
 SCALE = ForceScale(1.0, 10.0)

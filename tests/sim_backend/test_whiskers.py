@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.sim_backend.whiskers import (
+from tactile_rt.sim_backend.arrays.whiskers import (
     OPTIONAL,
     REQUIRED,
     Whisker,
@@ -128,7 +128,9 @@ def test_the_rat_has_thirty_whiskers_without_e0_and_with_e6() -> None:
 
 @pytest.mark.parametrize("animal", ["mouse", "rat"])
 def test_every_number_of_the_tables_is_used_once(animal: str) -> None:
-    text = resources.files("tactile_rt.sim_backend").joinpath(f"data/{animal}.csv").read_text()
+    text = (
+        resources.files("tactile_rt.sim_backend.arrays").joinpath(f"data/{animal}.csv").read_text()
+    )
     rows = list(csv.reader(line for line in text.splitlines() if not line.startswith("#")))
     assert tuple(rows[0]) == REQUIRED
     made = mouse_whiskers() if animal == "mouse" else rat_whiskers()

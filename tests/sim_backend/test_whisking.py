@@ -10,17 +10,17 @@ pytest.importorskip("mujoco")
 import mujoco
 
 from tactile_rt.sim_backend import whisking
-from tactile_rt.sim_backend.array import (
+from tactile_rt.sim_backend.arrays.whisker_array import Mount, mirrored
+from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.trajectories import Whisk, base_angles, mirror, read_trajectory
+from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
+from tactile_rt.sim_backend.world import (
     PROFILES,
     Profile,
     add_whiskers,
     empty_world,
     set_damping,
 )
-from tactile_rt.sim_backend.arrays import Mount, mirrored
-from tactile_rt.sim_backend.trajectories import Whisk, base_angles, mirror, read_trajectory
-from tactile_rt.sim_backend.whiskers import mouse_whiskers
-from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.stream import ConfigError
 
 MOUSE = {w.name: w for w in mouse_whiskers()}

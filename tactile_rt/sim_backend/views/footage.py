@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.array import SAMPLE_MS
+from tactile_rt.sim_backend.world import SAMPLE_MS
 from tactile_rt.stream import ArraySpec
 
 __all__ = ["Footage", "Simulation", "record"]

@@ -6,12 +6,12 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays import HEAD_FILES
+from tactile_rt.sim_backend.arrays.whisker_array import HEAD_FILES
 from tactile_rt.stream import ConfigError
 
 __all__ = ["HEAD_BIT", "add_head"]
 
-HEAD_BIT, WHISKER_BIT = 4, 1  # collision groups, as in `array.py`
+HEAD_BIT, WHISKER_BIT = 4, 1  # collision groups, as in `world.py`
 HEAD_GROUP = 0  # of geoms that viewers draw and no ray of a sweep looks for
 MAX_FACES = 200_000  # MuJoCo's own limit for STL files
 LEAST_MM = 1.0  # a smaller head is one whose file is in m

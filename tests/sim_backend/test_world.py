@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.sim_backend.array import (
+from tactile_rt.sim_backend.arrays.whiskers import Whisker, mouse_whiskers
+from tactile_rt.sim_backend.world import (
     CHANNELS,
     MOUNT,
     PROFILES,
@@ -30,7 +31,6 @@ from tactile_rt.sim_backend.array import (
     read_base_loads,
     set_damping,
 )
-from tactile_rt.sim_backend.whiskers import Whisker, mouse_whiskers
 
 Floats = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.random import Generator
 from trimesh import Trimesh
 
-from tactile_rt.sim_backend.solids import lathe, rod, tube, wall
+from tactile_rt.sim_backend.objects.solids import lathe, rod, tube, wall
 
 __all__ = ["bottle", "bowl", "goblet", "mug", "teapot"]
 

@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tactile_rt.recording import SPLITS, WITHHELD, split_by_object
-from tactile_rt.sim_backend import objects as shapes
-from tactile_rt.sim_backend.objects import TactileObject, load_object
-from tactile_rt.sim_backend.recipe_tables import misnamed
-from tactile_rt.sim_backend.recipes import SHAPES, ObjectChoice
+from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
+from tactile_rt.sim_backend.datasets.recipes import SHAPES, ObjectChoice
+from tactile_rt.sim_backend.objects import catalogue as shapes
+from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
-    from tactile_rt.sim_backend.object_sets import ObjectSet
+    from tactile_rt.sim_backend.objects.object_sets import ObjectSet
 
 __all__ = ["MeshObjects", "ShapeObjects", "choose_objects"]
 
@@ -92,7 +92,9 @@ class MeshObjects:
 
     @cached_property
     def _set(self) -> "ObjectSet":
-        from tactile_rt.sim_backend.object_sets import open_objects  # CoACD is slow to import
+        from tactile_rt.sim_backend.objects.object_sets import (
+            open_objects,  # CoACD is slow to import
+        )
 
         return open_objects(Path(self.choice.source))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.whiskers import Whisker, mouse_whiskers, rat_whiskers, rotation
+from tactile_rt.sim_backend.arrays.whiskers import Whisker, mouse_whiskers, rat_whiskers, rotation
 from tactile_rt.stream import ConfigError
 
 __all__ = [
@@ -112,7 +112,7 @@ def load_array(name: str) -> WhiskerArray:
     points is where the mouse's is.
 
     Args:
-        name: of an animal and side, or a path to a .csv or .toml file (see `array_files`).
+        name: of an animal and side, or a path to a .csv or .toml file (see `files`).
 
     Raises:
         ConfigError: no such array, or a file with a mistake.
@@ -149,7 +149,7 @@ def load_animals(name: str) -> tuple[WhiskerArray, ...]:
     path = Path(name)
     if path.suffix.lower() not in ARRAY_FILES:
         return (load_array(name),)
-    from tactile_rt.sim_backend.array_files import read_animals  # which reads into these types
+    from tactile_rt.sim_backend.arrays.files import read_animals  # which reads into these types
 
     return read_animals(path)
 

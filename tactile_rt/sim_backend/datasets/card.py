@@ -13,8 +13,8 @@ from typing import Any
 import msgspec
 
 from tactile_rt.recording import SweepManifest, write_whole
-from tactile_rt.sim_backend.card_survey import Card, survey
-from tactile_rt.sim_backend.separability import Separability
+from tactile_rt.sim_backend.datasets.card_survey import Card, survey
+from tactile_rt.sim_backend.datasets.separability import Separability
 from tactile_rt.stream import ArraySpec
 
 __all__ = ["write_card"]
@@ -26,7 +26,7 @@ def write_card(folder: Path) -> Card:
     Raises:
         RecordingError: no such set, nothing in it, or an object is damaged.
     """
-    from tactile_rt.sim_backend.card_pictures import draw_card, draw_examples  # matplotlib
+    from tactile_rt.sim_backend.datasets.card_pictures import draw_card, draw_examples  # matplotlib
 
     manifest = SweepManifest.read(folder)
     card, examples = survey(folder)

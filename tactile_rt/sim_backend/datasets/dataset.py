@@ -25,17 +25,17 @@ from tactile_rt.recording import (
     write_object,
     write_skipped,
 )
-from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS, array_spec
-from tactile_rt.sim_backend.arrays import load_array
-from tactile_rt.sim_backend.engines import ENGINES, run_processes, run_ray
-from tactile_rt.sim_backend.journal import Journal, SweepRecord, remove_leftovers
-from tactile_rt.sim_backend.objects import TactileObject
-from tactile_rt.sim_backend.recipe_objects import MeshObjects, ShapeObjects, choose_objects
-from tactile_rt.sim_backend.recipe_tables import misnamed
-from tactile_rt.sim_backend.recipes import SHAPES, SweepRecipe
+from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
+from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove_leftovers
+from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObjects, choose_objects
+from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
+from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
+from tactile_rt.sim_backend.datasets.sums import write_sums
+from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
-from tactile_rt.sim_backend.sums import write_sums
 from tactile_rt.sim_backend.sweep import SweepSimulation
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
 from tactile_rt.stream import Chunk, ConfigError, SourceError, TactileError
 from tactile_rt.timebase import Resampler
 

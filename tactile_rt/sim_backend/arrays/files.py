@@ -29,7 +29,7 @@ from typing import Any
 
 import msgspec
 
-from tactile_rt.sim_backend.arrays import (
+from tactile_rt.sim_backend.arrays.whisker_array import (
     ARRAY_FILES,
     HEAD_FILES,
     Mount,
@@ -40,7 +40,7 @@ from tactile_rt.sim_backend.arrays import (
     load_array,
     place,
 )
-from tactile_rt.sim_backend.whiskers import OPTIONAL, REQUIRED, Whisker
+from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, REQUIRED, Whisker
 from tactile_rt.stream import ConfigError
 
 __all__ = ["read_animals"]

@@ -3,9 +3,8 @@
 MuJoCo works in mm, mg and ms here (so forces are mN and moments uN m): in SI the inertia of a
 link falls below the smallest that MuJoCo accepts. `read_base_loads` converts to N and N m.
 
-Each whisker is cut into equal cells. The two hinges of a joint sit at a cell's midpoint with the
-bending stiffness E I(midpoint) / cell length, which makes tip stiffness and first resonance agree
-with the Euler-Bernoulli beam to second order in the cell length.
+Each whisker is cut into equal cells. The two hinges of a joint sit at a cell's midpoint and bend
+the tip as much as the cell's piece of the Euler-Bernoulli beam would (see `_joint_stiffness`).
 """
 
 from collections.abc import Iterable, Sequence
@@ -15,8 +14,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays import MOUNT, Mount, WhiskerArray
-from tactile_rt.sim_backend.whiskers import DAMPING_RATIO, Whisker, rotation
+from tactile_rt.sim_backend.arrays.whisker_array import MOUNT, Mount, WhiskerArray
+from tactile_rt.sim_backend.arrays.whiskers import DAMPING_RATIO, Whisker, rotation
 from tactile_rt.stream import ArraySpec
 
 __all__ = [

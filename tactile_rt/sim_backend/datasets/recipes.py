@@ -28,11 +28,11 @@ from typing import Any
 
 import numpy as np
 
-from tactile_rt.sim_backend.array import PROFILES, SAMPLE_MS
+from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
 from tactile_rt.sim_backend.randomisation import Randomisation
-from tactile_rt.sim_backend.recipe_tables import misnamed
 from tactile_rt.sim_backend.sensor import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
 from tactile_rt.stream import ConfigError
 
 __all__ = [

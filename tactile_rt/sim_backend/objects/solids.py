@@ -26,6 +26,8 @@ class TactileObject:
     name: str  # "mug-17", or the file's stem
     category: str  # "mug", or the file's stem for a mesh file
     pieces: tuple[trimesh.Trimesh, ...]  # convex, watertight, wound outward; union = the object
+    surface_error: float = 0.0  # farthest that the pieces' surface is from the mesh's, of extent 1
+    made_by: str = "drawn"  # how it became pieces: drawn so, or see `meshes`
 
 
 def normalised(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]:

@@ -7,9 +7,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from tactile_rt.sim_backend.randomisation import Randomisation
-from tactile_rt.sim_backend.recipe_tables import Table, misnamed
-from tactile_rt.sim_backend.recipes import (
+from tactile_rt.sim_backend.datasets.recipe_tables import Table, misnamed
+from tactile_rt.sim_backend.datasets.recipes import (
     PARAMETERS,
     SHAPES,
     Between,
@@ -19,6 +18,7 @@ from tactile_rt.sim_backend.recipes import (
     SweepChoice,
     SweepRecipe,
 )
+from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import SensorModel
 from tactile_rt.stream import ConfigError
 
@@ -35,7 +35,7 @@ DEFAULT_RECIPE = "default24"
 
 def shipped_recipes() -> tuple[str, ...]:
     """Names of the recipes that ship with the package."""
-    folder = resources.files("tactile_rt.sim_backend") / "recipes"
+    folder = resources.files(__package__) / "recipes"
     return tuple(sorted(p.name[:-5] for p in folder.iterdir() if p.name.endswith(".toml")))
 
 
@@ -56,7 +56,7 @@ def read_recipe(name: str) -> SweepRecipe:
         except UnicodeDecodeError:
             raise ConfigError(f"{path} is not a recipe: not UTF-8 text") from None
     elif name in shipped_recipes():
-        shipped = resources.files("tactile_rt.sim_backend") / "recipes" / f"{name}.toml"
+        shipped = resources.files(__package__) / "recipes" / f"{name}.toml"
         text = shipped.read_text(encoding="utf-8")
     else:
         raise ConfigError(

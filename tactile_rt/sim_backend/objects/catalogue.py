@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from tactile_rt.sim_backend.meshes import MESH_SUFFIXES, load_mesh
-from tactile_rt.sim_backend.shapes import furniture, outdoors, tools, vehicles, vessels
-from tactile_rt.sim_backend.solids import TactileObject, normalised
+from tactile_rt.sim_backend.objects.meshes import MESH_SUFFIXES, load_mesh
+from tactile_rt.sim_backend.objects.shapes import furniture, outdoors, tools, vehicles, vessels
+from tactile_rt.sim_backend.objects.solids import TactileObject, normalised
 from tactile_rt.stream import ConfigError
 
 __all__ = ["CATEGORIES", "WITHHELD", "TactileObject", "load_object", "make_object"]

@@ -1,6 +1,6 @@
 """Whiskers: the geometry and the material of one, and the animals' published measurements.
 
-Lengths in mm and angles in rad here, as the field publishes them; `array.py` converts.
+Lengths in mm and angles in rad here, as the field publishes them; `world.py` converts.
 """
 
 import csv

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.random import Generator
 from trimesh import Trimesh
 
-from tactile_rt.sim_backend.solids import ROUND, ball, box, hull, lathe, ring, rod
+from tactile_rt.sim_backend.objects.solids import ROUND, ball, box, hull, lathe, ring, rod
 
 __all__ = [
     "beehive",

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.random import Generator
 from trimesh import Trimesh
 
-from tactile_rt.sim_backend.solids import ROUND, box, hull, ring, rod, slab
+from tactile_rt.sim_backend.objects.solids import ROUND, box, hull, ring, rod, slab
 
 __all__ = ["car", "plane", "truck"]
 

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.random import Generator
 from trimesh import Trimesh
 
-from tactile_rt.sim_backend.solids import bar, box, hull, lathe, ring, rod, slab, wall
+from tactile_rt.sim_backend.objects.solids import bar, box, hull, lathe, ring, rod, slab, wall
 
 __all__ = ["chair", "ladder", "lamp", "stool", "table"]
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.random import Generator
 from trimesh import Trimesh
 
-from tactile_rt.sim_backend.solids import ROUND, ball, hull, lathe, rod, tube, wall
+from tactile_rt.sim_backend.objects.solids import ROUND, ball, hull, lathe, rod, tube, wall
 
 __all__ = ["birdcage", "dumbbell", "gear", "hourglass", "jack", "spring"]
 

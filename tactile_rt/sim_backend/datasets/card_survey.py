@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.recording import SweepManifest, has_object, read_object, read_skipped
-from tactile_rt.sim_backend.separability import (
+from tactile_rt.sim_backend.datasets.separability import (
     Features,
     Separability,
     check_separability,

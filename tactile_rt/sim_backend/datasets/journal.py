@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.recording import MANIFEST, SKIPPED
-from tactile_rt.sim_backend.sums import SUMS
+from tactile_rt.sim_backend.datasets.sums import SUMS
 
 __all__ = ["Journal", "SweepRecord", "remove_leftovers"]
 

@@ -8,7 +8,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.card_survey import NETWORK_CLIP, Card
+from tactile_rt.sim_backend.datasets.card_survey import NETWORK_CLIP, Card
 from tactile_rt.stream import ArraySpec
 
 __all__ = ["draw_card", "draw_examples"]

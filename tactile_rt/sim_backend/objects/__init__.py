@@ -1,0 +1,1 @@
+"""What whiskers sweep past: parametric shapes, and mesh files cut into convex pieces."""

@@ -1,0 +1,171 @@
+"""Folders of mesh files: which objects they hold, of which categories, and each by its name.
+
+Two layouts, told apart by what is there:
+
+    ShapeNetCore    <synset>/<object id>/models/model_normalized.obj, and taxonomy.json beside them,
+                    whose names the categories get (else they are called by their synset)
+    plain           <category>/<object>.obj (or .stl, .ply, .glb)
+
+ShapeNet's meshes (Chang et al. 2015) are y-up and mostly sheets that enclose nothing. The published
+sweeps took such ones through a convex decomposition of their voxels (Chung et al. 2025); here they
+are remeshed. In a plain folder a mesh that is not closed is skipped, unless said otherwise.
+"""
+
+import json
+import re
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+from tactile_rt.sim_backend.objects.meshes import MESH_SUFFIXES, MeshDetail, load_mesh
+from tactile_rt.sim_backend.objects.solids import TactileObject
+from tactile_rt.stream import ConfigError
+
+__all__ = ["ObjectSet", "SetReport", "open_objects"]
+
+SHAPENET_FILE = Path("models") / "model_normalized.obj"
+TAXONOMY = "taxonomy.json"
+
+
+@dataclass(frozen=True)
+class SetReport:
+    """What a folder's objects come to.
+
+    Attributes:
+        made_by: how many objects became pieces in which way, see `meshes`.
+        surface_error: of every usable object by its name, in fractions of its largest extent.
+        skipped: why each of the others cannot be used.
+    """
+
+    made_by: dict[str, int]
+    surface_error: dict[str, float]
+    skipped: dict[str, str]
+
+
+@dataclass(frozen=True)
+class ObjectSet:
+    """The objects of a folder.
+
+    Attributes:
+        folder: where they are.
+        paths: file of every object, by its name ``category/object``, in alphabetical order.
+        detail: how finely meshes are cut, and what becomes of those that are not closed.
+        y_up: whether the files are y-up; None: as their format has it.
+        skipped: names of objects found broken so far, and why each is.
+    """
+
+    folder: Path
+    paths: dict[str, Path]
+    detail: MeshDetail = field(default_factory=MeshDetail)
+    y_up: bool | None = None
+    skipped: dict[str, str] = field(default_factory=dict)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Of all objects."""
+        return tuple(self.paths)
+
+    @cached_property
+    def categories(self) -> dict[str, str]:
+        """Category of every object, by its name."""
+        return {name: name.rpartition("/")[0] for name in self.paths}
+
+    def path(self, name: str) -> Path:
+        """An object's file.
+
+        Raises:
+            ConfigError: no such object.
+        """
+        if name not in self.paths:
+            raise ConfigError(f"{self.folder}: holds no object {name!r}")
+        return self.paths[name]
+
+    def load(self, name: str) -> TactileObject:
+        """An object as convex pieces, called ``category-object``.
+
+        Raises:
+            ConfigError: no such object, or its mesh cannot be used; `skipped` has it then.
+        """
+        path = self.path(name)
+        try:
+            found = load_mesh(path, self.detail, y_up=self.y_up)
+        except ConfigError as error:
+            self.skipped[name] = str(error)
+            raise
+        return replace(found, name=name.replace("/", "-"), category=self.categories[name])
+
+    def check(self) -> SetReport:
+        """Load every object once: how many can be used, how well, and why the others cannot."""
+        errors: dict[str, float] = {}
+        made_by: Counter[str] = Counter()
+        for name in self.names:
+            try:
+                found = self.load(name)
+            except ConfigError:
+                continue  # noted by `load`
+            errors[name] = found.surface_error
+            made_by[found.made_by] += 1
+        skipped = {name: self.skipped[name] for name in self.names if name not in errors}
+        return SetReport(dict(sorted(made_by.items())), errors, skipped)
+
+
+def open_objects(where: str | Path, detail: MeshDetail | None = None) -> ObjectSet:
+    """The objects in a folder.
+
+    Args:
+        where: the folder, of either layout.
+        detail: how meshes are cut; by default to 0.1 mm at 40 mm, and meshes that are not closed
+            are remeshed in a ShapeNet folder and skipped in a plain one.
+
+    Raises:
+        ConfigError: no such folder, or none of the two layouts.
+    """
+    folder = Path(where)
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: no such folder of objects")
+    shapenet = sorted(folder.glob(f"*/*/{SHAPENET_FILE.as_posix()}"))
+    if shapenet:
+        called = _taxonomy(folder)
+        named = [(called.get(p.parents[2].name, p.parents[2].name), p.parents[1].name, p)
+                 for p in shapenet]  # fmt: skip
+        detail = detail or MeshDetail(broken="remesh")
+        return ObjectSet(folder, _named(folder, named), detail, y_up=True)
+    plain = sorted(p for p in folder.glob("[!.]*/[!.]*") if p.suffix.lower() in MESH_SUFFIXES)
+    if not plain:
+        raise ConfigError(
+            f"{folder}: holds no objects: expected category/object.obj (or "
+            f"{', '.join(MESH_SUFFIXES[1:])}), or ShapeNet's synset/id/{SHAPENET_FILE.as_posix()}"
+        )
+    named = [(p.parent.name, p.stem, p) for p in plain]
+    return ObjectSet(folder, _named(folder, named), detail or MeshDetail())
+
+
+def _named(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, Path]:
+    """Files by names that files can have."""
+    paths: dict[str, Path] = {}
+    for category, stem, path in found:
+        name = f"{_safe(category)}/{_safe(stem)}"
+        if name in paths:
+            raise ConfigError(
+                f"{folder}: {paths[name].relative_to(folder)} and {path.relative_to(folder)} would "
+                "have the same name: rename one"
+            )
+        paths[name] = path
+    return dict(sorted(paths.items()))
+
+
+def _safe(name: str) -> str:
+    return re.sub(r"[^\w.-]+", "_", name.strip())
+
+
+def _taxonomy(folder: Path) -> dict[str, str]:
+    """Name of every synset: the first of its synonyms."""
+    path = folder / TAXONOMY
+    if not path.exists():
+        return {}
+    try:
+        entries = json.loads(path.read_text(encoding="utf-8"))
+        return {str(e["synsetId"]): str(e["name"]).split(",")[0] for e in entries}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} is not ShapeNet's taxonomy: {error!r}") from None
