@@ -36,5 +36,5 @@ $(VENV)/.sim: pyproject.toml
 
 $(VENV)/.dev: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[sim,train,view,test,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[sim,train,view,dbc,test,dev]'
 	touch $@ $(VENV)/.sim

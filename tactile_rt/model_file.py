@@ -24,7 +24,7 @@ __all__ = ["METADATA_KEY", "ModelCard", "StateTensor", "load_model", "shipped_mo
 
 METADATA_KEY = "tactile_rt"
 CARD_VERSION = 1
-SHIPPED = Path(__file__).parent / "assets" / "mouse12.onnx"
+SHIPPED = Path(__file__).parent / "assets" / "mouse24.onnx"
 
 
 class StateTensor(msgspec.Struct, frozen=True):

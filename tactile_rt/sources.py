@@ -10,14 +10,20 @@ from importlib import import_module, metadata
 from typing import Any
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-import msgspec
-
+from tactile_rt.options import parse_options
 from tactile_rt.stream import ConfigError, Source
 
 __all__ = ["open_source"]
 
-# scheme: (module, source class, options dataclass, extra that it needs)
-SCHEMES = {"sim": ("tactile_rt.sim_backend.source", "SimSource", "SimOptions", "sim")}
+# scheme: (module, what opens it, extra that it needs). What opens it is a function of the target
+# and the options as written, or a class of the target and an `Options` dataclass that it names.
+SCHEMES = {
+    "sim": ("tactile_rt.sim_backend.source", "SimSource", "sim"),
+    "serial": ("tactile_rt.drivers.opening", "open_serial", ""),
+    "can": ("tactile_rt.drivers.opening", "open_can", ""),
+    "synthetic": ("tactile_rt.drivers.synthetic", "SyntheticSource", ""),
+    "combined": ("tactile_rt.combined", "open_combined", ""),
+}
 ENTRY_POINTS = "tactile_rt.sources"
 
 
@@ -32,32 +38,25 @@ def open_source(url: str) -> Source:
         parts = urlsplit(url, allow_fragments=False)  # a file's name may hold a #
     except ValueError as error:
         raise ConfigError(f"source {url!r}: {error}") from None
-    scheme = parts.scheme
     # A + is a +, as in a file's name, not the space that web forms make of it.
     pairs = parse_qsl(parts.query.replace("+", "%2B"), keep_blank_values=True)
     fields = dict(pairs)
     if len(fields) < len(pairs):
         raise ConfigError(f"source {url!r}: an option is given twice")
-    make, options = _lookup(url, scheme)
-    known = options.__dataclass_fields__
-    for name in fields:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"; did you mean {near[0]}?" if near else f"; it takes {', '.join(known)}"
-            raise ConfigError(f"source {scheme}: has no option {name!r}{hint}")
-    try:
-        chosen = msgspec.convert(fields, options, strict=False)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"source {url!r}: {error}") from None
-    source: Source = make(unquote(parts.netloc + parts.path), chosen)
+    make = _lookup(url, parts.scheme)
+    target = unquote(parts.netloc + parts.path)
+    options = getattr(make, "Options", None)
+    if options is not None:
+        fields = parse_options(f"source {parts.scheme}:", fields, options)
+    source: Source = make(target, fields)
     return source
 
 
-def _lookup(url: str, scheme: str) -> tuple[Any, Any]:
+def _lookup(url: str, scheme: str) -> Any:
     if scheme in SCHEMES:
-        module, source, options, extra = SCHEMES[scheme]
+        module, attribute, extra = SCHEMES[scheme]
         try:
-            there = import_module(module)
+            return getattr(import_module(module), attribute)
         except ModuleNotFoundError as error:
             if (error.name or "").startswith("tactile_rt"):
                 raise
@@ -65,10 +64,8 @@ def _lookup(url: str, scheme: str) -> tuple[Any, Any]:
                 f"source {scheme}: needs {error.name}, which is not installed: "
                 f"pip install 'tactile-rt[{extra}]'"
             ) from None
-        return getattr(there, source), getattr(there, options)
     for point in metadata.entry_points(group=ENTRY_POINTS, name=scheme):
-        made = point.load()
-        return made, made.Options
+        return point.load()
     known = sorted({*SCHEMES, *metadata.entry_points(group=ENTRY_POINTS).names})
     near = difflib.get_close_matches(scheme or url, known, 1)
     raise ConfigError(

@@ -34,19 +34,21 @@ class Resampler:
         period_ns: output period, ns.
         input_rate_hz: nominal input rate; below the output rate the kernel widens to the input's
             period, which interpolates.
+        aligned: whether outputs are at whole periods of the clock, so that several streams' outputs
+            coincide; else the first is as early as it can be.
 
     Attributes:
         out_of_order: input samples not later than the one before, which are left out.
     """
 
-    def __init__(self, period_ns: int, input_rate_hz: float) -> None:
+    def __init__(self, period_ns: int, input_rate_hz: float, aligned: bool = False) -> None:
         self.period_ns = period_ns
         self.half_width_ns = max(period_ns, round(NS_PER_S / input_rate_hz))
         self._least_weight = LEAST_WEIGHT * self.half_width_ns * input_rate_hz / NS_PER_S
         self._longest_gap_ns = max(LONGEST_GAP_NS, 2 * self.half_width_ns)
         self.out_of_order = 0
-        self._origin: int | None = None  # time of output 0
-        self._next = 0  # index of the next output
+        self._origin: int | None = 0 if aligned else None  # time of output 0
+        self._next: int | None = None if aligned else 0  # index of the next output
         self._held: Chunk | None = None  # inputs that a later output may still need
 
     def push(self, chunk: Chunk) -> Chunk | None:
@@ -56,9 +58,9 @@ class Resampler:
             chunk: (n, element, channel) samples in time order.
 
         Returns:
-            Outputs with `seq` counting output periods since the first, `t_ns` at the kernel's
-            centre, and `valid` False (value 0) where less than a quarter of the kernel's weight
-            had a valid sample, be it lost or marked.
+            Outputs with `seq` counting output periods since the first (`aligned`: since time 0),
+            `t_ns` at the kernel's centre, and `valid` False (value 0) where less than a quarter of
+            the kernel's weight had a valid sample, be it lost or marked.
         """
         ordered = self._in_order(chunk)
         if ordered is None:
@@ -96,6 +98,8 @@ class Resampler:
         if self._origin is None:
             # The first output is the first whose kernel is filled on both sides.
             self._origin = int(chunk.t_ns[0]) + self.half_width_ns
+        if self._next is None:
+            self._next = -(-(int(chunk.t_ns[0]) + self.half_width_ns) // self.period_ns)
         held = chunk if self._held is None else concatenate([self._held, chunk])
         # An output is complete when its kernel's end has been reached (the weight there is zero).
         ready = (int(held.t_ns[-1]) - self.half_width_ns - self._origin) // self.period_ns + 1

@@ -12,8 +12,8 @@ import pytest
 from hypothesis import settings
 
 # Helpers that several test modules share, `contract.py` for one, are imported by their bare names.
-sys.path.insert(0, str(Path(__file__).parent))
-pytest.register_assert_rewrite("contract", "tiny_model")
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent / "drivers")]
+pytest.register_assert_rewrite("contract", "codec_contract", "tiny_model")
 
 # No deadline: another process on the machine must not fail a test. Derandomised: whoever runs the
 # tests gets the same examples, so a pass stays a pass.

@@ -18,8 +18,8 @@ LINKS = ("drivers", "export", "models", "sim_backend")
 # What a robot has none of.
 HEAVY = ("torch", "mujoco", "trimesh", "scipy", "onnx", "onnxscript", "sklearn", "matplotlib")
 ONBOARD = (
-    "classifier", "cli", "contact", "model_file", "recording", "session", "sources", "stream",
-    "testing", "timebase",
+    "calibration", "classifier", "cli", "combined", "contact", "drivers.opening", "model_file",
+    "options", "recording", "session", "sources", "stream", "testing", "timebase",
 )  # fmt: skip
 
 MODULES = sorted(m.name for m in pkgutil.walk_packages([str(PACKAGE)], "tactile_rt."))

@@ -124,7 +124,7 @@ def test_a_constant_stays_that_constant(value, rate_hz, period_ms) -> None:
     out = resample(regular(np.full(n, value), rate_hz), period_ns=period_ns, rate_hz=rate_hz)
     assert len(out) >= 2
     assert out.valid.all()
-    assert out.values == pytest.approx(value, rel=1e-6)
+    assert out.values == pytest.approx(value, rel=1e-5)  # sums of up to 400 float32
 
 
 @settings(max_examples=40)

@@ -49,7 +49,17 @@ def main() -> None:
     """Run the command line."""
     # Each module adds its commands; what a command needs is imported when it runs, so that
     # `--help` is instant and a robot never imports torch.
-    from tactile_rt.cli import bench, live, modelling, simulation, view, whisking  # noqa: F401
+    from tactile_rt.cli import (  # noqa: F401
+        bench,
+        calibrating,
+        devices,
+        emulating,
+        live,
+        modelling,
+        simulation,
+        view,
+        whisking,
+    )
 
     try:
         app()

@@ -2,17 +2,19 @@
 
 sim:mouse?objects=mug-50,bottle-51&seed=3&pace=fast&profile=realtime&sweeps=10
 sim:mouse?noise_force=1e-5&noise_moment=5e-8&latency_ms=2&drop_probability=0.01
+sim:mouse?friction=0.3&young_modulus=0.2&angles_deg=3&mount_mm=0.5
 """
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from tactile_rt.sim_backend.arrays.whisker_array import load_animals
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, load_object
+from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation
+from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation, usual_distance
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, world_spec
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source
 from tactile_rt.timebase import NS_PER_S
@@ -25,18 +27,19 @@ PACES = ("realtime", "fast")
 
 
 @dataclass(frozen=True)
-class SimOptions(SensorModel):
-    """What the simulated array meets, and what its sensors make of it.
+class SimOptions(SensorModel, Randomisation):
+    """What the simulated array meets, what its sensors make of it, how it differs from the design.
 
-    The fields of `SensorModel` are options too; left out, the sensors are perfect.
+    The fields of `SensorModel` are options too; left out, the sensors are perfect. So are those of
+    `Randomisation`, whose array is drawn afresh for every sweep.
 
     Attributes:
         objects: comma-separated names (``mug-50``), categories (``mug``: its first instance) or
             mesh files (.obj, .stl, .ply, .glb), drawn in random order; empty: all categories.
         sweeps: how many objects pass before the stream ends; 0: endless.
         repeat: sweeps of the same object in succession.
-        seed: of the drawn objects, sweep parameters and sensor imperfections; the same seed gives
-            the same stream, and the same objects and sweeps whatever the sensors.
+        seed: of the drawn objects, sweep parameters, arrays and sensor imperfections; the same seed
+            gives the same stream, and the same objects and sweeps whatever the sensors.
         profile: simulation profile, see `array.PROFILES`.
         pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
     """
@@ -49,7 +52,8 @@ class SimOptions(SensorModel):
     pace: str = "realtime"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        SensorModel.__post_init__(self)
+        Randomisation.__post_init__(self)
         if self.profile not in PROFILES:
             raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
         if self.pace not in PACES:
@@ -58,6 +62,11 @@ class SimOptions(SensorModel):
             raise ConfigError("sweeps must be 0 or more, and repeat 1 or more")
         if self.seed < 0:
             raise ConfigError(f"seed must be 0 or more, not {self.seed}")
+
+    @property
+    def randomisation(self) -> Randomisation:
+        """The part of it that concerns the array."""
+        return Randomisation(**{f.name: getattr(self, f.name) for f in fields(Randomisation)})
 
 
 @dataclass(frozen=True)
@@ -86,6 +95,8 @@ class SimSource(Source):
         live: whether samples wait for nobody (real-time pace).
     """
 
+    Options = SimOptions
+
     def __init__(self, array: str, options: SimOptions) -> None:
         self._animals = load_animals(array or "mouse")
         super().__init__(world_spec(self._animals))
@@ -93,6 +104,9 @@ class SimSource(Source):
         names = [n for n in options.objects.split(",") if n] or list(CATEGORIES)
         self._objects = [load_object(name) for name in names]
         self._rng = np.random.default_rng(options.seed)
+        # Of its own, so that the objects are the same with and without.
+        self._array_rng = np.random.default_rng([options.seed, 1])
+        self._distance_mm = usual_distance(self._animals)
         self._sensor = Sensor(options, self.spec, options.seed)
         self.live = options.pace == "realtime"
         self.passes: list[Pass] = []
@@ -162,8 +176,10 @@ class SimSource(Source):
             order = self._rng.permutation(len(self._objects))
             self._order = [int(i) for i in order for _ in range(self._options.repeat)]
         target = self._objects[self._order.pop(0)]
+        draw, profile = self._options.randomisation.draw, PROFILES[self._options.profile]
+        animals = tuple(draw(self._array_rng, animal) for animal in self._animals)
         sweep, self._simulation = draw_simulation(
-            self._rng, self._animals, target, PROFILES[self._options.profile]
+            self._rng, animals, target, profile, self._distance_mm
         )
         self._rest = REST_SAMPLES
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)

@@ -1,0 +1,275 @@
+"""What one device's samples need to become SI loads of the array that a model knows."""
+
+import difflib
+import math
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.calibration.mirroring import Mirror
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError, SpecMismatch
+
+__all__ = ["Calibration", "check_device", "nearest"]
+
+Row = tuple[float, ...]
+
+DEVICE = re.compile(r"[A-Za-z0-9_+-][\w.:+-]*")  # it names a file
+HISTORY = 20  # entries kept: a robot that tares every morning must not grow a file for ever
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """From a device's raw samples to the output of its array, in SI units.
+
+    Of each element, output = M (raw - tare). M is its own matrix; else the gain of each channel;
+    else nothing is changed, if the output has the raw channels and units. Otherwise the element is
+    uncalibrated, and never valid. Then elements are mapped, then mirrored.
+
+    Attributes:
+        device: id of the device, letters, digits, and ``_ . : + -``; names its file.
+        elements, channels, units: of the device's spec; units may be counts (``1``).
+        output_channels, output_units: of what comes out; empty: the raw ones.
+        gain: (channel,) output unit per raw unit, of elements without a matrix; empty: none.
+        tare: (channel,) offset in raw units by raw element; none: 0.
+        noise: (channel,) standard deviation in raw units by raw element, when tared.
+        matrices: (output channel, channel) output unit per raw unit, by raw element.
+        mapping: raw element by output element, in the order of the output; empty: as they are.
+        mirror: whether the output is the array's mirror image, and how; None: it is not.
+        history: what was measured when, one line each.
+
+    Raises:
+        ConfigError: sizes disagree, a name is unknown, or a number is not finite.
+    """
+
+    device: str
+    elements: tuple[str, ...]
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    output_channels: tuple[str, ...] = ()
+    output_units: tuple[str, ...] = ()
+    gain: Row = ()
+    tare: dict[str, Row] = field(default_factory=dict)
+    noise: dict[str, Row] = field(default_factory=dict)
+    matrices: dict[str, tuple[Row, ...]] = field(default_factory=dict)
+    mapping: dict[str, str] = field(default_factory=dict)
+    mirror: Mirror | None = None
+    history: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, device: str, spec: ArraySpec) -> "Calibration":
+        """One that changes nothing yet, of this device.
+
+        Raises:
+            ConfigError: no id that could name a file.
+        """
+        return cls(device, spec.elements, spec.channels, spec.units)
+
+    def __post_init__(self) -> None:
+        check_device(self.device)
+        channels, units = self.output
+        outputs, inputs = len(channels), len(self.channels)
+        for what, names in (("elements", self.elements), ("channels", self.channels)):
+            if not names or len(set(names)) < len(names):
+                raise ConfigError(f"raw.{what}: name at least one, and none twice")
+        if len(set(channels)) < outputs:
+            raise ConfigError("output.channels: none may be there twice")
+        _sized("raw.units", self.units, inputs, "raw channels")
+        _sized("output.units", units, outputs, "output channels")
+        if self.gain:
+            _sized("gain", self.gain, inputs, "raw channels")
+            if outputs != inputs:
+                raise ConfigError(
+                    f"gain: makes {inputs} channels of {inputs}, but output.channels has {outputs};"
+                    f" give every element a matrix instead"
+                )
+            _finite("gain", self.gain)
+        for what, rows in (("tare", self.tare), ("noise", self.noise)):
+            for element, row in rows.items():
+                _known(f"{what}.{element}", element, self.elements, "raw element")
+                _sized(f"{what}.{element}", row, inputs, "raw channels")
+                _finite(f"{what}.{element}", row)
+        for element, matrix in self.matrices.items():
+            _known(f"matrix.{element}", element, self.elements, "raw element")
+            _sized(f"matrix.{element}", matrix, outputs, "output channels", "rows")
+            for channel, row in zip(channels, matrix, strict=True):
+                _sized(f"matrix.{element}, row {channel}", row, inputs, "raw channels")
+                _finite(f"matrix.{element}, row {channel}", row)
+        for element, source in self.mapping.items():
+            _known(f"mapping.{element}", source, self.elements, "raw element")
+        if len(set(self.mapping.values())) < len(self.mapping):
+            raise ConfigError("mapping: one raw element is mapped twice")
+        for channel in self.mirror.signs if self.mirror else ():
+            _known(f"mirror.signs.{channel}", channel, channels, "output channel")
+        _ = self.signs  # a mirror that cannot be must fail here, not on the robot's first sample
+
+    @property
+    def output(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Channels and units of the output."""
+        return self.output_channels or self.channels, self.output_units or self.units
+
+    @property
+    def signs(self) -> Row:
+        """(output channel,) 1 or -1: what mirroring multiplies by."""
+        if self.mirror is None:
+            return (1.0,) * len(self.output[0])
+        return tuple(float(self.mirror.sign(c, u)) for c, u in zip(*self.output, strict=True))
+
+    @cached_property
+    def uncalibrated(self) -> tuple[str, ...]:
+        """Raw elements that never give a valid value, for want of a matrix or gain."""
+        if self.gain or self.output == (self.channels, self.units):
+            return ()
+        used = self.mapping.values() if self.mapping else self.elements
+        return tuple(e for e in used if e not in self.matrices)
+
+    def output_spec(self, raw: ArraySpec) -> ArraySpec:
+        """What comes out for a device that describes itself so.
+
+        Raises:
+            SpecMismatch: it is not the device that this is for.
+        """
+        for what in ("elements", "channels", "units"):
+            mine, theirs = getattr(self, what), getattr(raw, what)
+            if mine != theirs:
+                raise SpecMismatch(
+                    f"calibration of {self.device} is for {what} {_listed(mine)}; "
+                    f"{raw.name} has {_listed(theirs)}"
+                )
+        at = self._plan.index
+        poses = [(raw.positions[i], raw.orientations[i]) for i in at]
+        if self.mirror is not None:
+            poses = [self.mirror.pose(*pose) for pose in poses]
+        channels, units = self.output
+        return replace(
+            raw,
+            elements=tuple(self.mapping) or raw.elements,
+            grid=tuple(raw.grid[i] for i in at),
+            positions=tuple(position for position, _ in poses),
+            orientations=tuple(orientation for _, orientation in poses),
+            channels=channels,
+            units=units,
+        )
+
+    def apply(self, chunk: Chunk) -> Chunk:
+        """Correct n samples.
+
+        Args:
+            chunk: of the raw spec; it is left as it is.
+
+        Returns:
+            A chunk of `output_spec`. An element that is not valid stays so; one whose output is
+            not finite becomes so.
+
+        Raises:
+            SpecMismatch: it has not as many elements or channels.
+        """
+        plan = self._plan
+        if chunk.values.shape[1:] != plan.shape:
+            raise SpecMismatch(
+                f"calibration of {self.device} is for samples of {plan.shape} (element, channel), "
+                f"not {chunk.values.shape[1:]}"
+            )
+        values, valid = chunk.values, chunk.valid
+        if plan.moves:
+            values, valid = values.take(plan.index, axis=1), valid.take(plan.index, axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):  # of what is not valid, or becomes so
+            values = values - plan.tare
+            if plan.gain is not None:
+                values *= plan.gain
+            else:
+                values = np.matmul(values.transpose(1, 0, 2), plan.matrix).transpose(1, 0, 2)
+        if plan.lacking is not None:
+            valid = valid & plan.lacking
+        if not np.isfinite(values).all():
+            valid = valid & np.isfinite(values).all(axis=2)
+        return Chunk(chunk.seq, chunk.t_ns, values, valid)
+
+    @cached_property
+    def _plan(self) -> "_Plan":
+        index = [self.elements.index(e) for e in self.mapping.values() or self.elements]
+        used = [self.elements[i] for i in index]
+        shape = len(self.elements), len(self.channels)
+        default = np.diag(self.gain) if self.gain else np.eye(len(self.output[0]), shape[1])
+        matrix = np.stack([np.asarray(self.matrices.get(e, default), np.float64) for e in used])
+        matrix = matrix * np.asarray(self.signs)[:, None]
+        zero = (0.0,) * shape[1]
+        tare = np.array([self.tare.get(e, zero) for e in used])
+        lacking = np.array([e not in self.uncalibrated for e in used])
+        gain = None
+        if matrix.shape[1] == matrix.shape[2]:
+            diagonal = np.einsum("ecc->ec", matrix)
+            if np.array_equal(matrix, diagonal[:, :, None] * np.eye(shape[1])):
+                gain = diagonal.astype(np.float32)
+        return _Plan(
+            shape,
+            np.array(index, np.intp),
+            index != list(range(shape[0])),
+            tare.astype(np.float32),
+            gain,
+            np.ascontiguousarray(matrix.transpose(0, 2, 1), dtype=np.float32),
+            None if lacking.all() else lacking,
+        )
+
+    def noted(self, line: str, **changes: Any) -> "Calibration":
+        """This one with other attributes, and a line more of history.
+
+        Raises:
+            ConfigError: the changes do not fit.
+        """
+        return replace(self, history=(*self.history, line)[-HISTORY:], **changes)
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    """A calibration as arrays, by output element; `matrix` is (element, channel, output)."""
+
+    shape: tuple[int, int]
+    index: NDArray[np.intp]
+    moves: bool
+    tare: NDArray[np.float32]
+    gain: NDArray[np.float32] | None
+    matrix: NDArray[np.float32]
+    lacking: NDArray[np.bool_] | None
+
+
+def check_device(device: str) -> None:
+    """Refuse an id that could not name a file.
+
+    Raises:
+        ConfigError: it has other characters, or begins with a dot.
+    """
+    if not DEVICE.fullmatch(device):
+        raise ConfigError(f"device id {device!r}: use letters, digits, '_', '.', ':', '+' and '-'")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A phrase for an error's end: the name that was probably meant, or all there are."""
+    names = list(known)
+    plain = {n.casefold(): n for n in names}
+    near = difflib.get_close_matches(name.casefold(), plain, 1)
+    return f"did you mean {plain[near[0]]}?" if near else f"there are {_listed(names) or 'none'}"
+
+
+def _known(key: str, name: str, known: tuple[str, ...], what: str) -> None:
+    if name not in known:
+        raise ConfigError(f"{key}: no {what} {name!r}; {nearest(name, known)}")
+
+
+def _sized(key: str, items: tuple[Any, ...], n: int, of: str, what: str = "values") -> None:
+    if len(items) != n:
+        raise ConfigError(f"{key} has {len(items)} {what} for {n} {of}")
+
+
+def _finite(key: str, row: Row) -> None:
+    if not all(map(math.isfinite, row)):
+        raise ConfigError(f"{key} must be finite numbers")
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" ... ({len(names)})" if len(names) > 12 else ""
+    return ", ".join(names[:12]) + more

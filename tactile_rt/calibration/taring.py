@@ -1,0 +1,182 @@
+"""Tare: what an array reads while nothing touches it, and how noisy that is.
+
+All statistics are medians, so that a spike moves none of them. Noise is 1.4826 times the median
+absolute deviation from the median of a sample's own block, an eighth of the recording (for normal
+noise that is its standard deviation; slow changes do not count). It is no smaller than the
+smallest step between two readings, the resolution of a converter quieter than its last digit.
+
+An element is refused that was touched (a block's median is off the median of all by more than 3
+noise, or 5 samples running are by more than 8) or that drifts (its last quarter is off its first
+by more than 2). What leans on an array all the time from before the tare reads as no load.
+"""
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.calibration.source import CalibratedSource
+from tactile_rt.stream import (
+    ArraySpec,
+    Chunk,
+    ConfigError,
+    EndOfStream,
+    Source,
+    SourceError,
+    concatenate,
+)
+
+__all__ = ["Tare", "record", "tare"]
+
+BLOCKS = 8
+LEAST_SAMPLES = 8 * BLOCKS  # a block's median must be surer than the limits below
+TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
+TOUCH, DRIFT = 3.0, 2.0  # of block and quarter medians, in noise
+TAP, TAP_SAMPLES = 8.0, 5  # of single samples
+PATIENCE_S = 3.0  # beyond the seconds asked for
+SLICE_S = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class Tare:
+    """What a quiet array reads.
+
+    Attributes:
+        spec: of the array, as its device describes it.
+        offset: (element, channel) median, raw units; 0 of an element without enough valid samples.
+        noise: (element, channel) standard deviation of a sample, raw units; 0 likewise.
+        samples: (element,) valid samples that these rest on.
+        seconds: from the first sample to the last.
+    """
+
+    spec: ArraySpec
+    offset: NDArray[np.float64]
+    noise: NDArray[np.float64]
+    samples: NDArray[np.int64]
+    seconds: float
+
+    @property
+    def untared(self) -> tuple[str, ...]:
+        """Elements with too few valid samples."""
+        return tuple(
+            e for e, n in zip(self.spec.elements, self.samples, strict=True) if n < LEAST_SAMPLES
+        )
+
+
+def tare(source: Source, seconds: float = 2.0) -> Tare:
+    """Read a source for some seconds, while nothing touches its array.
+
+    Args:
+        source: of raw samples; of a calibrated source those below it are read.
+        seconds: of the stream's own time.
+
+    Raises:
+        ConfigError: the array is touched or drifts (which element, which channel, when), or too few
+            samples came.
+        SourceError: the source is silent, or broke.
+    """
+    while isinstance(source, CalibratedSource):
+        source = source.source
+    if not 0 < seconds < np.inf:
+        raise ConfigError(f"seconds must be positive, not {seconds:g}")
+    whole = concatenate(record(source, seconds))
+    t_s = (whole.t_ns - whole.t_ns[0]) * 1e-9
+    offset, noise = np.zeros(source.spec.shape), np.zeros(source.spec.shape)
+    samples = whole.valid.sum(axis=0)
+    if samples.max() < LEAST_SAMPLES:
+        needed = np.ceil(1.5 * LEAST_SAMPLES / source.spec.rate_hz)
+        raise ConfigError(
+            f"{source.spec.name}: {samples.max()} valid samples in {t_s[-1]:.2g} s, and a tare "
+            f"needs {LEAST_SAMPLES}: take {max(needed, np.ceil(seconds) + 1):g} s or more"
+        )
+    troubles = []
+    for i, element in enumerate(source.spec.elements):
+        if samples[i] < LEAST_SAMPLES:
+            continue
+        quiet = whole.valid[:, i]
+        values = whole.values[quiet, i].astype(np.float64)
+        offset[i], noise[i] = _rest(values)
+        if trouble := _trouble(values, offset[i], noise[i], t_s[quiet], source.spec):
+            troubles.append(f"element {element} {trouble}")
+    if troubles:
+        more = f" (and {len(troubles) - 1} more elements)" if len(troubles) > 1 else ""
+        raise ConfigError(f"{source.spec.name}: {troubles[0]}{more}")
+    return Tare(source.spec, offset, noise, samples.astype(np.int64), float(t_s[-1]))
+
+
+def record(source: Source, seconds: float) -> list[Chunk]:
+    """The first so many seconds of a stream, by its own time; at least a chunk.
+
+    Raises:
+        SourceError: nothing comes.
+    """
+    chunks: list[Chunk] = []
+    end = None
+    patience = time.monotonic() + seconds + PATIENCE_S
+    while end is None or chunks[-1].t_ns[-1] < end:
+        try:
+            chunk = source.read(SLICE_S)
+        except EndOfStream:
+            break
+        if chunk is not None:
+            chunks.append(chunk)
+            end = chunks[0].t_ns[0] + round(seconds * 1e9)
+        elif time.monotonic() > patience:
+            break
+    if not chunks:
+        raise SourceError(f"{source.spec.name}: no sample came; see `tactile-rt doctor`")
+    return chunks
+
+
+def _blocks(values: NDArray[np.float64]) -> list[NDArray[np.float64]]:
+    return np.array_split(values, BLOCKS)
+
+
+def _rest(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Offset and noise of an element, each (channel,), from its valid samples (n, channel)."""
+    off = np.concatenate([np.abs(b - np.median(b, axis=0)) for b in _blocks(values)])
+    steps = np.diff(np.sort(values, axis=0), axis=0)
+    step = np.where(steps > 0, steps, np.inf).min(axis=0)
+    noise = np.maximum(TO_SIGMA * np.median(off, axis=0), np.where(np.isfinite(step), step, 0.0))
+    return np.median(values, axis=0), noise
+
+
+def _trouble(
+    values: NDArray[np.float64],
+    offset: NDArray[np.float64],
+    noise: NDArray[np.float64],
+    t_s: NDArray[np.float64],
+    spec: ArraySpec,
+) -> str:
+    """What kept an element from rest, if anything did; of its worst channel."""
+    scale = np.where(noise > 0, noise, 1.0)  # where there is none, nothing has changed either
+    medians = np.stack([np.median(b, axis=0) for b in _blocks(values)])
+    quarters = (
+        np.median(values[: len(values) // 4], axis=0),
+        np.median(values[-(len(values) // 4) :], axis=0),
+    )
+    away = np.abs(medians - offset) / scale
+    drift = np.abs(quarters[1] - quarters[0]) / scale
+    beyond = (np.abs(values - offset) > TAP * scale).astype(np.int64)
+    running = sum(beyond[k : len(beyond) - TAP_SAMPLES + k + 1] for k in range(TAP_SAMPLES))
+    tapped = np.asarray(running) == TAP_SAMPLES
+    if away.max() <= TOUCH and drift.max() <= DRIFT and not tapped.any():
+        return ""
+    worst = int(np.maximum(np.maximum(away.max(axis=0), drift), TAP * tapped.any(axis=0)).argmax())
+    what = spec.channels[worst]
+    unit = "" if spec.units[worst] in ("", "1") else f" {spec.units[worst]}"
+    jumps = np.abs(np.diff(medians[:, worst]))
+    # A ramp spreads over the blocks; a touch comes and goes within one or two.
+    if drift[worst] > DRIFT and jumps.max() <= 0.5 * np.ptp(medians[:, worst]):
+        by = abs(quarters[1][worst] - quarters[0][worst])
+        return (
+            f"drifts: {what} went by {by:.4g}{unit} ({drift[worst]:.0f} times its noise) in "
+            f"{t_s[-1]:.2g} s; let the sensor warm up, and tare again"
+        )
+    furthest = int(np.abs(values[:, worst] - offset[worst]).argmax())
+    by = abs(values[furthest, worst] - offset[worst])
+    return (
+        f"is being touched: {what} moved by {by:.4g}{unit} ({by / scale[worst]:.0f} times its "
+        f"noise) at {t_s[furthest]:.2g} s; leave the array alone, and tare again"
+    )

@@ -1,0 +1,203 @@
+"""`tactile-rt list`, `doctor`, `codecs`, `describe`, `echo`, `hz`, `dump`: looking at devices."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tactile_rt.cli import app, check_output, starting
+from tactile_rt.cli.live import Seconds, leaving
+
+Url = Annotated[str, typer.Argument(help="URL of a source, e.g. serial:///dev/ttyUSB0?codec=bota.")]
+WINDOW_S = 1.0
+
+
+@app.command("list")
+def list_devices() -> None:
+    """Show serial ports and CAN buses, what is likely there, and the URL to begin with."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from tactile_rt.drivers.discovery import can_buses, serial_ports
+
+    table = Table("device", "likely", "url", box=None, header_style="bold")
+    for port in serial_ports():
+        table.add_row(port.path, port.likely, port.url)
+    for bus in can_buses():
+        rate = f", {bus.bitrate} bit/s" if bus.bitrate else ""
+        table.add_row(bus.name, f"CAN bus, {'up' if bus.up else 'down'}{rate}", bus.url)
+    if not table.row_count:
+        typer.echo("no serial port and no CAN bus; `tactile-rt emulate native` makes a device")
+        return
+    Console().print(table)
+
+
+@app.command()
+def doctor(
+    udev: Annotated[Path | None, typer.Option(help="Write udev rules for what is there.")] = None,
+) -> None:
+    """Look for what may keep devices from being opened or being fast; say what to do.
+
+    Exit code 1 if there is anything to do.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+
+    from tactile_rt.drivers.discovery import can_buses, serial_ports
+    from tactile_rt.drivers.doctor import diagnose, udev_rules
+    from tactile_rt.recording import write_whole
+
+    check_output(udev)
+    ports = serial_ports()
+    console = Console(soft_wrap=True, highlight=False)
+    findings = diagnose(ports, can_buses())
+    for finding in findings:
+        mark = "[green]ok [/]" if finding.good else "[red]bad[/]"
+        console.print(f"{mark} [bold]{escape(finding.what)}[/]: {escape(finding.says)}")
+        if finding.do:
+            console.print(f"    -> {escape(finding.do)}")
+    if udev is not None:
+        write_whole(udev, lambda file: file.write(udev_rules(ports).encode()))
+        console.print(
+            f"udev rules written to {escape(str(udev))}: its head tells how to install it"
+        )
+    if not all(f.good for f in findings):
+        raise typer.Exit(1)
+
+
+@app.command()
+def codecs() -> None:
+    """Show what devices can speak, their options, and what each protocol cannot show."""
+    import inspect
+
+    from rich.console import Console
+    from rich.table import Table
+
+    from tactile_rt.drivers.codec import CODECS, codec_class
+    from tactile_rt.stream import ConfigError
+
+    table = Table("wire", "codec", "device", "options", "cannot detect", header_style="bold")
+    for wire, name in sorted(CODECS):
+        try:
+            kind = codec_class(wire, name)
+        except ConfigError as error:
+            table.add_row(wire, name, f"[dim]{error}[/]", "", "")
+            continue
+        about = (inspect.getdoc(kind) or "").partition("\n")[0]
+        options = ", ".join(kind.Options.__dataclass_fields__)
+        table.add_row(wire, name, about, options, kind.cannot_detect)
+    Console().print(table)
+
+
+@app.command()
+def describe(
+    source: Url,
+    out: Annotated[Path | None, typer.Option(help="A file to write, instead of stdout.")] = None,
+) -> None:
+    """Write a source's array (elements, poses, channels, units, rate) as JSON."""
+    import msgspec
+
+    from tactile_rt.recording import write_whole
+    from tactile_rt.sources import open_source
+
+    check_output(out)
+    with starting(), open_source(source) as opened:
+        text = msgspec.json.format(opened.spec.to_json().encode(), indent=1) + b"\n"
+    if out is None:
+        typer.echo(text, nl=False)
+    else:
+        write_whole(out, lambda file: file.write(text))
+
+
+@app.command()
+def echo(source: Url, seconds: Seconds = None) -> None:
+    """Print every sample as one line of JSON: seq, t_ns, values (element by channel), valid."""
+    import msgspec
+
+    from tactile_rt.sources import open_source
+
+    with starting():
+        opened = open_source(source)
+    with opened, leaving(seconds):
+        for chunk in opened:
+            for k in range(len(chunk)):
+                line = {
+                    "seq": int(chunk.seq[k]),
+                    "t_ns": int(chunk.t_ns[k]),
+                    "values": [[float(f"{x:.6g}") for x in row] for row in chunk.values[k]],
+                    "valid": chunk.valid[k].tolist(),
+                }
+                typer.echo(msgspec.json.encode(line))
+
+
+@app.command()
+def hz(source: Url, seconds: Seconds = None) -> None:
+    """Print once a second: the rate, the jitter of arrival, what was lost, the device's state."""
+    import numpy as np
+
+    from tactile_rt.sources import open_source
+    from tactile_rt.stream import EndOfStream
+
+    with starting():
+        opened = open_source(source)
+    with opened, leaving(seconds):
+        spec = opened.spec
+        shape = f"{spec.shape[0]} elements x {spec.shape[1]} channels"
+        typer.echo(f"{spec.name}: {shape}, nominally {spec.rate_hz:g} Hz")
+        while True:
+            began, n, late = time.monotonic(), 0, []
+            try:
+                while (left := began + WINDOW_S - time.monotonic()) > 0:
+                    chunk = opened.read(left)
+                    if chunk is not None:
+                        n += len(chunk)
+                        late.append((time.monotonic_ns() - int(chunk.t_ns[-1])) / 1e6)
+            except EndOfStream:
+                return
+            rate = n / (time.monotonic() - began)
+            spread = np.quantile(late, (0.5, 0.99)) - min(late) if late else (0.0, 0.0)
+            stats = opened.stats
+            health = getattr(opened, "health", None)
+            state = (
+                f", {health.state}{f': {health.reason}' if health.reason else ''}" if health else ""
+            )
+            typer.echo(
+                f"{rate:8.1f} Hz, jitter p50 {spread[0]:.2f} p99 {spread[1]:.2f} ms, "
+                f"missing {stats.missing}, corrupt {stats.corrupt}, "
+                f"duplicates {stats.duplicates}{state}"
+            )
+
+
+@app.command()
+def dump(
+    line: Annotated[str, typer.Argument(help="serial:PORT?baud=115200 or can:INTERFACE:CHANNEL.")],
+    seconds: Seconds = None,
+) -> None:
+    """Print what comes over a line, undecoded: time, bytes in hex, text; or CAN frames."""
+    from tactile_rt.drivers.opening import open_line
+
+    link = open_line(line)
+    start = time.monotonic_ns()
+    try:
+        with leaving(seconds):
+            while True:
+                found = link.receive(0.2)
+                if found is None:
+                    continue
+                packet, t_ns = found
+                ms = (t_ns - start) / 1e6
+                if isinstance(packet, bytes):
+                    for at in range(0, len(packet), 16):
+                        row = packet[at : at + 16]
+                        text = "".join(chr(b) if 32 <= b < 127 else "." for b in row)
+                        typer.echo(f"{ms:12.3f} ms  {row.hex(' '):<47}  {text}")
+                    continue
+                for f in packet:
+                    kind = "R" if f.remote else "F" if f.fd else " "
+                    width = 8 if f.extended else 3
+                    typer.echo(
+                        f"{ms:12.3f} ms  {f.id:0{width}X} {kind} [{len(f.data)}] {f.data.hex(' ')}"
+                    )
+    finally:
+        link.close()

@@ -1,0 +1,97 @@
+"""Which samples came, came twice or never, by the device's own counter."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.drivers.codec import Samples
+from tactile_rt.stream import SourceStats
+
+__all__ = ["Sequencer"]
+
+REMEMBERED = 64  # samples back that a repeated one is looked for
+
+
+class Sequencer:
+    """Numbers samples and counts what is lost, keeping to the counter that the device sends.
+
+    A gap of g samples with d damaged frames in it counts min(d, g) as corrupt and the rest as
+    missing. A counter that moves back to a sample that is not one already seen, or that moves
+    forward though the device's clock did not, has begun anew: what was lost meanwhile nobody knows.
+    A device without a counter can show damage only.
+
+    Args:
+        bits: the counter wraps at 2^bits; None: there is none.
+        stats: where to count.
+        period_ticks: nominal, of the device's clock; None: it has none.
+        tick_bits: that clock wraps at 2^tick_bits.
+
+    Attributes:
+        resets: times that the counter began anew.
+    """
+
+    def __init__(
+        self,
+        bits: int | None,
+        stats: SourceStats,
+        period_ticks: float | None = None,
+        tick_bits: int = 32,
+    ) -> None:
+        self.resets = 0
+        self._wrap = None if bits is None else 1 << bits
+        self._stats = stats
+        self._period_ticks, self._tick_wrap = period_ticks, 1 << tick_bits
+        self._count: int | None = None  # of the newest sample
+        self._tick = 0
+        self._next = 0
+        self._seen: dict[int, int] = {}  # of the last samples: what was in it, by its counter
+
+    def number(self, samples: Samples) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """((n,) sequence numbers, (n,) which samples to keep); the others came before.
+
+        Sequence numbers count from 0 and go on over a reset; a gap in them is a gap in the stream.
+        """
+        n = len(samples)
+        seq, keep = np.empty(n, np.int64), np.ones(n, np.bool_)
+        damaged = samples.damaged.tolist()
+        if self._wrap is None or samples.count is None:
+            self._stats.corrupt += sum(damaged)
+            seq[:] = self._next + np.arange(n)
+            self._next += n
+            return seq, keep
+        ticks = [0] * n if samples.ticks is None else samples.ticks.tolist()
+        for i, count in enumerate(samples.count.tolist()):
+            content = hash((ticks[i], samples.values[i].tobytes()))
+            gap = self._gap(count, ticks[i])
+            if gap < 0 and self._seen.get(count) == content:
+                keep[i], seq[i] = False, self._next
+                self._stats.duplicates += 1
+                continue
+            if gap < 0:
+                self.resets += 1
+                self._seen.clear()
+                gap = 0
+            corrupt = min(damaged[i], gap)
+            self._stats.corrupt += corrupt
+            self._stats.missing += gap - corrupt
+            seq[i] = self._next + gap
+            self._next = int(seq[i]) + 1
+            self._count, self._tick = count, ticks[i]
+            self._seen[count] = content
+            if len(self._seen) > REMEMBERED:
+                del self._seen[next(iter(self._seen))]
+        return seq, keep
+
+    def _gap(self, count: int, tick: int) -> int:
+        """Samples between the newest one and this; negative: none, it is not after it."""
+        assert self._wrap is not None
+        if self._count is None:
+            return 0
+        ahead = (count - self._count) % self._wrap
+        if not 0 < ahead <= self._wrap // 2:
+            return -1
+        if self._period_ticks is not None and ahead > 1:
+            passed = (tick - self._tick) % self._tick_wrap
+            expected = ahead * self._period_ticks
+            if expected < self._tick_wrap / 2 and passed < expected / 2:
+                return -1
+        return ahead - 1

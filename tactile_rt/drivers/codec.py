@@ -1,0 +1,312 @@
+"""What a device speaks: bytes or CAN frames to samples, and back.
+
+    wire --> Codec.feed --> Samples --> source (sequence, clock) --> Chunk
+    Chunk --> Codec.encode --> wire          (an emulated device, answering by Codec.respond)
+
+A codec is pure: no I/O, no clock, no thread. What comes over a wire is never trusted and never
+raises: what fails a check is counted in `stats`.
+"""
+
+import abc
+import difflib
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from importlib import import_module, metadata
+from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+
+__all__ = [
+    "CODECS",
+    "CanCodec",
+    "Codec",
+    "Event",
+    "Frame",
+    "Samples",
+    "SerialCodec",
+    "Step",
+    "WireStats",
+    "codec_class",
+]
+
+ENTRY_POINTS = "tactile_rt.codecs"  # names "serial.NAME" and "can.NAME"
+_HERE = "tactile_rt.drivers.codecs"
+
+# (wire, name): where the class is; imported when used
+CODECS = {
+    ("serial", "native"): f"{_HERE}.native:NativeSerial",
+    ("can", "native"): f"{_HERE}.native_can:NativeCan",
+    ("serial", "bota"): f"{_HERE}.bota:Bota",
+    ("serial", "optoforce"): f"{_HERE}.optoforce:OptoForceSerial",
+    ("can", "optoforce"): f"{_HERE}.optoforce:OptoForceCan",
+    ("serial", "anyskin"): f"{_HERE}.anyskin:AnySkin",
+    ("serial", "mlx_hex"): f"{_HERE}.mlx_hex:MlxHex",
+    ("serial", "hx711_whisker"): f"{_HERE}.hx711_whisker:Hx711Whisker",
+    ("serial", "ascii_line"): f"{_HERE}.ascii_line:AsciiLine",
+    ("serial", "ft300"): f"{_HERE}.ft300:Ft300",
+    ("serial", "tsf85"): f"{_HERE}.tsf85:Tsf85",
+    ("serial", "ati_485"): f"{_HERE}.ati_485:Ati485",
+    ("serial", "kwr75"): f"{_HERE}.kwr75:Kwr75",
+    ("can", "xela"): f"{_HERE}.xela:Xela",
+    ("can", "can-dbc"): f"{_HERE}.can_dbc:CanDbc",
+    ("can", "ati_can"): f"{_HERE}.ati_can:AtiCan",
+    ("can", "aft200"): f"{_HERE}.aft200:Aft200",
+    ("can", "icub_skin"): f"{_HERE}.icub_skin:IcubSkin",
+}
+
+
+class Event(StrEnum):
+    """What a host tells a device; see `Codec.commands`."""
+
+    START = "start"  # after connecting: configure it and let it stream
+    STOP = "stop"  # before closing
+    POLL = "poll"  # ask for one sample
+
+
+class Frame(NamedTuple):
+    """One CAN frame.
+
+    Attributes:
+        id: arbitration identifier, 11 bits, or 29 if `extended`.
+        data: 0 to 8 bytes, to 64 if `fd`.
+        extended: whether the identifier is of 29 bits.
+        fd: whether it is a CAN FD frame.
+        remote: whether it asks for data (RTR) and has none.
+    """
+
+    id: int
+    data: bytes = b""
+    extended: bool = False
+    fd: bool = False
+    remote: bool = False
+
+
+Packet = TypeVar("Packet", bytes, Sequence[Frame])
+
+
+@dataclass(frozen=True)
+class Step(Generic[Packet]):
+    """One thing to send to a device, and what to wait for.
+
+    Attributes:
+        send: what to send; empty: only wait.
+        expect: what the answer has in it: bytes, or the identifier of a CAN frame; None: no answer.
+        timeout_s: how long the answer may take; without one the device counts as not there.
+        pause_s: how long to wait before the next step, answer or not.
+        what: the step in words, for the message when no answer comes.
+    """
+
+    send: Packet
+    expect: bytes | int | None = None
+    timeout_s: float = 1.0
+    pause_s: float = 0.0
+    what: str = ""
+
+
+@dataclass(frozen=True)
+class Samples:
+    """n >= 1 samples as the device numbers and times them.
+
+    Attributes:
+        values: (n, element, channel) float32, SI units.
+        valid: (n, element) bool; False where the device or the wire says that there is no value.
+        arrived_ns: (n,) int64 host time at which the last part of each sample arrived.
+        damaged: (n,) int64 frames that failed a check since the sample before.
+        count: (n,) int64 the device's sample counter as it came (modulo 2^count_bits); None if it
+            has none.
+        ticks: (n,) int64 the device's clock as it came (modulo 2^tick_bits); None if it has none.
+        status: (n,) int64 the device's status bits; None if it has none.
+    """
+
+    values: NDArray[np.float32]
+    valid: NDArray[np.bool_]
+    arrived_ns: NDArray[np.int64]
+    damaged: NDArray[np.int64]
+    count: NDArray[np.int64] | None = None
+    ticks: NDArray[np.int64] | None = None
+    status: NDArray[np.int64] | None = None
+
+    def __len__(self) -> int:
+        return len(self.arrived_ns)
+
+
+@dataclass
+class WireStats:
+    """What came over the wire since the codec was made.
+
+    Attributes:
+        intact: frames that passed every check.
+        corrupt: frames that failed one.
+        skipped: bytes between frames; on CAN, frames of identifiers that are not this device's.
+        incomplete: samples of which parts never came (devices that send a sample in parts).
+    """
+
+    intact: int = 0
+    corrupt: int = 0
+    skipped: int = 0
+    incomplete: int = 0
+
+
+class Codec(abc.ABC, Generic[Packet]):
+    """One device's protocol. Implementations are of `SerialCodec` or `CanCodec`.
+
+    Args (of every implementation):
+        options: its `Options`.
+
+    Attributes:
+        Options: frozen dataclass of what a URL may set; its docstring explains them.
+        wire: ``serial`` or ``can``.
+        count_bits: width of the device's sample counter; None: it has none.
+        tick_ns: length of a tick of the device's clock, ns; None: it sends no time.
+        tick_bits: width of that clock.
+        status_bits: what each bit of the status means when set.
+        cannot_detect: which losses and damages this protocol cannot show, in a sentence.
+        spec: what the samples are; None until the device has described itself.
+        stats: what has come so far.
+    """
+
+    wire: ClassVar[str]
+    Options: ClassVar[type[Any]]
+    count_bits: int | None = None
+    tick_ns: float | None = None
+    tick_bits: int = 32
+    status_bits: ClassVar[dict[int, str]] = {}
+    cannot_detect: ClassVar[str] = ""
+
+    def __init__(self, spec: ArraySpec | None) -> None:
+        self.spec = spec
+        self.stats = WireStats()
+
+    @abc.abstractmethod
+    def feed(self, packet: Packet, t_ns: int) -> Samples | None:
+        """Take what has arrived, cut anywhere; return the samples that it completes, or None.
+
+        Never raises, whatever comes. The result does not depend on how the input was cut, arrival
+        times apart.
+        """
+
+    @abc.abstractmethod
+    def encode(self, chunk: Chunk) -> list[Packet]:
+        """What the device sends for each of these samples.
+
+        Args:
+            chunk: of `spec`; `seq` is the device's counter and `t_ns` its clock, neither wrapped.
+
+        Returns:
+            One packet per sample.
+        """
+
+    def commands(self, event: Event) -> tuple[Step[Packet], ...]:
+        """What to send to the device when this happens."""
+        return ()
+
+    def respond(self, packet: Packet) -> Packet:
+        """What the device answers; the device's side, for an emulator.
+
+        It also updates `streaming` and `polled`.
+        """
+        return packet[:0]
+
+    streaming = True  # the device's side: whether it sends without being asked, now
+    polled = 0  # the device's side: samples asked for and not yet sent
+    polls = False  # the host's side: whether each sample must be asked for (`Event.POLL`)
+
+    @abc.abstractmethod
+    def forget(self) -> None:
+        """Drop what has come of a frame not yet complete (after a reconnection)."""
+
+
+class SerialCodec(Codec[bytes]):
+    """A protocol over a serial line.
+
+    Attributes:
+        baud: the device's default.
+        parity: ``N``, ``E`` or ``O``.
+    """
+
+    wire = "serial"
+    baud: ClassVar[int] = 115200
+    parity: ClassVar[str] = "N"
+
+
+class CanCodec(Codec[Sequence[Frame]]):
+    """A protocol over a CAN bus.
+
+    Attributes:
+        bitrate: the device's default, bit/s.
+        data_bitrate: of the data phase, if it speaks CAN FD.
+    """
+
+    wire = "can"
+    bitrate: ClassVar[int] = 1_000_000
+    data_bitrate: ClassVar[int | None] = None
+
+
+@dataclass
+class Batch:
+    """Samples collected while a packet is decoded; `take` makes one `Samples` of them."""
+
+    values: list[Any] = field(default_factory=list)  # each (element, channel), or flat
+    valid: list[Any] = field(default_factory=list)
+    damaged: list[int] = field(default_factory=list)
+    count: list[int] = field(default_factory=list)
+    ticks: list[int] = field(default_factory=list)
+    status: list[int] = field(default_factory=list)
+
+    def take(self, shape: tuple[int, int], t_ns: int) -> Samples | None:
+        """All samples so far, or None; each list is empty or of one entry per sample.
+
+        Args:
+            shape: (element, channel) of a sample.
+            t_ns: when they arrived.
+        """
+        n = len(self.values)
+        if n == 0:
+            return None
+        values = np.asarray(self.values, dtype=np.float32).reshape(n, *shape)
+        valid = np.asarray(self.valid, dtype=np.bool_) if self.valid else np.ones((n, 1), np.bool_)
+        # what is not finite is no measurement, whatever the device says
+        valid = valid & np.isfinite(values).all(axis=2)
+        whole = [
+            np.array(x, np.int64) if x else None for x in (self.count, self.ticks, self.status)
+        ]
+        damaged = np.array(self.damaged or [0] * n, np.int64)
+        return Samples(values, valid, np.full(n, t_ns, np.int64), damaged, *whole)
+
+
+def codec_class(wire: str, name: str) -> type[Codec[Any]]:
+    """The codec of this name for ``serial`` or ``can``.
+
+    Raises:
+        ConfigError: there is none, or what it needs is not installed.
+    """
+    if (wire, name) in CODECS:
+        module, _, attribute = CODECS[wire, name].partition(":")
+        try:
+            found: type[Codec[Any]] = getattr(import_module(module), attribute)
+        except ModuleNotFoundError as error:
+            if (error.name or "").startswith("tactile_rt"):
+                raise
+            raise ConfigError(
+                f"codec {name} needs {error.name}, which is not installed: pip install {error.name}"
+            ) from None
+        return found
+    points = metadata.entry_points(group=ENTRY_POINTS)
+    for point in points.select(name=f"{wire}.{name}"):
+        loaded: type[Codec[Any]] = point.load()
+        return loaded
+    known = {n for w, n in CODECS if w == wire}
+    known |= {n.partition(".")[2] for n in points.names if n.startswith(f"{wire}.")}
+    other = {n for w, n in CODECS if w != wire} - known
+    if name in other:
+        elsewhere = "can" if wire == "serial" else "serial"
+        raise ConfigError(f"codec {name} speaks over {elsewhere}:, not over {wire}:")
+    near = difflib.get_close_matches(name, sorted(known), 1)
+    raise ConfigError(
+        f"no {wire} codec {name!r}: there are {', '.join(sorted(known))}"
+        + (f" (did you mean {near[0]}?)" if near else "")
+    )

@@ -1,0 +1,126 @@
+"""Aidin Robotics AFT200-D80 force/torque sensor on CAN."""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
+from tactile_rt.drivers.codecs.rounds import Rounds
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+
+__all__ = ["Aft200", "Aft200Options"]
+
+COMMAND_ID: Final = 0x102
+BIAS, TRANSMIT, PERIOD = 2, 3, 5  # second byte of a command
+XYZ: Final = struct.Struct(">3H")
+# SI units per count, and the value of a 0: force in N, torque in N m
+SCALE: Final = np.array([0.01] * 3 + [0.002] * 3)
+ZERO: Final = np.array([-300.0] * 3 + [-50.0] * 3)
+BIAS_S: Final = 1.0  # the sensor is silent while it takes its bias
+
+
+@dataclass(frozen=True)
+class Aft200Options:
+    """Options of an AFT200.
+
+    Attributes:
+        sensor: its number, first byte of the commands.
+        force_id: identifier of its force frames; torque has the next one.
+        rate_hz: to set, from 15.3 to 1000 Hz.
+        bias: whether it shall take its present load as zero at the start.
+    """
+
+    sensor: int = 1
+    force_id: int = 1
+    rate_hz: float = 1000.0
+    bias: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.sensor <= 0xFF:
+            raise ConfigError(f"sensor must be from 0 to 255, not {self.sensor}")
+        if not 0 <= self.force_id <= 0x7FE:
+            raise ConfigError(f"force_id must be from 0 to 0x7fe, not {self.force_id:#x}")
+        if not 1e6 / 0xFFFF <= self.rate_hz <= 1000:
+            raise ConfigError(f"rate_hz must be from 15.3 to 1000, not {self.rate_hz:g}")
+
+
+class Aft200(CanCodec):
+    """A frame of forces, then one of torques, three u16 big-endian each.
+
+    Of a sample without its torques, or without its forces, nothing is valid.
+
+    Source: the public driver rise_aft_can (class AFT200D80).
+    """
+
+    Options = Aft200Options
+    cannot_detect = "a lost sample: there is no counter, and forces and torques pair by order only"
+
+    def __init__(self, options: Aft200Options) -> None:
+        self._options, self._first = options, options.force_id
+        self._period_us = round(1e6 / options.rate_hz)
+        super().__init__(
+            ArraySpec(
+                name="AFT200-D80",
+                elements=("sensor",),
+                grid=((0, 0),),
+                positions=((0.0, 0.0, 0.0),),
+                orientations=((1.0, 0.0, 0.0, 0.0),),
+                channels=("fx", "fy", "fz", "mx", "my", "mz"),
+                units=("N",) * 3 + ("N m",) * 3,
+                rate_hz=1e6 / self._period_us,  # it takes whole microseconds
+                frame="sensor",
+            )
+        )
+        self._rounds: Rounds[bytes] = Rounds(2)
+        self.streaming = False
+
+    def forget(self) -> None:
+        self._rounds.forget()
+
+    def feed(self, packet: Sequence[Frame], t_ns: int) -> Samples | None:
+        batch, stats = Batch(), self.stats
+        for identifier, data, extended, _, remote in packet:
+            part = identifier - self._first
+            if extended or remote or not 0 <= part <= 1:
+                stats.skipped += 1
+            elif len(data) < XYZ.size:
+                stats.corrupt += 1
+            else:
+                stats.intact += 1
+                for parts in self._rounds.add(part, data[: XYZ.size]):
+                    whole = None not in parts
+                    stats.incomplete += not whole
+                    raw = b"".join([p or bytes(XYZ.size) for p in parts])
+                    batch.values.append(np.frombuffer(raw, ">u2") * SCALE + ZERO)
+                    batch.valid.append((whole,))
+        return batch.take((1, 6), t_ns)
+
+    def commands(self, event: Event) -> tuple[Step[Sequence[Frame]], ...]:
+        if event != Event.START:  # how to stop it is not public
+            return ()
+        steps = [self._command(PERIOD, *self._period_us.to_bytes(2, "big"))]
+        if self._options.bias:
+            steps.append(self._command(BIAS, 1, pause_s=BIAS_S))
+        return (*steps, self._command(TRANSMIT, 1))
+
+    def _command(self, *data: int, pause_s: float = 0.0) -> Step[Sequence[Frame]]:
+        whole = bytes((self._options.sensor, *data)).ljust(8, b"\0")
+        return Step((Frame(COMMAND_ID, whole),), pause_s=pause_s)
+
+    def encode(self, chunk: Chunk) -> list[Sequence[Frame]]:
+        counts = np.rint((np.nan_to_num(chunk.values[:, 0].astype(np.float64)) - ZERO) / SCALE)
+        words = np.clip(counts, 0, 0xFFFF).astype(">u2")
+        return [
+            [Frame(self._first + part, w[3 * part : 3 * part + 3].tobytes()) for part in range(2)]
+            for w in words
+        ]
+
+    def respond(self, packet: Sequence[Frame]) -> Sequence[Frame]:
+        for frame in packet:
+            mine = frame.id == COMMAND_ID and len(frame.data) >= 3 and not frame.extended
+            if mine and frame.data[:2] == bytes((self._options.sensor, TRANSMIT)):
+                self.streaming = frame.data[2] == 1
+        return []

@@ -1,0 +1,253 @@
+"""What the columns of a board that prints numbers are, from a TOML file or a few words.
+
+A column is written in one word:
+
+    -                                 nothing of interest
+    count[:BITS]                      the sample's number, which wraps at 2^BITS (32)
+    time[*SCALE]:s                    seconds, with decimals
+    time:ms|us|ns[:BITS]              whole milli-, micro- or nanoseconds, wrapping at 2^BITS (32)
+    ELEMENT.CHANNEL[*SCALE][:UNIT]    a measurement
+
+SCALE is what a one on the wire stands for, in UNIT; what is stored is SI. Without UNIT it is SI.
+"""
+
+import re
+import tomllib
+from dataclasses import dataclass
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from tactile_rt.stream import ArraySpec, ConfigError
+
+__all__ = ["UNITS", "Column", "Element", "Mapping", "array_of", "parse_column", "read_mapping"]
+
+VERSION: Final = 1
+MOST_BITS: Final = 53  # of a counter: what a float64 holds
+
+_G: Final = 9.80665  # m/s^2
+# unit on the wire: (SI unit, SI units in it, offset)
+UNITS: Final[dict[str, tuple[str, float, float]]] = {
+    "N": ("N", 1.0, 0.0), "mN": ("N", 1e-3, 0.0), "uN": ("N", 1e-6, 0.0),
+    "gf": ("N", 1e-3 * _G, 0.0), "kgf": ("N", _G, 0.0),
+    "N m": ("N m", 1.0, 0.0), "Nm": ("N m", 1.0, 0.0), "mNm": ("N m", 1e-3, 0.0),
+    "uNm": ("N m", 1e-6, 0.0), "Pa": ("Pa", 1.0, 0.0), "kPa": ("Pa", 1e3, 0.0),
+    "T": ("T", 1.0, 0.0), "mT": ("T", 1e-3, 0.0), "uT": ("T", 1e-6, 0.0),
+    "K": ("K", 1.0, 0.0), "degC": ("K", 1.0, 273.15), "rad": ("rad", 1.0, 0.0),
+    "deg": ("rad", np.pi / 180, 0.0), "m": ("m", 1.0, 0.0), "mm": ("m", 1e-3, 0.0),
+    "um": ("m", 1e-6, 0.0), "V": ("V", 1.0, 0.0), "mV": ("V", 1e-3, 0.0),
+    "F": ("F", 1.0, 0.0), "pF": ("F", 1e-12, 0.0), "m/s2": ("m/s2", 1.0, 0.0),
+    "g": ("m/s2", _G, 0.0), "1": ("1", 1.0, 0.0),
+}  # fmt: skip
+# SI units of channels whose names say what they are
+_KNOWN: Final = {
+    **dict.fromkeys(("fx", "fy", "fz"), "N"), **dict.fromkeys(("mx", "my", "mz"), "N m"),
+    **dict.fromkeys(("bx", "by", "bz"), "T"), "temperature": "K", "angle": "rad", "pressure": "Pa",
+}  # fmt: skip
+
+_MEASUREMENT: Final = re.compile(r"([^.*:\s]+)\.([^.*:\s]+)(?:\*([^:\s]+))?(?::(.+))?")
+_SECONDS: Final = re.compile(r"time(?:\*([^:\s]+))?:s")
+_TIME: Final = re.compile(r"time:(ms|us|ns)(?::(\d+))?")
+_COUNT: Final = re.compile(r"count(?::(\d+))?")
+_WHISKER: Final = re.compile(r"([A-Z])(\d{1,2})")
+
+
+class Element(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Where one element is.
+
+    Attributes:
+        grid: (row, column).
+        position: of its base in the mount frame, m.
+        orientation: unit quaternion (w, x, y, z) that turns its own frame into the mount frame.
+    """
+
+    grid: tuple[int, int] | None = None
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+
+class Mapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a board prints, key by key as in its TOML file; docs/codecs/ascii_line.toml is one.
+
+    Attributes:
+        columns: of a line, in order, as the module's docstring says.
+        version: of this format.
+        name: of the array.
+        frame: name of the mount frame.
+        rate_hz: how often the board prints.
+        labels: whether numbers have names before them, ``x:1.5 y=2``.
+        start: what to send so that it begins.
+        stop: what to send so that it ends.
+        poll: what to send for each sample; without it the board prints by itself.
+        elements: where each is. Without a grid, those named like whiskers, A0 to Z99, get their row
+            and column, others stand in one row.
+    """
+
+    columns: tuple[str, ...]
+    version: int = VERSION
+    name: str = "ascii_line"
+    frame: str = "mount"
+    rate_hz: float = 100.0
+    labels: bool = False
+    start: str = ""
+    stop: str = ""
+    poll: str = ""
+    elements: dict[str, Element] = {}
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column; what is measured is number x scale + offset in SI.
+
+    Attributes:
+        kind: ``value``, ``count``, ``s`` (decimal time), ``ms``, ``us``, ``ns`` or ``-``.
+        bits: of a counter or a whole-numbered time.
+        element: whose value it is.
+        channel: which.
+        unit: SI.
+    """
+
+    kind: str
+    scale: float = 1.0
+    offset: float = 0.0
+    bits: int = 32
+    element: str = ""
+    channel: str = ""
+    unit: str = ""
+
+
+def read_mapping(path: str) -> Mapping:
+    """Read a mapping file.
+
+    Raises:
+        ConfigError: it cannot be read or is none; names the file and the key or line.
+    """
+    try:
+        with open(path, "rb") as file:
+            fields = tomllib.load(file)
+        mapping = msgspec.convert(fields, Mapping)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: not a text file") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not TOML: {error}") from None
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    if mapping.version != VERSION:
+        raise ConfigError(f"{path}: version {mapping.version}; this release reads {VERSION}")
+    return mapping
+
+
+def parse_column(word: str, where: str) -> Column:
+    """One column from its word.
+
+    Args:
+        word: as the module's docstring says.
+        where: it stands, for the message.
+
+    Raises:
+        ConfigError: not of that form, an unknown unit, a scale that is none.
+    """
+    if word == "-":
+        return Column("-")
+    if found := _COUNT.fullmatch(word):
+        return Column("count", bits=_bits(found[1], where))
+    if found := _SECONDS.fullmatch(word):
+        return Column("s", scale=_scale(found[1], where))
+    if found := _TIME.fullmatch(word):
+        return Column(found[1], bits=_bits(found[2], where))
+    found = _MEASUREMENT.fullmatch(word)
+    if found is None:
+        raise ConfigError(
+            f"{where}: {word!r} is no column: write ELEMENT.CHANNEL*SCALE:UNIT (A0.fx*0.5:mN), "
+            "count, time:ms, time:s, or - for nothing"
+        )
+    element, channel, scale, unit = found.groups()
+    unit = unit or _KNOWN.get(channel, "1")
+    if unit not in UNITS:
+        raise ConfigError(f"{where}: unknown unit {unit!r}; there are {', '.join(UNITS)}")
+    si, factor, offset = UNITS[unit]
+    return Column("value", _scale(scale, where) * factor, offset, 0, element, channel, si)
+
+
+def array_of(mapping: Mapping, columns: tuple[Column, ...], where: str) -> ArraySpec:
+    """The array that the columns make up, elements and channels as they first come.
+
+    Args:
+        mapping: for names and poses.
+        columns: parsed.
+        where: they stand, for messages.
+
+    Raises:
+        ConfigError: a column is missing, doubled or of another unit, or a pose of no element.
+    """
+    values = [c for c in columns if c.kind == "value"]
+    if not values:
+        raise ConfigError(f"{where}: no column measures anything, e.g. A0.fx")
+    elements = tuple(dict.fromkeys(c.element for c in values))
+    units: dict[str, str] = {}
+    seen = set()
+    for c in values:
+        if (c.element, c.channel) in seen:
+            raise ConfigError(f"{where}: {c.element}.{c.channel} stands there twice")
+        seen.add((c.element, c.channel))
+        if units.setdefault(c.channel, c.unit) != c.unit:
+            raise ConfigError(
+                f"{where}: {c.element}.{c.channel} is in {c.unit}, another {c.channel} in "
+                f"{units[c.channel]}"
+            )
+    for element in elements:
+        for channel in units:
+            if (element, channel) not in seen:
+                raise ConfigError(
+                    f"{where}: no column {element}.{channel}; every element needs every channel"
+                )
+    for what, kinds in (("count", ["count"]), ("time", ["s", "ms", "us", "ns"])):
+        if sum(c.kind in kinds for c in columns) > 1:
+            raise ConfigError(f"{where}: {what} stands there twice")
+    for name in mapping.elements:
+        if name not in elements:
+            raise ConfigError(f"{where}: no column is of elements.{name}")
+    poses = [mapping.elements.get(e, Element()) for e in elements]
+    try:
+        return ArraySpec(
+            name=mapping.name,
+            elements=elements,
+            grid=_grid(elements, poses),
+            positions=tuple(p.position for p in poses),
+            orientations=tuple(p.orientation for p in poses),
+            channels=tuple(units),
+            units=tuple(units.values()),
+            rate_hz=mapping.rate_hz,
+            frame=mapping.frame,
+        )
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from None
+
+
+def _grid(elements: tuple[str, ...], poses: list[Element]) -> tuple[tuple[int, int], ...]:
+    names = [_WHISKER.fullmatch(e) for e in elements]
+    cells = [
+        p.grid or ((ord(n[1]) - ord("A"), int(n[2])) if n and all(names) else (0, i))
+        for i, (p, n) in enumerate(zip(poses, names, strict=True))
+    ]
+    return tuple(cells)
+
+
+def _scale(text: str | None, where: str) -> float:
+    try:
+        scale = float(text or 1.0)
+    except ValueError:
+        scale = 0.0
+    if not (np.isfinite(scale) and scale):
+        raise ConfigError(f"{where}: scale must be a number other than 0, not {text!r}")
+    return scale
+
+
+def _bits(text: str | None, where: str) -> int:
+    bits = int(text or 32)
+    if not 1 <= bits <= MOST_BITS:
+        raise ConfigError(f"{where}: a counter has 1 to {MOST_BITS} bits, not {bits}")
+    return bits

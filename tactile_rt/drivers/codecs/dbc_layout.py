@@ -1,0 +1,116 @@
+"""Where in a device's CAN frames its samples are."""
+
+import math
+import struct
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.drivers.codec import Frame
+from tactile_rt.stream import ArraySpec
+
+__all__ = ["Mapping", "Part", "Signal"]
+
+FLOATS: Final = {16: ">e", 32: ">f", 64: ">d"}
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Where a number is in a frame's data.
+
+    Attributes:
+        message: of which it is.
+        name: of the signal.
+        start: its lowest bit, counted from the lowest bit of byte 0; if `big`: its highest bit,
+            counted from the highest of byte 0.
+        length: bits.
+        big: whether its bytes are big-endian.
+        signed: whether it is in two's complement.
+        real: whether it is an IEEE 754 number.
+    """
+
+    message: str
+    name: str
+    start: int
+    length: int
+    big: bool
+    signed: bool
+    real: bool
+
+    def read(self, data: bytes) -> float:
+        """The number as it is in the data, before the DBC file's factor and offset."""
+        if self.big:
+            raw = int.from_bytes(data, "big") >> (8 * len(data) - self.start - self.length)
+        else:
+            raw = int.from_bytes(data, "little") >> self.start
+        raw &= (1 << self.length) - 1
+        if self.real:
+            number: float = struct.unpack(FLOATS[self.length], raw.to_bytes(self.length // 8))[0]
+            return number
+        if self.signed and raw >> (self.length - 1):
+            raw -= 1 << self.length
+        return raw
+
+    def nearest(self, value: float) -> float:
+        """What it can hold that is nearest to this value; NaN is 0."""
+        if not math.isfinite(value):
+            value = 0.0
+        if self.real:
+            return value
+        low, high = (0, 1 << self.length) if not self.signed else (-1 << self.length - 1, 0)
+        high = high or 1 << self.length - 1
+        return min(max(round(value), low), high - 1)
+
+
+@dataclass(frozen=True)
+class Part:
+    """A frame that every sample has: a message, with these values of its multiplexers.
+
+    Attributes:
+        id: identifier.
+        extended: whether it has 29 bits.
+        length: bytes of data.
+        when: multiplexers and the values of each that make it this part.
+        message: cantools' object.
+    """
+
+    id: int
+    extended: bool
+    length: int
+    when: tuple[tuple[Signal, frozenset[int]], ...]
+    message: Any
+
+    def matches(self, data: bytes) -> bool:
+        """Whether the multiplexers in the data have these values."""
+        return all(signal.read(data) in values for signal, values in self.when)
+
+
+@dataclass(frozen=True)
+class Mapping:
+    """How a sample is put together.
+
+    Attributes:
+        spec: what the samples are.
+        parts: in the order in which the device sends them.
+        cells: (element * channel) signals, and the parts that each is in.
+        gain: (element, channel) SI units per raw count.
+        bias: (element, channel) SI value of a raw 0.
+        counter: signal and its parts, if there is one; also `time` and `status`.
+        tick_ns: length of a tick of `time`, ns.
+        invalid: bits of the status that make a sample invalid.
+        commands: (event, frame, identifier of the answer).
+    """
+
+    spec: ArraySpec
+    parts: tuple[Part, ...]
+    cells: tuple[tuple[Signal, tuple[int, ...]], ...]
+    gain: NDArray[np.float64]
+    bias: NDArray[np.float64]
+    counter: tuple[Signal, tuple[int, ...]] | None
+    time: tuple[Signal, tuple[int, ...]] | None
+    status: tuple[Signal, tuple[int, ...]] | None
+    tick_ns: float | None
+    invalid: int
+    commands: tuple[tuple[str, Frame, int | None], ...]

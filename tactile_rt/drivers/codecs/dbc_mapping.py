@@ -1,0 +1,269 @@
+"""Which signals of a DBC file are which elements and channels: ``docs/codecs/can_dbc.toml``."""
+
+import difflib
+import math
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import cantools
+import msgspec
+import numpy as np
+from cantools.database.errors import Error as DatabaseError
+
+from tactile_rt.drivers.codec import Frame
+from tactile_rt.drivers.codecs.dbc_layout import Mapping, Part, Signal
+from tactile_rt.stream import ArraySpec, ConfigError
+
+__all__ = ["read_mapping"]
+
+Cell = tuple[int, int]
+Point = tuple[float, float, float]
+
+
+class _Channel(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    unit: str
+    scale: float = 1.0
+    offset: float = 0.0
+
+
+class _Element(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    grid: Cell
+    signals: dict[str, str]
+    position_m: Point = (0.0, 0.0, 0.0)
+    orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+
+class _Signal(msgspec.Struct, forbid_unknown_fields=True):
+    signal: str
+
+
+class _Time(_Signal):
+    tick_us: Annotated[float, msgspec.Meta(gt=0)]
+
+
+class _Status(_Signal):
+    invalid: int = 0
+
+
+class _Command(msgspec.Struct, forbid_unknown_fields=True):
+    when: Literal["start", "stop", "poll"]
+    id: Annotated[int, msgspec.Meta(ge=0, le=0x1FFFFFFF)]
+    data: str = ""
+    extended: bool = False
+    answer: int | None = None
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    dbc: str
+    name: str
+    rate_hz: float
+    channel: Annotated[list[_Channel], msgspec.Meta(min_length=1)]
+    element: Annotated[list[_Element], msgspec.Meta(min_length=1)]
+    frame: str = "mount"
+    order: list[str] = []
+    counter: _Signal | None = None
+    time: _Time | None = None
+    status: _Status | None = None
+    command: list[_Command] = []
+
+
+_STRUCTS = (_File, _Channel, _Element, _Time, _Status, _Command)
+
+
+def read_mapping(path: Path) -> Mapping:
+    """Read a mapping and the DBC file that it names.
+
+    Raises:
+        ConfigError: one line that names the file, the message or signal, and the nearest name.
+    """
+    file = _decode(path)
+    return _Reader(path, file).mapping()
+
+
+def _decode(path: Path) -> _File:
+    try:
+        return msgspec.toml.decode(path.read_text(encoding="utf-8"), type=_File)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from None
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
+    except msgspec.MsgspecError as error:
+        message = str(error)
+        if unknown := re.search(r"unknown field `(.*?)`", message):
+            message += _near(unknown[1], [f for s in _STRUCTS for f in s.__struct_fields__])
+        raise ConfigError(f"{path}: {message}") from None
+
+
+def _near(name: str, known: Iterable[str]) -> str:
+    near = difflib.get_close_matches(name, list(known), 1)
+    return f" (did you mean {near[0]}?)" if near else ""
+
+
+class _Reader:
+    def __init__(self, path: Path, file: _File) -> None:
+        self.path, self.file = path, file
+        self.dbc = path.parent / file.dbc
+        try:
+            database: Any = cantools.database.load_file(self.dbc, "dbc")
+        except OSError as error:
+            raise ConfigError(f"{path}, dbc: {self.dbc}: {error.strerror or error}") from None
+        except (DatabaseError, UnicodeDecodeError, ValueError) as error:
+            why = " ".join(str(error).split())
+            raise ConfigError(f"{self.dbc}: is not a DBC file that cantools reads: {why}") from None
+        self.messages: dict[str, Any] = {m.name: m for m in database.messages}
+        # (message, multiplexers' values) of each signal that is used
+        self.used: dict[tuple[str, str], tuple[tuple[str, frozenset[int]], ...]] = {}
+
+    def mapping(self) -> Mapping:
+        file, path = self.file, self.path
+        spec = self._spec()
+        names = [c.name for c in file.channel]
+        signals, gain, bias = [], [], []
+        for element in file.element:
+            where = f"{path}, element {element.name}"
+            for name in element.signals:
+                if name not in names:
+                    raise ConfigError(f"{where}: no channel {name!r}{_near(name, names)}")
+            for channel in file.channel:
+                if channel.name not in element.signals:
+                    raise ConfigError(f"{where}: no signal for channel {channel.name}; add one")
+                if not (math.isfinite(channel.scale) and channel.scale):
+                    raise ConfigError(f"{path}, channel {channel.name}: scale must not be 0")
+                signal, found = self._find(
+                    f"{where}, channel {channel.name}", element.signals[channel.name]
+                )
+                signals.append(found)
+                gain.append(signal.scale * channel.scale)
+                bias.append(signal.offset * channel.scale + channel.offset)
+        singles = [
+            self._integer(what, getattr(file, what)) for what in ("counter", "time", "status")
+        ]
+        parts = self._parts()
+        counter, time, status = (None if s is None else (s, self._in(s, parts)) for s in singles)
+        return Mapping(
+            spec,
+            parts,
+            tuple((s, self._in(s, parts)) for s in signals),
+            np.array(gain).reshape(spec.shape),
+            np.array(bias).reshape(spec.shape),
+            counter,
+            time,
+            status,
+            file.time.tick_us * 1e3 if file.time else None,
+            file.status.invalid if file.status else 0,
+            tuple(self._command(i, c) for i, c in enumerate(file.command, 1)),
+        )
+
+    def _spec(self) -> ArraySpec:
+        elements, channels = self.file.element, self.file.channel
+        try:
+            return ArraySpec(
+                name=self.file.name,
+                elements=tuple(e.name for e in elements),
+                grid=tuple(e.grid for e in elements),
+                positions=tuple(e.position_m for e in elements),
+                orientations=tuple(e.orientation for e in elements),
+                channels=tuple(c.name for c in channels),
+                units=tuple(c.unit for c in channels),
+                rate_hz=self.file.rate_hz,
+                frame=self.file.frame,
+            )
+        except ConfigError as error:
+            raise ConfigError(f"{self.path}: {error}") from None
+
+    def _message(self, where: str, name: str) -> Any:
+        if name not in self.messages:
+            hint = _near(name, self.messages)
+            raise ConfigError(f"{where}: no message {name!r} in {self.dbc}{hint}")
+        return self.messages[name]
+
+    def _find(self, where: str, name: str) -> tuple[Any, Signal]:
+        """cantools' signal, and ours, of ``Message.Signal``."""
+        of, dot, signal_name = name.partition(".")
+        if not dot:
+            owners = [m.name for m in self.messages.values() for s in m.signals if s.name == name]
+            hint = f" (did you mean {owners[0]}.{name}?)" if owners else ""
+            raise ConfigError(f"{where}: {name!r} must be written Message.Signal{hint}")
+        message = self._message(where, of)
+        known = {s.name: s for s in message.signals}
+        if signal_name not in known:
+            hint = _near(signal_name, known) or f"; it has {', '.join(known)}"
+            raise ConfigError(
+                f"{where}: no signal {signal_name!r} in message {of} of {self.dbc}{hint}"
+            )
+        signal = known[signal_name]
+        chain = []
+        outer = signal
+        while outer.multiplexer_signal:
+            chain.append((outer.multiplexer_signal, frozenset(outer.multiplexer_ids)))
+            outer = known[outer.multiplexer_signal]
+        self.used[of, signal_name] = tuple(chain)
+        return signal, _signal(message, signal)
+
+    def _integer(self, what: str, wanted: _Signal | None) -> Signal | None:
+        if wanted is None:
+            return None
+        _, signal = self._find(f"{self.path}, {what}", wanted.signal)
+        if signal.real:
+            raise ConfigError(f"{self.path}, {what}: {wanted.signal} must be of whole numbers")
+        return signal
+
+    def _parts(self) -> tuple[Part, ...]:
+        chains = {(of, frozenset(chain)) for (of, _), chain in self.used.items()}
+        # what every frame of a message has belongs to each of its multiplexed parts
+        last = [c for c in chains if not any(c[0] == o[0] and c[1] < o[1] for o in chains)]
+        order, messages = self.file.order, {of for of, _ in last}
+        for name in order:
+            self._message(f"{self.path}, order", name)
+        if order and (left := sorted(messages - set(order))):
+            raise ConfigError(f"{self.path}, order: {left[0]} is missing; name every message used")
+        parts = []
+        for of, chain in last:
+            message = self.messages[of]
+            known = {s.name: s for s in message.signals}
+            when = tuple(
+                sorted(
+                    ((_signal(message, known[m]), values) for m, values in chain),
+                    key=lambda w: w[0].name,
+                )
+            )
+            extended = bool(message.is_extended_frame)
+            part = Part(message.frame_id, extended, message.length, when, message)
+            rank = order.index(of) if order else message.frame_id
+            parts.append((rank, sorted(min(v) for _, v in when), part))
+        return tuple(part for *_, part in sorted(parts, key=lambda p: p[:2]))
+
+    def _in(self, signal: Signal, parts: Sequence[Part]) -> tuple[int, ...]:
+        needs = self.used[signal.message, signal.name]
+        return tuple(
+            i
+            for i, part in enumerate(parts)
+            if part.message.name == signal.message
+            and {(m, v) for m, v in needs} <= {(s.name, v) for s, v in part.when}
+        )
+
+    def _command(self, number: int, command: _Command) -> tuple[str, Frame, int | None]:
+        where = f"{self.path}, command {number}"
+        try:
+            data = bytes.fromhex(command.data)
+        except ValueError:
+            raise ConfigError(f"{where}: data {command.data!r} must be hexadecimal") from None
+        if command.id > 0x7FF and not command.extended:
+            raise ConfigError(f"{where}: id {command.id:#x} has over 11 bits: add extended = true")
+        if len(data) > 64:
+            raise ConfigError(f"{where}: a CAN frame has at most 64 bytes, not {len(data)}")
+        frame = Frame(command.id, data, command.extended, fd=len(data) > 8)
+        return command.when, frame, command.answer
+
+
+def _signal(message: Any, signal: Any) -> Signal:
+    big = signal.byte_order == "big_endian"
+    # a DBC file counts bits from the lowest of each byte, in either order
+    start = signal.start // 8 * 8 + 7 - signal.start % 8 if big else signal.start
+    return Signal(
+        message.name, signal.name, start, signal.length, big, signal.is_signed, signal.is_float
+    )

@@ -1,0 +1,194 @@
+"""The iCub's capacitive skin on CAN: triangles of twelve taxels, sixteen to a board."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Final
+
+import numpy as np
+
+from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
+from tactile_rt.drivers.codecs.rounds import Rounds
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+
+__all__ = ["IcubSkin", "IcubSkinOptions"]
+
+TAXELS: Final = 12  # of a triangle
+TRIANGLES: Final = 16  # of a board, at most
+HEAD, TAIL = 0x40, 0xC0  # first byte of a triangle's two frames; bit 7 tells them apart
+IN_HEAD: Final = 7  # taxels
+CLASS: Final = {"new": 0x400, "old": 0x300}  # of identifiers, by firmware
+CONFIGURE_ID: Final = 0x200  # | board
+SET_BOARD, SET_TRIANGLES, SET_TX_MODE, OLD_SETUP, OLD_SETUP_2 = 0x4D, 0x50, 0x07, 0x4C, 0x4E
+OFFSET: Final = 0x2200  # of the converters: the makers' default
+NOT_READ: Final = 0x0003  # error bits of a whole triangle; the upper twelve are of its taxels
+
+
+@dataclass(frozen=True)
+class IcubSkinOptions:
+    """Options of one skin board; several boards are several sources, to be combined.
+
+    Attributes:
+        board: its address, from 0 to 15.
+        triangles: those that are connected, as a list of numbers and ranges, e.g. ``0-6,9``.
+        firmware: ``new`` (configured by messages 4D and 50, sends when told to) or ``old``
+            (4C and 4E, sends at once).
+        period_ms: between samples.
+    """
+
+    board: int = 1
+    triangles: str = "0-15"
+    firmware: str = "new"
+    period_ms: int = 20
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.board <= 15:
+            raise ConfigError(f"board must be from 0 to 15, not {self.board}")
+        if self.firmware not in CLASS:
+            raise ConfigError(f"firmware must be new or old, not {self.firmware!r}")
+        if not 1 <= self.period_ms <= 255:
+            raise ConfigError(f"period_ms must be from 1 to 255, not {self.period_ms}")
+        self.numbers()
+
+    def numbers(self) -> tuple[int, ...]:
+        """The triangles' numbers, ascending."""
+        found: set[int] = set()
+        for item in self.triangles.split(","):
+            first, dash, last = item.strip().partition("-")
+            if not (first.isdecimal() and (last.isdecimal() or not dash)):
+                raise ConfigError(
+                    f"triangles must be numbers and ranges like 0-6,9, not {self.triangles!r}"
+                )
+            found |= set(range(int(first), min(int(last or first), 255) + 1))
+        if not found or max(found) >= TRIANGLES:
+            raise ConfigError(f"triangles must be from 0 to 15, not {self.triangles!r}")
+        return tuple(sorted(found))
+
+
+class IcubSkin(CanCodec):
+    """A frame with the first seven taxels of a triangle, one with the other five and its errors.
+
+    Values are the board's counts from 0 to 255, which fall as a taxel is pressed; newtons need a
+    calibration. Taxels of which the frame did not come, or that the board calls stuck, are invalid;
+    so is a whole triangle that the board could not read.
+
+    Source: icub-main (class CanBusSkin and SkinDiagnostics.h) and the skin board's firmware, which
+    sends the triangles in ascending order.
+    """
+
+    Options = IcubSkinOptions
+    status_bits: ClassVar[dict[int, str]] = {
+        0: "a triangle could not be read",
+        1: "a triangle did not take its configuration",
+        **{4 + i: f"taxel {i} of a triangle is stuck" for i in range(TAXELS)},
+    }
+    cannot_detect = "a lost sample: there is no counter"
+
+    def __init__(self, options: IcubSkinOptions) -> None:
+        self._options = options
+        self._first = CLASS[options.firmware] | options.board << 4
+        self._numbers = options.numbers()
+        self._part = {n: 2 * i for i, n in enumerate(self._numbers)}
+        cells = [(n, k) for n in self._numbers for k in range(TAXELS)]
+        # where the taxels are depends on the robot's part that the board sits in: left at zero
+        super().__init__(
+            ArraySpec(
+                name=f"icub-skin-{options.board}",
+                elements=tuple(f"t{n}.{k}" for n, k in cells),
+                grid=tuple(cells),
+                positions=((0.0, 0.0, 0.0),) * len(cells),
+                orientations=((1.0, 0.0, 0.0, 0.0),) * len(cells),
+                channels=("c",),
+                units=("1",),
+                rate_hz=1e3 / options.period_ms,
+                frame="board",
+            )
+        )
+        self._rounds: Rounds[bytes] = Rounds(2 * len(self._numbers))
+        self.streaming = options.firmware == "old"
+
+    def forget(self) -> None:
+        self._rounds.forget()
+
+    def feed(self, packet: Sequence[Frame], t_ns: int) -> Samples | None:
+        batch, stats, parts = Batch(), self.stats, self._part
+        for identifier, data, extended, _, remote in packet:
+            part = parts.get(identifier - self._first)
+            if part is None or extended or remote:
+                stats.skipped += 1
+                continue
+            tail = bool(data and data[0] & 0x80)
+            if len(data) < (6 if tail else 8):
+                stats.corrupt += 1
+                continue
+            stats.intact += 1
+            for ended in self._rounds.add(part + tail, data):
+                self._sample(batch, ended)
+        return batch.take((len(self._numbers) * TAXELS, 1), t_ns)
+
+    def _sample(self, batch: Batch, parts: list[bytes | None]) -> None:
+        self.stats.incomplete += None in parts
+        counts = bytearray()
+        valid: list[bool] = []
+        status = 0
+        for head, tail in zip(parts[::2], parts[1::2], strict=True):
+            # boards without diagnostics send a tail of six bytes
+            error = int.from_bytes(tail[6:8], "big") if tail and len(tail) >= 8 else 0
+            status |= error
+            counts += head[1 : 1 + IN_HEAD] if head else bytes(IN_HEAD)
+            counts += tail[1 : 1 + TAXELS - IN_HEAD] if tail else bytes(TAXELS - IN_HEAD)
+            for k in range(TAXELS):
+                came = head if k < IN_HEAD else tail
+                valid.append(came is not None and not error & (NOT_READ | 1 << 4 + k))
+        batch.values.append(np.frombuffer(bytes(counts), np.uint8))
+        batch.valid.append(valid)
+        batch.status.append(status)
+
+    def commands(self, event: Event) -> tuple[Step[Sequence[Frame]], ...]:
+        options = self._options
+        if options.firmware == "old":
+            if event != Event.START:
+                return ()
+            mask = sum(1 << n for n in self._numbers)
+            # the makers' defaults but for the mask of triangles
+            return (
+                self._send(OLD_SETUP, 1, 1, 1, 0, 0x20, 0, 0),
+                self._send(OLD_SETUP_2, 2, 0x22, 0xF0, 0, *mask.to_bytes(2, "little"), 0x0A),
+            )
+        if event == Event.STOP:
+            return (self._send(SET_TX_MODE, 1),)
+        if event == Event.START:
+            offset = OFFSET.to_bytes(2, "little")
+            return (
+                # skin type 0: triangles with temperature compensation; counts at rest: 245
+                self._send(SET_BOARD, 0, options.period_ms, 245),
+                self._send(SET_TRIANGLES, 0, TRIANGLES - 1, 2, 0, *offset),
+                *(self._send(SET_TRIANGLES, n, n, 2, 1, *offset) for n in self._numbers),
+                self._send(SET_TX_MODE, 0),
+            )
+        return ()
+
+    def _send(self, *data: int) -> Step[Sequence[Frame]]:
+        return Step((Frame(CONFIGURE_ID | self._options.board, bytes(data)),), pause_s=0.01)
+
+    def encode(self, chunk: Chunk) -> list[Sequence[Frame]]:
+        counts = np.clip(np.rint(np.nan_to_num(chunk.values[..., 0])), 0, 255).astype(np.uint8)
+        shape = (-1, len(self._numbers), TAXELS)
+        stuck = ~(chunk.valid & np.isfinite(chunk.values[..., 0]))
+        errors = (stuck.reshape(shape) << np.arange(4, 4 + TAXELS)).sum(axis=2)
+        packets: list[Sequence[Frame]] = []
+        for sample, error in zip(counts.reshape(shape), errors.tolist(), strict=True):
+            packet = []
+            for n, taxels, word in zip(self._numbers, sample, error, strict=True):
+                raw = taxels.tobytes()
+                tail = raw[IN_HEAD:] + word.to_bytes(2, "big")
+                packet.append(Frame(self._first | n, bytes((HEAD,)) + raw[:IN_HEAD]))
+                packet.append(Frame(self._first | n, bytes((TAIL,)) + tail))
+            packets.append(packet)
+        return packets
+
+    def respond(self, packet: Sequence[Frame]) -> Sequence[Frame]:
+        for frame in packet:
+            mine = frame.id == CONFIGURE_ID | self._options.board and not frame.extended
+            if mine and len(frame.data) == 2 and frame.data[0] == SET_TX_MODE:
+                self.streaming = frame.data[1] == 0
+        return []

@@ -1,0 +1,388 @@
+"""The native protocol over a serial line: our own reference format, see docs/native-protocol.md.
+
+A frame is a header of 20 bytes with its own CRC-16/XMODEM, a payload, and a CRC-32 of both, all
+little-endian. The header's checksum means that a length is believed only if it is true, so a false
+synchronisation in damaged bytes costs no waiting; the last one covers the header too, so that a
+header and the payload of another frame (where exactly a frame's length was lost between) do not
+pass for a sample.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.drivers.codec import Event, Samples, SerialCodec, Step
+from tactile_rt.drivers.codecs.framing import ByteBuffer, crc16_xmodem
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+
+__all__ = [
+    "FORMATS",
+    "Description",
+    "Message",
+    "NativeOptions",
+    "NativeSerial",
+    "frame",
+    "pack_valid",
+    "quantise",
+    "unpack_valid",
+]
+
+VERSION: Final = 1
+SYNC: Final = b"TR"
+HEADER: Final = struct.Struct("<2sBBHHIIBBH")  # sync .. header CRC
+CRC: Final = struct.Struct("<I")
+LONGEST: Final = 65_535  # of a payload: the length field's range
+WHISKING: Final = struct.Struct("<3f")  # frequency in Hz, amplitude and offset in rad
+
+# What an ACK says went wrong: a type or length that the device does not know; a thing it cannot do.
+UNKNOWN: Final = 1
+IMPOSSIBLE: Final = 2
+
+FORMATS: Final = {"float32": 0, "int16": 1}
+_TYPES: Final[dict[int, np.dtype[Any]]] = {0: np.dtype("<f4"), 1: np.dtype("<i2")}
+# What int16's largest value stands for, by SI unit, unless the device describes another scale.
+FULL_SCALE: Final = {"N": 0.1, "N m": 1e-3, "rad": float(np.pi)}
+LARGEST: Final = 1e30  # scale: any count times it is a float32
+# Bits of the status; 4 to 7 are ours to give a meaning later, 8 to 15 the device's own (serial).
+STATUS: Final = {
+    0: "a channel is at the end of its range",
+    1: "a sensor fails",
+    2: "the device lost samples before this one",
+    3: "the whisking drive fails",
+}
+
+
+class Message:
+    """Types of frames."""
+
+    SAMPLE = 0
+    DESCRIBE = 1  # host: what are you?
+    DESCRIPTION = 2  # device: JSON, see `Description`
+    START = 3
+    STOP = 4
+    WHISK = 5  # host: move the whiskers like this
+    ACK = 6  # device: payload is the type acknowledged and 0, UNKNOWN or IMPOSSIBLE
+
+    FROM_DEVICE = (SAMPLE, DESCRIPTION, ACK)
+
+
+@dataclass(frozen=True)
+class NativeOptions:
+    """Options of the native protocol.
+
+    Attributes:
+        format: ``float32`` or ``int16``: what an emulated device sends. A host takes both.
+        array: JSON file of an array (`tactile-rt describe` writes one) for devices that do not
+            describe themselves.
+    """
+
+    format: str = "float32"
+    array: str = ""
+
+    def __post_init__(self) -> None:
+        if self.format not in FORMATS:
+            raise ConfigError(f"format must be one of {', '.join(FORMATS)}, not {self.format!r}")
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a native device says of itself.
+
+    Attributes:
+        spec: the array.
+        scale: SI units per count of int16, by channel.
+    """
+
+    spec: ArraySpec
+    scale: tuple[float, ...]
+
+    @classmethod
+    def of(cls, spec: ArraySpec) -> "Description":
+        """With the default scales."""
+        return cls(spec, tuple(FULL_SCALE.get(unit, 1.0) / 32767 for unit in spec.units))
+
+    def to_json(self) -> bytes:
+        """The payload of a DESCRIPTION."""
+        spec = msgspec.Raw(self.spec.to_json().encode())
+        return msgspec.json.encode({"spec": spec, "scale": self.scale})
+
+    @classmethod
+    def from_json(cls, text: bytes) -> "Description | None":
+        """Read a payload; None if it is not one."""
+        try:
+            fields = msgspec.json.decode(text, type=dict[str, msgspec.Raw])
+            spec = ArraySpec.from_json(bytes(fields["spec"]).decode())
+            scale = msgspec.json.decode(fields["scale"], type=tuple[float, ...])
+        except (msgspec.MsgspecError, ConfigError, KeyError, UnicodeDecodeError):
+            return None
+        good = len(scale) == len(spec.channels) and all(0 < s <= LARGEST for s in scale)
+        return cls(spec, scale) if good else None
+
+
+def frame(
+    kind: int,
+    payload: bytes = b"",
+    *,
+    format: int = 0,
+    status: int = 0,
+    seq: int = 0,
+    time_us: int = 0,
+    shape: tuple[int, int] = (0, 0),
+) -> bytes:
+    """One frame of the serial form."""
+    head = HEADER.pack(
+        SYNC, VERSION << 4 | kind, format, len(payload), status, seq & 0xFFFFFFFF,
+        time_us & 0xFFFFFFFF, *shape, 0,
+    )[:-2]  # fmt: skip
+    whole = head + crc16_xmodem(head[2:]).to_bytes(2, "little") + payload
+    return whole + CRC.pack(zlib.crc32(whole))
+
+
+def pack_valid(valid: NDArray[np.bool_]) -> bytes:
+    """(element,) bool as bits, the first element lowest."""
+    return np.packbits(valid, bitorder="little").tobytes()
+
+
+def unpack_valid(bits: bytes, elements: int) -> NDArray[np.bool_]:
+    """What `pack_valid` packed."""
+    return np.unpackbits(np.frombuffer(bits, np.uint8), count=elements, bitorder="little").view(
+        np.bool_
+    )
+
+
+def quantise(values: NDArray[np.float32], scale: tuple[float, ...]) -> NDArray[np.int16]:
+    """Values as counts, rounded to the nearest and saturated."""
+    counts = np.rint(np.nan_to_num(values.astype(np.float64) / scale))
+    return np.clip(counts, -32767, 32767).astype(np.int16)
+
+
+class NativeSerial(SerialCodec):
+    """Our reference firmware's protocol: counted, timed, described and checked."""
+
+    Options = NativeOptions
+    baud = 2_000_000  # nominal: most boards speak it over USB, which has no baud rate
+    count_bits = 32
+    tick_ns = 1000.0
+    status_bits = STATUS
+    cannot_detect = ""
+
+    def __init__(self, options: NativeOptions) -> None:
+        super().__init__(read_array(options.array))
+        self._format = FORMATS[options.format]
+        self._described: Description | None = None
+        self._buffer = ByteBuffer()
+        self._synchronised = True
+        self._damaged = 0
+        self.streaming = False
+        self.whisking: tuple[float, float, float] | None = None  # as last commanded, rad and Hz
+
+    # the host's side
+
+    def feed(self, packet: bytes, t_ns: int) -> Samples | None:
+        heads: list[tuple[Any, ...]] = []
+        payloads: list[bytes] = []
+        damaged: list[int] = []
+        for kind, head, payload in self._frames(packet):
+            if kind == Message.SAMPLE:
+                if self.spec is None:
+                    continue  # nothing can be said of it yet
+                if head[7:9] != self.spec.shape:
+                    self._refuse()
+                    continue
+                heads.append(head)
+                payloads.append(payload)
+                damaged.append(self._damaged)
+                self._damaged = 0
+            elif kind == Message.DESCRIPTION:
+                found = Description.from_json(payload)
+                if found is None:
+                    self._refuse()
+                    continue
+                if self.spec is not None and found.spec.shape != self.spec.shape:
+                    del heads[:], payloads[:], damaged[:]  # of what it was before: another device
+                self._described, self.spec = found, found.spec
+        if not heads:
+            return None
+        values, valid = self._values([head[2] for head in heads], payloads)
+        # what is not finite is no measurement, whatever the device says
+        finite = np.isfinite(values)
+        if not finite.all():
+            valid &= finite.all(axis=2)
+        _, _, _, _, status, count, ticks, *_ = zip(*heads, strict=True)
+        columns = np.array((damaged, count, ticks, status), np.int64)
+        return Samples(values, valid, np.full(len(heads), t_ns, np.int64), *columns)
+
+    def commands(self, event: Event) -> tuple[Step[bytes], ...]:
+        if event == Event.START:
+            ask = Step(frame(Message.DESCRIBE), _reply(Message.DESCRIPTION), what="its description")
+            start = Step(frame(Message.START))
+            return (start,) if self.spec and not self._described else (ask, start)
+        return (Step(frame(Message.STOP)),) if event == Event.STOP else ()
+
+    def whisk(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> Step[bytes]:
+        """The command that sets an active array's whisking."""
+        return Step(frame(Message.WHISK, WHISKING.pack(frequency_hz, amplitude_rad, offset_rad)))
+
+    def forget(self) -> None:
+        self._buffer.data.clear()
+        self._synchronised = True
+
+    # the device's side
+
+    def encode(self, chunk: Chunk) -> list[bytes]:
+        described = self._description()
+        shape = described.spec.shape
+        width = _TYPES[self._format].itemsize
+        if max(shape) > 255 or -(-shape[0] // 8) + shape[0] * shape[1] * width > LONGEST:
+            raise ConfigError(
+                f"{shape[0]} elements of {shape[1]} channels: the native protocol carries 255 of "
+                f"255 at most, in {LONGEST} bytes"
+            )
+        packets = []
+        for seq, t_ns, values, valid in zip(
+            chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True
+        ):
+            if self._format == FORMATS["int16"]:
+                body = quantise(values, described.scale).astype("<i2").tobytes()
+                valid = valid & np.isfinite(values).all(axis=1)  # a count cannot say so itself
+            else:
+                body = values.astype("<f4").tobytes()
+            packets.append(
+                frame(
+                    Message.SAMPLE,
+                    pack_valid(valid) + body,
+                    format=self._format,
+                    seq=seq,
+                    time_us=t_ns // 1000,
+                    shape=shape,
+                )
+            )
+        return packets
+
+    def respond(self, packet: bytes) -> bytes:
+        answer = b""
+        for kind, _, payload in self._frames(packet):
+            error = 0
+            if kind in Message.FROM_DEVICE:
+                continue  # an echo of our own; answering answers would never end
+            if kind == Message.DESCRIBE:
+                answer += frame(Message.DESCRIPTION, self._description().to_json())
+                continue
+            if kind in (Message.START, Message.STOP):
+                self.streaming = kind == Message.START
+            elif kind == Message.WHISK and len(payload) == WHISKING.size:
+                asked = WHISKING.unpack(payload)
+                if np.isfinite(asked).all():
+                    self.whisking = asked
+                else:
+                    error = IMPOSSIBLE
+            else:
+                error = UNKNOWN
+            answer += frame(Message.ACK, bytes((kind, error)))
+        return answer
+
+    # both
+
+    def _description(self) -> Description:
+        if self._described is None:
+            assert self.spec is not None
+            self._described = Description.of(self.spec)
+        return self._described
+
+    def _values(
+        self, forms: list[int], payloads: list[bytes]
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """(n, element, channel) values and (n, element) validity of n payloads."""
+        elements, channels = self._description().spec.shape
+        bits = -(-elements // 8)
+        if len(set(forms)) > 1:  # a device that changed its mind: one by one
+            parts = [self._values([f], [p]) for f, p in zip(forms, payloads, strict=True)]
+            values, valid = zip(*parts, strict=True)
+            return np.concatenate(values), np.concatenate(valid)
+        rows = np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), -1)
+        flags = np.unpackbits(rows[:, :bits], axis=1, count=elements, bitorder="little")
+        body = rows[:, bits:].copy().view(_TYPES[forms[0]]).reshape(-1, elements, channels)
+        if forms[0] == FORMATS["int16"]:
+            scaled: NDArray[Any] = body * np.asarray(self._description().scale)
+            return scaled.astype(np.float32), flags.view(np.bool_)
+        return body.astype(np.float32, copy=False), flags.view(np.bool_)
+
+    def _frames(self, packet: bytes) -> Iterator[tuple[int, tuple[Any, ...], bytes]]:
+        """The intact frames that this packet completes: (type, header, payload)."""
+        buffer = self._buffer
+        buffer.data += packet
+        while True:
+            skipped = buffer.skip_to(SYNC)
+            self.stats.skipped += skipped
+            if skipped and self._synchronised:  # where a frame should have begun
+                self._refuse()
+                self._synchronised = False
+            if len(buffer.data) < HEADER.size:
+                return
+            head = HEADER.unpack_from(buffer.data)
+            if crc16_xmodem(bytes(buffer.data[2 : HEADER.size - 2])) != head[-1]:
+                if self._synchronised:  # else this was never the beginning of a frame
+                    self._refuse()
+                self._synchronised = False
+                self.stats.skipped += 1
+                del buffer.data[:1]
+                continue
+            size = HEADER.size + head[3] + CRC.size
+            if len(buffer.data) < size:
+                return
+            whole = bytes(buffer.data[: size - CRC.size])
+            (check,) = CRC.unpack_from(buffer.data, size - CRC.size)
+            if zlib.crc32(whole) != check:
+                self._refuse()
+                self._synchronised = False
+                self.stats.skipped += 1
+                del buffer.data[:1]
+                continue
+            del buffer.data[:size]
+            self._synchronised = True
+            kind = head[1] & 15
+            if head[1] >> 4 != VERSION or (kind == Message.SAMPLE and not _fits(head)):
+                self._refuse()
+                continue
+            self.stats.intact += 1
+            yield kind, head, whole[HEADER.size :]
+
+    def _refuse(self) -> None:
+        self.stats.corrupt += 1
+        self._damaged += 1
+
+
+def read_array(path: str) -> ArraySpec | None:
+    """The array that a file describes; None without a path.
+
+    Raises:
+        ConfigError: it cannot be read or is not one.
+    """
+    if not path:
+        return None
+    try:
+        with open(path, encoding="utf-8") as file:
+            return ArraySpec.from_json(file.read())
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise ConfigError(f"{path}: {why}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def _reply(kind: int) -> bytes:
+    return SYNC + bytes((VERSION << 4 | kind,))
+
+
+def _fits(head: tuple[Any, ...]) -> bool:
+    """Whether a sample's length is that of its elements and channels."""
+    form, length, elements, channels = head[2], head[3], head[7], head[8]
+    if form not in _TYPES or not elements or not channels:
+        return False
+    return bool(length == -(-elements // 8) + elements * channels * _TYPES[form].itemsize)

@@ -1,0 +1,238 @@
+"""The native protocol over CAN and CAN FD: see docs/native-protocol.md.
+
+    base      host     command: type u8, payload
+    base + 1  device   ACK: type u8 (6), type acknowledged u8, 0 or an error number u8
+    base + 2  device   header of a sample: sequence u16, time in us u32, status u8, flags u8 (low
+                       four bits: 1 float32, 2 parts of 62 bytes; high four: the same inverted)
+    base + 3  device   part of a sample: low byte of its sequence u8, index u8, payload
+    base + 4  device   part of the description: type u8 (2), index u16, payload
+
+all little-endian. A sample is its header, then its parts with indices from 0; put together they are
+the payload of the serial form (one bit of validity per element, then the values) and the
+CRC-16/XMODEM of header and payload: CAN has a CRC, what lies between a bus and a program often has
+none. The description is its length u16, the JSON of the serial form, and the CRC-32 of that; it
+ends with an ACK. Commands come first in arbitration, so that a device that fills the bus can still
+be stopped.
+"""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
+from tactile_rt.drivers.codecs.native import (
+    FORMATS,
+    IMPOSSIBLE,
+    STATUS,
+    UNKNOWN,
+    Description,
+    Message,
+    pack_valid,
+    quantise,
+    read_array,
+)
+from tactile_rt.drivers.codecs.native_can_parts import (
+    FLOAT32,
+    LONG,
+    DescriptionParts,
+    SampleParts,
+    cut_description,
+    head_of,
+    sample_parts,
+)
+from tactile_rt.stream import Chunk, ConfigError
+
+__all__ = ["NativeCan", "NativeCanOptions"]
+
+COMMAND, ACK, HEADER, PART, DESCRIPTION = range(5)  # identifiers from the base
+WHISKING: Final = struct.Struct("<BHhh")  # type, mHz, 0.1 mrad, 0.1 mrad: one frame, so one change
+LENGTHS: Final = (8, 12, 16, 20, 24, 32, 48, 64)  # of CAN FD frames, above 7
+
+
+@dataclass(frozen=True)
+class NativeCanOptions:
+    """Options of the native protocol over CAN.
+
+    Attributes:
+        base: the first of its five identifiers (11 bits).
+        fd: whether commands, and what an emulated device sends, are CAN FD frames. A host takes
+            samples in both.
+        format: ``float32`` or ``int16``: what an emulated device sends. A host takes both.
+        array: JSON file of an array for devices that do not describe themselves.
+    """
+
+    base: int = 0x100
+    fd: bool = False
+    format: str = "int16"
+    array: str = ""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.base <= 0x7FF - DESCRIPTION:
+            raise ConfigError(
+                f"base must be from 0 to {0x7FF - DESCRIPTION:#x}, so that base to base + 4 have "
+                f"11 bits, not {self.base:#x}"
+            )
+        if self.format not in FORMATS:
+            raise ConfigError(f"format must be one of {', '.join(FORMATS)}, not {self.format!r}")
+
+
+class NativeCan(CanCodec):
+    """Our reference firmware's protocol over CAN: counted, timed, described.
+
+    A device queues its frames first-in-first-out, not by identifier. A sample ends when all parts
+    have come, or else with the next sample's first frame; then the elements of which a part was
+    lost are invalid, and nothing checks the others but CAN. A sample whose header, or all but its
+    header, was lost is not delivered: its number is missing.
+    """
+
+    Options = NativeCanOptions
+    data_bitrate = 8_000_000  # 35 elements x 6 x int16 at 1 kHz take 1.09 ms a sample at 5 Mbit/s
+    count_bits = 16
+    tick_ns = 1000.0
+    status_bits = STATUS
+    cannot_detect = "65,536 samples lost in succession look like none lost"
+
+    def __init__(self, options: NativeCanOptions) -> None:
+        super().__init__(read_array(options.array))
+        self._base, self._fd = options.base, options.fd
+        self._float32 = options.format == "float32"
+        self._described: Description | None = None
+        self._sample = SampleParts(self.stats)
+        self._text = DescriptionParts()
+        self.streaming = False
+        self.whisking: tuple[float, float, float] | None = None  # as last commanded, Hz and rad
+
+    def forget(self) -> None:
+        self._sample.forget()
+        self._text = DescriptionParts()
+
+    # the host's side
+
+    def feed(self, packet: Sequence[Frame], t_ns: int) -> Samples | None:
+        batch = Batch()
+        first, stats, sample = self._base, self.stats, self._sample
+        described = self._description()
+        for identifier, data, extended, _, remote in packet:
+            which = identifier - first
+            if extended or remote or not ACK <= which <= DESCRIPTION:
+                stats.skipped += 1
+            elif which == PART:
+                sample.part(batch, data, described)
+            elif which == HEADER:
+                sample.header(batch, data, described)
+            elif which == DESCRIPTION:
+                self._describe(data)
+                described = self._description()
+            else:
+                stats.intact += 1
+        return batch.take(self.spec.shape, t_ns) if self.spec else None
+
+    def _describe(self, data: bytes) -> None:
+        if len(data) < 4 or data[0] != Message.DESCRIPTION:
+            self._sample.refuse()
+            return
+        self.stats.intact += 1
+        found = self._text.add(data)
+        if not isinstance(found, Description):
+            if found is False:
+                self._sample.refuse()
+            return
+        # among samples another array would change their shape half-way
+        if self.spec and found.spec.shape != self.spec.shape and not self._sample.fresh:
+            self._sample.refuse()
+        else:
+            self._described, self.spec = found, found.spec
+
+    def commands(self, event: Event) -> tuple[Step[Sequence[Frame]], ...]:
+        if event == Event.START:
+            ask = self._command(Message.DESCRIBE, "its description", 2.0)
+            start = self._command(Message.START, "the answer to START", 1.0)
+            return (start,) if self.spec and not self._described else (ask, start)
+        if event == Event.STOP:
+            return (Step((self._frame(COMMAND, bytes((Message.STOP,))),)),)
+        return ()
+
+    def _command(self, kind: int, what: str, timeout_s: float) -> Step[Sequence[Frame]]:
+        frame = self._frame(COMMAND, bytes((kind,)))
+        return Step((frame,), self._base + ACK, timeout_s, what=what)
+
+    def whisk(
+        self, frequency_hz: float, amplitude_rad: float, offset_rad: float
+    ) -> Step[Sequence[Frame]]:
+        """The command that sets an active array's whisking (to 65 Hz and 3.2 rad)."""
+        wanted = np.array([frequency_hz * 1e3, amplitude_rad * 1e4, offset_rad * 1e4])
+        counts = np.clip(np.rint(np.nan_to_num(wanted)), (0, -32767, -32767), (65535, 32767, 32767))
+        data = WHISKING.pack(Message.WHISK, *counts.astype(int).tolist())
+        return Step((self._frame(COMMAND, data),))
+
+    # the device's side
+
+    def encode(self, chunk: Chunk) -> list[Sequence[Frame]]:
+        described = self._description()
+        assert described is not None
+        flags = (LONG if self._fd else 0) | (FLOAT32 if self._float32 else 0)
+        packets: list[Sequence[Frame]] = []
+        for seq, t_ns, values, valid in zip(
+            chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True
+        ):
+            if self._float32:
+                body = values.astype("<f4").tobytes()
+            else:
+                body = quantise(values, described.scale).astype("<i2").tobytes()
+                valid = valid & np.isfinite(values).all(axis=1)  # a count cannot say so itself
+            head = head_of(seq, t_ns // 1000, flags)
+            parts = sample_parts(head, pack_valid(valid) + body)
+            if parts is None:
+                elements, channels = described.spec.shape
+                raise ConfigError(
+                    f"{elements} elements of {channels} channels do not fit in the 256 frames that "
+                    f"a sample may have: use {'int16' if self._fd else 'fd'}"
+                )
+            packets.append(
+                [self._frame(HEADER, head), *(self._frame(PART, data) for data in parts)]
+            )
+        return packets
+
+    def respond(self, packet: Sequence[Frame]) -> Sequence[Frame]:
+        answer: list[Frame] = []
+        for frame in packet:
+            mine = frame.id == self._base + COMMAND and not frame.extended and not frame.remote
+            if not mine or not frame.data or frame.data[0] in Message.FROM_DEVICE:
+                continue
+            kind = frame.data[0]
+            error = self._obey(kind, frame.data, answer)
+            answer.append(self._frame(ACK, bytes((Message.ACK, kind, error))))
+        return answer
+
+    def _obey(self, kind: int, data: bytes, answer: list[Frame]) -> int:
+        """Do what the host says, adding to the answer; the error number of the ACK."""
+        if kind == Message.DESCRIBE:
+            described = self._description()
+            if described is None:
+                return IMPOSSIBLE
+            size = 64 if self._fd else 8
+            pieces = cut_description(Message.DESCRIPTION, described.to_json(), size)
+            answer += [self._frame(DESCRIPTION, piece) for piece in pieces]
+        elif kind in (Message.START, Message.STOP):
+            self.streaming = kind == Message.START
+        elif kind == Message.WHISK and len(data) >= WHISKING.size:
+            _, mhz, amplitude, offset = WHISKING.unpack_from(data)
+            self.whisking = (mhz / 1e3, amplitude / 1e4, offset / 1e4)
+        else:
+            return UNKNOWN
+        return 0
+
+    # both
+
+    def _frame(self, which: int, data: bytes) -> Frame:
+        if self._fd and len(data) > 8:
+            data = data.ljust(next(n for n in LENGTHS if n >= len(data)), b"\0")
+        return Frame(self._base + which, data, fd=self._fd)
+
+    def _description(self) -> Description | None:
+        if self._described is None and self.spec is not None:
+            return Description.of(self.spec)
+        return self._described

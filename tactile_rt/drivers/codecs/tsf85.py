@@ -1,0 +1,302 @@
+"""Robotiq TSF-85 (CoRo tactile sensor): two fingertips of 4 x 7 taxels, over USB.
+
+A packet is 9A, a CRC that neither side computes, a command, the length of what follows (one byte),
+and signals one after the other: a byte with the type in its high half, the finger in bits 2-3 and
+an index in bits 0-1, then big-endian values. Its own length fits no whole set of signals, so a set
+comes in several packets, in no promised order. The host's 58 makes the device send a set every so
+many ms; 0 stops it.
+
+Sources: facts of the public drivers that go back to Robotiq's tactile sensor interface
+(UsbCommands, UsbSensorType and the scales of the motion sensor, +-2 g and +-250 deg/s).
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.drivers.codec import Batch, Event, Samples, SerialCodec, Step
+from tactile_rt.drivers.codecs.framing import ByteBuffer
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+
+__all__ = ["Tsf85", "Tsf85Options"]
+
+START: Final = b"\x9a"
+READ, SEND, SEND_WHEN_NEW = 0x61, 0x58, 0x59  # commands; packets carry the one they answer
+STATIC, DYNAMIC, ACCELERATION, TURNING, FIELD, TEMPERATURE, TIME = range(1, 8)  # types
+VALUES: Final = {  # of each type, as they come
+    STATIC: np.dtype((">u2", 28)),
+    DYNAMIC: np.dtype((">i2", 1)),
+    ACCELERATION: np.dtype((">i2", 3)),
+    TURNING: np.dtype((">i2", 3)),
+    FIELD: np.dtype((">i2", 3)),
+    TEMPERATURE: np.dtype((">i2", 1)),
+    TIME: np.dtype((">u8", 1)),
+}
+ROWS, COLUMNS = 4, 7
+MOTION: Final = np.array(  # per count: m/s2, rad/s
+    [2 * 9.80665 / 32768] * 3 + [np.deg2rad(250) / 32768] * 3
+)
+SETTLE_S: Final = 0.1
+
+
+@dataclass(frozen=True)
+class Tsf85Options:
+    """Options of the Robotiq TSF-85.
+
+    Attributes:
+        signals: ``taxels`` (28 of each finger) or ``fingers`` (each one's dynamic taxel and motion
+            sensor): which of what the device sends become samples.
+        fingers: how many are plugged in, 1 or 2.
+        period_ms: time between samples, 1 to 255.
+        times: whether the firmware sends its time. Older ones do not: then no sample comes.
+    """
+
+    signals: str = "taxels"
+    fingers: int = 2
+    period_ms: int = 1
+    times: bool = True
+
+    def __post_init__(self) -> None:
+        if self.signals not in ("taxels", "fingers"):
+            raise ConfigError(f"signals must be taxels or fingers, not {self.signals!r}")
+        if self.fingers not in (1, 2):
+            raise ConfigError(f"fingers must be 1 or 2, not {self.fingers}")
+        if not 1 <= self.period_ms <= 255:
+            raise ConfigError(f"period_ms must be 1 to 255, not {self.period_ms}")
+
+
+class Tsf85(SerialCodec):
+    """Pressure counts of the taxels; or dynamic counts, acceleration and turning of the fingers.
+
+    The taxels' counts have no published scale (unit 1). A sample is complete when each signal that
+    it is made of has come. The first one after START shows in which order they come; a signal out
+    of that order is of the next sample already: a packet was lost, and the fingers that miss a
+    signal are invalid. A host that joins a running stream may put the order's beginning elsewhere
+    in the round, and so a finger one period late.
+    """
+
+    Options = Tsf85Options
+    baud = 115_200  # nominal: USB has none
+    tick_bits = 48  # of the 64 sent
+    cannot_detect = (
+        "Its checksum is not used: damage that leaves a packet's structure intact is taken for a "
+        "measurement. Without a counter, lost samples show only in the time (whole ms)."
+    )
+
+    def __init__(self, options: Tsf85Options) -> None:
+        super().__init__(_spec(options))
+        taxels = options.signals == "taxels"
+        kinds = (STATIC,) if taxels else (DYNAMIC, ACCELERATION, TURNING)
+        self._wanted = [(kind, finger) for finger in range(options.fingers) for kind in kinds]
+        self._needed = list(self._wanted)
+        self._options = options
+        if options.times:
+            self.tick_ns = 1e6
+            self._needed.append((TIME, 0))
+        self._buffer, self._heard = ByteBuffer(), ByteBuffer()
+        self.streaming = False
+        self._damaged = 0
+        self.forget()
+
+    def forget(self) -> None:
+        self._buffer.data.clear()
+        self._synchronised = False
+        self._set: dict[tuple[int, int], bytes] = {}  # signals of a sample not yet complete
+        self._order: list[tuple[int, int]] = []  # in which they come; empty: not yet known
+
+    # the host's side
+
+    def feed(self, packet: bytes, t_ns: int) -> Samples | None:
+        batch = Batch()
+        for command, signals in self._packets(self._buffer, packet):
+            if command in (READ, SEND, SEND_WHEN_NEW):
+                for signal, data in signals:
+                    self._take(batch, signal, data)
+        assert self.spec is not None
+        return batch.take(self.spec.shape, t_ns)
+
+    def _take(self, batch: Batch, signal: tuple[int, int], data: bytes) -> None:
+        if signal not in self._needed:
+            return
+        if self._ends_sample(signal):
+            self.stats.incomplete += 1
+            if (TIME, 0) in self._set or not self._options.times:
+                self._deliver(batch)
+            self._set.clear()
+        self._set[signal] = data
+        if len(self._set) == len(self._needed):
+            self._order = list(self._set)
+            self._deliver(batch)
+            self._set.clear()
+
+    def _ends_sample(self, signal: tuple[int, int]) -> bool:
+        """Whether the sample so far must do without what it misses."""
+        if not self._set or not self._order:
+            return signal in self._set
+        return self._order.index(signal) <= self._order.index(next(reversed(self._set)))
+
+    def _deliver(self, batch: Batch) -> None:
+        assert self.spec is not None
+        got: list[NDArray[np.float64]] = []
+        valid: list[bool] = []
+        for kind, finger in self._wanted:
+            data = self._set.get((kind, finger))
+            dtype = VALUES[kind]
+            values = np.zeros(dtype.shape) if data is None else np.frombuffer(data, dtype.base)
+            got.append(values.astype(np.float64))
+            valid.append(data is not None)
+        if self._options.signals == "taxels":
+            flags = np.repeat(np.array(valid), ROWS * COLUMNS)
+            values = np.concatenate(got)
+        else:
+            flags = np.array([all(valid[k : k + 3]) for k in range(0, len(valid), 3)])
+            values = np.concatenate(got).reshape(-1, 7) * [1.0, *MOTION]
+        batch.values.append(values)
+        batch.valid.append(flags)
+        batch.damaged.append(self._damaged)
+        self._damaged = 0
+        if self._options.times:
+            ticks = int.from_bytes(self._set[TIME, 0], "big")
+            batch.ticks.append(ticks % 2**self.tick_bits)
+
+    def commands(self, event: Event) -> tuple[Step[bytes], ...]:
+        stop = Step(_packet(SEND, b"\0"), pause_s=SETTLE_S)
+        if event == Event.START:
+            return stop, Step(_packet(SEND, bytes((self._options.period_ms,))))
+        return (stop,) if event == Event.STOP else ()
+
+    # the device's side
+
+    def encode(self, chunk: Chunk) -> list[bytes]:
+        values = np.nan_to_num(chunk.values.astype(np.float64))
+        n = len(values)
+        still: list[list[bytes]] = [[bytes(14)] * 2 for _ in range(n)]
+        if self._options.signals == "taxels":
+            counts = np.clip(np.rint(values), 0, 65535).astype(">u2").reshape(n, -1, 28)
+            fingers = [[row.tobytes() for row in sample] for sample in counts]
+        else:
+            fingers = [[bytes(56)] * self._options.fingers for _ in range(n)]
+            moves = np.clip(np.rint(values / [1.0, *MOTION]), -32768, 32767).astype(">i2")
+            still = [[row.tobytes() for row in sample] for sample in moves]
+        packets = []
+        for taxels, moving, t_ns in zip(fingers, still, chunk.t_ns.tolist(), strict=True):
+            wire, rest = b"", b""
+            for finger, row in enumerate(taxels):
+                wire += _packet(SEND, _signal(STATIC, finger, row))
+                rest += _signal(DYNAMIC, finger, moving[finger][:2])
+                rest += _signal(ACCELERATION, finger, moving[finger][2:8])
+                rest += _signal(TURNING, finger, moving[finger][8:])
+                if self._options.times:
+                    rest += _signal(TIME, finger, (round(t_ns / 1e6) % 2**64).to_bytes(8, "big"))
+            packets.append(wire + _packet(SEND, rest))
+        return packets
+
+    def respond(self, packet: bytes) -> bytes:
+        heard = self._heard
+        heard.data += packet
+        while True:
+            heard.skip_to(START)
+            if len(heard.data) < 4:
+                return b""
+            command, length = heard.data[2], heard.data[3]
+            if (command, length) not in ((SEND, 1), (SEND_WHEN_NEW, 1), (READ, 0)):
+                heard.take(1)
+                continue
+            if len(heard.data) < 4 + length:
+                return b""
+            data = heard.take(4 + length)[4:]
+            if command == READ:
+                self.polled += 1
+            else:
+                self.streaming = data != b"\0"
+
+    # both
+
+    def _packets(
+        self, buffer: ByteBuffer, packet: bytes
+    ) -> list[tuple[int, list[tuple[tuple[int, int], bytes]]]]:
+        """The packets of sound structure that this completes: (command, signals)."""
+        buffer.data += packet
+        found: list[tuple[int, list[tuple[tuple[int, int], bytes]]]] = []
+        while True:
+            skipped = buffer.skip_to(START)
+            self._lose(skipped)
+            if len(buffer.data) < 4:
+                return found
+            command, length = buffer.data[2], buffer.data[3]
+            signals = None
+            if command in (READ, SEND, SEND_WHEN_NEW) and length:
+                if len(buffer.data) < 4 + length:
+                    return found
+                signals = _signals(bytes(buffer.data[4 : 4 + length]))
+            if signals is None:
+                self._lose(len(buffer.take(1)))
+                continue
+            buffer.take(4 + length)
+            self._synchronised = True
+            self.stats.intact += 1
+            found.append((command, signals))
+
+    def _lose(self, n: int) -> None:
+        self.stats.skipped += n
+        if n and not self._order:  # what came before may not be of the same sample
+            self._set.clear()
+        if n and self._synchronised:
+            self.stats.corrupt += 1
+            self._damaged += 1
+            self._synchronised = False
+
+
+def _spec(options: Tsf85Options) -> ArraySpec:
+    fingers = range(options.fingers)
+    if options.signals == "taxels":
+        # side by side on the grid, an empty column between; where they are depends on the gripper
+        cells = [
+            (r, f * (COLUMNS + 1) + c) for f in fingers for r in range(ROWS) for c in range(COLUMNS)
+        ]
+        names = [f"f{f}t{k}" for f in fingers for k in range(ROWS * COLUMNS)]
+        channels: tuple[str, ...] = ("pressure",)
+        units: tuple[str, ...] = ("1",)
+    else:
+        cells = [(0, f) for f in fingers]
+        names = [f"f{f}" for f in fingers]
+        channels = ("dynamic", "ax", "ay", "az", "wx", "wy", "wz")
+        units = ("1", *("m/s2",) * 3, *("rad/s",) * 3)
+    return ArraySpec(
+        name="tsf85",
+        elements=tuple(names),
+        grid=tuple(cells),
+        positions=((0.0, 0.0, 0.0),) * len(names),
+        orientations=((1.0, 0.0, 0.0, 0.0),) * len(names),
+        channels=channels,
+        units=units,
+        rate_hz=1000.0 / options.period_ms,
+        frame="fingers",
+    )
+
+
+def _packet(command: int, data: bytes) -> bytes:
+    return START + bytes((0, command, len(data))) + data
+
+
+def _signal(kind: int, finger: int, data: bytes) -> bytes:
+    return bytes((kind << 4 | finger << 2,)) + data
+
+
+def _signals(data: bytes) -> list[tuple[tuple[int, int], bytes]] | None:
+    """((type, finger), values) of each signal; None: they do not end where the packet does."""
+    found = []
+    at = 0
+    while at < len(data):
+        kind, finger, index = data[at] >> 4, data[at] >> 2 & 3, data[at] & 3
+        if kind not in VALUES or finger > 1:
+            return None
+        size = VALUES[kind].itemsize
+        if at + 1 + size > len(data):
+            return None
+        if index == 0:  # one of each is known of
+            found.append(((kind, finger), data[at + 1 : at + 1 + size]))
+        at += 1 + size
+    return found

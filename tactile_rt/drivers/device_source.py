@@ -1,0 +1,331 @@
+"""A device as a source: a line, a codec, the device's counter and clock, and its ups and downs.
+
+    link --> codec --> sequence --> clock --> Chunk
+
+There is no thread here: `read` does it all, so that nothing is buffered out of sight. A device that
+goes away is tried again inside `read`; the stream goes on with the next sample it sends.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tactile_rt.drivers.accounting import Sequencer
+from tactile_rt.drivers.codec import Codec, Event, Samples, Step
+from tactile_rt.drivers.device_clock import DeviceClock, host_stamps
+from tactile_rt.drivers.health import Health, State
+from tactile_rt.drivers.links import Link
+from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError
+from tactile_rt.timebase import NS_PER_S
+
+__all__ = ["DeviceOptions", "DeviceSource"]
+
+SLICE_S = 0.1  # how soon a waiting read notices that the source was closed
+FIRST_RETRY_S, LAST_RETRY_S = 0.02, 0.1  # a path is looked for cheaply and often
+COUNTED_TOLERANCE = 0.1  # of a rate that is only nominal: the counter is the device's only clock
+ATTEMPTS = 3  # at a step of the start that gets no answer
+
+
+@dataclass(frozen=True)
+class DeviceOptions:
+    """Options of every device.
+
+    Attributes:
+        codec: what the device speaks, see `tactile-rt codecs`.
+        start_s: how long the first sample may take, s; 0 does not wait for it.
+        stale_s: without a sample for so long the stream is stale, s; 0: ten periods, at least 0.1.
+        reconnect: whether to try again when the line is lost; else the source breaks.
+        calibration: file, or id of a device calibrated before; empty: none.
+    """
+
+    codec: str
+    start_s: float = 3.0
+    stale_s: float = 0.0
+    reconnect: bool = True
+    calibration: str = ""
+
+    def __post_init__(self) -> None:
+        if self.start_s < 0 or self.stale_s < 0:
+            raise ConfigError("start_s and stale_s must not be negative")
+
+
+class DeviceSource(Source):
+    """Samples from a device on a serial line or a CAN bus.
+
+    Args:
+        connect: opens the line; called again after it was lost.
+        codec: what the device speaks.
+        options: how patient to be.
+        name: of the device, for messages.
+
+    Raises:
+        SourceError: it cannot be opened, does not answer, or nothing that comes is of its codec.
+    """
+
+    def __init__(
+        self, connect: Callable[[], Link[Any]], codec: Codec[Any], options: DeviceOptions, name: str
+    ) -> None:
+        self.codec, self.options, self.name = codec, options, name
+        self._connect = connect
+        self._link: Link[Any] | None = None
+        self._closed = False
+        self._state, self._since, self._reason = State.CONNECTING, time.monotonic_ns(), ""
+        self._connections = self._newest = self._can_errors = self._status = 0
+        self._retry_at, self._retry_s = 0.0, FIRST_RETRY_S
+        self._poll_at = 0.0
+        self._early: list[Samples] = []  # that came while the device was being started
+        try:
+            self._open()
+            self._await_first()
+        except BaseException:
+            self._drop()
+            raise
+        assert codec.spec is not None
+        super().__init__(codec.spec)
+        self._period_ns = round(NS_PER_S / self.spec.rate_hz)
+        self._stale_ns = round(1e9 * (options.stale_s or max(0.1, 10 / self.spec.rate_hz)))
+        ticks = None if codec.tick_ns is None else self._period_ns / codec.tick_ns
+        self._sequencer = Sequencer(codec.count_bits, self.stats, ticks, codec.tick_bits)
+        self._clock: DeviceClock | None = None
+        if codec.tick_ns is not None:
+            self._clock = DeviceClock(codec.tick_ns, codec.tick_bits)
+        elif codec.count_bits is not None:
+            self._clock = DeviceClock(
+                NS_PER_S / self.spec.rate_hz, codec.count_bits, COUNTED_TOLERANCE
+            )
+        self._told = 0  # time given to the newest sample
+
+    # reading
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        end = None if timeout is None else time.monotonic() + timeout
+        while not self._closed:
+            chunk = self._chunk(self._early.pop(0)) if self._early else self._receive(end)
+            if chunk is not None:
+                return chunk
+            if not self._early and end is not None and time.monotonic() >= end:
+                return None
+        raise EndOfStream
+
+    def close(self) -> None:
+        self._closed = True
+        self._early.clear()
+        if self._link is not None:
+            try:
+                for step in self.codec.commands(Event.STOP):
+                    self._link.send(step.send)
+            except SourceError:
+                pass  # it is gone, which is what we want
+        self._drop()
+
+    @property
+    def health(self) -> Health:
+        """How the device is doing now."""
+        state, since, reason = self._state, self._since, self._reason
+        silent = time.monotonic_ns() - self._newest
+        if state == State.STREAMING and silent > self._stale_ns:
+            state, since = State.STALE, self._newest + self._stale_ns
+            reason = f"no sample for {silent / 1e9:.1f} s"
+        bits = self.codec.status_bits.items()
+        return Health(
+            state, since, reason, self._connections, self._newest,
+            self._clock.drift_ppm if self._clock and self.codec.tick_ns else 0.0,
+            self._clock.steps if self._clock else 0,
+            self._sequencer.resets,
+            tuple(meaning for bit, meaning in bits if self._status >> bit & 1),
+            self._can_errors + (self._link.can_errors if self._link else 0),
+            self.codec.stats,
+        )  # fmt: skip
+
+    def set_whisking(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> None:
+        """Move the whiskers of an active array: protraction = offset + amplitude sin(2 pi f t).
+
+        Raises:
+            SourceError: this device takes no such command, or is away.
+        """
+        whisk = getattr(self.codec, "whisk", None)
+        if whisk is None:
+            raise SourceError(f"{self.name}: codec {self.options.codec} has no whisking command")
+        if self._link is None:
+            raise SourceError(f"{self.name}: not connected")
+        self._link.send(whisk(frequency_hz, amplitude_rad, offset_rad).send)
+
+    def _receive(self, end: float | None) -> Chunk | None:
+        """Wait for one packet, a slice of time at most."""
+        now = time.monotonic()
+        left = SLICE_S if end is None else min(SLICE_S, max(0.0, end - now))
+        if self._link is None:
+            if now < self._retry_at:
+                time.sleep(min(left, self._retry_at - now))
+                return None
+            try:
+                self._open()
+            except SourceError as error:
+                self._lose(str(error))
+            return None
+        link = self._link
+        if self.codec.polls:
+            left = self._poll(link, now, left)
+        try:
+            found = link.receive(left)
+        except SourceError as error:
+            if not self._closed:  # else closing it is what ended the wait
+                self._lose(str(error))
+            return None
+        if found is None:
+            return None
+        samples = self.codec.feed(*found)
+        return None if samples is None else self._chunk(samples)
+
+    def _poll(self, link: Link[Any], now: float, left: float) -> float:
+        if now >= self._poll_at:
+            try:
+                for step in self.codec.commands(Event.POLL):
+                    link.send(step.send)
+            except SourceError as error:
+                self._lose(str(error))
+            period = self._period_ns / NS_PER_S
+            self._poll_at = max(self._poll_at + period, now)
+        return min(left, max(0.0, self._poll_at - now))
+
+    def _chunk(self, samples: Samples) -> Chunk | None:
+        if samples.values.shape[1:] != self.spec.shape:
+            return None  # the codec has counted it
+        seq, keep = self._sequencer.number(samples)
+        arrived, ticks, count = samples.arrived_ns, samples.ticks, samples.count
+        values, valid = samples.values, samples.valid
+        if not keep.all():
+            seq, arrived, values, valid = seq[keep], arrived[keep], values[keep], valid[keep]
+            ticks = None if ticks is None else ticks[keep]
+            count = None if count is None else count[keep]
+            if not len(seq):
+                return None
+        counter = ticks if ticks is not None else count
+        if self._clock is not None and counter is not None:
+            t_ns = self._clock.to_host(counter, arrived)
+        else:
+            t_ns = host_stamps(arrived, self._told, self._period_ns)
+        self._told = int(t_ns[-1])
+        self._newest = int(arrived[-1])
+        if samples.status is not None:
+            self._status = int(samples.status[-1])
+        if self._state != State.STREAMING:
+            self._turn(State.STREAMING, "")
+        self.stats.delivered += len(seq)
+        if valid.shape != values.shape[:2]:
+            valid = np.broadcast_to(valid, values.shape[:2])
+        return Chunk(seq, t_ns, values, valid)
+
+    # connecting
+
+    def _open(self) -> None:
+        """Open the line and start the device."""
+        self._link = self._connect()
+        self._connections += 1
+        self.codec.forget()
+        if self._connections > 1 and self._clock is not None:
+            self._clock.resume()
+        self._turn(State.CONNECTING, "")
+        for step in self.codec.commands(Event.START):
+            self._do(step)
+
+    def _do(self, step: Step[Any]) -> None:
+        link = self._link
+        assert link is not None
+        for _ in range(ATTEMPTS):
+            if step.send:
+                link.send(step.send)
+            answered = self._listen(step.timeout_s, step.expect) if step.expect else True
+            if answered:
+                if step.pause_s:
+                    self._listen(step.pause_s, None)
+                return
+        raise SourceError(
+            f"{self.name}: no answer to {step.what or 'the start command'}: is it a "
+            f"{self.options.codec} device, switched on, at the right baud or bit rate?"
+        )
+
+    def _listen(self, seconds: float, expect: bytes | int | None) -> bool:
+        """Take what comes for so long, or until this answer has; whether it has."""
+        assert self._link is not None
+        end = time.monotonic() + seconds
+        tail: Any = None
+        while (left := end - time.monotonic()) > 0:
+            found = self._link.receive(left)
+            if found is None:
+                continue
+            packet, t_ns = found
+            samples = self.codec.feed(packet, t_ns)
+            if samples is not None:
+                self._early.append(samples)
+            if isinstance(expect, bytes):
+                tail = (tail or b"") + packet
+                if expect in tail:
+                    return True
+                tail = tail[-len(expect) :]
+            elif expect is not None and any(frame.id == expect for frame in packet):
+                return True
+        return False
+
+    def _await_first(self) -> None:
+        """Wait for the device to describe itself and to send."""
+        assert self._link is not None
+        before = time.monotonic()
+        end = before + self.options.start_s
+        came = 0
+        while not (self._early and self.codec.spec) and time.monotonic() < end:
+            if self.codec.polls:
+                for step in self.codec.commands(Event.POLL):
+                    self._link.send(step.send)
+            found = self._link.receive(min(SLICE_S, max(0.0, end - time.monotonic())))
+            if found is None:
+                continue
+            came += len(found[0])
+            samples = self.codec.feed(*found)
+            if samples is not None:
+                self._early.append(samples)
+        if self.codec.spec is None or (self.options.start_s and not self._early):
+            raise SourceError(f"{self.name}: {self._silence(came)}")
+
+    def _silence(self, came: int) -> str:
+        stats = self.codec.stats
+        seconds = f"{self.options.start_s:g} s"
+        things = "bytes" if self.codec.wire == "serial" else "frames"
+        if not came and not stats.intact:
+            return f"nothing came for {seconds}: is the device on, and this its line?"
+        if stats.intact and self.codec.spec is None:
+            return (
+                "the device sends samples but does not describe its array: give array=FILE.json, "
+                "as `tactile-rt describe` writes it"
+            )
+        rate = "baud rate" if self.codec.wire == "serial" else "bit rate or identifier"
+        return (
+            f"{came} {things} came in {seconds}, and no whole {self.options.codec} sample: wrong "
+            f"codec, or wrong {rate}? ({stats.corrupt} damaged frames, {stats.skipped} {things} "
+            f"beside frames); `tactile-rt dump` shows what comes"
+        )
+
+    def _lose(self, why: str) -> None:
+        self._drop()
+        if not self.options.reconnect:
+            self._closed = True
+            raise SourceError(why)
+        if self._state != State.LOST:
+            self._retry_s = FIRST_RETRY_S
+        self._turn(State.LOST, why)
+        self._retry_at = time.monotonic() + self._retry_s
+        self._retry_s = min(LAST_RETRY_S, 2 * self._retry_s)
+
+    def _drop(self) -> None:
+        link, self._link = self._link, None
+        if link is not None:
+            self._can_errors += link.can_errors
+            link.close()
+
+    def _turn(self, state: State, reason: str) -> None:
+        if state != self._state:
+            self._since = time.monotonic_ns()
+        self._state, self._reason = state, reason

@@ -1,0 +1,348 @@
+"""An emulated device: any source's samples, spoken by any codec, over a real line.
+
+source --> [fit] --> device's counter and clock --> Codec.encode --> [faults] --> endpoint
+                                 host's commands --> Codec.respond --> endpoint
+"""
+
+import threading
+import time
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any, Final, Self
+
+import numpy as np
+
+from tactile_rt.drivers.codec import Codec
+from tactile_rt.drivers.emulation.damage import DeviceLog
+from tactile_rt.drivers.emulation.endpoints import Endpoint
+from tactile_rt.drivers.emulation.faults import QUIET_S, FaultSchedule
+from tactile_rt.drivers.emulation.fitting import fit
+from tactile_rt.drivers.emulation.transmitter import EmulatedClock, Transmitter
+from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source
+from tactile_rt.timebase import NS_PER_S
+
+__all__ = ["PACES", "Emulator"]
+
+PACES = ("realtime", "fast")
+SETTLE_S: Final = 0.2  # a host that opens a port throws away what was there before
+SLICE_S: Final = 0.05  # how soon a wait notices that the emulator is closed
+YIELD_S: Final = 1e-5  # a source that never waits would keep the host's commands waiting
+PIECE: Final = 16  # samples encoded at a time when nobody waits for the clock
+AHEAD_BYTES: Final = 65_536  # what is queued at most when the host sets the pace
+
+
+class Emulator:
+    """A device that measures what a source delivers. A context manager; runs in two threads.
+
+    The source is first read when a host is there and, if the codec needs that, has asked for
+    samples; one that is not live and paced ``fast`` then waits for its host for ever after, and
+    loses nothing. Samples that the source delivers while the device is not to send are not
+    numbered. A polled device sends the newest sample. The source stays the caller's to close.
+
+    Args:
+        codec: what it speaks. Its `spec` is the source's if it has none; else see `fit`.
+        source: what it measures.
+        endpoint: where it is plugged in.
+        faults: what goes wrong; the schedule is used up.
+        log: whether to keep a record of each sample (17 bytes), or only counts.
+        pace: ``realtime`` sends samples when they are due (a live source has its own pace);
+            ``fast`` as soon as the host takes them.
+        seconds: how long the source's stream is, if known, else where to stop; s of its time. The
+            schedule keeps the end quiet. Not needed for a source that is not live.
+        start_count: the counter's first value, e.g. just before it wraps.
+        start_tick: the clock's.
+        drift_ppm: how much faster than true its clock runs.
+        settle_s: a device that sends unasked begins so long after a host has come.
+
+    Attributes:
+        log: what was done to each sample.
+        codec: with what hosts have commanded.
+
+    Raises:
+        ConfigError: codec and endpoint are of different wires, or a fault cannot happen there.
+    """
+
+    def __init__(
+        self,
+        codec: Codec[Any],
+        source: Source,
+        endpoint: Endpoint[Any],
+        faults: FaultSchedule | None = None,
+        log: bool = True,
+        *,
+        pace: str = "realtime",
+        seconds: float | None = None,
+        start_count: int = 0,
+        start_tick: int = 0,
+        drift_ppm: float = 0.0,
+        settle_s: float = SETTLE_S,
+    ) -> None:
+        if codec.wire != endpoint.wire:
+            raise ConfigError(f"a {codec.wire} codec cannot speak over a {endpoint.wire} endpoint")
+        if pace not in PACES:
+            raise ConfigError(f"pace must be one of {', '.join(PACES)}, not {pace!r}")
+        if faults and codec.wire == "serial" and any(f.kind == "can_error" for f in faults.faults):
+            raise ConfigError("fault can_error: a serial line has no error frames")
+        if codec.spec is None:
+            codec.spec = source.spec
+        self.codec, self.source, self.endpoint = codec, source, endpoint
+        self.log = DeviceLog(log)
+        self._fit = fit(source.spec, codec.spec)
+        self._seconds = seconds
+        self._ahead_ns = QUIET_S * NS_PER_S if faults and not source.live else 0.0
+        self._settle_s = settle_s
+        self._waits = pace == "fast" and not source.live  # the host sets the pace
+        self._unasked = codec.streaming  # when switched on
+        tick_ns = codec.tick_ns or 1.0
+        wrap_ns = round(2**codec.tick_bits * tick_ns)
+        clock = EmulatedClock(round(start_tick * tick_ns), drift_ppm, wrap_ns)
+        self._out = Transmitter(codec, endpoint, faults, self.log, clock, start_count)
+        self._first_ns: int | None = None  # of the source's time
+        self._began_ns = 0  # host time then
+        self._newest: Chunk | None = None
+        self._whisking: Any = None
+        self._state = threading.Condition(threading.RLock())
+        self._heard_at: float | None = None
+        self._stopping = self._done = False
+        self._failure: BaseException | None = None
+        self._threads: list[threading.Thread] = []
+
+    # for its owner
+
+    @property
+    def address(self) -> str:
+        """What a host opens: the beginning of a source's URL."""
+        return self.endpoint.address
+
+    @property
+    def done(self) -> bool:
+        """Whether the source has ended and all that can be sent has been handed on."""
+        return self._done and (not self.endpoint.backlog or not self.endpoint.heard)
+
+    def start(self) -> None:
+        """Appear and begin.
+
+        Raises:
+            ConfigError: the endpoint cannot be plugged in.
+        """
+        self.endpoint.plug()
+        for work in (self._listen, self._measure):
+            thread = threading.Thread(target=work, name=f"emulator-{work.__name__[1:]}")
+            thread.start()
+            self._threads.append(thread)
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait until it is `done`; whether it is.
+
+        Raises:
+            TactileError: the source broke.
+        """
+        end = None if timeout is None else time.monotonic() + timeout
+        while not self.done and self._failure is None:
+            left = SLICE_S if end is None else min(SLICE_S, end - time.monotonic())
+            if left <= 0:
+                return False
+            with self._state:
+                if self._done:
+                    left = min(left, 0.005)  # the backlog tells nobody when it is gone
+                self._state.wait(left)
+        if self._failure is not None:
+            raise self._failure
+        return True
+
+    def close(self) -> None:
+        """Disappear; safe to call twice."""
+        with self._state:
+            self._stopping = True
+            self._state.notify_all()
+        self.endpoint.wake()
+        for thread in self._threads:
+            thread.join()
+        self._threads.clear()
+        self.endpoint.close()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def unplug(self) -> None:
+        """Pull it out: what is on its way is lost, and what it measures meanwhile is unheard."""
+        with self._state:
+            self.endpoint.pull()
+            self._heard_at = None
+
+    def replug(self, restart: bool = False) -> None:
+        """Plug it in again, under the same link.
+
+        Args:
+            restart: it had no power meanwhile: it counts from 0, and waits to be started.
+        """
+        with self._state:
+            self.endpoint.plug()
+            if restart:
+                self._out.restart()
+                self.codec.forget()
+                self.codec.streaming, self.codec.polled = self._unasked, 0
+        self.endpoint.wake()
+
+    # the host's commands
+
+    def _listen(self) -> None:
+        try:
+            while not self._stopping:
+                packet = self.endpoint.receive(SLICE_S)
+                with self._state:
+                    heard = self.endpoint.heard
+                    if heard != (self._heard_at is not None):
+                        self._heard_at = time.monotonic() if heard else None
+                    elif not packet:
+                        continue
+                    if packet:
+                        self._obey(packet)
+                    self._state.notify_all()
+        except BaseException as error:  # whoever waits for the device shall know
+            self._failure = error
+
+    def _obey(self, packet: Any) -> None:
+        answer = self.codec.respond(packet)
+        if answer:
+            self.endpoint.send(answer, answer=True)
+        if not self._waits and not self.codec.streaming and self._newest is not None:
+            self._answer_polls(self._newest)
+
+    # the samples
+
+    def _measure(self) -> None:
+        try:
+            if self._wait_for_host():
+                for chunk in self._chunks():
+                    self._play(self._fit(chunk))
+            with self._state:
+                self._out.finish()
+        except BaseException as error:
+            self._failure = error
+        with self._state:
+            self._done = True
+            self._state.notify_all()
+
+    def _chunks(self) -> Iterator[Chunk]:
+        """The source's chunks, some held back so that the end is known before it comes."""
+        ahead: list[Chunk] = []
+        while not self._stopping:
+            self._pass_on_whisking()
+            try:
+                chunk = self.source.read(SLICE_S)
+            except EndOfStream:
+                if ahead:
+                    self._out.end_ns = min(self._out.end_ns, int(ahead[-1].t_ns[-1]))
+                break
+            if chunk is None:
+                continue
+            if self._first_ns is None:
+                self._first_ns, self._began_ns = int(chunk.t_ns[0]), time.monotonic_ns()
+                self._out.begin(self._first_ns)
+                if self._seconds is not None:
+                    self._out.end_ns = self._first_ns + self._seconds * NS_PER_S
+            n = int(np.searchsorted(chunk.t_ns, self._out.end_ns))
+            if n:
+                ahead.append(chunk if n == len(chunk) else _slice(chunk, 0, n))
+            while ahead and ahead[-1].t_ns[-1] - ahead[0].t_ns[-1] >= self._ahead_ns:
+                yield ahead.pop(0)
+                if not self._ahead_ns:
+                    break
+            if n < len(chunk):
+                break
+        for chunk in ahead:
+            if not self._stopping:
+                yield chunk
+
+    def _play(self, chunk: Chunk) -> None:
+        """Send a chunk's samples as they fall due."""
+        at = 0
+        while at < len(chunk) and not self._stopping:
+            if self._waits:
+                time.sleep(YIELD_S)
+                with self._state:  # else a STOP could come between
+                    if not self._wait_for_host():
+                        return
+                    stop = at + (PIECE if self.codec.streaming else 1)
+                    self._offer(_slice(chunk, at, stop))
+            else:
+                if self.source.live:
+                    time.sleep(YIELD_S)
+                    stop = at + PIECE
+                else:
+                    stop = self._due(chunk, at)
+                self._offer(_slice(chunk, at, stop))
+            at = min(stop, len(chunk))
+
+    def _due(self, chunk: Chunk, at: int) -> int:
+        """Wait until sample `at` is due; return the first one that is not."""
+        assert self._first_ns is not None
+        while True:
+            now = time.monotonic_ns() - self._began_ns + self._first_ns
+            wait_s = (int(chunk.t_ns[at]) - now) / NS_PER_S
+            if wait_s <= 0 or self._stopping:
+                return max(at + 1, int(np.searchsorted(chunk.t_ns, now, "right")))
+            time.sleep(min(wait_s, SLICE_S))
+
+    def _wait_for_host(self) -> bool:
+        """Wait until a host wants samples and there is room for them; False: we are closing."""
+        with self._state:
+            while not self._stopping:
+                wanted = self.codec.streaming or self.codec.polled > 0
+                left = SLICE_S
+                if self._heard_at is not None and self.endpoint.heard and wanted:
+                    settled = self._heard_at + (self._settle_s if self._unasked else 0.0)
+                    left = min(left, settled - time.monotonic())
+                    if left <= 0:
+                        if self.endpoint.backlog < AHEAD_BYTES:
+                            return True
+                        left = 0.001
+                elif self._out.away:  # only more samples bring it back
+                    return True
+                self._state.wait(left)
+        return False
+
+    def _offer(self, piece: Chunk) -> None:
+        with self._state:
+            if self.codec.streaming:
+                self._out.send(piece)
+            else:
+                self._newest = _slice(piece, -1, None)
+                if self._out.away:  # nobody can ask, and only time brings it back
+                    self._out.look(int(self._newest.t_ns[0]))
+                self._answer_polls(self._newest)
+
+    def _answer_polls(self, sample: Chunk) -> None:
+        while self.codec.polled > 0 and not self._stopping:
+            self.codec.polled -= 1
+            self._out.send(sample)
+            if self._waits:
+                return
+
+    def _pass_on_whisking(self) -> None:
+        """What a host commands the device to do, a simulated array does."""
+        wanted = getattr(self.codec, "whisking", None)
+        if wanted is not None and wanted != self._whisking:
+            self._whisking = wanted
+            move = getattr(self.source, "set_whisking", None)
+            if move is not None:
+                move(*wanted)
+
+
+def _slice(chunk: Chunk, start: int, stop: int | None) -> Chunk:
+    return Chunk(
+        chunk.seq[start:stop],
+        chunk.t_ns[start:stop],
+        chunk.values[start:stop],
+        chunk.valid[start:stop],
+    )

@@ -1,0 +1,300 @@
+"""The device's end of a line, for an emulator: a pty, an slcan adapter on a pty, a CAN bus.
+
+None of them ever waits for a reader: what does not fit is refused whole.
+"""
+
+import abc
+import random
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Generic
+
+from tactile_rt.drivers.codec import Frame, Packet
+from tactile_rt.drivers.emulation.pseudo_terminal import Pty
+from tactile_rt.drivers.slcan import SlcanAdapter
+from tactile_rt.stream import ConfigError
+
+__all__ = ["BusEndpoint", "Endpoint", "SerialEndpoint", "SlcanEndpoint"]
+
+FIFO_BYTES = 1 << 20  # a second of 1 kHz x 850 B: a busy host machine is no fault of the device
+LOOK_S = 0.005  # how often a bus that is not there is looked at
+WAIT_S = 0.05  # how soon a wait on a bus notices that the device is closed
+SEND_S = 0.05  # what a bus may take to take a frame
+MOST_FRAMES = 512  # taken from a bus at a time
+BUS_ERROR = 0x80  # slcan's status flag
+
+
+class Endpoint(abc.ABC, Generic[Packet]):
+    """The device's end of a line.
+
+    Attributes:
+        wire: ``serial`` or ``can``.
+        address: what a host opens, the beginning of a source's URL; known once plugged in.
+    """
+
+    wire: ClassVar[str]
+    address: str = ""
+
+    @property
+    @abc.abstractmethod
+    def heard(self) -> bool:
+        """Whether a host listens."""
+
+    @abc.abstractmethod
+    def plug(self) -> None:
+        """Appear.
+
+        Raises:
+            ConfigError: it cannot: what and why.
+        """
+
+    @abc.abstractmethod
+    def pull(self) -> None:
+        """Disappear, with all that has not been read."""
+
+    @abc.abstractmethod
+    def receive(self, timeout_s: float) -> Packet:
+        """What the host has sent, or an empty packet when nothing came in time; in one thread."""
+
+    @abc.abstractmethod
+    def send(self, packet: Packet, answer: bool = False) -> bool:
+        """Send, at once or as the host reads; False: nobody hears, or there is no room.
+
+        Args:
+            packet: what to send.
+            answer: to a command: there is always room for it.
+        """
+
+    @abc.abstractmethod
+    def disturb(self, amount: int, draw: random.Random) -> None:
+        """Send what means nothing: so many random bytes, or frames that nobody knows."""
+
+    def error(self, frames: int) -> None:
+        """Send so many CAN error frames."""
+
+    @property
+    def backlog(self) -> int:
+        """Bytes accepted and not yet sent."""
+        return 0
+
+    def wake(self) -> None:
+        """End a wait in `receive`."""
+
+    def close(self) -> None:
+        """Disappear for good; safe to call twice."""
+        self.pull()
+
+
+class _PtyEndpoint(Endpoint[Packet]):
+    """What a device on a pty has, whatever it speaks."""
+
+    def __init__(self, link: str | Path | None, fifo_bytes: int) -> None:
+        self.pty = Pty(link, fifo_bytes)
+
+    @property
+    def heard(self) -> bool:
+        return self.pty.heard
+
+    @property
+    def backlog(self) -> int:
+        return self.pty.queued
+
+    def pull(self) -> None:
+        self.pty.pull()
+
+    def wake(self) -> None:
+        self.pty.wake()
+
+    def close(self) -> None:
+        self.pty.close()
+
+
+class SerialEndpoint(_PtyEndpoint[bytes]):
+    """A serial port: a pty.
+
+    Args:
+        link: a name under which it appears, besides /dev/pts/N.
+        fifo_bytes: what it holds for a host that does not read.
+    """
+
+    wire = "serial"
+
+    def __init__(self, link: str | Path | None = None, fifo_bytes: int = FIFO_BYTES) -> None:
+        super().__init__(link, fifo_bytes)
+
+    def plug(self) -> None:
+        self.pty.plug()
+        self.address = f"serial://{self.pty.name}"
+
+    def receive(self, timeout_s: float) -> bytes:
+        return self.pty.read(timeout_s)
+
+    def send(self, packet: bytes, answer: bool = False) -> bool:
+        return self.pty.write(packet, answer)
+
+    def disturb(self, amount: int, draw: random.Random) -> None:
+        self.pty.write(draw.randbytes(amount))
+
+
+class SlcanEndpoint(_PtyEndpoint[Sequence[Frame]]):
+    """A device on a CAN bus with an slcan adapter on a pty: frames come once the channel is open.
+
+    Args:
+        link: a name under which it appears, besides /dev/pts/N.
+        bitrate: of the bus; a host that chooses another one hears nothing; None: any.
+        fifo_bytes: what it holds for a host that does not read.
+    """
+
+    wire = "can"
+
+    def __init__(
+        self,
+        link: str | Path | None = None,
+        bitrate: int | None = None,
+        fifo_bytes: int = FIFO_BYTES,
+    ) -> None:
+        super().__init__(link, fifo_bytes)
+        self._bitrate = bitrate
+        self.adapter = SlcanAdapter(bitrate)
+
+    @property
+    def heard(self) -> bool:
+        return self.pty.heard and self.adapter.hears
+
+    def plug(self) -> None:
+        self.adapter = SlcanAdapter(self._bitrate)  # it gets its power from the port
+        self.pty.plug()
+        self.address = f"can:slcan:{self.pty.name}"
+
+    def receive(self, timeout_s: float) -> Sequence[Frame]:
+        data = self.pty.read(timeout_s)
+        if not data:
+            return []
+        with self.pty.lock:  # nothing may come between a command and its answer
+            answer, frames = self.adapter.respond(data)
+            self.pty.write(answer, answer=True)
+        return frames
+
+    def send(self, packet: Sequence[Frame], answer: bool = False) -> bool:
+        with self.pty.lock:
+            data = self.adapter.encode(packet, time.monotonic_ns())
+            return bool(data) and self.pty.write(data, answer)
+
+    def disturb(self, amount: int, draw: random.Random) -> None:
+        # with an end of line: what follows is a line of its own
+        if self.adapter.hears:
+            self.pty.write(draw.randbytes(amount) + b"\r")
+
+    def error(self, frames: int) -> None:
+        self.adapter.flags |= BUS_ERROR
+
+
+class BusEndpoint(Endpoint[Sequence[Frame]]):
+    """A device on a bus of python-can.
+
+    Args:
+        name: ``INTERFACE:CHANNEL``, e.g. ``virtual:test``.
+        fd: whether to open it for CAN FD.
+        bitrate: of the bus, where the interface sets it.
+
+    Raises:
+        ConfigError: not such a name.
+    """
+
+    wire = "can"
+
+    def __init__(self, name: str, fd: bool = False, bitrate: int = 1_000_000) -> None:
+        self._interface, _, self._channel = name.partition(":")
+        if not self._channel:
+            raise ConfigError(f"bus {name!r} is not INTERFACE:CHANNEL, e.g. virtual:test")
+        self.address = f"can:{name}"
+        self._fd, self._bitrate = fd, bitrate
+        self._bus: Any = None
+        self._others: list[Any] | None = None
+
+    @property
+    def heard(self) -> bool:
+        # a virtual bus knows who is on it; of another nobody can tell
+        bus = self._bus
+        if bus is None:
+            return False
+        return len(bus.channel) > 1 if self._interface == "virtual" else True
+
+    def plug(self) -> None:
+        import can
+
+        if self._bus is not None:
+            return
+        options: dict[str, Any] = {"fd": True} if self._fd else {}
+        if self._interface == "virtual":
+            options = {"protocol": can.CanProtocol.CAN_FD} if self._fd else {}
+        try:
+            self._bus = can.Bus(self._channel, self._interface, bitrate=self._bitrate, **options)
+        except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
+            why = " ".join(str(error).split()) or type(error).__name__
+            raise ConfigError(f"bus {self.address[4:]} cannot be opened ({why})") from None
+
+    def pull(self) -> None:
+        bus, self._bus = self._bus, None
+        if bus is not None:
+            bus.shutdown()
+
+    def close(self) -> None:
+        self.pull()
+
+    def receive(self, timeout_s: float) -> Sequence[Frame]:
+        import can
+
+        bus = self._bus
+        if bus is None:
+            time.sleep(min(timeout_s, LOOK_S))
+            return []
+        frames: list[Frame] = []
+        try:
+            message = bus.recv(min(timeout_s, WAIT_S))
+            while message is not None:
+                if not message.is_error_frame:
+                    frames.append(
+                        Frame(
+                            message.arbitration_id, bytes(message.data), message.is_extended_id,
+                            message.is_fd, message.is_remote_frame,
+                        )
+                    )  # fmt: skip
+                message = bus.recv(0) if len(frames) < MOST_FRAMES else None
+        except (can.CanError, OSError, ValueError):
+            time.sleep(LOOK_S)  # pulled out meanwhile, or the bus is off
+        return frames
+
+    def send(self, packet: Sequence[Frame], answer: bool = False) -> bool:
+        import can
+
+        return self._put(
+            can.Message(
+                arbitration_id=f.id, data=f.data, is_extended_id=f.extended, is_fd=f.fd,
+                bitrate_switch=f.fd, is_remote_frame=f.remote,
+            )
+            for f in packet
+        )  # fmt: skip
+
+    def disturb(self, amount: int, draw: random.Random) -> None:
+        for _ in range(-(-amount // 8)):  # 29 bits: no device of ours has such an identifier
+            self.send([Frame(1 << 28 | draw.getrandbits(28), draw.randbytes(8), extended=True)])
+
+    def error(self, frames: int) -> None:
+        import can
+
+        self._put(can.Message(is_error_frame=True) for _ in range(frames))
+
+    def _put(self, messages: Iterable[Any]) -> bool:
+        import can
+
+        bus = self._bus
+        if bus is None or not self.heard:
+            return False
+        try:
+            for message in messages:
+                bus.send(message, timeout=SEND_S)
+        except (can.CanError, OSError, ValueError):
+            return False
+        return True

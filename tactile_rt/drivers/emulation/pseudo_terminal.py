@@ -1,0 +1,216 @@
+"""A pseudo-terminal as a device's port: raw, named, never blocking, and it can be pulled out."""
+
+import os
+import pty
+import select
+import termios
+import threading
+import time
+import tty
+from collections import deque
+from pathlib import Path
+
+from tactile_rt.stream import ConfigError
+
+__all__ = ["Pty"]
+
+LOOK_S = 0.005  # how often a port that nobody has open is looked at
+READ_BYTES = 65_536
+
+
+class Pty:
+    """A pseudo-terminal, raw and without echo; `read` in one thread, all else in any.
+
+    What is written is queued up to a limit and goes out as the host reads, in `read`. What the
+    host has not read when it closes the port is gone, as with a real port.
+
+    Args:
+        link: a symbolic link to it, which comes and goes with it; None: none.
+        fifo_bytes: how much it holds for a host that does not read, beyond the kernel's 18 kB.
+
+    Attributes:
+        path: of the terminal, once plugged in.
+        heard: whether a host has it open.
+        queued: bytes written and not yet passed on.
+        lock: held wherever its state is used.
+    """
+
+    def __init__(self, link: str | Path | None, fifo_bytes: int) -> None:
+        self.link = None if link is None else Path(link)
+        self.path = ""
+        self.heard = False
+        self.fifo_bytes = fifo_bytes
+        self.lock = threading.RLock()
+        self._master = -1
+        self._plugged = 0  # times; a descriptor's number may come again, this does not
+        self._fifo: deque[bytes] = deque()
+        self.queued = 0
+        self._wake = (-1, -1)
+
+    @property
+    def name(self) -> str:
+        """What a host opens: the link, or the terminal itself."""
+        return self.path if self.link is None else str(self.link.absolute())
+
+    def plug(self) -> None:
+        """Appear.
+
+        Raises:
+            ConfigError: the link's name is taken, or it cannot be made.
+        """
+        with self.lock:
+            if self._master >= 0:
+                return
+            self._check_link()
+            master, slave = pty.openpty()
+            tty.setraw(slave)
+            self.path = os.ttyname(slave)
+            os.close(slave)  # from now on a hang-up tells that nobody has it open
+            os.set_blocking(master, False)
+            if self.link is not None:
+                try:
+                    os.symlink(self.path, self.link)
+                except OSError as error:
+                    os.close(master)
+                    raise ConfigError(f"{self.link}: {error.strerror}") from None
+            self._master = master
+            self._plugged += 1
+            if self._wake[0] < 0:
+                self._wake = os.pipe()
+                os.set_blocking(self._wake[0], False)
+                os.set_blocking(self._wake[1], False)
+
+    def pull(self) -> None:
+        """Disappear; what was not read is lost."""
+        with self.lock:
+            if self._master < 0:
+                return
+            if self.link is not None and self.link.is_symlink():
+                if os.readlink(self.link) == self.path:  # else another device's by now
+                    self.link.unlink()
+            os.close(self._master)
+            self._master, self.heard = -1, False
+            self._fifo.clear()
+            self.queued = 0
+            self.wake()
+
+    def close(self) -> None:
+        """Disappear for good; safe to call twice."""
+        with self.lock:
+            self.pull()
+            for end in self._wake:
+                if end >= 0:
+                    os.close(end)
+            self._wake = (-1, -1)
+
+    def write(self, data: bytes, answer: bool = False) -> bool:
+        """Queue all of these bytes, or none: nobody has it open, or there is no room.
+
+        Args:
+            data: what to send.
+            answer: to a command: it may take as much room again.
+        """
+        with self.lock:
+            room = self.fifo_bytes * (2 if answer else 1)
+            if not self.heard or self.queued + len(data) > room:
+                return False
+            if not self._fifo:
+                data = data[self._put(data) :]
+                if not data:
+                    return True
+                self.wake()  # the reader's thread shall now wait for room, too
+            self._fifo.append(data)
+            self.queued += len(data)
+            return True
+
+    def read(self, timeout_s: float) -> bytes:
+        """What the host has sent; meanwhile it gets what is queued."""
+        with self.lock:
+            master, plugged, wake = self._master, self._plugged, self._wake[0]
+            sleep_s = timeout_s if self.heard else min(timeout_s, LOOK_S)
+            mask = select.POLLIN | (select.POLLOUT if self._fifo else 0)
+            heard = self.heard
+        if wake < 0:
+            time.sleep(timeout_s)
+            return b""
+        poll = select.poll()
+        poll.register(wake, select.POLLIN)
+        if master < 0:
+            poll.poll(1e3 * timeout_s)
+        elif not heard:  # a hang-up would end the wait at once
+            poll.poll(1e3 * sleep_s)
+        else:
+            poll.register(master, mask)
+            poll.poll(1e3 * sleep_s)
+        with self.lock:
+            if self._wake[0] >= 0:
+                try:
+                    os.read(self._wake[0], 4096)
+                except BlockingIOError:
+                    pass
+            if self._master < 0 or self._plugged != plugged:
+                return b""
+            return self._serve()
+
+    def wake(self) -> None:
+        """End a wait in `read`."""
+        with self.lock:
+            if self._wake[1] >= 0:
+                try:
+                    os.write(self._wake[1], b"\0")
+                except BlockingIOError:
+                    pass  # it is awake
+
+    def _serve(self) -> bytes:
+        poll = select.poll()
+        poll.register(self._master, select.POLLIN | select.POLLOUT)
+        ((_, events),) = poll.poll(0) or [(0, 0)]
+        if events & select.POLLHUP:
+            if self.heard:
+                self._hang_up()
+        else:
+            self.heard = True
+        if self.heard and events & select.POLLOUT:
+            while self._fifo:
+                data = self._fifo.popleft()
+                done = self._put(data)
+                self.queued -= done
+                if done < len(data):
+                    self._fifo.appendleft(data[done:])
+                    break
+        if not events & select.POLLIN:
+            return b""
+        try:
+            return os.read(self._master, READ_BYTES)
+        except OSError:
+            return b""
+
+    def _put(self, data: bytes) -> int:
+        try:
+            return os.write(self._master, data)
+        except OSError:  # no room, or nobody there
+            return 0
+
+    def _hang_up(self) -> None:
+        """The host has gone: the next one shall not find what was meant for it."""
+        self.heard = False
+        self._fifo.clear()
+        self.queued = 0
+        try:
+            slave = os.open(self.path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        except OSError:
+            return
+        try:
+            termios.tcflush(slave, termios.TCIOFLUSH)
+        except termios.error:
+            pass
+        finally:
+            os.close(slave)
+
+    def _check_link(self) -> None:
+        if self.link is None or not (self.link.is_symlink() or self.link.exists()):
+            return
+        if self.link.is_symlink() and not self.link.exists():
+            self.link.unlink()  # left by a device that is no more
+            return
+        raise ConfigError(f"{self.link} is there already: name another link, or remove it")

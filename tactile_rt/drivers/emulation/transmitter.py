@@ -1,0 +1,217 @@
+"""How an emulated device numbers, times and encodes its samples, and what goes wrong with them."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.drivers.codec import Codec
+from tactile_rt.drivers.emulation.damage import DeviceLog, Fate, damaged
+from tactile_rt.drivers.emulation.endpoints import Endpoint
+from tactile_rt.drivers.emulation.faults import QUIET_S, Fault, FaultSchedule
+from tactile_rt.stream import Chunk
+from tactile_rt.timebase import NS_PER_S
+
+__all__ = ["EmulatedClock", "Transmitter"]
+
+
+class Transmitter:
+    """Samples to packets to an endpoint, with faults on the way; in one thread at a time.
+
+    Args:
+        codec: what it speaks.
+        endpoint: where to.
+        faults: what goes wrong; None: nothing.
+        log: where to write down what becomes of each sample.
+        clock: the device's.
+        start_count: the device's counter's first value.
+
+    Attributes:
+        end_ns: when the stream ends, on the source's clock; nothing goes wrong just before.
+        away: whether a fault has it pulled out.
+    """
+
+    def __init__(
+        self,
+        codec: Codec[Any],
+        endpoint: Endpoint[Any],
+        faults: FaultSchedule | None,
+        log: DeviceLog,
+        clock: "EmulatedClock",
+        start_count: int = 0,
+    ) -> None:
+        self._codec, self._endpoint = codec, endpoint
+        self._faults, self._log, self._clock = faults, log, clock
+        self._count = start_count
+        self._first_ns = 0
+        self.end_ns: float = np.inf
+        self.away = False
+        self._held: list[tuple[int, Any, Fate]] = []  # while nothing gets through
+
+    def begin(self, t_ns: int) -> None:
+        """The first sample is of this time, on the source's clock."""
+        self._first_ns = t_ns
+        self._clock.begin(t_ns)
+
+    def finish(self) -> None:
+        """Nothing follows: plug in, send what is held back."""
+        self._pull_out(False)
+        self._release()
+
+    def restart(self, t_ns: int | None = None) -> None:
+        """Counter and clock begin anew, the clock at this moment of the source's."""
+        self._count = 0
+        self._clock.restart(t_ns)
+
+    def look(self, t_ns: int) -> None:
+        """Time passes without a sample to send: it may come back."""
+        hit = self._hit(t_ns)
+        self._pull_out(hit is not None and hit.kind == "unplug")
+
+    def send(self, piece: Chunk) -> None:
+        """Number, time, encode and send these samples."""
+        n = len(piece)
+        hits: list[Fault | None] = [None] * n
+        if self._faults is None:
+            seq = np.arange(self._count, self._count + n, dtype=np.int64)
+            t_ns = self._clock.at(piece.t_ns)
+            self._count += n
+        else:
+            seq, t_ns = np.empty(n, np.int64), np.empty(n, np.int64)
+            for i in range(n):
+                hits[i] = self._hit(int(piece.t_ns[i]))
+                seq[i] = self._count
+                t_ns[i] = self._clock.at(piece.t_ns[i : i + 1])[0]
+                self._count += 1
+        packets = self._codec.encode(Chunk(seq, t_ns, piece.values, piece.valid))
+        for number, now, packet, hit in zip(
+            seq.tolist(), t_ns.tolist(), packets, hits, strict=True
+        ):
+            self._emit(number, now, packet, hit)
+
+    def _hit(self, t_ns: int) -> Fault | None:
+        """What hits the sample of this time; clock and counter are changed at once."""
+        assert self._faults is not None
+        elapsed_s = (t_ns - self._first_ns) / NS_PER_S
+        quiet = t_ns > self.end_ns - QUIET_S * NS_PER_S
+        fault = self._faults.at(elapsed_s, quiet)
+        self._clock.look(t_ns)
+        if fault is None:
+            return None
+        if fault.kind == "clock_drift":
+            self._clock.drift(t_ns, fault.size, fault.duration_s)
+        elif fault.kind == "clock_jump":
+            self._clock.jump(t_ns, round(fault.size * NS_PER_S))
+        elif fault.kind == "sequence_reset":
+            self.restart(t_ns)
+        return fault
+
+    def _emit(self, seq: int, t_ns: int, packet: Any, hit: Fault | None) -> None:
+        kind = "" if hit is None else hit.kind
+        if kind != "stall" and self._held:
+            self._release()
+        self._pull_out(kind == "unplug")
+        if hit is None:
+            self._log.add(seq, t_ns, self._put(packet, Fate.SENT))
+        elif kind in ("bit_flip", "truncate"):
+            assert self._faults is not None
+            packet, fate = damaged(packet, hit, self._faults.random)
+            self._log.add(seq, t_ns, self._put(packet, fate))
+        elif kind == "duplicate":
+            fate = self._put(packet, Fate.SENT)
+            for _ in range(int(hit.size) if fate == Fate.SENT else 0):
+                if self._put(packet, Fate.DUPLICATED) == Fate.DUPLICATED:
+                    fate = Fate.DUPLICATED
+                    self._log.duplicated += 1
+            self._log.add(seq, t_ns, fate)
+        elif kind in ("drop", "unplug"):
+            self._log.add(seq, t_ns, Fate.DROPPED if kind == "drop" else Fate.UNHEARD)
+        elif kind == "stall":
+            self._held.append((self._log.add(seq, t_ns, Fate.SENT), packet, Fate.SENT))
+        else:
+            if kind == "burst":
+                assert self._faults is not None
+                self._endpoint.disturb(int(hit.size), self._faults.random)
+            elif kind == "can_error":
+                self._endpoint.error(int(hit.size))
+            self._log.add(seq, t_ns, self._put(packet, Fate.SENT))
+
+    def _pull_out(self, away: bool) -> None:
+        """What the schedule says of the plug."""
+        if away == self.away:
+            return
+        self.away = away
+        if away:
+            self._endpoint.pull()
+        else:
+            self._endpoint.plug()
+            self._endpoint.wake()
+
+    def _put(self, packet: Any, fate: Fate) -> Fate:
+        if self._endpoint.send(packet):
+            return fate
+        return Fate.OVERFLOWED if self._endpoint.heard else Fate.UNHEARD
+
+    def _release(self) -> None:
+        """Send what a stall held back."""
+        for at, packet, fate in self._held:
+            became = self._put(packet, fate)
+            if became != fate:
+                self._log.change(at, fate, became)
+        self._held.clear()
+
+
+class EmulatedClock:
+    """The device's clock: the source's time to device time, with drift, jumps and restarts.
+
+    Args:
+        start_ns: what it shows when the first sample is taken.
+        drift_ppm: how much faster than true it runs.
+        wrap_ns: what it can show on the wire.
+    """
+
+    def __init__(self, start_ns: int, drift_ppm: float, wrap_ns: int) -> None:
+        self._here, self._there = 0, start_ns  # the same moment on both clocks
+        self._base_ppm = self._ppm = drift_ppm
+        self._wrap_ns = wrap_ns
+        self._drift_ends: float = np.inf
+
+    def begin(self, t_ns: int) -> None:
+        """The first sample is taken now."""
+        self._here = t_ns
+
+    def at(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(n,) device time, ns, not wrapped."""
+        passed = t_ns - self._here
+        if self._ppm == 0.0:
+            return self._there + passed
+        return self._there + passed + np.round(passed * (self._ppm * 1e-6)).astype(np.int64)
+
+    def look(self, t_ns: int) -> None:
+        """End a drift that is over."""
+        if t_ns >= self._drift_ends:
+            self._anchor(t_ns)
+            self._ppm, self._drift_ends = self._base_ppm, np.inf
+
+    def drift(self, t_ns: int, ppm: float, duration_s: float) -> None:
+        """Run so much fast from now on; a duration of 0 is for ever."""
+        self._anchor(t_ns)
+        self._ppm = ppm
+        self._drift_ends = t_ns + duration_s * NS_PER_S if duration_s else np.inf
+
+    def jump(self, t_ns: int, by_ns: int) -> None:
+        """Leap now."""
+        self._anchor(t_ns)
+        self._there += by_ns
+        while self._there < 0:
+            self._there += self._wrap_ns  # on the wire that is the same
+
+    def restart(self, t_ns: int | None) -> None:
+        """Begin anew at this moment of the source's; None: at the last one that is known."""
+        if t_ns is not None:
+            self._here = t_ns
+        self._there = 0
+
+    def _anchor(self, t_ns: int) -> None:
+        self._there = int(self.at(np.array([t_ns]))[0])
+        self._here = t_ns

@@ -1,0 +1,171 @@
+"""`serial:` and `can:` URLs.
+
+serial:///dev/ttyUSB0?codec=bota            can:socketcan:can0?codec=xela
+serial:socket://10.0.0.7:4000?codec=native  can:slcan:/dev/ttyACM0?codec=native&bitrate=1000000
+serial:COM3?codec=ascii_line&baud=9600      can:virtual:test?codec=can-dbc&mapping=glove.toml
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import parse_qsl
+
+from tactile_rt.calibration import CalibratedSource, load_calibration
+from tactile_rt.drivers.codec import CanCodec, Codec, SerialCodec, codec_class
+from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
+from tactile_rt.drivers.links import CanLink, Link, SerialLink, SlcanLink
+from tactile_rt.options import take_options
+from tactile_rt.stream import ConfigError, Source
+
+__all__ = ["CanOptions", "SerialOptions", "make_codec", "open_can", "open_line", "open_serial"]
+
+
+@dataclass(frozen=True)
+class SerialOptions(DeviceOptions):
+    """Options of ``serial:``, besides those of its codec.
+
+    Attributes:
+        baud: bit/s; 0: the codec's.
+        parity: ``N``, ``E`` or ``O``; empty: the codec's.
+        dtr: whether to assert DTR; many boards reset when it rises.
+    """
+
+    baud: int = 0
+    parity: str = ""
+    dtr: bool = True
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.parity not in ("", "N", "E", "O"):
+            raise ConfigError(f"parity must be N, E or O, not {self.parity!r}")
+        if self.baud < 0:
+            raise ConfigError(f"baud must be positive, not {self.baud}")
+
+
+@dataclass(frozen=True)
+class CanOptions(DeviceOptions):
+    """Options of ``can:``, besides those of its codec.
+
+    Attributes:
+        bitrate: bit/s; 0: the codec's.
+        fd: whether to open the bus for CAN FD.
+        data_bitrate: of its data phase, bit/s; 0: the codec's.
+    """
+
+    bitrate: int = 0
+    fd: bool = False
+    data_bitrate: int = 0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.bitrate < 0 or self.data_bitrate < 0:
+            raise ConfigError("bitrate and data_bitrate must be positive")
+
+
+def make_codec(wire: str, name: str, fields: dict[str, str]) -> Codec[Any]:
+    """A codec from its options as written.
+
+    Raises:
+        ConfigError: no such codec or option.
+    """
+    kind = codec_class(wire, name)
+    (options,) = take_options(f"codec {name}", fields, kind.Options)
+    made: Codec[Any] = kind(options)
+    return made
+
+
+def open_serial(target: str, fields: dict[str, str]) -> Source:
+    """The device on a serial port.
+
+    Raises:
+        ConfigError: wrong options.
+        SourceError: it cannot be opened, or does not send.
+    """
+    if not target:
+        raise ConfigError("serial: needs a port, e.g. serial:///dev/ttyUSB0?codec=bota")
+    kind = _kind("serial", target, fields)
+    assert issubclass(kind, SerialCodec)
+    options, own = take_options(f"serial:{target}", fields, SerialOptions, kind.Options)
+    baud, parity = options.baud or kind.baud, options.parity or kind.parity
+
+    def connect() -> Link[Any]:
+        return SerialLink(target, baud, parity, options.dtr)
+
+    return _open(connect, kind(own), options, target)
+
+
+def open_can(target: str, fields: dict[str, str]) -> Source:
+    """The device on a CAN bus.
+
+    Raises:
+        ConfigError: wrong options.
+        SourceError: it cannot be opened, or does not send.
+    """
+    interface, _, channel = target.partition(":")
+    if not channel:
+        raise ConfigError(
+            f"can:{target} needs an interface and a channel, e.g. can:socketcan:can0?codec=xela"
+        )
+    kind = _kind("can", target, fields)
+    assert issubclass(kind, CanCodec)
+    # `fd` is the bus's affair and the codec's
+    options, own = take_options(f"can:{target}", fields, CanOptions, kind.Options)
+    fd = options.fd or bool(getattr(own, "fd", False))
+    bitrate = options.bitrate or kind.bitrate
+    data_bitrate = options.data_bitrate or kind.data_bitrate
+
+    def connect() -> Link[Any]:
+        if interface == "slcan":
+            return SlcanLink(channel, bitrate, fd)
+        return CanLink(interface, channel, bitrate, fd, data_bitrate)
+
+    return _open(connect, kind(own), options, target)
+
+
+def open_line(url: str) -> Link[Any]:
+    """The bare line of a ``serial:`` or ``can:`` URL, for looking at what comes.
+
+    Args:
+        url: as of a source; of its options only those of the line matter.
+
+    Raises:
+        ConfigError: another scheme, or a wrong option.
+        SourceError: it cannot be opened.
+    """
+    scheme, _, rest = url.partition(":")
+    target, _, query = rest.partition("?")
+    fields = {"codec": "", **dict(parse_qsl(query))}
+    if scheme == "serial":
+        target = target.removeprefix("//")
+        (serial,) = take_options(f"serial:{target}", fields, SerialOptions)
+        return SerialLink(target, serial.baud or SerialCodec.baud, serial.parity or "N", serial.dtr)
+    interface, _, channel = target.partition(":")
+    if scheme != "can" or not channel:
+        raise ConfigError(f"{url!r} is no line: serial:PORT?baud=... or can:INTERFACE:CHANNEL")
+    (can,) = take_options(f"can:{target}", fields, CanOptions)
+    bitrate = can.bitrate or CanCodec.bitrate
+    if interface == "slcan":
+        return SlcanLink(channel, bitrate, can.fd)
+    return CanLink(interface, channel, bitrate, can.fd, can.data_bitrate or None)
+
+
+def _kind(wire: str, target: str, fields: dict[str, str]) -> type[Codec[Any]]:
+    if "codec" not in fields:
+        raise ConfigError(
+            f"{wire}:{target} needs codec=...: what the device speaks, see `tactile-rt codecs`"
+        )
+    return codec_class(wire, fields["codec"])
+
+
+def _open(
+    connect: Callable[[], Link[Any]], codec: Codec[Any], options: DeviceOptions, name: str
+) -> Source:
+    calibration = load_calibration(options.calibration) if options.calibration else None
+    source = DeviceSource(connect, codec, options, name)
+    if calibration is None:
+        return source
+    try:
+        return CalibratedSource(source, calibration)
+    except BaseException:
+        source.close()
+        raise

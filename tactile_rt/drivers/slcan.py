@@ -1,0 +1,272 @@
+"""slcan: CAN frames as lines of text over a serial line, as most USB adapters speak it.
+
+After the LAWICEL CANUSB and CAN232 manuals (t, T, r, R, commands, answers, time stamps) and the
+CANable 2 firmware (d, D, b, B: CAN FD). The format has no checksum and no counter: what a damaged
+line makes of itself can't always be told, and lost lines not at all. USB has a checksum of its
+own.
+"""
+
+from collections import deque
+from collections.abc import Iterable
+from typing import Final
+
+from tactile_rt.drivers.codec import Frame
+from tactile_rt.stream import ConfigError
+
+__all__ = ["SlcanAdapter", "SlcanDecoder", "closing", "encode", "opening"]
+
+CR, BELL = b"\r", b"\a"
+# S7 is 800 kbit/s to LAWICEL and 750 kbit/s to CANable.
+BITRATES: Final = {
+    10_000: b"S0", 20_000: b"S1", 50_000: b"S2", 100_000: b"S3", 125_000: b"S4", 250_000: b"S5",
+    500_000: b"S6", 750_000: b"S7", 800_000: b"S7", 1_000_000: b"S8", 83_300: b"S9",
+}  # fmt: skip
+DATA_BITRATES: Final = {2_000_000: b"Y2", 5_000_000: b"Y5"}
+
+_CLASSIC: Final = {ord(f"{n}"): n for n in range(9)}
+_FD_LENGTHS: Final = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+_FD: Final = {ord(c): _FD_LENGTHS[int(c, 16)] for c in "0123456789ABCDEFabcdef"}
+# first letter: (where the identifier ends, its largest value, lengths, extended, FD, remote)
+_KINDS: Final = {
+    ord(letter): (9 if extended else 4, 0x1FFFFFFF if extended else 0x7FF, _FD if fd else _CLASSIC,
+                  extended, fd, remote)
+    for letter, extended, fd, remote in (
+        ("t", False, False, False), ("T", True, False, False),
+        ("r", False, False, True), ("R", True, False, True),
+        ("d", False, True, False), ("D", True, True, False),
+        ("b", False, True, False), ("B", True, True, False),
+    )
+}  # fmt: skip
+_LONGEST: Final = 1 + 8 + 1 + 2 * 64 + 8
+_REPLIES: Final = b"VNFv"  # version, serial number, status flags, detailed version
+
+
+class SlcanDecoder:
+    """The host's side: bytes to frames. Never raises, holds one line at most.
+
+    Time stamps, 4 or 8 hexadecimal digits after a frame's data, are allowed but not used: they
+    are the adapter's, not the device's. Whether frames have them is learnt from the first line; it
+    changes when two lines in succession agree that it has, so that a damaged length is noticed.
+
+    Attributes:
+        corrupt: lines that are neither a frame nor an answer.
+        acks: commands answered with OK.
+        bells: commands answered with an error.
+        replies: the last 16 answers to V, N and F, without their end of line.
+    """
+
+    def __init__(self) -> None:
+        self.corrupt = self.acks = self.bells = 0
+        self.replies: deque[bytes] = deque(maxlen=16)
+        self._rest = b""
+        self._stamp: int | None = None  # digits of a time stamp
+        self._other: int | None = None  # of the line before, if it differed
+
+    def feed(self, data: bytes) -> list[Frame]:
+        """The frames that these bytes complete; the result does not depend on how they were cut."""
+        data = self._rest + data
+        if BELL in data:
+            data = data.replace(BELL, BELL + CR)
+        if b"\n" in data:  # some adapters end their lines with CR LF
+            data = data.replace(b"\n", b"")
+        *lines, rest = data.split(CR)
+        self._rest = rest[: _LONGEST + 1]  # one too long is corrupt, however much longer it is
+        frames = []
+        for line in lines:
+            kind = _KINDS.get(line[0]) if line else None
+            if kind is None:
+                self._answer(line)
+                continue
+            end, highest, lengths, extended, fd, remote = kind
+            # int() and fromhex() would allow spaces, signs and underscores
+            if len(line) <= end or not line.isalnum():
+                self.corrupt += 1
+                continue
+            size = lengths.get(line[end])
+            if size is None:
+                self.corrupt += 1
+                continue
+            stop = end + 1 if remote else end + 1 + 2 * size
+            stamp = len(line) - stop
+            if stamp == self._stamp:
+                self._other = None
+            elif not self._stamped(stamp):
+                self.corrupt += 1
+                continue
+            try:
+                ident = int(line[1:end], 16)
+                body = bytes.fromhex(line[end + 1 : stop].decode())
+                if stamp:
+                    int(line[stop:], 16)
+            except ValueError:
+                self.corrupt += 1
+                continue
+            if ident > highest:
+                self.corrupt += 1
+                continue
+            frames.append(Frame(ident, body, extended, fd, remote))
+        return frames
+
+    def forget(self) -> None:
+        """Drop the line that is not yet complete (after a reconnection)."""
+        self._rest = b""
+        self._stamp = self._other = None
+
+    def _stamped(self, digits: int) -> bool:
+        """Whether a line with so many more digits than expected is to be believed."""
+        if digits not in (0, 4, 8):
+            return False
+        if self._stamp is not None and self._other != digits:
+            self._other = digits
+            return False
+        self._stamp, self._other = digits, None
+        return True
+
+    def _answer(self, line: bytes) -> None:
+        if line.endswith(BELL):
+            self.bells += 1
+            line = line[:-1]
+            if line:
+                self.corrupt += 1
+        elif line in (b"", b"z", b"Z"):
+            self.acks += 1
+        elif line[0] in _REPLIES and len(line) <= 40 and line.isalnum():
+            self.replies.append(line)
+        else:
+            self.corrupt += 1
+
+
+def encode(frames: Iterable[Frame], stamp_ms: int | None = None) -> bytes:
+    """Frames as lines; FD frames with bit-rate switching.
+
+    Args:
+        frames: data longer than 8 bytes is padded with zeros to the next length CAN FD has.
+        stamp_ms: append this time, modulo a minute; None: no time stamps.
+    """
+    end = b"\r" if stamp_ms is None else b"%04X\r" % (stamp_ms % 60_000)
+    lines = []
+    for ident, data, extended, fd, remote in frames:
+        address = b"%08X" % ident if extended else b"%03X" % ident
+        if remote:
+            lines.append(b"%c%b%X" % (b"R" if extended else b"r", address, len(data)))
+        elif not fd:
+            letter = b"T" if extended else b"t"
+            lines.append(b"%b%b%X%b" % (letter, address, len(data), data.hex().upper().encode()))
+        else:
+            code = next(k for k, n in enumerate(_FD_LENGTHS) if n >= len(data))
+            body = data.ljust(_FD_LENGTHS[code], b"\0").hex().upper().encode()
+            lines.append(b"%b%b%X%b" % (b"B" if extended else b"b", address, code, body))
+    lines.append(b"")
+    return end.join(lines)
+
+
+def opening(
+    bitrate: int, data_bitrate: int | None = None, listen_only: bool = False
+) -> tuple[bytes, ...]:
+    """What a host sends, one after the other, to open the channel; each is answered.
+
+    The first empties what an adapter has of an unfinished line, the second closes the channel: an
+    error in answer to either means nothing.
+
+    Raises:
+        ConfigError: slcan has no such bit rate.
+    """
+    for rate, known, what in (
+        (bitrate, BITRATES, "bitrate"),
+        (data_bitrate, DATA_BITRATES, "data_bitrate"),
+    ):
+        if rate is not None and rate not in known:
+            rates = ", ".join(str(r) for r in sorted(known))
+            raise ConfigError(f"slcan has no {what} {rate}: there are {rates}")
+    data = () if data_bitrate is None else (DATA_BITRATES[data_bitrate] + CR,)
+    return (CR * 3, b"C\r", BITRATES[bitrate] + CR, *data, b"L\r" if listen_only else b"O\r")
+
+
+def closing() -> bytes:
+    """What a host sends to close the channel."""
+    return b"C\r"
+
+
+class SlcanAdapter:
+    """The device's side: an adapter that answers commands, for an emulator.
+
+    Args:
+        bitrate: of the bus that it is on: opened with another one it hears and says nothing and
+            reports bus errors; None: whichever the host chooses.
+
+    Attributes:
+        open: whether the channel is open.
+        hears: whether frames come through: it is open, and at the bus's bit rate.
+        flags: status as F reports it and clears it; bit 3: data overrun, bit 7: bus error.
+    """
+
+    VERSION = b"V1013"
+    SERIAL = b"NA123"
+
+    def __init__(self, bitrate: int | None = None) -> None:
+        self.open = False
+        self.flags = 0
+        self._right = None if bitrate is None else BITRATES[bitrate]
+        self._rate = self._right
+        self._stamps = False
+        self._silent = False
+        self._rest = b""
+
+    @property
+    def hears(self) -> bool:
+        return self.open and self._rate == (self._right or self._rate)
+
+    def respond(self, data: bytes) -> tuple[bytes, list[Frame]]:
+        """What the host has sent: (the answer, the frames for the bus)."""
+        *lines, rest = (self._rest + data).split(CR)
+        self._rest = rest[: _LONGEST + 1]
+        answers, frames = [], []
+        for line in lines:
+            line = line.strip(b"\n")
+            if line[:1] and line[:1] in b"tTrRdDbB":
+                found = SlcanDecoder().feed(line + CR) if self.open and not self._silent else []
+                frames += found if self.hears else []
+                answers.append((b"Z\r" if line[:1].isupper() else b"z\r") if found else BELL)
+            else:
+                answers.append(self._command(line))
+        return b"".join(answers), frames
+
+    def encode(self, frames: Iterable[Frame], time_ns: int = 0) -> bytes:
+        """Frames from the bus as the host gets them; nothing unless `hears`."""
+        if not self.hears:
+            return b""
+        return encode(frames, time_ns // 1_000_000 if self._stamps else None)
+
+    def _command(self, line: bytes) -> bytes:
+        name, value = line[:1], line[1:]
+        if name in (b"O", b"L", b"S", b"s", b"Y", b"Z", b"M", b"m", b"W") and self.open:
+            return BELL  # only while it is closed
+        match name:
+            case b"":
+                return CR
+            case b"V":
+                return self.VERSION + CR
+            case b"N":
+                return self.SERIAL + CR
+            case b"F":
+                flags, self.flags = self.flags | (0x80 if self.open and not self.hears else 0), 0
+                return b"F%02X\r" % flags if self.open else BELL
+            case b"O" | b"L":
+                self.open, self._silent = True, name == b"L"
+            case b"C":
+                if not self.open:
+                    return BELL
+                self.open = False
+            case b"S":
+                if line not in BITRATES.values():
+                    return BELL
+                self._rate = line
+            case b"Z":
+                if value not in (b"0", b"1"):
+                    return BELL
+                self._stamps = value == b"1"
+            case b"s" | b"Y" | b"X" | b"M" | b"m" | b"W" | b"Q":
+                pass  # taken, and of no effect here
+            case _:
+                return BELL
+        return CR

@@ -1,0 +1,96 @@
+"""Which samples were lost: the sender's book against the receiver's."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactile_rt.drivers.accounting import Sequencer
+from tactile_rt.drivers.codec import Samples
+from tactile_rt.stream import SourceStats
+
+
+def samples(counts, damaged=None, ticks=None, content=None):
+    n = len(counts)
+    values = np.asarray(counts if content is None else content, np.float32).reshape(n, 1, 1)
+    return Samples(
+        values,
+        np.ones((n, 1), np.bool_),
+        np.arange(n, dtype=np.int64),
+        np.array(damaged or [0] * n, np.int64),
+        np.array(counts, np.int64),
+        None if ticks is None else np.array(ticks, np.int64),
+    )
+
+
+# What may become of each sample on its way; after a damaged one, noise may look like damage, too.
+FATES = st.sampled_from(["came", "came", "came", "dropped", "damaged", "twice"])
+
+
+@given(st.lists(FATES, min_size=1, max_size=200), st.sampled_from([8, 16, 32]), st.data())
+def test_every_sample_is_accounted_for(fates, bits, data):
+    fates = ["came", *fates, "came"]
+    stats, got = SourceStats(), []
+    sequencer = Sequencer(bits, stats)
+    start = data.draw(st.integers(0, 2**bits - 1))
+    damaged = run = 0
+    for k, fate in enumerate(fates):
+        run = run + 1 if fate in ("dropped", "damaged") else 0
+        if run > 100:  # an 8-bit counter cannot show more
+            fate = "came"
+        if fate == "dropped":
+            continue
+        if fate == "damaged":
+            damaged += 1
+            continue
+        for _ in range(2 if fate == "twice" else 1):
+            seq, keep = sequencer.number(
+                samples([(start + k) % 2**bits], [damaged], content=[float(k)])
+            )
+            got += seq[keep].tolist()
+            damaged = 0
+    count = {fate: fates.count(fate) for fate in set(fates)}
+    assert stats.duplicates == count.get("twice", 0)
+    assert stats.corrupt == count.get("damaged", 0)
+    assert stats.missing == count.get("dropped", 0)
+    lost = {k for k, fate in enumerate(fates) if fate in ("dropped", "damaged")}
+    assert got == [k for k in range(len(fates)) if k not in lost]  # the gaps are where they were
+    assert sequencer.resets == 0
+
+
+def test_noise_between_samples_is_no_lost_sample():
+    stats = SourceStats()
+    Sequencer(16, stats).number(samples([0, 1, 2], [0, 5, 0]))
+    assert stats == SourceStats()
+
+
+def test_a_counter_that_begins_anew_loses_nothing():
+    stats = SourceStats()
+    sequencer = Sequencer(16, stats)
+    seq, keep = sequencer.number(samples([500, 501, 502, 0, 1, 2], content=range(6)))
+    assert keep.all() and seq.tolist() == [0, 1, 2, 3, 4, 5]
+    assert sequencer.resets == 1 and stats == SourceStats()
+
+
+def test_a_device_that_begins_anew_at_once_is_not_taken_for_repeating_itself():
+    sequencer = Sequencer(16, SourceStats())
+    _, keep = sequencer.number(samples([0, 1, 2, 0, 1, 2], content=[1, 2, 3, 4, 5, 6]))
+    assert keep.all() and sequencer.resets == 1
+
+
+def test_a_counter_that_jumps_ahead_of_the_clock_lost_nothing():
+    stats = SourceStats()
+    sequencer = Sequencer(16, stats, period_ticks=1000.0)
+    seq, _ = sequencer.number(samples([7, 8, 900, 901], ticks=[0, 1000, 2000, 3000]))
+    assert seq.tolist() == [0, 1, 2, 3]
+    assert stats.missing == 0 and sequencer.resets == 1
+
+
+@pytest.mark.parametrize("damaged", [0, 3])
+def test_a_device_without_a_counter_shows_damage_only(damaged):
+    stats = SourceStats()
+    one = samples([0, 0, 0], [0, damaged, 0])
+    one = Samples(one.values, one.valid, one.arrived_ns, one.damaged)
+    seq, keep = Sequencer(None, stats).number(one)
+    assert seq.tolist() == [0, 1, 2] and keep.all()
+    assert stats == SourceStats(corrupt=damaged)

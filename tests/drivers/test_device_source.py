@@ -1,0 +1,245 @@
+"""Devices as sources, through real lines: pyserial over a pty, slcan over a pty, python-can."""
+
+import os
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from tactile_rt.drivers.emulation.damage import Fate
+from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
+from tactile_rt.drivers.health import State
+from tactile_rt.sources import open_source
+from tactile_rt.stream import ConfigError, EndOfStream, SourceError
+from tactile_rt.testing import FakeCan, FakeSerial
+
+PATIENCE_S = 20.0
+
+
+def signal(n=2000, elements=4, channels=6):
+    """Values that tell their sample's number."""
+    draw = np.random.default_rng(7)
+    values = draw.normal(size=(n, elements, channels)) * 1e-3
+    values[:, 0, 0] = np.arange(n) * 1e-5
+    return values.astype(np.float32)
+
+
+def take(source, n, over=lambda: False):
+    """Read until n samples have come, or nothing comes any more because it is over."""
+    chunks, have, end = [], 0, time.monotonic() + PATIENCE_S
+    while have < n:
+        assert time.monotonic() < end, f"{have} of {n} samples in {PATIENCE_S} s"
+        chunk = source.read(0.1)
+        if chunk is not None:
+            chunks.append(chunk)
+            have += len(chunk)
+        elif over():
+            break
+    return chunks
+
+
+def until(condition, source=None):
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end
+        if source is not None:
+            source.read(0.01)
+        else:
+            time.sleep(0.01)
+
+
+DEVICES = {
+    "serial native": lambda x, **k: FakeSerial(x, **k),
+    "slcan native": lambda x, **k: FakeCan(x, options={"format": "float32"}, **k),
+    "virtual native": lambda x, **k: FakeCan(
+        x, options={"format": "float32"}, bus=f"virtual:{threading.get_native_id()}-{id(x)}", **k
+    ),
+}
+
+
+@pytest.fixture(params=DEVICES)
+def device(request):
+    """Makes a device on each kind of line."""
+    return DEVICES[request.param]
+
+
+def test_what_a_device_measures_arrives_bit_for_bit(device, no_thread_left):
+    values = signal()
+    with device(values, pace="fast") as fake, open_source(fake.url) as source:
+        chunks = take(source, len(values))
+        assert np.array_equal(np.concatenate([c.values for c in chunks]), values)
+        seq = np.concatenate([c.seq for c in chunks])
+        assert np.array_equal(seq, np.arange(len(values)))
+        assert source.stats.delivered == len(values)
+        assert source.stats.missing == source.stats.corrupt == source.stats.duplicates == 0
+        assert source.health.state == State.STREAMING
+        assert source.spec == fake.emulator.source.spec
+
+
+@pytest.mark.parametrize("kind", ["bit_flip", "truncate", "duplicate", "drop", "burst"])
+def test_every_sample_is_accounted_for(kind):
+    values = signal(6000)
+    faults = FaultSchedule([Fault(kind, rate=20.0)], seed=1)
+    with (
+        FakeSerial(values, faults=faults, pace="fast") as fake,
+        open_source(fake.url) as source,
+    ):
+        chunks = take(source, len(values), lambda: fake.emulator.done)
+        log, stats = fake.emulator.log, source.stats
+        assert log.sent == len(values)
+        received = stats.delivered + stats.corrupt + stats.missing + stats.dropped
+        assert log.sent + log.duplicated == received + stats.duplicates
+        fate = np.asarray(log.fate)
+        assert stats.duplicates == (fate == Fate.DUPLICATED).sum()
+        assert stats.missing == (fate == Fate.DROPPED).sum()
+        assert stats.corrupt == np.isin(fate, (Fate.CORRUPTED, Fate.TRUNCATED)).sum()
+        if kind != "burst":
+            assert (fate != Fate.SENT).sum() > 50  # something did happen
+        # sample by sample: what came is what was sent, and what did not come was lost
+        seq = np.concatenate([c.seq for c in chunks])
+        lost = np.isin(fate, (Fate.DROPPED, Fate.CORRUPTED, Fate.TRUNCATED))
+        assert np.array_equal(seq, np.flatnonzero(~lost))
+        assert np.array_equal(np.concatenate([c.values for c in chunks]), values[seq])
+
+
+def test_a_device_that_is_unplugged_comes_again(tmp_path, no_thread_left):
+    link = str(tmp_path / "whisker0")
+    before = len(os.listdir("/proc/self/fd"))
+    with FakeSerial(signal(60_000), link=link) as fake, open_source(fake.url) as source:
+        take(source, 50)
+        for connections in range(2, 7):
+            fake.unplug()
+            until(lambda: source.health.state == State.LOST, source)
+            assert source.health.reason
+            assert source.read(0.0) is None  # nothing old is given out as new
+            fake.replug()
+            take(source, 20)
+            assert source.health.state == State.STREAMING
+            assert source.health.connections == connections
+        log, stats = fake.emulator.log, source.stats
+        unheard = int(np.isin(np.asarray(log.fate), (Fate.UNHEARD, Fate.OVERFLOWED)).sum())
+        assert unheard > 0
+        assert stats.missing >= unheard  # and what was on its way
+    assert len(os.listdir("/proc/self/fd")) <= before
+
+
+def test_without_reconnection_a_lost_line_breaks_the_source(tmp_path):
+    link = str(tmp_path / "whisker0")
+    with FakeSerial(signal(60_000), link=link) as fake:
+        with open_source(f"{fake.url}&reconnect=false") as source:
+            take(source, 20)
+            fake.unplug()
+            with pytest.raises(SourceError, match="whisker0: the line is gone"):
+                take(source, 10**6)
+            with pytest.raises(EndOfStream):
+                source.read(0.0)
+
+
+def test_a_silent_device_is_stale_not_fresh():
+    with FakeSerial(signal(300)) as fake, open_source(f"{fake.url}&stale_s=0.2") as source:
+        take(source, 300)
+        until(lambda: source.health.state == State.STALE)
+        assert "no sample for" in source.health.reason
+
+
+def test_a_device_that_restarts_goes_on(tmp_path):
+    link = str(tmp_path / "whisker0")
+    with FakeSerial(signal(60_000), link=link) as fake, open_source(fake.url) as source:
+        first = take(source, 50)
+        fake.unplug()
+        until(lambda: source.health.state == State.LOST, source)
+        fake.replug(restart=True)
+        again = take(source, 50)
+        t = np.concatenate([c.t_ns for c in first + again])
+        assert (np.diff(t) > 0).all()
+        assert source.health.counter_resets + source.health.clock_steps >= 1
+        assert source.stats.missing < 60_000  # not what a counter that began anew would suggest
+
+
+def test_whisking_commands_reach_the_device():
+    with FakeSerial(signal(5000)) as fake, open_source(fake.url) as source:
+        take(source, 10)
+        source.set_whisking(8.0, 0.6, -0.1)
+        until(lambda: fake.codec.whisking is not None, source)
+        assert fake.codec.whisking == pytest.approx((8.0, 0.6, -0.1))
+
+
+def test_a_passive_device_has_no_whisking_command():
+    with FakeSerial(np.zeros((3000, 1, 6)), "bota") as fake, open_source(fake.url) as source:
+        with pytest.raises(SourceError, match="codec bota has no whisking command"):
+            source.set_whisking(8.0, 0.6, 0.0)
+
+
+# what a user does wrong
+
+
+def test_a_port_that_is_not_there():
+    with pytest.raises(SourceError, match="/dev/ttyUSB77: no such port: is it plugged in"):
+        open_source("serial:///dev/ttyUSB77?codec=native")
+
+
+def test_a_port_in_use():
+    with FakeSerial(signal(20_000)) as fake, open_source(fake.url):
+        with pytest.raises(SourceError, match="in use by another program"):
+            open_source(fake.url)
+
+
+def test_a_file_that_is_no_port(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("hello")
+    with pytest.raises(SourceError, match=r"notes\.txt: not a serial port"):
+        open_source(f"serial://{path}?codec=native")
+
+
+def test_the_wrong_codec_is_told_from_silence():
+    with FakeSerial(signal(20_000), pace="realtime") as fake:
+        url = fake.url.partition("?")[0]
+        with pytest.raises(SourceError, match="no whole kwr75 sample: wrong codec, or wrong baud"):
+            with open_source(f"{fake.url}") as source:  # which starts it, and leaves it running
+                take(source, 5)
+                source._link.send = lambda packet: None
+            open_source(f"{url}?codec=kwr75&start_s=0.5")
+
+
+def test_a_silent_line():
+    device, host = os.openpty()
+    try:
+        with pytest.raises(SourceError, match=r"nothing came for 0\.3 s: is the device on"):
+            open_source(f"serial://{os.ttyname(host)}?codec=anyskin&start_s=0.3")
+    finally:
+        os.close(device)
+        os.close(host)
+
+
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("serial:///dev/ttyUSB0", "needs codec="),
+        ("serial:?codec=bota", "needs a port"),
+        ("serial:///dev/x?codec=botta", "no serial codec 'botta'.*did you mean bota"),
+        ("serial:///dev/x?codec=xela", "xela speaks over can:, not over serial:"),
+        ("serial:///dev/x?codec=bota&bauds=9600", "no option 'bauds'; did you mean baud"),
+        ("serial:///dev/x?codec=bota&baud=fast", "Expected `int`"),
+        ("serial:///dev/x?codec=bota&parity=Q", "parity must be N, E or O"),
+        ("can:can0?codec=xela", "needs an interface and a channel"),
+        ("can:sockettcan:can0?codec=xela", "sockettcan"),
+        ("can:virtual:x?codec=native&stale_s=-1", "must not be negative"),
+    ],
+)
+def test_a_wrong_url_is_explained(url, said):
+    with pytest.raises(ConfigError, match=said):
+        open_source(url)
+
+
+@pytest.mark.skipif(not os.path.isdir("/sys/class/net/vcan0"), reason="no kernel CAN (vcan0)")
+def test_socketcan():
+    values = signal()
+    with FakeCan(values, bus="socketcan:vcan0", pace="fast") as fake:
+        with open_source(fake.url) as source:
+            assert len(np.concatenate([c.seq for c in take(source, 100)])) >= 100
+
+
+def test_a_bus_that_is_not_there():
+    with pytest.raises(SourceError, match="can:socketcan:can77: "):
+        open_source("can:socketcan:can77?codec=xela")
