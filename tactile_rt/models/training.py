@@ -1,6 +1,6 @@
 """Train an EAD network on a sweep set, from top to bottom.
 
-    tactile-rt train data/mouse12 runs/mouse12
+    tactile-rt train data/mouse24 runs/mouse24
 
 A run folder holds `config.json`, `history.csv` (a line per epoch), `last.pt` (everything needed to
 go on) and `best.pt` (the network of the best validation accuracy). A run that is killed goes on
