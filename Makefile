@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check bench format clean
+.PHONY: demo test check bench fuzz format clean
 
 demo: $(VENV)/.sim
 	$(BIN)/tactile-rt demo --sweeps 12
@@ -22,6 +22,9 @@ check: $(VENV)/.dev
 bench: $(VENV)/.dev
 	$(BIN)/tactile-rt bench
 
+fuzz: $(VENV)/.dev
+	$(BIN)/python bench/fuzz_codecs.py
+
 format: $(VENV)/.dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
@@ -36,5 +39,5 @@ $(VENV)/.sim: pyproject.toml
 
 $(VENV)/.dev: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[sim,train,view,dbc,test,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[sim,train,view,dbc,record,test,dev]'
 	touch $@ $(VENV)/.sim

@@ -19,9 +19,11 @@ __all__ = ["open_source"]
 # and the options as written, or a class of the target and an `Options` dataclass that it names.
 SCHEMES = {
     "sim": ("tactile_rt.sim_backend.source", "SimSource", "sim"),
+    "whisking": ("tactile_rt.sim_backend.active", "WhiskingSource", "sim"),
     "serial": ("tactile_rt.drivers.opening", "open_serial", ""),
     "can": ("tactile_rt.drivers.opening", "open_can", ""),
     "synthetic": ("tactile_rt.drivers.synthetic", "SyntheticSource", ""),
+    "replay": ("tactile_rt.stream_recording.replay", "open_replay", "record"),
     "combined": ("tactile_rt.combined", "open_combined", ""),
 }
 ENTRY_POINTS = "tactile_rt.sources"

@@ -19,7 +19,8 @@ LINKS = ("drivers", "export", "models", "sim_backend")
 HEAVY = ("torch", "mujoco", "trimesh", "scipy", "onnx", "onnxscript", "sklearn", "matplotlib")
 ONBOARD = (
     "calibration", "classifier", "cli", "combined", "contact", "drivers.opening", "model_file",
-    "options", "recording", "session", "sources", "stream", "testing", "timebase",
+    "options", "recording", "session", "sources", "stream", "stream_recording",
+    "testing", "timebase",
 )  # fmt: skip
 
 MODULES = sorted(m.name for m in pkgutil.walk_packages([str(PACKAGE)], "tactile_rt."))

@@ -1,13 +1,18 @@
 """Every source keeps the contract; a new one is a line in `CASES`."""
 
+import functools
 from contextlib import contextmanager
 from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 from contract import Case, SourceContract
 
+from tactile_rt.recording import SweepManifest, write_object
 from tactile_rt.sources import open_source
+from tactile_rt.stream_recording import StreamWriter
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
 
 SPEC = small_spec()
@@ -24,6 +29,39 @@ def device(make, **options):
         yield source
 
 
+@functools.cache
+def recording():
+    """A recording of a device, and its sweeps' set, in memory."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "run.mcap"
+        with device(FakeSerial) as source, StreamWriter(path, source) as recorder:
+            while source.stats.delivered < 500:
+                chunk = source.read(1.0)
+                if chunk is not None:
+                    recorder.push(chunk)
+        return path.read_bytes()
+
+
+@contextmanager
+def replay(options):
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "run.mcap"
+        path.write_bytes(recording())
+        with open_source(f"replay:{path}?{options}") as source:
+            yield source
+
+
+@contextmanager
+def sweeps():
+    with TemporaryDirectory() as folder:
+        manifest = SweepManifest(SPEC, 9_000_000, 5, ("mug",), {"train": ("mug-1",)})
+        manifest.write(Path(folder))
+        values = np.random.default_rng(2).normal(size=(3, 40, *SPEC.shape))
+        write_object(Path(folder), "mug-1", values, {})
+        with open_source(f"replay:{folder}/mug-1.npz?speed=20&rest_s=0.09") as source:
+            yield source
+
+
 def driver(make, **options):
     return Case(lambda: device(make, **options), 500, rate_tolerance=0.02, endless=True)
 
@@ -37,10 +75,17 @@ CASES = {
     "array live": Case(lambda: ArraySource(SPEC, CHUNKS, live=True), 500),
     "synthetic fast": Case(lambda: open_source("synthetic:4x6?seconds=0.5&pace=fast"), 500),
     "synthetic realtime": Case(lambda: open_source("synthetic:4x6?seconds=0.5"), 500),
+    "replay samples": Case(lambda: replay("speed=1"), 500, rate_tolerance=0.02),
+    "replay samples fast": Case(lambda: replay("speed=0"), 500, rate_tolerance=0.02),
+    "replay wire": Case(lambda: replay("from=wire&speed=2"), 500, rate_tolerance=0.02),
+    "replay wire fast": Case(lambda: replay("from=wire&speed=0"), 500, rate_tolerance=0.02),
+    "replay sweeps": Case(sweeps, 150),
     "sim fast": Case(lambda: open_source(f"{SIM}&pace=fast")),
+    "sim whisking fast": Case(lambda: open_source("whisking:mouse?seconds=0.5&pace=fast"), 500),
+    "sim whisking realtime": Case(lambda: open_source("whisking:mouse?seconds=0.5"), 500),
     "sim realtime": Case(lambda: open_source(f"{SIM}&pace=realtime")),
 }
-NEEDS = {"sim": "mujoco"}
+NEEDS = {"sim": "mujoco", "replay": "mcap"}
 
 
 @pytest.fixture(scope="module", params=CASES)

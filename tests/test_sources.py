@@ -102,8 +102,8 @@ def test_a_wrong_option_is_named_with_what_would_be_right(url: str, said: str) -
 def test_third_parties_are_among_the_known_schemes() -> None:
     said = refused("glvoe:left")
     assert said == (
-        "unknown source 'glvoe:left': it begins with one of can:, combined:, glove:, serial:, "
-        "sim:, synthetic: (did you mean glove:?)"
+        "unknown source 'glvoe:left': it begins with one of can:, combined:, glove:, replay:, "
+        "serial:, sim:, synthetic:, whisking: (did you mean glove:?)"
     )
 
 

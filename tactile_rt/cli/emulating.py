@@ -73,7 +73,7 @@ def emulate(
         raise ConfigError("--wire can needs --bus INTERFACE:CHANNEL, and only it takes one")
     if bus is not None and link is not None:
         raise ConfigError("--link names a port; a --bus has none")
-    fields = _options(option or [])
+    fields = codec_options(option or [])
     spoken = make_codec("serial" if wire == "serial" else "can", codec, fields)
     schedule = read_faults(faults) if faults else None
     endpoint: Endpoint[Any]
@@ -101,7 +101,8 @@ def emulate(
         typer.echo(_count(device), err=True)
 
 
-def _options(given: list[str]) -> dict[str, str]:
+def codec_options(given: list[str]) -> dict[str, str]:
+    """``NAME=VALUE`` options of a codec, as fields."""
     fields = {}
     for pair in given:
         name, equals, value = pair.partition("=")

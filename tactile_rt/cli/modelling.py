@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tactile_rt.cli import app, check_output, needs
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.stream import ConfigError
 
 
@@ -45,16 +45,10 @@ def train(
         seed=seed,
     )
     console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    # Gone when it is done or fails, and nothing in a log file: an error is one line alone.
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        task = bar.add_task("finding onsets", total=None)
+    with progress_bar(console, "finding onsets") as update:
 
         def show(at: training.Progress) -> None:
-            bar.update(
-                task,
+            update(
                 total=at.updates,
                 completed=at.update,
                 description=f"epoch {at.epoch}/{at.epochs} loss {at.loss:.3f}",

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tactile_rt.cli import app, needs, starting
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
@@ -57,7 +58,12 @@ def sweep(
         return
     try:
         with starting():
-            from tactile_rt.sim_backend.datasets.dataset import describe_set, make_sweeps
+            from tactile_rt.sim_backend.datasets.dataset import (
+                describe_set,
+                finished_objects,
+                make_sweeps,
+            )
+            from tactile_rt.sim_backend.datasets.tally import tally
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
     chosen = _override(
@@ -67,22 +73,17 @@ def sweep(
         {"profile": profile, "seed": seed},
     )
     splits = tuple(dict.fromkeys(s.strip() for s in split.split(","))) if split else ()
-    total = len(describe_set(chosen).names(splits))
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-    )
-    # Gone when it is done or fails, and nothing in a log file: an error is one line alone.
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as progress:
-        task = progress.add_task("objects", total=total)
-        for name in make_sweeps(chosen, folder, processes or None, splits, engine, address):
-            progress.update(task, advance=1, description=name)
-    made = total * len(chosen.sweeps)
-    console.print(f"{folder}: {made} sweeps at profile {chosen.profile}")
+    if address is not None and engine != "ray":
+        raise ConfigError("--address is that of a Ray cluster: give --engine ray, too")
+    names = describe_set(chosen).names(splits)
+    there = len(finished_objects(folder, names))
+    made = make_sweeps(chosen, folder, processes or None, splits, engine, address)
+    with progress_bar(console, "objects", len(names), there, counted=True) as update:
+        for k, name in enumerate(made):  # those that were there first
+            update(advance=int(k >= there), description=name)
+    found = tally(folder, names, len(chosen.sweeps))
+    but = f"; {found.shortcomings}" if found.shortcomings else ""
+    console.print(f"{folder}: {found.sweeps} sweeps at profile {chosen.profile}{but}")
     if card:
         _write_card(folder)
         console.print(f"{folder / 'README.md'} describes them")

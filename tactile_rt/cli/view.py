@@ -1,16 +1,16 @@
 """`tactile-rt view`: a sweep as a picture, as a video, or in a window."""
 
+import math
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tactile_rt.cli import app, check_output, needs, starting
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -48,8 +48,12 @@ def view(
     yaw: Annotated[float, typer.Option(help="Turn of the object about z, degrees.")] = 0.0,
     height: Annotated[float, typer.Option(help="Of the object's centre, mm.")] = -2.0,
     distance: Annotated[
-        float, typer.Option(help="From the whiskers' bases to the object, mm.")
-    ] = 6.5,
+        float | None,
+        typer.Option(
+            help="From the whiskers' bases to the object, mm. Default: 6.5 for a mouse, for "
+            "others as much more as their whiskers reach further."
+        ),
+    ] = None,
     profile: Annotated[
         str, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
     ] = "dataset",
@@ -64,7 +68,7 @@ def view(
         with starting():
             from tactile_rt.sim_backend.arrays.whisker_array import load_animals
             from tactile_rt.sim_backend.objects.catalogue import load_object
-            from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+            from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, usual_distance
             from tactile_rt.sim_backend.views.camera import VIEWS
             from tactile_rt.sim_backend.views.film import Film, camera_of
             from tactile_rt.sim_backend.views.footage import record
@@ -92,11 +96,18 @@ def view(
         raise ConfigError(f"no camera {camera!r}: there are {', '.join(VIEWS)}")
     if profile not in PROFILES:
         raise ConfigError(f"no profile {profile!r}: there are {', '.join(PROFILES)}")
+    for option, value in (("yaw", yaw), ("height", height), ("distance", distance or 0.0)):
+        if not math.isfinite(value):
+            raise ConfigError(f"--{option} must be a finite number, not {value}")
 
     animals, thing = load_animals(array), load_object(target)
     spec = world_spec(animals)
     sweep = Sweep(
-        size_mm=size, speed_mm_s=speed, yaw_deg=yaw, height_mm=height, distance_mm=distance
+        size_mm=size,
+        speed_mm_s=speed,
+        yaw_deg=yaw,
+        height_mm=height,
+        distance_mm=usual_distance(animals) if distance is None else distance,
     )
     simulation = SweepSimulation(animals, thing, sweep, PROFILES[profile], whole=True)
     if at is not None and not 0 <= at <= simulation.duration_ms:
@@ -106,8 +117,8 @@ def view(
         console.print(f"{thing.name} passes without touching: change --height or --distance")
     fps = FPS.get(suffix, 25)
     period = PICTURE_MS if suffix in IMAGES else max(1, round(1000 / (fps * slow)))
-    with _progress(console, "simulating") as done:
-        footage = record(simulation, spec, period, done)
+    with progress_bar(console, "simulating", total=1.0) as update:
+        footage = record(simulation, spec, period, lambda done: update(completed=done))
     if not out:
         seen = camera_of(footage, camera, orthographic)
         show(footage, seen, ForceScale.fitting(footage.forces, seen.extent_mm), slow)
@@ -126,21 +137,11 @@ def view(
         if suffix in IMAGES:
             write_image(out, film.picture(footage.strongest if at is None else footage.at(at)))
             return
-        with _progress(console, "drawing") as done:
+        with progress_bar(console, "drawing", total=len(footage)) as update:
 
             def frames() -> Iterator["NDArray[np.uint8]"]:
-                for k, picture in enumerate(film):
+                for picture in film:
                     yield picture
-                    done((k + 1) / len(footage))
+                    update(advance=1)
 
             write_video(out, frames(), fps, film.picture(footage.strongest))
-
-
-@contextmanager
-def _progress(console: Console, what: str) -> Iterator[Callable[[float], None]]:
-    """A bar that is gone when it is done or fails: an error is one line alone."""
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-    hidden = not console.is_terminal
-    with Progress(*columns, console=console, transient=True, disable=hidden) as progress:
-        task = progress.add_task(what, total=1.0)
-        yield lambda done: progress.update(task, completed=done)

@@ -1,15 +1,16 @@
 """`tactile-rt whisk`: the array whisks against an object, or the stimuli of a recording."""
 
 import hashlib
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tactile_rt.cli import app, check_output, needs, starting
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.stream import ConfigError
 
 
@@ -24,7 +25,10 @@ def whisk(
         str | None, typer.Option("--object", help="Instead of a stimulus: mug-3, or a mesh file.")
     ] = None,
     position: Annotated[
-        str, typer.Option(help="Of the object's centre: x lateral, y rostral, z up, mm.")
+        str,
+        typer.Option(
+            help="Of the object's centre: x lateral (away from the head), y rostral, z up, mm."
+        ),
     ] = "25,5,0",
     size: Annotated[float, typer.Option(help="Of the object: its largest extent, mm.")] = 20.0,
     yaw: Annotated[float, typer.Option(help="Of the object, degrees.")] = 0.0,
@@ -83,42 +87,48 @@ def whisk(
         )
     )
     pieces, described = {}, {}
+    # The stimuli stand on the right of the head, those of an array of the left on its left.
+    left = all(w.base[0] < 0 for w in animal.whiskers)
+    head, mirror = (HEAD.mirrored(), (-1.0, 1.0, 1.0)) if left else (HEAD, (1.0, 1.0, 1.0))
     if target is not None:
         if not 0 < size < 1e3:
             raise ConfigError(f"--size must be above 0 and below 1000 mm, not {size:g}")
+        if not math.isfinite(yaw):
+            raise ConfigError(f"--yaw must be a number of degrees, not {yaw}")
         thing = load_object(target)
-        at, turn = np.array(_three(position, "--position")), rotation("z", np.radians(yaw))
+        at = np.array(_three(position, "--position")) * mirror
+        turn = rotation("z", np.radians(yaw))
         pieces[thing.name] = tuple(p.vertices * size @ turn.T + at for p in thing.pieces)
         described[thing.name] = {"position_mm": at.tolist(), "size_mm": size, "yaw_deg": yaw}
     else:
         names = STIMULI if stimulus in (None, "all") else stimulus.split(",")
         for name in dict.fromkeys(n.strip() for n in names):
             surface = Surface.named(name, _three(step, "--step"), radius)
-            pieces[name] = surface.pieces()
-            described[name] = {**asdict(surface), "facet_error_mm": surface.largest_gap_mm}
+            pieces[name] = tuple(corners * mirror for corners in surface.pieces())
+            described[name] = {
+                **asdict(surface),
+                "mirrored": left,
+                "facet_error_mm": surface.largest_gap_mm,
+            }
 
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     console = Console(stderr=True)
     felt = {}
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as progress:
-        task = progress.add_task("whisking", total=None)
+    with progress_bar(console, "whisking") as update:
         for name, corners in pieces.items():
             try:
                 simulation = WhiskSimulation(
-                    animal.whiskers, moves, PROFILES[profile], corners, HEAD
+                    animal.whiskers, moves, PROFILES[profile], corners, head
                 )
             except ConfigError as error:
                 raise ConfigError(f"{name}: {error}") from None
-            progress.update(task, total=simulation.samples * len(pieces), description=name)
-            felt[name] = whisk_against(simulation, lambda n: progress.advance(task, n))
+            update(total=simulation.samples * len(pieces), description=name)
+            felt[name] = whisk_against(simulation, lambda n: update(advance=n))
     times = np.arange(simulation.samples, dtype=np.float64) * 1e-3
     parameters: dict[str, Any] = {
         "parameters": described,
         "approximate": target is None,
         "trajectory": _described(trajectory) if trajectory else asdict(moves),
-        "head": asdict(HEAD),
+        "head": asdict(head),
         "profile": {"name": profile, **asdict(PROFILES[profile])},
     }
     write_input(
@@ -140,6 +150,8 @@ def whisk(
 def _three(text: str, option: str) -> tuple[float, float, float]:
     try:
         x, y, z = (float(part) for part in text.split(","))
+        if not all(map(math.isfinite, (x, y, z))):
+            raise ValueError
     except ValueError:
         raise ConfigError(f"{option} is three numbers, x,y,z, in mm; not {text!r}") from None
     return x, y, z

@@ -51,13 +51,12 @@ class Sequencer:
         Sequence numbers count from 0 and go on over a reset; a gap in them is a gap in the stream.
         """
         n = len(samples)
-        seq, keep = np.empty(n, np.int64), np.ones(n, np.bool_)
         damaged = samples.damaged.tolist()
         if self._wrap is None or samples.count is None:
             self._stats.corrupt += sum(damaged)
-            seq[:] = self._next + np.arange(n)
             self._next += n
-            return seq, keep
+            return self._next - n + np.arange(n), np.ones(n, np.bool_)
+        seq, keep = [0] * n, [True] * n
         ticks = [0] * n if samples.ticks is None else samples.ticks.tolist()
         for i, count in enumerate(samples.count.tolist()):
             content = hash((ticks[i], samples.values[i].tobytes()))
@@ -70,16 +69,17 @@ class Sequencer:
                 self.resets += 1
                 self._seen.clear()
                 gap = 0
-            corrupt = min(damaged[i], gap)
-            self._stats.corrupt += corrupt
-            self._stats.missing += gap - corrupt
+            if gap:
+                corrupt = min(damaged[i], gap)
+                self._stats.corrupt += corrupt
+                self._stats.missing += gap - corrupt
             seq[i] = self._next + gap
-            self._next = int(seq[i]) + 1
+            self._next = seq[i] + 1
             self._count, self._tick = count, ticks[i]
             self._seen[count] = content
             if len(self._seen) > REMEMBERED:
                 del self._seen[next(iter(self._seen))]
-        return seq, keep
+        return np.array(seq, np.int64), np.array(keep, np.bool_)
 
     def _gap(self, count: int, tick: int) -> int:
         """Samples between the newest one and this; negative: none, it is not after it."""

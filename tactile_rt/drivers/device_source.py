@@ -7,25 +7,26 @@ goes away is tried again inside `read`; the stream goes on with the next sample 
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
-from tactile_rt.drivers.accounting import Sequencer
 from tactile_rt.drivers.codec import Codec, Event, Samples, Step
-from tactile_rt.drivers.device_clock import DeviceClock, host_stamps
+from tactile_rt.drivers.device_time import DeviceTime
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.drivers.links import Link
+from tactile_rt.drivers.stamping import Stamper
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError
 from tactile_rt.timebase import NS_PER_S
 
-__all__ = ["DeviceOptions", "DeviceSource"]
+__all__ = ["DeviceOptions", "DeviceSource", "Tap"]
+
+# Called with each packet as it came and its arrival (host time, ns), and with None whenever the
+# line has been opened. It must be quick: the device is not read meanwhile.
+Tap = Callable[[Any, int], None]
 
 SLICE_S = 0.1  # how soon a waiting read notices that the source was closed
 FIRST_RETRY_S, LAST_RETRY_S = 0.02, 0.1  # a path is looked for cheaply and often
-COUNTED_TOLERANCE = 0.1  # of a rate that is only nominal: the counter is the device's only clock
 ATTEMPTS = 3  # at a step of the start that gets no answer
 
 
@@ -39,6 +40,8 @@ class DeviceOptions:
         stale_s: without a sample for so long the stream is stale, s; 0: ten periods, at least 0.1.
         reconnect: whether to try again when the line is lost; else the source breaks.
         calibration: file, or id of a device calibrated before; empty: none.
+        clock: ``host``: samples have the host's time; ``device``: that of the device's own clock,
+            which depends on the device alone, and agrees with nothing else's.
     """
 
     codec: str
@@ -46,10 +49,13 @@ class DeviceOptions:
     stale_s: float = 0.0
     reconnect: bool = True
     calibration: str = ""
+    clock: str = "host"
 
     def __post_init__(self) -> None:
         if self.start_s < 0 or self.stale_s < 0:
             raise ConfigError("start_s and stale_s must not be negative")
+        if self.clock not in ("host", "device"):
+            raise ConfigError(f"clock must be host or device, not {self.clock!r}")
 
 
 class DeviceSource(Source):
@@ -60,20 +66,32 @@ class DeviceSource(Source):
         codec: what the device speaks.
         options: how patient to be.
         name: of the device, for messages.
+        codec_options: of the codec as written, for a recording to tell.
 
     Raises:
         SourceError: it cannot be opened, does not answer, or nothing that comes is of its codec.
     """
 
     def __init__(
-        self, connect: Callable[[], Link[Any]], codec: Codec[Any], options: DeviceOptions, name: str
+        self,
+        connect: Callable[[], Link[Any]],
+        codec: Codec[Any],
+        options: DeviceOptions,
+        name: str,
+        codec_options: Mapping[str, str] | None = None,
     ) -> None:
+        if options.clock == "device" and codec.tick_ns is None:
+            raise ConfigError(f"codec {options.codec} sends no time: it needs clock=host")
         self.codec, self.options, self.name = codec, options, name
+        self.codec_options = dict(codec_options or {})
         self._connect = connect
         self._link: Link[Any] | None = None
         self._closed = False
         self._state, self._since, self._reason = State.CONNECTING, time.monotonic_ns(), ""
-        self._connections = self._newest = self._can_errors = self._status = 0
+        self._connections = self._can_errors = 0
+        self._stamper: Stamper | None = None
+        self._first: list[tuple[Any, int]] | None = []  # packets before the first read
+        self._tap: Tap | None = None
         self._retry_at, self._retry_s = 0.0, FIRST_RETRY_S
         self._poll_at = 0.0
         self._early: list[Samples] = []  # that came while the device was being started
@@ -85,23 +103,17 @@ class DeviceSource(Source):
             raise
         assert codec.spec is not None
         super().__init__(codec.spec)
+        self._stamper = Stamper(codec, self.spec, self.stats)
+        if options.clock == "device" and codec.tick_ns is not None:
+            self._stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
         self._period_ns = round(NS_PER_S / self.spec.rate_hz)
         self._stale_ns = round(1e9 * (options.stale_s or max(0.1, 10 / self.spec.rate_hz)))
-        ticks = None if codec.tick_ns is None else self._period_ns / codec.tick_ns
-        self._sequencer = Sequencer(codec.count_bits, self.stats, ticks, codec.tick_bits)
-        self._clock: DeviceClock | None = None
-        if codec.tick_ns is not None:
-            self._clock = DeviceClock(codec.tick_ns, codec.tick_bits)
-        elif codec.count_bits is not None:
-            self._clock = DeviceClock(
-                NS_PER_S / self.spec.rate_hz, codec.count_bits, COUNTED_TOLERANCE
-            )
-        self._told = 0  # time given to the newest sample
 
     # reading
 
     def read(self, timeout: float | None = None) -> Chunk | None:
         end = None if timeout is None else time.monotonic() + timeout
+        self._first = None
         while not self._closed:
             chunk = self._chunk(self._early.pop(0)) if self._early else self._receive(end)
             if chunk is not None:
@@ -121,22 +133,37 @@ class DeviceSource(Source):
                 pass  # it is gone, which is what we want
         self._drop()
 
+    def tap(self, on_packet: Tap | None) -> None:
+        """Pass every packet on as it came, before it is decoded; None: no longer.
+
+        Those that came while the device was started are passed on at once, if nothing has been
+        read yet: without them a device that describes itself cannot be decoded again.
+        """
+        first, self._first = self._first, None
+        if on_packet is not None:
+            for packet, t_ns in first or ():
+                on_packet(packet, t_ns)
+        self._tap = on_packet
+
     @property
     def health(self) -> Health:
-        """How the device is doing now."""
+        """How the device is doing now; from any thread."""
+        stamper, link = self._stamper, self._link
+        assert stamper is not None
+        clock, newest, status = stamper.clock, stamper.newest_ns, stamper.status
         state, since, reason = self._state, self._since, self._reason
-        silent = time.monotonic_ns() - self._newest
+        silent = time.monotonic_ns() - newest
         if state == State.STREAMING and silent > self._stale_ns:
-            state, since = State.STALE, self._newest + self._stale_ns
+            state, since = State.STALE, newest + self._stale_ns
             reason = f"no sample for {silent / 1e9:.1f} s"
         bits = self.codec.status_bits.items()
         return Health(
-            state, since, reason, self._connections, self._newest,
-            self._clock.drift_ppm if self._clock and self.codec.tick_ns else 0.0,
-            self._clock.steps if self._clock else 0,
-            self._sequencer.resets,
-            tuple(meaning for bit, meaning in bits if self._status >> bit & 1),
-            self._can_errors + (self._link.can_errors if self._link else 0),
+            state, since, reason, self._connections, newest,
+            clock.drift_ppm if clock and self.codec.tick_ns else 0.0,
+            clock.steps if clock else 0,
+            stamper.sequencer.resets,
+            tuple(meaning for bit, meaning in bits if status >> bit & 1),
+            self._can_errors + (link.can_errors if link else 0),
             self.codec.stats,
         )  # fmt: skip
 
@@ -177,8 +204,18 @@ class DeviceSource(Source):
             return None
         if found is None:
             return None
-        samples = self.codec.feed(*found)
+        samples = self._feed(*found)
         return None if samples is None else self._chunk(samples)
+
+    def _feed(self, packet: Any, t_ns: int) -> Samples | None:
+        self._note(packet, t_ns)
+        return self.codec.feed(packet, t_ns)
+
+    def _note(self, packet: Any, t_ns: int) -> None:
+        if self._tap is not None:
+            self._tap(packet, t_ns)
+        elif self._first is not None:
+            self._first.append((packet, t_ns))
 
     def _poll(self, link: Link[Any], now: float, left: float) -> float:
         if now >= self._poll_at:
@@ -192,32 +229,13 @@ class DeviceSource(Source):
         return min(left, max(0.0, self._poll_at - now))
 
     def _chunk(self, samples: Samples) -> Chunk | None:
-        if samples.values.shape[1:] != self.spec.shape:
-            return None  # the codec has counted it
-        seq, keep = self._sequencer.number(samples)
-        arrived, ticks, count = samples.arrived_ns, samples.ticks, samples.count
-        values, valid = samples.values, samples.valid
-        if not keep.all():
-            seq, arrived, values, valid = seq[keep], arrived[keep], values[keep], valid[keep]
-            ticks = None if ticks is None else ticks[keep]
-            count = None if count is None else count[keep]
-            if not len(seq):
-                return None
-        counter = ticks if ticks is not None else count
-        if self._clock is not None and counter is not None:
-            t_ns = self._clock.to_host(counter, arrived)
-        else:
-            t_ns = host_stamps(arrived, self._told, self._period_ns)
-        self._told = int(t_ns[-1])
-        self._newest = int(arrived[-1])
-        if samples.status is not None:
-            self._status = int(samples.status[-1])
-        if self._state != State.STREAMING:
-            self._turn(State.STREAMING, "")
-        self.stats.delivered += len(seq)
-        if valid.shape != values.shape[:2]:
-            valid = np.broadcast_to(valid, values.shape[:2])
-        return Chunk(seq, t_ns, values, valid)
+        assert self._stamper is not None
+        chunk = self._stamper.chunk(samples)
+        if chunk is not None:
+            if self._state != State.STREAMING:
+                self._turn(State.STREAMING, "")
+            self.stats.delivered += len(chunk)
+        return chunk
 
     # connecting
 
@@ -225,9 +243,10 @@ class DeviceSource(Source):
         """Open the line and start the device."""
         self._link = self._connect()
         self._connections += 1
+        self._note(None, time.monotonic_ns())
         self.codec.forget()
-        if self._connections > 1 and self._clock is not None:
-            self._clock.resume()
+        if self._stamper is not None:
+            self._stamper.resume()
         self._turn(State.CONNECTING, "")
         for step in self.codec.commands(Event.START):
             self._do(step)
@@ -258,7 +277,7 @@ class DeviceSource(Source):
             if found is None:
                 continue
             packet, t_ns = found
-            samples = self.codec.feed(packet, t_ns)
+            samples = self._feed(packet, t_ns)
             if samples is not None:
                 self._early.append(samples)
             if isinstance(expect, bytes):
@@ -284,7 +303,7 @@ class DeviceSource(Source):
             if found is None:
                 continue
             came += len(found[0])
-            samples = self.codec.feed(*found)
+            samples = self._feed(*found)
             if samples is not None:
                 self._early.append(samples)
         if self.codec.spec is None or (self.options.start_s and not self._early):

@@ -91,7 +91,7 @@ def open_serial(target: str, fields: dict[str, str]) -> Source:
     def connect() -> Link[Any]:
         return SerialLink(target, baud, parity, options.dtr)
 
-    return _open(connect, kind(own), options, target)
+    return _open(connect, kind(own), options, target, _of(kind, fields))
 
 
 def open_can(target: str, fields: dict[str, str]) -> Source:
@@ -119,7 +119,7 @@ def open_can(target: str, fields: dict[str, str]) -> Source:
             return SlcanLink(channel, bitrate, fd)
         return CanLink(interface, channel, bitrate, fd, data_bitrate)
 
-    return _open(connect, kind(own), options, target)
+    return _open(connect, kind(own), options, target, _of(kind, fields))
 
 
 def open_line(url: str) -> Link[Any]:
@@ -157,11 +157,20 @@ def _kind(wire: str, target: str, fields: dict[str, str]) -> type[Codec[Any]]:
     return codec_class(wire, fields["codec"])
 
 
+def _of(kind: type[Codec[Any]], fields: dict[str, str]) -> dict[str, str]:
+    """Those of the fields that are the codec's."""
+    return {k: v for k, v in fields.items() if k in kind.Options.__dataclass_fields__}
+
+
 def _open(
-    connect: Callable[[], Link[Any]], codec: Codec[Any], options: DeviceOptions, name: str
+    connect: Callable[[], Link[Any]],
+    codec: Codec[Any],
+    options: DeviceOptions,
+    name: str,
+    codec_options: dict[str, str],
 ) -> Source:
     calibration = load_calibration(options.calibration) if options.calibration else None
-    source = DeviceSource(connect, codec, options, name)
+    source = DeviceSource(connect, codec, options, name, codec_options)
     if calibration is None:
         return source
     try:

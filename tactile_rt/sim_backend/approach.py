@@ -10,10 +10,10 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays.whisker_array import Mount
+from tactile_rt.sim_backend.arrays.whisker_array import Mount, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 
-__all__ = ["centrelines", "way_to_contact", "within_reach"]
+__all__ = ["centrelines", "faces_right", "lateral_reach", "way_to_contact", "within_reach"]
 
 SPACING_MM = 0.25
 TOUCH_MM = 0.15  # counts as contact: both soft layers, and a link's chord off the centreline
@@ -31,6 +31,37 @@ def centrelines(whiskers: Sequence[Whisker], mount: Mount) -> list[Floats]:
         inside = whisker.centreline(s) @ whisker.orientation.T + np.array(whisker.base)
         lines.append(inside @ turn.T + origin)
     return lines
+
+
+def faces_right(animals: Sequence[WhiskerArray], lines: Sequence[Floats]) -> NDArray[np.bool_]:
+    """(whisker,) whether the side of the head that each whisker is on faces world +x.
+
+    Whole sides do: on a turned head some whiskers of the far side point across.
+    """
+    out = np.array([line[-1, 0] - line[0, 0] for line in lines])
+    sides = np.array([2 * k + _to_left(w) for k, a in enumerate(animals) for w in a.whiskers])
+    right = np.zeros(len(out), dtype=np.bool_)
+    for side in np.unique(sides):
+        right[sides == side] = out[sides == side].mean() > 0
+    return right
+
+
+def _to_left(whisker: Whisker) -> bool:
+    """Whether a whisker points to the left in the frame of its head."""
+    tip = whisker.orientation @ whisker.centreline(np.array([whisker.length]))[0]
+    return bool(tip[0] < 0)
+
+
+def lateral_reach(animals: Sequence[WhiskerArray]) -> float:
+    """How far whiskers reach out from their bases along world x: the median over them, mm.
+
+    Where they reach to both sides, of those on the side on which objects pass.
+    """
+    lines = [line for animal in animals for line in centrelines(animal.whiskers, animal.mount)]
+    right = faces_right(animals, lines)
+    seen = right == (2 * right.sum() >= len(right))
+    out = np.array([line[-1, 0] - line[0, 0] for line in lines])
+    return float(np.median(abs(out[seen])))
 
 
 def way_to_contact(

@@ -55,7 +55,7 @@ class Randomisation:
     mount_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in (f.name for f in fields(self)):
+        for name in (f.name for f in fields(Randomisation)):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ConfigError(f"{name} must be 0 or more, not {value}")

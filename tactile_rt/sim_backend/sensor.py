@@ -26,6 +26,7 @@ EFFECTS = ("gain", "crosstalk", "bias", "drift", "noise", "dead", "jitter", "dro
 # What leaves the values as they are.
 NOT_VALUES = ("drift_time_s", "latency_ms", "jitter_ms", "drop_probability")
 NS_PER_MS = 1_000_000
+LARGEST = 1e6  # of any value: beyond it time stamps and single precision overflow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,8 +62,8 @@ class SensorModel:
     spread however long the stream runs, and is the same process whenever one starts to look.
 
     Raises:
-        ConfigError: a negative or infinite value, a share or probability above 1, a drop
-            probability of 1, or a drift time that is not positive.
+        ConfigError: a negative value or one beyond a million, a share or probability above 1, a
+            drop probability of 1, or a drift time that is not positive.
     """
 
     gain: float = 0.0
@@ -87,8 +88,9 @@ class SensorModel:
     def __post_init__(self) -> None:
         for name in (f.name for f in fields(SensorModel)):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ConfigError(f"{name} must be 0 or more, not {value}")
+            if not 0 <= value <= LARGEST:
+                bound = f"at most {LARGEST:g}" if value > 0 else "0 or more"
+                raise ConfigError(f"{name} must be {bound}, not {value}")
         for name in ("crosstalk_channels", "crosstalk_elements", "dead_probability"):
             if getattr(self, name) > 1:
                 raise ConfigError(f"{name} must lie between 0 and 1, not {getattr(self, name)}")

@@ -5,25 +5,22 @@ sim:mouse?noise_force=1e-5&noise_moment=5e-8&latency_ms=2&drop_probability=0.01
 sim:mouse?friction=0.3&young_modulus=0.2&angles_deg=3&mount_mm=0.5
 """
 
-import time
 from dataclasses import dataclass, fields
 
 import numpy as np
 
 from tactile_rt.sim_backend.arrays.whisker_array import load_animals
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, load_object
+from tactile_rt.sim_backend.pacing import CHUNK_SAMPLES, PacedSource, check_pace
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation, usual_distance
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, world_spec
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source
-from tactile_rt.timebase import NS_PER_S
+from tactile_rt.stream import Chunk, ConfigError, EndOfStream
 
 __all__ = ["Pass", "SimOptions", "SimSource"]
 
 REST_SAMPLES = 600  # after an object its episode ends and contact is released; before one, a tare
-CHUNK_SAMPLES = 9
-PACES = ("realtime", "fast")
 
 
 @dataclass(frozen=True)
@@ -56,8 +53,7 @@ class SimOptions(SensorModel, Randomisation):
         Randomisation.__post_init__(self)
         if self.profile not in PROFILES:
             raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
-        if self.pace not in PACES:
-            raise ConfigError(f"no pace {self.pace!r}: there are {', '.join(PACES)}")
+        check_pace(self.pace)
         if self.sweeps < 0 or self.repeat < 1:
             raise ConfigError("sweeps must be 0 or more, and repeat 1 or more")
         if self.seed < 0:
@@ -79,10 +75,9 @@ class Pass:
     sweep: Sweep
 
 
-class SimSource(Source):
+class SimSource(PacedSource):
     """A whisker array in MuJoCo with objects sweeping past it.
 
-    Time is simulated: it starts at the first read, and in real time the reader waits for it.
     Samples that the sensors drop count as missing.
 
     Args:
@@ -92,14 +87,13 @@ class SimSource(Source):
 
     Attributes:
         passes: the objects that have come by so far, in order.
-        live: whether samples wait for nobody (real-time pace).
     """
 
     Options = SimOptions
 
     def __init__(self, array: str, options: SimOptions) -> None:
         self._animals = load_animals(array or "mouse")
-        super().__init__(world_spec(self._animals))
+        super().__init__(world_spec(self._animals), options.pace)
         self._options = options
         names = [n for n in options.objects.split(",") if n] or list(CATEGORIES)
         self._objects = [load_object(name) for name in names]
@@ -108,41 +102,24 @@ class SimSource(Source):
         self._array_rng = np.random.default_rng([options.seed, 1])
         self._distance_mm = usual_distance(self._animals)
         self._sensor = Sensor(options, self.spec, options.seed)
-        self.live = options.pace == "realtime"
         self.passes: list[Pass] = []
-        self._start_ns: int | None = None
         self._sent = 0  # samples simulated so far
         self._rest = 0  # samples of rest still to deliver
         self._simulation: SweepSimulation | None = None
         self._left = 0  # samples of the sweep still to deliver
         self._order: list[int] = []
-        self._next: Chunk | None = None  # simulated, not yet due
-        self._closed = False
-
-    def read(self, timeout: float | None = None) -> Chunk | None:
-        if self._start_ns is None:
-            self._start_ns = time.monotonic_ns() if self.live else 0
-        while self._next is None:  # all of a chunk may be dropped
-            self._next = self._sensor.push(self._simulate(self._start_ns))
-            self.stats.missing = self._sensor.dropped
-        chunk = self._next
-        if self.live:
-            wait = (int(chunk.t_ns[-1]) - time.monotonic_ns()) / NS_PER_S
-            if timeout is not None and wait > timeout:
-                time.sleep(max(timeout, 0))
-                return None
-            time.sleep(max(wait, 0))
-        self._next = None
-        self.stats.delivered += len(chunk)
-        return chunk
 
     def close(self) -> None:
-        self._closed = True
-        self._simulation = self._next = None
+        super().close()
+        self._simulation = None
 
-    def _simulate(self, start_ns: int) -> Chunk:
-        if self._closed:
-            raise EndOfStream
+    def _simulate(self, start_ns: int) -> Chunk | None:
+        received = self._sensor.push(self._true(start_ns))
+        self.stats.missing = self._sensor.dropped
+        return received
+
+    def _true(self, start_ns: int) -> Chunk:
+        """What the array really feels next."""
         if self._left == 0 and self._rest == 0:
             self._begin_sweep(start_ns)
         if self._rest:

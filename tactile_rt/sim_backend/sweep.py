@@ -6,6 +6,7 @@ it (see `arrays.MOUNT`). The object moves along -y, as things do past a head tha
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import mujoco
 import numpy as np
@@ -13,9 +14,15 @@ import trimesh
 from mujoco import rollout
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.approach import centrelines, way_to_contact, within_reach
+from tactile_rt.sim_backend.approach import (
+    centrelines,
+    faces_right,
+    lateral_reach,
+    way_to_contact,
+    within_reach,
+)
 from tactile_rt.sim_backend.arrays.head import add_head
-from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray, load_animals
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.world import (
@@ -31,7 +38,14 @@ from tactile_rt.sim_backend.world import (
 )
 from tactile_rt.stream import SourceError
 
-__all__ = ["Sweep", "SweepSimulation", "draw_simulation", "draw_sweep"]
+__all__ = [
+    "UNSTABLE",
+    "Sweep",
+    "SweepSimulation",
+    "draw_simulation",
+    "draw_sweep",
+    "usual_distance",
+]
 
 FAR_MM = 200.0  # where the object is when the way to first contact is measured
 DRAWS = 20  # tries to draw parameters with which an object meets the array at all
@@ -94,7 +108,7 @@ class SweepSimulation:
         lines = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
         turn = rotation("z", np.radians(sweep.yaw_deg))
         shape = [piece.vertices * sweep.size_mm @ turn.T for piece in target.pieces]
-        start = _beside(lines, np.concatenate(shape), sweep)
+        start = _beside(lines, faces_right(animals, lines), np.concatenate(shape), sweep)
         pieces = [
             trimesh.Trimesh(points + start, piece.faces, process=False)
             for points, piece in zip(shape, target.pieces, strict=True)
@@ -192,13 +206,32 @@ UNSTABLE = tuple(
 )
 
 
-def draw_sweep(rng: np.random.Generator) -> Sweep:
-    """Draw the parameters of one sweep: any yaw, a spread of heights, distances and speeds."""
+def usual_distance(animals: tuple[WhiskerArray, ...]) -> float:
+    """A mouse's 6.5 mm, for other arrays as much more as their whiskers reach further, mm.
+
+    So an object comes to the same share of the whiskers: 20 of a mouse's 30 reach beyond its
+    6.5 mm, 19 of a rat's 30 beyond its 8.75.
+    """
+    return round(Sweep.distance_mm * lateral_reach(animals) / _mouse_reach(), 2)
+
+
+@cache
+def _mouse_reach() -> float:
+    return lateral_reach(load_animals("mouse"))
+
+
+def draw_sweep(rng: np.random.Generator, distance_mm: float = Sweep.distance_mm) -> Sweep:
+    """Draw the parameters of one sweep: any yaw, a spread of heights, distances and speeds.
+
+    Args:
+        rng: to draw from.
+        distance_mm: about which distances spread, see `usual_distance`.
+    """
     return Sweep(
         speed_mm_s=float(rng.uniform(28, 40)),
         yaw_deg=float(rng.uniform(0, 360)),
         height_mm=float(rng.uniform(-8, 4)),
-        distance_mm=float(rng.uniform(5.5, 8)),
+        distance_mm=float(rng.uniform(5.5, 8)) * distance_mm / Sweep.distance_mm,
         gap_mm=float(rng.uniform(0.5, 4)),
     )
 
@@ -208,20 +241,27 @@ def draw_simulation(
     array: WhiskerArray | tuple[WhiskerArray, ...],
     target: TactileObject,
     profile: Profile,
+    distance_mm: float = Sweep.distance_mm,
 ) -> tuple[Sweep, SweepSimulation]:
-    """Draw sweeps until the object meets the array; give up, with a miss, after many tries."""
+    """Draw sweeps until the object meets the array; give up, with a miss, after many tries.
+
+    Args:
+        rng, distance_mm: see `draw_sweep`.
+        array, target, profile: see `SweepSimulation`.
+    """
     for _ in range(DRAWS):
-        sweep = draw_sweep(rng)
+        sweep = draw_sweep(rng, distance_mm)
         simulation = SweepSimulation(array, target, sweep, profile)
         if simulation.touches:
             break
     return sweep, simulation
 
 
-def _beside(lines: Sequence[Floats], shape: Floats, sweep: Sweep) -> Floats:
+def _beside(
+    lines: Sequence[Floats], outward: NDArray[np.bool_], shape: Floats, sweep: Sweep
+) -> Floats:
     """Where the object's centre is far up the y axis, mm, on the side that whiskers reach to."""
     bases = np.array([line[0, 0] for line in lines])
-    outward = np.array([line[-1, 0] for line in lines]) > bases
     right = 2 * outward.sum() >= len(lines)
     face = bases[outward == right].mean()
     nearest = shape[:, 0].min() if right else shape[:, 0].max()

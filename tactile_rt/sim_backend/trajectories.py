@@ -7,6 +7,7 @@ the last two follow the first with a slope that differs from row to row.
 import csv
 import re
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Protocol
 
@@ -25,11 +26,12 @@ __all__ = [
     "Trajectory",
     "Whisk",
     "base_angles",
+    "coupled",
     "mirror",
     "read_trajectory",
 ]
 
-# d phi / d theta and d zeta / d theta of rows A-E (Knutsen et al. 2008, J. Neurophysiol.)
+# d phi / d theta and d zeta / d theta of rows A-E (Knutsen et al. 2008, Neuron)
 ELEVATION_SLOPES = (0.398, 0.591, 0.578, 0.393, 0.217)
 TORSION_SLOPES = (-0.9, -0.284, 0.243, 0.449, 0.744)
 ANGLES = ("theta", "phi", "zeta")
@@ -42,7 +44,7 @@ class Trajectory(Protocol):
 
     @property
     def duration_s(self) -> float:
-        """How long it lasts, s."""
+        """How long it lasts, s; infinite if it has no end."""
 
     def offsets(
         self, t_s: NDArray[np.float64], whiskers: tuple[Whisker, ...]
@@ -110,7 +112,7 @@ class Whisk:
         middle = (self.protraction_deg - self.retraction_deg) / 2
         amplitude = (self.protraction_deg + self.retraction_deg) / 2
         theta = np.radians(middle - amplitude * np.cos(phase)) * _ramp(t / self.ramp_s)
-        return _coupled(theta, whiskers)
+        return coupled(theta, whiskers)
 
 
 @dataclass(frozen=True)
@@ -134,13 +136,17 @@ class Recorded:
         """How long it lasts, s."""
         return float(self.times_s[-1])
 
+    @cached_property
+    def _spline(self) -> CubicSpline:
+        return CubicSpline(self.times_s, self.turns - self.turns[0])
+
     def offsets(
         self, t_s: NDArray[np.float64], whiskers: tuple[Whisker, ...]
     ) -> NDArray[np.float64]:
         """See `Trajectory`. The last posture is kept after the end."""
         at = [self.names.index(w.name) for w in whiskers]
         t = np.clip(np.asarray(t_s, dtype=np.float64), 0.0, self.duration_s)
-        moved = CubicSpline(self.times_s, self.turns - self.turns[0])(t)
+        moved = self._spline(t)
         turns: NDArray[np.float64] = self.turns[0] + moved * _ramp(t / self.ramp_s)[:, None, None]
         return turns[:, at]
 
@@ -151,8 +157,8 @@ def _ramp(x: NDArray[np.float64]) -> NDArray[np.float64]:
     return x**3 * (10 - 15 * x + 6 * x**2)
 
 
-def _coupled(theta: NDArray[np.float64], whiskers: tuple[Whisker, ...]) -> NDArray[np.float64]:
-    """(n, whisker, 3): protraction with the elevation and torsion of each whisker's row."""
+def coupled(theta: NDArray[np.float64], whiskers: tuple[Whisker, ...]) -> NDArray[np.float64]:
+    """Protractions (n, whisker) with each row's elevation and torsion: (n, whisker, 3) rad."""
     slopes = np.array([[1.0, *_slopes(w.row)] for w in whiskers])
     turns: NDArray[np.float64] = theta[:, :, None] * slopes
     return turns

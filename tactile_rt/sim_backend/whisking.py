@@ -6,12 +6,16 @@ trajectory. So the bases have a velocity, which friction and the whiskers' own i
 which a body that is merely placed (a mocap body) would not have.
 """
 
+import math
+from typing import Final
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.arrays.whisker_array import Mount
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
+from tactile_rt.sim_backend.sweep import UNSTABLE
 from tactile_rt.sim_backend.trajectories import ANGLES, Trajectory, mirror
 from tactile_rt.sim_backend.world import (
     OBJECT_BIT,
@@ -23,15 +27,17 @@ from tactile_rt.sim_backend.world import (
     read_base_loads,
     set_damping,
 )
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import ConfigError, SourceError
 
-__all__ = ["HEAD", "WhiskSimulation"]
+__all__ = ["ENDLESS", "HEAD", "WhiskSimulation"]
 
-# Head of the published whisking simulations (Chung et al. 2025, code): nose 15 degrees up about
-# the lateral axis. The world's origin is that of the array: x to the right, y rostral, z up.
+# Head of the published whisking simulations (Chung et al. 2025, code): its "pitch" of 15 degrees is
+# about the rostral axis there, right side down. The world's origin is that of the array: x to the
+# right, y rostral, z up.
 HEAD = Mount((0.0, 0.0, 0.0), (0.0, float(np.radians(15.0)), 0.0))
 # mg mm^2; a whisker has 10 at most. From 1e8 on the solver converges badly.
 BASE_INERTIA = 1e6
+ENDLESS: Final = 1 << 62  # samples
 # Of the solver. Its usual 1e-8 counts in the bases' inertia and is met before a contact is solved.
 TOLERANCE = 1e-16
 
@@ -47,7 +53,7 @@ class WhiskSimulation:
         mount: pose of the head frame in the world.
 
     Attributes:
-        samples: of 1 ms, that the trajectory lasts.
+        samples: of 1 ms, that the trajectory lasts; `ENDLESS` if it has no end.
 
     Raises:
         ConfigError: a whisker begins inside the object.
@@ -64,7 +70,9 @@ class WhiskSimulation:
         world = empty_world(profile)
         add_whiskers(world, whiskers, profile, mount)
         clamped = world.compile()
-        set_damping(clamped)  # by the resonance of the whisker on a base that stands still
+        set_damping(
+            clamped, whiskers
+        )  # by the resonance of the whisker on a base that stands still
         for whisker in whiskers:
             _add_base_joints(world, whisker)
         _add_object(world, pieces)
@@ -82,14 +90,12 @@ class WhiskSimulation:
         self._owner = _owners(self.model, whiskers)
 
         self._steps_per_sample = round(SAMPLE_MS / profile.timestep_ms)
-        self.samples = int(trajectory.duration_s * 1e3 / SAMPLE_MS + 1e-6)
-        # The step before the first, and the one after the last, for their accelerations.
-        steps = np.arange(-1, self.samples * self._steps_per_sample + 2)
-        times = steps.astype(np.float64) * (profile.timestep_ms * 1e-3)
-        turns = trajectory.offsets(times, whiskers) * mirror(whiskers)
-        self._turns = turns.reshape(len(times), -1)
+        duration_s = trajectory.duration_s
+        endless = math.isinf(duration_s)
+        self.samples = ENDLESS if endless else int(duration_s * 1e3 / SAMPLE_MS + 1e-6)
+        self._trajectory, self._whiskers, self._mirror = trajectory, whiskers, mirror(whiskers)
         self._step = 0
-        self._prescribe()
+        self._prescribe(self._turns(1))
         mujoco.mj_forward(self.model, self.data)
         if (touched := self._touched()).any():
             names = ", ".join(w.name for w, hit in zip(whiskers, touched, strict=True) if hit)
@@ -102,23 +108,43 @@ class WhiskSimulation:
             (samples, element, 6) base loads, N and N m, each the mean over its millisecond, in
             the element's own frame, which turns with its base; and (samples, element) whether it
             touched the object.
+
+        Raises:
+            SourceError: the simulation has become unstable.
         """
         samples = min(samples, self.samples - self._step // self._steps_per_sample)
         sensors = np.zeros((samples, self.model.nsensordata))
         touch = np.zeros((samples, self._count), dtype=np.bool_)
+        turns = self._turns(samples * self._steps_per_sample)
         for i in range(samples):
-            for _ in range(self._steps_per_sample):
-                self._prescribe()
+            for k in range(self._steps_per_sample):
+                self._prescribe(turns[i * self._steps_per_sample + k :])
                 mujoco.mj_step(self.model, self.data)
                 self._step += 1
                 sensors[i] += self.data.sensordata
                 touch[i] |= self._touched()
+        if any(self.data.warning[kind].number for kind in UNSTABLE):
+            raise SourceError(
+                "the simulation has become unstable: a whisker jams that is too stiff for this "
+                "profile; move the object away, whisk less far, or take a finer profile"
+            )
         return read_base_loads(sensors / self._steps_per_sample), touch
 
-    def _prescribe(self) -> None:
-        """Put the bases where they belong, with the force that takes them a step further."""
+    def _turns(self, steps: int) -> NDArray[np.float64]:
+        """(steps + 2, base angle) turns of the bases, from the step before the next one on."""
+        at = np.arange(self._step - 1, self._step + steps + 1)
+        times = at.astype(np.float64) * (self.model.opt.timestep * 1e-3)
+        turns = self._trajectory.offsets(times, self._whiskers) * self._mirror
+        return turns.reshape(len(times), -1)
+
+    def _prescribe(self, turns: NDArray[np.float64]) -> None:
+        """Put the bases where they belong, with the force that takes them a step further.
+
+        Args:
+            turns: from the step before on, that after it included, for the acceleration.
+        """
         h = self.model.opt.timestep
-        before, now, after = self._turns[self._step : self._step + 3]  # it begins one step before 0
+        before, now, after = turns[:3]
         self.data.qpos[self._positions] = now
         self.data.qvel[self._dofs] = (now - before) / h
         # The integrator's own second difference: v += h a, then q += h v.

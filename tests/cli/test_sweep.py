@@ -72,6 +72,9 @@ def test_a_set_is_made_gone_on_with_described_and_checked(call, recipe, tmp_path
         (("--validation", 0), "objects.validation must be a whole number"),
         (("--engine", "spark"), "no engine 'spark': there are processes, ray"),
         (("--verify",), "has no SHA256SUMS"),
+        (("--validation", "nan"), "objects.validation must be at most 100000, not nan"),
+        (("--test", "inf"), "objects.test must be at most 100000, not inf"),
+        (("--address", "head:6379"), "--address is that of a Ray cluster: give --engine ray, too"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(call, tmp_path, monkeypatch, options, said):
@@ -90,3 +93,18 @@ def test_another_profile_of_a_set_goes_elsewhere(call, recipe, tmp_path):
     code, _, err = call("sweep", folder, "--profile", "accurate")
     assert code == 2
     assert "holds another sweep set (other recipe.profile, " in err
+
+
+def test_sweeps_that_miss_are_told(call, recipe, tmp_path):
+    recipe.write_text(TINY + "height_mm = 200\n")
+    code, _, err = call("sweep", tmp_path / "set", "--recipe", recipe, "--processes", 1)
+    assert code == 0
+    assert "6 sweeps at profile realtime; 6 miss the array" in err.replace("\n", " ")
+
+
+def test_a_ray_cluster_is_named_by_host_and_port(call, recipe, tmp_path):
+    pytest.importorskip("ray")
+    options = ("--recipe", recipe, "--engine", "ray", "--address", "head")
+    code, _, err = call("sweep", tmp_path / "set", *options)
+    assert code == 2
+    assert "no Ray cluster at head: give its HOST:PORT" in err

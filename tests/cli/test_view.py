@@ -78,6 +78,8 @@ def test_a_gif(view):
         (("--out", "a.png", "--camera", "above"), "no camera 'above': there are front, side, top"),
         (("--out", "a.png", "--profile", "fast"), "no profile 'fast'"),
         (("--out", "a.png", "--at", 1e6), "the sweep lasts"),
+        (("--out", "a.png", "--height", "nan"), "--height must be a finite number, not nan"),
+        (("--out", "a.png", "--distance", "inf"), "--distance must be a finite number, not inf"),
         (("--out", "a.mp4", "--at", 5), "--at is the moment of a picture"),
         (("--out", "a.png", "--array", "mosue"), "did you mean mouse?"),
         ((), "no display to open a window on: write a picture or video with --out"),

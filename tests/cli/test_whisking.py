@@ -95,6 +95,8 @@ def test_an_object_and_a_recorded_trajectory(call, tmp_path, robot):
         (("out.npz", "--object", "mug", "--size", "-3"), "--size must be above 0"),
         (("out.npz", "--object", "mug", "--position", "1,2"), "--position is three numbers"),
         (("out.npz", "--step", "a"), "--step is three numbers"),
+        (("out.npz", "--step", "1,nan,0"), "--step is three numbers"),
+        (("out.npz", "--object", "mug", "--yaw", "nan"), "--yaw must be a number of degrees"),
         (("out.npz", "--profile", "best"), "no profile 'best'"),
         (("out.npz", "--array", "cat"), "'cat'"),
         (("out.npz", "--frequency", "-1"), "frequency_hz must be"),
@@ -111,3 +113,28 @@ def test_mistakes_are_one_line_and_leave_nothing(refused, tmp_path, robot, monke
     monkeypatch.chdir(tmp_path)
     assert said in refused("whisk", *arguments)
     assert [p.name for p in tmp_path.iterdir()] == ["robot.csv"]
+
+
+def test_the_left_side_meets_the_mirror_image(call, tmp_path, robot):
+    """The same whiskers mirrored feel the same: fx, fy, mz alike, fz, mx, my of opposite sign."""
+    mirrored = tmp_path / "mirrored.csv"
+    signs = {"base_x_mm": -1, "base_theta_rad": -1, "base_zeta_rad": -1}
+    header, *rows = (line.split(",") for line in ROBOT.splitlines())
+    lines = [
+        [str(float(v) * signs[c]) if c in signs else v for c, v in zip(header, row, strict=True)]
+        for row in rows
+    ]
+    mirrored.write_text("\n".join(map(",".join, [header, *lines])))
+    felt = []
+    for array in (robot, mirrored):
+        out = tmp_path / f"{array.stem}.npz"
+        options = ("--stimulus", "convex-close", "--profile", "realtime", "--protraction", 45)
+        code, _, err = call("whisk", out, "--array", array, *options, "--duration", 1.3)
+        assert code == 0, err
+        with np.load(out) as arrays:
+            felt.append(arrays["values"])
+    right, left = felt[0], felt[1] * np.array([1, 1, -1, -1, -1, 1])
+    assert np.linalg.norm(left - right) < 0.05 * np.linalg.norm(right)
+    assert json.loads(out.with_suffix(".json").read_text())["parameters"]["convex-close"][
+        "mirrored"
+    ]

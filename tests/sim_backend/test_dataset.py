@@ -1,5 +1,6 @@
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -171,6 +172,38 @@ def test_another_profile_sweeps_the_same() -> None:
     )
     assert coarse.parameters == fine.parameters
     assert not np.array_equal(coarse.values, fine.values)
+
+
+def test_several_animals_share_the_world_of_a_set(tmp_path: Path) -> None:
+    path = tmp_path / "two.toml"
+    path.write_text(
+        '[[animal]]\narray = "mouse"\n[[animal]]\narray = "mouse"\n'
+        "mount = { position_mm = [300.0, 0.0, 0.0] }\n"
+    )
+    recipe = replace(RECIPE, array=str(path), sweeps=SweepChoice(distance_mm=150.0))
+    assert describe_set(recipe).spec.elements[::30] == ("1.A0", "2.A0")
+    record = simulate_sweep(recipe, make_object("mug", 0), 0)
+    assert record.values.shape == (25, 60, 6)
+
+
+@pytest.mark.parametrize("stray", ["mug-1.npz", "mug-1.part"])
+def test_sweeps_without_their_manifest_are_no_ones(tmp_path: Path, stray: str) -> None:
+    """They may be of another recipe: a set that took them in would be a mixture."""
+    (tmp_path / stray).write_bytes(b"of another set")
+    (tmp_path / "six.npz").write_bytes(b"none of its business")
+    with pytest.raises(ConfigError, match=r"holds sweeps but no manifest\.json"):
+        list(make_sweeps(RECIPE, tmp_path, processes=1))
+    assert not (tmp_path / "manifest.json").exists()
+
+
+def test_a_finished_set_gets_a_lost_manifest_back(finished: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(finished, folder)
+    (folder / "manifest.json").unlink()
+    with pytest.raises(ConfigError, match="no manifest"):
+        list(make_sweeps(replace(RECIPE, seed=1), folder, processes=1))
+    list(make_sweeps(RECIPE, folder, processes=1))
+    assert files(folder) == files(finished)
 
 
 def test_a_point_of_a_grid_that_misses_stays_and_a_draw_is_repeated() -> None:

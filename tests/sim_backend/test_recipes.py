@@ -252,6 +252,10 @@ def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
         ("[sweeps]\nyaw_deg = { each = [nan] }", "each must be a list of numbers"),
         ("[sweeps]\nyaw_deg = inf", "sweeps.yaw_deg must be a number"),
         ("[sweeps]\nyaw_deg = { between = [9, 1] }", "between has its lower end first, not 9, 1"),
+        ("[sweeps]\nsize_mm = 1e300", "sweeps.size_mm must be within [+]-10000, not 1e[+]300"),
+        ("[sweeps]\nheight_mm = { between = [-2e4, 0] }", "must be within [+]-10000, not -20000"),
+        ("length_ms = 1e12", "length_ms must be at most 600000, not 1e[+]12"),
+        ("[objects]\nper_category = 1000000000", "per_category must be at most 100000, not 1e"),
         ("[sweeps]\nsize_mm = 0", "sweeps.size_mm must be positive, not 0"),
         (
             "[sweeps]\nspeed_mm_s = { each = [30, -3] }",
@@ -375,3 +379,15 @@ def test_a_stored_recipe_can_be_written_as_toml_again() -> None:
     assert None not in raw.values()
     assert tomllib.loads("a = { each = [1.0] }")["a"].keys() == {"each"}
     assert raw["sweeps"]["height_mm"] == {"each": [-3.0, 0.0, 3.0]}
+
+
+def test_without_a_distance_it_is_that_of_the_array(tmp_path: Path) -> None:
+    """Recipes that name one keep it: millimetres are millimetres."""
+
+    def distance(text: str) -> object:
+        return read_recipe(write(tmp_path / "mine.toml", text)).sweeps.distance_mm
+
+    assert distance("") == 6.5
+    assert distance("array = 'rat'") == 8.75
+    assert distance("array = 'rat'\n[sweeps]\ndistance_mm = 6.5") == 6.5
+    assert distance("array = 'rat'\n[sweeps]\nyaw_deg = 3") == 8.75

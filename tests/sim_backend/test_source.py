@@ -199,9 +199,30 @@ def test_a_read_waits_no_longer_than_asked() -> None:
         assert waits and min(waits) < 0.006
 
 
+def test_its_url_takes_randomised_arrays() -> None:
+    """Drawn afresh for every sweep; objects come as they would, and the spec is the design's."""
+    url = "sim:mouse?objects=mug-1,bowl-1&pace=fast&sweeps=2&seed=3&young_modulus=0.3&mount_mm=0.2"
+    with (
+        open_source(url) as one,
+        open_source(url) as same,
+        fast(objects="mug-1,bowl-1", sweeps=2, seed=3) as plain,
+    ):
+        stream, again = (concatenate(list(source)) for source in (one, same))
+        ideal = concatenate(list(plain))
+        assert isinstance(one, SimSource)
+        assert one.spec == plain.spec
+        assert [p.name for p in one.passes] == [p.name for p in plain.passes]
+        assert one.passes[0].sweep == plain.passes[0].sweep
+    np.testing.assert_array_equal(stream.values, again.values)
+    n = REST_SAMPLES + 500
+    felt, meant = stream.values[:n], ideal.values[:n]
+    assert 0.01 < np.linalg.norm(felt - meant) / np.linalg.norm(meant) < 1
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
+        ({"friction": 1.5}, "friction is relative and must be less than 1, not 1.5"),
         ({"profile": "quick"}, "no profile 'quick': there are realtime, dataset, accurate"),
         ({"sweeps": -1}, "sweeps must be 0 or more"),
         ({"repeat": 0}, "repeat 1 or more"),
@@ -218,3 +239,13 @@ def test_an_unknown_array_or_object_is_refused() -> None:
         SimSource("mose", SimOptions())
     with pytest.raises(ConfigError, match="no object called 'mugg'"):
         SimSource("mouse", SimOptions(objects="bottle,mugg"))
+
+
+def test_objects_pass_a_rat_further_out() -> None:
+    """Where as many of its whiskers reach as of a mouse's."""
+    distances = []
+    for array in ("mouse", "rat"):
+        with SimSource(array, SimOptions(objects="mug-1", pace="fast", seed=3)) as source:
+            source.read()
+            distances.append(source.passes[0].sweep.distance_mm)
+    assert distances[1] == pytest.approx(distances[0] * 8.75 / 6.5)

@@ -12,7 +12,12 @@ import mujoco
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray, load_array, place
+from tactile_rt.sim_backend.arrays.whisker_array import (
+    WhiskerArray,
+    load_animals,
+    load_array,
+    place,
+)
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.objects.catalogue import (
     CATEGORIES,
@@ -21,7 +26,7 @@ from tactile_rt.sim_backend.objects.catalogue import (
     make_object,
 )
 from tactile_rt.sim_backend.objects.solids import box
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_sweep, usual_distance
 from tactile_rt.sim_backend.world import (
     MOUNT,
     OBJECT_BIT,
@@ -283,3 +288,36 @@ def test_a_world_of_two_animals_has_one_spec() -> None:
     turn = Rotation.from_quat(spec.orientations[2], scalar_first=True).as_matrix()
     np.testing.assert_allclose(turn, MOUNT.rotation @ ALL.whiskers[2].orientation, atol=1e-8)
     assert world_spec((ALL,)).frame == "head"
+
+
+def test_an_object_passes_a_mouse_of_two_sides_as_it_passes_the_right_one() -> None:
+    """On the turned head two left whiskers point across: the distance is not theirs."""
+    sweep, target = Sweep(size_mm=30, yaw_deg=90), load_object("mug-1")
+    one, both = (
+        SweepSimulation(load_array(n), target, sweep, REALTIME) for n in ("mouse", "mouse-both")
+    )
+    np.testing.assert_allclose(both.data.mocap_pos[0], one.data.mocap_pos[0], atol=1e-9)
+
+
+def test_distances_grow_with_the_reach_of_the_whiskers() -> None:
+    """As large a share of the whiskers as of a mouse's reaches beyond it, within one in 30."""
+
+    def beyond(name: str) -> float:
+        animals = load_animals(name)
+        (array,) = animals
+        tips = [
+            array.mount.rotation
+            @ (w.orientation @ w.centreline(np.array([w.length]))[0] + np.array(w.base))
+            for w in array.whiskers
+        ]
+        bases = [array.mount.rotation @ np.array(w.base) for w in array.whiskers]
+        middle = np.mean(bases, axis=0)[0]
+        return float(np.mean([t[0] - middle > usual_distance(animals) for t in tips]))
+
+    assert usual_distance(load_animals("mouse")) == Sweep.distance_mm == 6.5
+    assert usual_distance(load_animals("mouse-both")) == 6.5
+    assert usual_distance(load_animals("mouse-left")) == 6.5
+    assert abs(beyond("rat") - beyond("mouse")) <= 1 / 30 + 1e-9
+    near, far = (draw_sweep(np.random.default_rng(1), d) for d in (6.5, 13.0))
+    assert far == replace(near, distance_mm=2 * near.distance_mm)
+    assert 5.5 <= near.distance_mm <= 8

@@ -177,6 +177,10 @@ def test_a_centreline_of_any_curvature(a: float, length: float) -> None:
         ({"tip_radius": 0.0}, "tip_radius_mm must be positive"),
         ({"tip_radius": 0.2}, "tip_radius_mm 0.2 exceeds base_radius_mm 0.04"),
         ({"base_radius": 48.365}, "is less than 10 times base_radius_mm 48.365"),
+        ({"length": 2000.0}, "arc_length_mm must be 0.1 to 500, not 2000: mind the unit"),
+        ({"tip_radius": 6e-5}, "tip_radius_mm must be 0.0005 to 50, not 6e-05: mind the unit"),
+        ({"young_modulus": 2.9}, "young_modulus_pa must be 10000 to .*, not 2.9: mind the unit"),
+        ({"density_base": 1.13}, "density_base_kg_m3 must be 100 to .* not 1.13: mind the unit"),
         ({"damping_ratio": -0.1}, "damping_ratio must be 0 or more"),
         ({"friction": float("nan")}, "friction must be 0 or more, not nan"),
         ({"curvature": float("nan")}, "must be finite"),
@@ -198,7 +202,8 @@ ROW: dict[str, object] = dict.fromkeys(REQUIRED, 1) | {"whisker": "B1", "arc_len
 
 
 def test_a_row_of_a_table_is_a_whisker() -> None:
-    every_field = {name: 0.01 * (9 - i) for i, name in enumerate(OPTIONAL)}
+    units = {"young_modulus_pa": 1e6, "density_base_kg_m3": 1e6, "density_tip_kg_m3": 1e6}
+    every_field = {n: 0.01 * (9 - i) * units.get(n, 1.0) for i, n in enumerate(OPTIONAL)}
     made = Whisker.from_columns(ROW | every_field)
     assert (made.name, made.row, made.column, made.length) == ("B1", 0, 1, 30.0)
     for column, name in OPTIONAL.items():

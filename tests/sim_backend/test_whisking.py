@@ -21,7 +21,7 @@ from tactile_rt.sim_backend.world import (
     empty_world,
     set_damping,
 )
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import ConfigError, SourceError
 
 MOUSE = {w.name: w for w in mouse_whiskers()}
 FEW = tuple(MOUSE[n] for n in ("A1", "B0", "C2", "D3", "E5"))
@@ -74,6 +74,28 @@ def point(whisker, protraction, s):
     )
     at = np.array(whisker.base) + orientation(*turned) @ whisker.centreline(np.array([s]))[0]
     return about((0, 1, 0), np.radians(15)) @ at
+
+
+def test_a_whisker_keeps_its_own_damping_ratio():
+    """Rayleigh's c = 2 zeta k / omega, less the step times k that the integrator adds."""
+    profile = PROFILES["accurate"]
+    damping = []
+    for ratio in (0.15, 0.45):
+        c2 = dataclasses.replace(MOUSE["C2"], damping_ratio=ratio)
+        still = Turning(lambda t: np.zeros((len(t), 3)), 0.01)
+        model = WhiskSimulation((c2,), still, profile).model
+        bending = model.jnt_stiffness[model.dof_jntid] > 0
+        stiffness = model.jnt_stiffness[model.dof_jntid][bending]
+        damping.append(model.dof_damping[bending] / stiffness + profile.timestep_ms)
+    np.testing.assert_allclose(damping[1], 3 * damping[0], rtol=1e-9)
+
+
+def test_a_simulation_that_went_unstable_is_not_taken_for_a_result():
+    still = Turning(lambda t: np.zeros((len(t), 3)), 0.01)
+    simulation = WhiskSimulation((MOUSE["C2"],), still, DATASET)
+    simulation.data.qvel[-1] = np.nan
+    with pytest.raises(SourceError, match="unstable: a whisker jams"):
+        simulation.advance(2)
 
 
 # ---- kinematics
@@ -169,7 +191,7 @@ def test_tracking_is_exact_even_in_contact():
     worst, touched = 0.0, 0
     for _ in range(100):
         touched += sim.advance(1)[1].sum()
-        worst = max(worst, np.abs(sim.data.qpos[sim._positions] - sim._turns[sim._step + 1]).max())
+        worst = max(worst, np.abs(sim.data.qpos[sim._positions] - sim._turns(1)[1]).max())
     assert touched > 20
     assert 0 < worst < 1e-7
 

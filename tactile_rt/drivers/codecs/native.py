@@ -9,7 +9,8 @@ pass for a sample.
 
 import struct
 import zlib
-from collections.abc import Iterator
+from binascii import crc_hqx
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -18,15 +19,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Event, Samples, SerialCodec, Step
-from tactile_rt.drivers.codecs.framing import ByteBuffer, crc16_xmodem
+from tactile_rt.drivers.codecs.framing import crc16_xmodem
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
 __all__ = [
     "FORMATS",
+    "RANGE_N",
+    "RANGE_NM",
     "Description",
     "Message",
     "NativeOptions",
     "NativeSerial",
+    "check_ranges",
     "frame",
     "pack_valid",
     "quantise",
@@ -47,7 +51,9 @@ IMPOSSIBLE: Final = 2
 FORMATS: Final = {"float32": 0, "int16": 1}
 _TYPES: Final[dict[int, np.dtype[Any]]] = {0: np.dtype("<f4"), 1: np.dtype("<i2")}
 # What int16's largest value stands for, by SI unit, unless the device describes another scale.
-FULL_SCALE: Final = {"N": 0.1, "N m": 1e-3, "rad": float(np.pi)}
+RANGE_N: Final = 0.1
+RANGE_NM: Final = 1e-3
+RANGE_RAD: Final = float(np.pi)
 LARGEST: Final = 1e30  # scale: any count times it is a float32
 # Bits of the status; 4 to 7 are ours to give a meaning later, 8 to 15 the device's own (serial).
 STATUS: Final = {
@@ -80,12 +86,16 @@ class NativeOptions:
         format: ``float32`` or ``int16``: what an emulated device sends. A host takes both.
         array: JSON file of an array (`tactile-rt describe` writes one) for devices that do not
             describe themselves.
+        range_n, range_nm: largest force (N) and moment (N m) of an emulated device's int16.
     """
 
     format: str = "float32"
     array: str = ""
+    range_n: float = RANGE_N
+    range_nm: float = RANGE_NM
 
     def __post_init__(self) -> None:
+        check_ranges(self.range_n, self.range_nm)
         if self.format not in FORMATS:
             raise ConfigError(f"format must be one of {', '.join(FORMATS)}, not {self.format!r}")
 
@@ -103,9 +113,12 @@ class Description:
     scale: tuple[float, ...]
 
     @classmethod
-    def of(cls, spec: ArraySpec) -> "Description":
-        """With the default scales."""
-        return cls(spec, tuple(FULL_SCALE.get(unit, 1.0) / 32767 for unit in spec.units))
+    def of(
+        cls, spec: ArraySpec, range_n: float = RANGE_N, range_nm: float = RANGE_NM
+    ) -> "Description":
+        """With scales for these largest forces and moments, and +-pi rad."""
+        full = {"N": range_n, "N m": range_nm, "rad": RANGE_RAD}
+        return cls(spec, tuple(full.get(unit, 1.0) / 32767 for unit in spec.units))
 
     def to_json(self) -> bytes:
         """The payload of a DESCRIPTION."""
@@ -174,30 +187,35 @@ class NativeSerial(SerialCodec):
 
     def __init__(self, options: NativeOptions) -> None:
         super().__init__(read_array(options.array))
-        self._format = FORMATS[options.format]
+        self._format, self._ranges = FORMATS[options.format], (options.range_n, options.range_nm)
         self._described: Description | None = None
-        self._buffer = ByteBuffer()
+        self._rest = b""  # of a frame that is not complete
         self._synchronised = True
         self._damaged = 0
+        self._flags, self._valid = b"", np.empty((0, 0), np.bool_)  # of the last packet
         self.streaming = False
-        self.whisking: tuple[float, float, float] | None = None  # as last commanded, rad and Hz
+        self.whisking: tuple[float, float, float] | None = None  # as last commanded, Hz and rad
+        self.may_whisk: Callable[[float, float, float], bool] = lambda *asked: True
 
     # the host's side
 
     def feed(self, packet: bytes, t_ns: int) -> Samples | None:
-        heads: list[tuple[Any, ...]] = []
-        payloads: list[bytes] = []
-        damaged: list[int] = []
+        rows: list[tuple[int, ...]] = []
+        parts: list[NDArray[Any]] = []
+        flags = b""
         for kind, head, payload in self._frames(packet):
             if kind == Message.SAMPLE:
                 if self.spec is None:
                     continue  # nothing can be said of it yet
-                if head[7:9] != self.spec.shape:
+                shape = head[7:9]
+                if shape != self.spec.shape:
                     self._refuse()
                     continue
-                heads.append(head)
-                payloads.append(payload)
-                damaged.append(self._damaged)
+                bits = -(-shape[0] // 8)
+                part = np.frombuffer(payload, _TYPES[head[2]], offset=bits).reshape(1, *shape)
+                parts.append(part * self._scale() if head[2] == FORMATS["int16"] else part)
+                flags += payload[:bits]
+                rows.append((t_ns, self._damaged, head[5], head[6], head[4]))
                 self._damaged = 0
             elif kind == Message.DESCRIPTION:
                 found = Description.from_json(payload)
@@ -205,18 +223,18 @@ class NativeSerial(SerialCodec):
                     self._refuse()
                     continue
                 if self.spec is not None and found.spec.shape != self.spec.shape:
-                    del heads[:], payloads[:], damaged[:]  # of what it was before: another device
+                    del rows[:], parts[:]  # of what it was before: another device
+                    flags = b""
                 self._described, self.spec = found, found.spec
-        if not heads:
+        if not rows:
             return None
-        values, valid = self._values([head[2] for head in heads], payloads)
+        values = np.concatenate(parts, dtype=np.float32, casting="same_kind")
+        valid = self._valid_of(flags, len(rows))
         # what is not finite is no measurement, whatever the device says
         finite = np.isfinite(values)
-        if not finite.all():
+        if 0 in finite.tobytes():
             valid &= finite.all(axis=2)
-        _, _, _, _, status, count, ticks, *_ = zip(*heads, strict=True)
-        columns = np.array((damaged, count, ticks, status), np.int64)
-        return Samples(values, valid, np.full(len(heads), t_ns, np.int64), *columns)
+        return Samples(values, valid, *np.array(rows, np.int64).T)
 
     def commands(self, event: Event) -> tuple[Step[bytes], ...]:
         if event == Event.START:
@@ -230,7 +248,7 @@ class NativeSerial(SerialCodec):
         return Step(frame(Message.WHISK, WHISKING.pack(frequency_hz, amplitude_rad, offset_rad)))
 
     def forget(self) -> None:
-        self._buffer.data.clear()
+        self._rest = b""
         self._synchronised = True
 
     # the device's side
@@ -278,7 +296,7 @@ class NativeSerial(SerialCodec):
                 self.streaming = kind == Message.START
             elif kind == Message.WHISK and len(payload) == WHISKING.size:
                 asked = WHISKING.unpack(payload)
-                if np.isfinite(asked).all():
+                if np.isfinite(asked).all() and self.may_whisk(*asked):
                     self.whisking = asked
                 else:
                     error = IMPOSSIBLE
@@ -292,59 +310,50 @@ class NativeSerial(SerialCodec):
     def _description(self) -> Description:
         if self._described is None:
             assert self.spec is not None
-            self._described = Description.of(self.spec)
+            self._described = Description.of(self.spec, *self._ranges)
         return self._described
 
-    def _values(
-        self, forms: list[int], payloads: list[bytes]
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """(n, element, channel) values and (n, element) validity of n payloads."""
-        elements, channels = self._description().spec.shape
-        bits = -(-elements // 8)
-        if len(set(forms)) > 1:  # a device that changed its mind: one by one
-            parts = [self._values([f], [p]) for f, p in zip(forms, payloads, strict=True)]
-            values, valid = zip(*parts, strict=True)
-            return np.concatenate(values), np.concatenate(valid)
-        rows = np.frombuffer(b"".join(payloads), np.uint8).reshape(len(payloads), -1)
-        flags = np.unpackbits(rows[:, :bits], axis=1, count=elements, bitorder="little")
-        body = rows[:, bits:].copy().view(_TYPES[forms[0]]).reshape(-1, elements, channels)
-        if forms[0] == FORMATS["int16"]:
-            scaled: NDArray[Any] = body * np.asarray(self._description().scale)
-            return scaled.astype(np.float32), flags.view(np.bool_)
-        return body.astype(np.float32, copy=False), flags.view(np.bool_)
+    def _scale(self) -> NDArray[np.float64]:
+        """(channel,) SI units per count of int16."""
+        return np.array(self._description().scale)
+
+    def _valid_of(self, flags: bytes, n: int) -> NDArray[np.bool_]:
+        """(n, element) from the validity bits of n samples, which hardly ever change."""
+        if flags != self._flags:
+            assert self.spec is not None
+            bits = np.frombuffer(flags, np.uint8).reshape(n, -1)
+            count = len(self.spec.elements)
+            valid = np.unpackbits(bits, axis=1, count=count, bitorder="little")
+            self._flags, self._valid = flags, valid.view(np.bool_)
+        return self._valid.copy()
 
     def _frames(self, packet: bytes) -> Iterator[tuple[int, tuple[Any, ...], bytes]]:
         """The intact frames that this packet completes: (type, header, payload)."""
-        buffer = self._buffer
-        buffer.data += packet
+        data = self._rest + packet if self._rest else packet
+        at = 0  # all before it is done with
         while True:
-            skipped = buffer.skip_to(SYNC)
-            self.stats.skipped += skipped
-            if skipped and self._synchronised:  # where a frame should have begun
-                self._refuse()
-                self._synchronised = False
-            if len(buffer.data) < HEADER.size:
-                return
-            head = HEADER.unpack_from(buffer.data)
-            if crc16_xmodem(bytes(buffer.data[2 : HEADER.size - 2])) != head[-1]:
-                if self._synchronised:  # else this was never the beginning of a frame
-                    self._refuse()
-                self._synchronised = False
-                self.stats.skipped += 1
-                del buffer.data[:1]
+            begin = data.find(SYNC, at)
+            if begin < 0:  # at the end there may be half of one
+                begin = len(data) - data.endswith(SYNC[:1], at)
+            if begin > at:
+                self.stats.skipped += begin - at
+                at = begin
+                self._lose_sync()  # where a frame should have begun
+            if len(data) - at < HEADER.size:
+                break
+            head = HEADER.unpack_from(data, at)
+            if crc_hqx(data[at + 2 : at + HEADER.size - 2], 0) != head[-1]:  # XMODEM
+                at = self._skip(at)
                 continue
-            size = HEADER.size + head[3] + CRC.size
-            if len(buffer.data) < size:
-                return
-            whole = bytes(buffer.data[: size - CRC.size])
-            (check,) = CRC.unpack_from(buffer.data, size - CRC.size)
-            if zlib.crc32(whole) != check:
-                self._refuse()
-                self._synchronised = False
-                self.stats.skipped += 1
-                del buffer.data[:1]
+            end = at + HEADER.size + head[3]
+            if len(data) < end + CRC.size:
+                break
+            whole = data[at:end]
+            if zlib.crc32(whole) != CRC.unpack_from(data, end)[0]:
+                self._synchronised = True  # this was a frame
+                at = self._skip(at)
                 continue
-            del buffer.data[:size]
+            at = end + CRC.size
             self._synchronised = True
             kind = head[1] & 15
             if head[1] >> 4 != VERSION or (kind == Message.SAMPLE and not _fits(head)):
@@ -352,6 +361,19 @@ class NativeSerial(SerialCodec):
                 continue
             self.stats.intact += 1
             yield kind, head, whole[HEADER.size :]
+        self._rest = data[at:]
+
+    def _skip(self, at: int) -> int:
+        """Here no frame begins; where to look on."""
+        self._lose_sync()
+        self.stats.skipped += 1
+        return at + 1
+
+    def _lose_sync(self) -> None:
+        """Count one damaged frame, however many pieces of it pass for a beginning."""
+        if self._synchronised:
+            self._refuse()
+        self._synchronised = False
 
     def _refuse(self) -> None:
         self.stats.corrupt += 1
@@ -374,6 +396,12 @@ def read_array(path: str) -> ArraySpec | None:
         raise ConfigError(f"{path}: {why}") from None
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
+
+
+def check_ranges(*ranges: float) -> None:
+    """Raise a `ConfigError` if one cannot be a range."""
+    if not all(0 < r <= LARGEST for r in ranges):
+        raise ConfigError("range_n and range_nm must be above 0")
 
 
 def _reply(kind: int) -> bytes:

@@ -16,7 +16,7 @@ be stopped.
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -26,10 +26,13 @@ from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Ste
 from tactile_rt.drivers.codecs.native import (
     FORMATS,
     IMPOSSIBLE,
+    RANGE_N,
+    RANGE_NM,
     STATUS,
     UNKNOWN,
     Description,
     Message,
+    check_ranges,
     pack_valid,
     quantise,
     read_array,
@@ -62,14 +65,18 @@ class NativeCanOptions:
             samples in both.
         format: ``float32`` or ``int16``: what an emulated device sends. A host takes both.
         array: JSON file of an array for devices that do not describe themselves.
+        range_n, range_nm: largest force (N) and moment (N m) of an emulated device's int16.
     """
 
     base: int = 0x100
     fd: bool = False
     format: str = "int16"
     array: str = ""
+    range_n: float = RANGE_N
+    range_nm: float = RANGE_NM
 
     def __post_init__(self) -> None:
+        check_ranges(self.range_n, self.range_nm)
         if not 0 <= self.base <= 0x7FF - DESCRIPTION:
             raise ConfigError(
                 f"base must be from 0 to {0x7FF - DESCRIPTION:#x}, so that base to base + 4 have "
@@ -99,11 +106,13 @@ class NativeCan(CanCodec):
         super().__init__(read_array(options.array))
         self._base, self._fd = options.base, options.fd
         self._float32 = options.format == "float32"
+        self._ranges = options.range_n, options.range_nm
         self._described: Description | None = None
         self._sample = SampleParts(self.stats)
         self._text = DescriptionParts()
         self.streaming = False
         self.whisking: tuple[float, float, float] | None = None  # as last commanded, Hz and rad
+        self.may_whisk: Callable[[float, float, float], bool] = lambda *asked: True
 
     def forget(self) -> None:
         self._sample.forget()
@@ -220,7 +229,10 @@ class NativeCan(CanCodec):
             self.streaming = kind == Message.START
         elif kind == Message.WHISK and len(data) >= WHISKING.size:
             _, mhz, amplitude, offset = WHISKING.unpack_from(data)
-            self.whisking = (mhz / 1e3, amplitude / 1e4, offset / 1e4)
+            asked = (mhz / 1e3, amplitude / 1e4, offset / 1e4)
+            if not self.may_whisk(*asked):
+                return IMPOSSIBLE
+            self.whisking = asked
         else:
             return UNKNOWN
         return 0
@@ -234,5 +246,5 @@ class NativeCan(CanCodec):
 
     def _description(self) -> Description | None:
         if self._described is None and self.spec is not None:
-            return Description.of(self.spec)
+            return Description.of(self.spec, *self._ranges)
         return self._described

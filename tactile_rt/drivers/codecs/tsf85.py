@@ -10,6 +10,7 @@ Sources: facts of the public drivers that go back to Robotiq's tactile sensor in
 (UsbCommands, UsbSensorType and the scales of the motion sensor, +-2 g and +-250 deg/s).
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -216,20 +217,19 @@ class Tsf85(SerialCodec):
 
     def _packets(
         self, buffer: ByteBuffer, packet: bytes
-    ) -> list[tuple[int, list[tuple[tuple[int, int], bytes]]]]:
+    ) -> Iterator[tuple[int, list[tuple[tuple[int, int], bytes]]]]:
         """The packets of sound structure that this completes: (command, signals)."""
         buffer.data += packet
-        found: list[tuple[int, list[tuple[tuple[int, int], bytes]]]] = []
         while True:
             skipped = buffer.skip_to(START)
             self._lose(skipped)
             if len(buffer.data) < 4:
-                return found
+                return
             command, length = buffer.data[2], buffer.data[3]
             signals = None
             if command in (READ, SEND, SEND_WHEN_NEW) and length:
                 if len(buffer.data) < 4 + length:
-                    return found
+                    return
                 signals = _signals(bytes(buffer.data[4 : 4 + length]))
             if signals is None:
                 self._lose(len(buffer.take(1)))
@@ -237,7 +237,7 @@ class Tsf85(SerialCodec):
             buffer.take(4 + length)
             self._synchronised = True
             self.stats.intact += 1
-            found.append((command, signals))
+            yield command, signals  # what follows is lost after it, if it is
 
     def _lose(self, n: int) -> None:
         self.stats.skipped += n

@@ -86,6 +86,8 @@ class Emulator:
         if codec.spec is None:
             codec.spec = source.spec
         self.codec, self.source, self.endpoint = codec, source, endpoint
+        if hasattr(codec, "may_whisk") and hasattr(source, "may_whisk"):
+            codec.may_whisk = source.may_whisk  # what it cannot do is not acknowledged
         self.log = DeviceLog(log)
         self._fit = fit(source.spec, codec.spec)
         self._seconds = seconds

@@ -57,6 +57,15 @@ NOT_NEGATIVE = ("damping_ratio", "friction")
 POSITIVE = {"arc_length_mm": "length"} | {
     column: field for column, field in OPTIONAL.items() if field not in NOT_NEGATIVE
 }
+# What lies outside is in another unit, or beyond what can be simulated: in the columns' units.
+PLAUSIBLE = {
+    "arc_length_mm": (0.1, 500.0),
+    "base_radius_mm": (5e-4, 50.0),
+    "tip_radius_mm": (5e-4, 50.0),
+    "young_modulus_pa": (1e4, 1e13),
+    "density_base_kg_m3": (100.0, 1e5),
+    "density_tip_kg_m3": (100.0, 1e5),
+}
 NAME = re.compile(r"[\w.+-]+")  # MuJoCo's names are cut at spaces and joined by slashes
 TAKEN = ("world", "head", "object")  # bodies that share a model with the whiskers
 
@@ -117,6 +126,12 @@ class Whisker:
         for name in NOT_NEGATIVE:
             if not 0 <= getattr(self, name) < math.inf:
                 raise ConfigError(f"{who}: {name} must be 0 or more, not {getattr(self, name):g}")
+        for column, (least, most) in PLAUSIBLE.items():
+            value = getattr(self, POSITIVE[column])
+            if not least <= value <= most:
+                raise ConfigError(
+                    f"{who}: {column} must be {least:g} to {most:g}, not {value:g}: mind the unit"
+                )
         if self.tip_radius > self.base_radius:
             raise ConfigError(
                 f"{who}: tip_radius_mm {self.tip_radius:g} exceeds base_radius_mm "

@@ -14,32 +14,34 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt import __version__
 from tactile_rt.recording import (
+    MANIFEST,
     SweepManifest,
     has_object,
     read_skipped,
     write_object,
     write_skipped,
 )
-from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.arrays.whisker_array import load_animals
 from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
 from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove_leftovers
 from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObjects, choose_objects
 from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
 from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
-from tactile_rt.sim_backend.datasets.sums import write_sums
+from tactile_rt.sim_backend.datasets.sums import write_sums, written_sum
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import SweepSimulation
-from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, world_spec
 from tactile_rt.stream import Chunk, ConfigError, SourceError, TactileError
 from tactile_rt.timebase import Resampler
 
-__all__ = ["describe_set", "fingerprint", "make_sweeps", "simulate_sweep"]
+__all__ = ["describe_set", "fingerprint", "finished_objects", "make_sweeps", "simulate_sweep"]
 
 # Of a sweep's parameters; the others are numbers.
 KINDS: dict[str, type] = {"draw": np.int64, "touches": np.bool_, "unstable": np.bool_}
@@ -54,14 +56,15 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
     Raises:
         ConfigError: objects or array are not there, or cannot be split as the recipe says.
     """
-    objects, array = choose_objects(recipe.objects), load_array(recipe.array)
-    morphology = repr((array.whiskers, array.mount))
+    objects, animals = choose_objects(recipe.objects), load_animals(recipe.array)
+    heads = [(animal.whiskers, animal.mount) for animal in animals]
+    morphology = repr(heads if len(heads) > 1 else heads[0])
     # Said in full: a later release may know more categories.
     chosen = replace(recipe.objects, categories=objects.categories, withheld=objects.withheld)
     of_meshes = () if recipe.objects.source == SHAPES else ("coacd",)
     packages = ("mujoco", "numpy", "scipy", "trimesh", *of_meshes)
     return SweepManifest(
-        spec=array_spec(array.whiskers, array.name),
+        spec=world_spec(animals),
         period_ns=recipe.period_ns,
         lead=recipe.lead,
         categories=objects.categories,
@@ -97,20 +100,22 @@ def make_sweeps(
         address: of the Ray cluster, see `engines.run_ray`.
 
     Raises:
-        ConfigError: no such split or engine, or the folder holds another set.
+        ConfigError: no such split or engine, or the folder holds another set, or sweeps of who
+            knows which.
         TactileError: an object kills every process that tries to make it.
     """
     if engine not in ENGINES:
         raise ConfigError(misnamed("engine", engine, ENGINES))
     manifest = describe_set(recipe)
     names = manifest.names(splits)  # which refuses unknown ones before anything is written
+    _refuse_strays(folder, manifest)
     manifest.write(folder)
     remove_leftovers(folder)
     skipped = read_skipped(folder)
     if broken := choose_objects(recipe.objects).skipped:
         skipped = broken | skipped
         write_skipped(folder, skipped)
-    done = [n for n in names if n in skipped or has_object(folder, n)]
+    done = finished_objects(folder, names)
     yield from done
     missing = set(names) - set(done)
     todo = [n for n in names if n in missing]
@@ -127,6 +132,25 @@ def make_sweeps(
             write_skipped(folder, skipped)
         yield name
     write_sums(folder)
+
+
+def finished_objects(folder: Path, names: Sequence[str]) -> list[str]:
+    """Which of these objects need no more work: they are there, or cannot be made."""
+    skipped = read_skipped(folder) if folder.is_dir() else {}
+    return [n for n in names if n in skipped or has_object(folder, n)]
+
+
+def _refuse_strays(folder: Path, manifest: SweepManifest) -> None:
+    """Without its manifest a folder's sweeps may be another set's: take them for no one's."""
+    strays = (f for n in manifest.names() for f in (f"{n}.npz", f"{n}.part"))
+    if (folder / MANIFEST).exists() or not any((folder / f).exists() for f in strays):
+        return
+    text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
+    if written_sum(folder, MANIFEST) != hashlib.sha256(text).hexdigest():
+        raise ConfigError(
+            f"{folder} holds sweeps but no {MANIFEST} that says what made them: choose another "
+            "folder (a finished set goes on with the options that began it)"
+        )
 
 
 @dataclass(frozen=True)
@@ -197,11 +221,14 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
         `unstable`, 1 when it could not be simulated at this profile: its values are 0 then.
     """
     rng, profile = recipe.rng(target.name, index), PROFILES[recipe.profile]
-    ideal = load_array(recipe.array)
-    array = recipe.randomisation.draw(recipe.rng(target.name, index, RANDOMISATION), ideal)
+    ideal = load_animals(recipe.array)
+    # The description stays the ideal arrays': a robot does not know by how much its own differs.
+    spec = world_spec(ideal)
+    draws = recipe.rng(target.name, index, RANDOMISATION)
+    animals = tuple(recipe.randomisation.draw(draws, animal) for animal in ideal)
     for _ in range(1 if recipe.sweeps.is_grid else DRAWS):
         sweep = recipe.sweeps.draw(rng, index)
-        simulation = SweepSimulation(array, target, sweep, profile)
+        simulation = SweepSimulation(animals, target, sweep, profile)
         chunk = _with_lead(recipe, simulation) if simulation.touches else None
         if chunk is not None:
             break
@@ -212,10 +239,8 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
         "unstable": float(simulation.touches and chunk is None),
     }
     if chunk is None:
-        chunk = _chunk(recipe, np.zeros((0, len(ideal.whiskers), 6)))
+        chunk = _chunk(recipe, np.zeros((0, *spec.shape)))
     if recipe.sensor != SensorModel():
-        # The description stays the ideal array's: a robot does not know by how much it differs.
-        spec = array_spec(ideal.whiskers, ideal.name)
         sensor = Sensor(recipe.sensor, spec, recipe.key(target.name, index, SENSOR))
         chunk = sensor.push(chunk) or chunk
     return SweepRecord(_resampled(recipe, chunk), parameters)

@@ -197,7 +197,8 @@ def _join_cluster(ray: Any, address: str | None, processes: int | None) -> None:
             except ConnectionError:
                 ray.init(address="local", **here, **options)
     except (OSError, ValueError) as error:
-        raise ConfigError(f"no Ray cluster at {address or 'this machine'}: {error}") from None
+        why = "give its HOST:PORT" if isinstance(error, ValueError) else error
+        raise ConfigError(f"no Ray cluster at {address or 'this machine'}: {why}") from None
 
 
 def _call(work: Work, name: str) -> str | None:

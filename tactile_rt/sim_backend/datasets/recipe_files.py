@@ -3,10 +3,12 @@
 import math
 import tomllib
 from collections.abc import Sequence
+from contextlib import suppress
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from tactile_rt.sim_backend.arrays.whisker_array import load_animals
 from tactile_rt.sim_backend.datasets.recipe_tables import Table, misnamed
 from tactile_rt.sim_backend.datasets.recipes import (
     PARAMETERS,
@@ -20,6 +22,7 @@ from tactile_rt.sim_backend.datasets.recipes import (
 )
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import SensorModel
+from tactile_rt.sim_backend.sweep import usual_distance
 from tactile_rt.stream import ConfigError
 
 __all__ = [
@@ -112,10 +115,15 @@ def recipe_from_dict(raw: dict[str, Any], where: str = "recipe") -> SweepRecipe:
     top = Table(where, raw)
     objects, sweeps = top.table("objects"), top.table("sweeps")
     source, array = objects.text("from", SHAPES), top.text("array", SweepRecipe.array)
+    array = _absolute(array) if Path(array).suffix else array
+    usual = {name: getattr(SweepChoice, name) for name in PARAMETERS}
+    if "distance_mm" not in sweeps:
+        with suppress(ConfigError):  # of an array that is not there: told when it is needed
+            usual["distance_mm"] = usual_distance(load_animals(array))
     all_of_it = source != SHAPES  # a folder's own counts; the published split is 8 : 1 : 1
     recipe: dict[str, Any] = {
         "name": top.text("name", SweepRecipe.name),
-        "array": _absolute(array) if Path(array).suffix else array,
+        "array": array,
         "profile": top.text("profile", SweepRecipe.profile),
         "seed": top.whole("seed", SweepRecipe.seed),
         "period_ms": top.number("period_ms", SweepRecipe.period_ms),
@@ -131,7 +139,7 @@ def recipe_from_dict(raw: dict[str, Any], where: str = "recipe") -> SweepRecipe:
             per_withheld=objects.whole("per_withheld", 0),
         ),
         "sweeps": SweepChoice(
-            **{n: _choice(sweeps, n, getattr(SweepChoice, n)) for n in PARAMETERS},
+            **{n: _choice(sweeps, n, usual[n]) for n in PARAMETERS},
             draws=sweeps.whole("draws", 1),
             held_out_draws=sweeps.whole("held_out_draws", 0),
         ),

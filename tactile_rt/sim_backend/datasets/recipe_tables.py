@@ -33,6 +33,9 @@ class Table:
         self.where, self.prefix = where, prefix
         self._raw, self._asked = raw, dict[str, None]()
 
+    def __contains__(self, key: str) -> bool:
+        return key in self._raw
+
     def take(self, key: str) -> Any:
         """The value of a key, or None."""
         self._asked[key] = None

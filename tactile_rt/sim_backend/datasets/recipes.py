@@ -13,6 +13,7 @@
     [sweeps]
     draws = 12                # for every combination of the `each` values
     height_mm = { each = [-5, 0] }
+    distance_mm = 6.5         # left out, in proportion to how far the array's whiskers reach
     speed_mm_s = { between = [28, 40] }
     size_mm = 40
 
@@ -23,15 +24,22 @@ one of the profiles cannot simulate, which are drawn again).
 
 import zlib
 from dataclasses import asdict, dataclass, fields
-from itertools import product
 from typing import Any
 
 import numpy as np
 
+from tactile_rt.sim_backend.datasets.recipe_choices import (
+    PARAMETERS,
+    SHAPES,
+    Between,
+    Choice,
+    Each,
+    ObjectChoice,
+    SweepChoice,
+)
 from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import SensorModel
-from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
 from tactile_rt.stream import ConfigError
 
@@ -46,101 +54,9 @@ __all__ = [
     "SweepRecipe",
 ]
 
-SHAPES = "shapes"
+OBJECTS, SWEEPS = ObjectChoice(), SweepChoice()
 PERFECT, UNVARIED = SensorModel(), Randomisation()
-POSITIVE = ("size_mm", "speed_mm_s")  # of the sweep's parameters; a gap may also be 0
-
-
-@dataclass(frozen=True)
-class Between:
-    """Drawn evenly from an interval, afresh for every sweep."""
-
-    low: float
-    high: float
-
-
-@dataclass(frozen=True)
-class Each:
-    """Every one of these values, with every one of the other parameters'."""
-
-    values: tuple[float, ...]
-
-
-Choice = float | Between | Each
-
-
-@dataclass(frozen=True)
-class ObjectChoice:
-    """Which objects, and who is held out.
-
-    Attributes:
-        source: "shapes" (the parametric ones) or a folder of meshes.
-        categories: class names; empty: all that there are.
-        withheld: categories of the extra split "withheld", which is for open-set tests: their
-            objects are in no other split. Empty: none, or `objects.WITHHELD` if `per_withheld`
-            asks for some.
-        per_category: objects of every category; 0: all that the folder has.
-        validation, test: how many of every category are held out; below 1 a fraction.
-        per_withheld: objects of every withheld category; 0: 12, or all that the folder has.
-    """
-
-    source: str = SHAPES
-    categories: tuple[str, ...] = ()
-    withheld: tuple[str, ...] = ()
-    per_category: int = 60
-    validation: float = 4
-    test: float = 12
-    per_withheld: int = 0
-
-
-@dataclass(frozen=True)
-class SweepChoice:
-    """How every object is swept: see `sweep.Sweep` for the parameters.
-
-    Attributes:
-        draws: sweeps of every combination of the `Each` values.
-        held_out_draws: as many more, marked by a `draw` of `draws` and above.
-    """
-
-    size_mm: Choice = 40.0
-    speed_mm_s: Choice = 34.0
-    yaw_deg: Choice = 0.0
-    height_mm: Choice = -2.0
-    distance_mm: Choice = 6.5
-    gap_mm: Choice = 2.0
-    draws: int = 1
-    held_out_draws: int = 0
-
-    def combinations(self) -> list[dict[str, float]]:
-        """The `Each` values, in every combination; the last parameter varies fastest."""
-        each = {n: c.values for n in PARAMETERS if isinstance(c := getattr(self, n), Each)}
-        return [dict(zip(each, values, strict=True)) for values in product(*each.values())]
-
-    def __len__(self) -> int:
-        return len(self.combinations()) * (self.draws + self.held_out_draws)
-
-    @property
-    def is_grid(self) -> bool:
-        """Whether a sweep that misses the array stays: a grid is to have all its points."""
-        return any(isinstance(getattr(self, n), Each) for n in PARAMETERS)
-
-    def draw_index(self, index: int) -> int:
-        """Which draw of its combination sweep `index` of an object is, from 0."""
-        return index % (self.draws + self.held_out_draws)
-
-    def draw(self, rng: np.random.Generator, index: int) -> Sweep:
-        """Draw the parameters of sweep `index`."""
-        values = self.combinations()[index // (self.draws + self.held_out_draws)]
-        for name in PARAMETERS:
-            choice = getattr(self, name)
-            if isinstance(choice, Between):
-                values[name] = float(rng.uniform(choice.low, choice.high))
-            elif not isinstance(choice, Each):
-                values[name] = float(choice)
-        return Sweep(**values)
-
-
-PARAMETERS = tuple(f.name for f in fields(SweepChoice) if not f.name.endswith("draws"))
+LONGEST_MS = 600_000.0
 
 
 @dataclass(frozen=True)
@@ -149,7 +65,7 @@ class SweepRecipe:
 
     Attributes:
         name: what the set is called.
-        array: which whiskers, see `arrays.load_array`.
+        array: which whiskers, see `whisker_array.load_animals`.
         profile: simulation profile, see `array.PROFILES`.
         seed: of the drawn parameters.
         period_ms: of the stored samples, ms.
@@ -172,8 +88,8 @@ class SweepRecipe:
     period_ms: float = 9.0  # five of them make one network step (Chung et al. 2025)
     lead_ms: float = 216.0
     length_ms: float = 1476.0  # 22 network steps from onset and to spare
-    objects: ObjectChoice = ObjectChoice()
-    sweeps: SweepChoice = SweepChoice()
+    objects: ObjectChoice = OBJECTS
+    sweeps: SweepChoice = SWEEPS
     sensor: SensorModel = PERFECT
     randomisation: Randomisation = UNVARIED
 
@@ -251,41 +167,12 @@ def _check_recipe(recipe: SweepRecipe) -> None:
         raise ConfigError(
             f"period_ms must be {SAMPLE_MS:g} or more, the simulator's own, not {recipe.period_ms}"
         )
+    if not recipe.length_ms <= LONGEST_MS:
+        raise ConfigError(f"length_ms must be at most {LONGEST_MS:g}, not {recipe.length_ms:g}")
     if not 0 <= recipe.lead < recipe.samples:
         raise ConfigError(
             f"length_ms ({recipe.length_ms:g}) must exceed lead_ms ({recipe.lead_ms:g}), which "
             "must be 0 or more"
         )
-    sweeps, objects = recipe.sweeps, recipe.objects
-    if sweeps.draws < 1:
-        raise ConfigError(f"sweeps.draws must be at least 1, not {sweeps.draws}")
-    if sweeps.held_out_draws < 0:
-        raise ConfigError(f"sweeps.held_out_draws must be 0 or more, not {sweeps.held_out_draws}")
-    for name in PARAMETERS:
-        choice = getattr(sweeps, name)
-        if isinstance(choice, Between) and choice.low > choice.high:
-            raise ConfigError(
-                f"sweeps.{name}: between has its lower end first, not {choice.low:g}, "
-                f"{choice.high:g}"
-            )
-        lowest = _lowest(choice)
-        if (name in POSITIVE and lowest <= 0) or (name == "gap_mm" and lowest < 0):
-            least = "0 or more" if name == "gap_mm" else "positive"
-            raise ConfigError(f"sweeps.{name} must be {least}, not {lowest:g}")
-    both = sorted(set(objects.categories) & set(objects.withheld))
-    if both:
-        raise ConfigError(f"objects.withheld: {both[0]!r} is also one of the categories")
-    whole = objects.source == SHAPES
-    if objects.per_withheld < 0:
-        raise ConfigError(f"objects.per_withheld must be 0 or more, not {objects.per_withheld}")
-    for name in ("per_category", "validation", "test"):
-        value = getattr(objects, name)
-        if value < 0 or (whole and value < 1) or (value >= 1 and value != int(value)):
-            kinds = "a whole number" if whole else "a whole number, or a fraction below 1"
-            raise ConfigError(f"objects.{name} must be {kinds}, at least 1, not {value:g}")
-
-
-def _lowest(choice: Choice) -> float:
-    if isinstance(choice, Between):
-        return choice.low
-    return min(choice.values) if isinstance(choice, Each) else choice
+    recipe.objects.check()
+    recipe.sweeps.check()

@@ -6,7 +6,7 @@ from pathlib import Path
 from tactile_rt.recording import MANIFEST, SKIPPED, SweepManifest, has_object, write_whole
 from tactile_rt.stream import RecordingError
 
-__all__ = ["SUMS", "check_sums", "write_sums"]
+__all__ = ["SUMS", "check_sums", "write_sums", "written_sum"]
 
 SUMS = "SHA256SUMS"
 
@@ -24,6 +24,11 @@ def write_sums(folder: Path) -> None:
     known.pop(SKIPPED, None)  # the one file that grows
     lines = [f"{known.get(n) or _sha256(folder / n)}  {n}\n" for n in sorted(names)]
     write_whole(folder / SUMS, lambda file: file.write("".join(lines).encode()))
+
+
+def written_sum(folder: Path, name: str) -> str | None:
+    """The checksum that a file of a finished set had; None if there is none."""
+    return _read_sums(folder).get(name) if (folder / SUMS).exists() else None
 
 
 def check_sums(folder: Path) -> int:

@@ -1,0 +1,143 @@
+"""`tactile-rt hil`: hardware in the loop, with an emulated device."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+from urllib.parse import parse_qsl
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from tactile_rt.cli import INTERRUPTED, app, starting
+from tactile_rt.cli.emulating import codec_options
+from tactile_rt.cli.live import leaving
+from tactile_rt.stream import ConfigError
+
+if TYPE_CHECKING:
+    from tactile_rt.hil import LoopReport
+
+SWEEPS = 6  # unless told otherwise
+
+
+@app.command()
+def hil(
+    source: Annotated[
+        str | None,
+        typer.Option(help="What the device measures. Default: sim:mouse with new objects."),
+    ] = None,
+    wire: Annotated[str, typer.Option(help="serial, slcan or virtual (a CAN bus).")] = "serial",
+    codec: Annotated[str, typer.Option(help="What the device speaks.")] = "native",
+    option: Annotated[
+        list[str] | None,
+        typer.Option(help="Of the codec: NAME=VALUE, e.g. format=int16; may be repeated."),
+    ] = None,
+    faults: Annotated[Path | None, typer.Option(help="A .toml of what goes wrong.")] = None,
+    sweeps: Annotated[
+        int | None, typer.Option(min=1, help=f"Of sim:, how many objects pass. Default: {SWEEPS}.")
+    ] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.001, max=1e9, help="Leave after so much of the stream.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the default source.")] = 0,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="In real time, not as fast as it goes.")
+    ] = False,
+    clock: Annotated[
+        str, typer.Option(help="Time of the driver's samples: device; host (in real time).")
+    ] = "device",
+    model: Annotated[
+        Path | None, typer.Option(help="An .onnx model; default: the package's own.")
+    ] = None,
+) -> None:
+    """Run a simulated array through an emulated device and its real driver.
+
+    The classifier's decisions on what the driver delivers are compared with
+    those on the same samples without device and wire. Native float32 must be
+    equal in every bit; of what a format rounds, 99 % of the decisions must
+    have the same label; with --faults, each loss must be counted. Exit code
+    1 if it is not so.
+    """
+    from tactile_rt.drivers.emulation.faults import read_faults
+    from tactile_rt.hil import Loop, check_line
+    from tactile_rt.model_file import load_model, shipped_model
+    from tactile_rt.sources import open_source
+
+    file = model or shipped_model()
+    if source is None:
+        unseen = load_model(file)[1].provenance.get("unseen_objects", [])
+        source = f"sim:mouse?seed={seed}" + (f"&objects={','.join(unseen)}" if unseen else "")
+    if source.startswith(("sim:", "whisking:")):
+        source = _with(source, "pace", "realtime" if realtime else "fast")
+    if source.startswith("sim:"):
+        if sweeps is not None or seconds is None:
+            source = _with(source, "sweeps", str(sweeps or SWEEPS))
+    elif sweeps is not None:
+        raise ConfigError("--sweeps is of a sim: source; of others give --seconds")
+    schedule = read_faults(faults) if faults else None
+    fields = codec_options(option or [])
+    check_line(wire, codec, fields, clock)
+    console = Console(stderr=True)
+    with starting():
+        opened = open_source(source)
+    try:
+        loop = Loop(opened, file, wire, codec, fields, schedule, seconds, clock)
+    except BaseException:
+        opened.close()
+        raise
+    with leaving(None), console.status(f"{wire}, {codec}"):
+        loop.run()
+    report = loop.report()
+    Console().print(_table(report, source, f"{codec} over {wire}"))
+    if not loop.complete:
+        typer.echo("interrupted: what was on its way is missing above", err=True)
+        raise typer.Exit(INTERRUPTED)
+    if report.failure:
+        typer.secho(f"tactile-rt: {report.failure}", err=True, fg="red")
+        raise typer.Exit(1)
+
+
+def _with(url: str, name: str, value: str) -> str:
+    """The URL with this option, unless it has one."""
+    _, mark, query = url.partition("?")
+    if any(key == name for key, _ in parse_qsl(query, keep_blank_values=True)):
+        return url
+    return f"{url}{'&' if mark else '?'}{name}={value}"
+
+
+def _table(report: "LoopReport", source: str, title: str) -> Table:
+    table = Table("", "", title=title, show_header=False, title_justify="left")
+    decisions = max(report.direct, report.wire)
+    stats, health = report.stats, report.health
+
+    def share(n: int, of: int) -> str:
+        return f"{n} of {of}" + (f" ({100 * n / of:.2f} %)" if of else "")
+
+    table.add_row("source", source.partition("?")[0])
+    table.add_row("samples", f"{report.samples}, {stats.delivered} through the driver")
+    table.add_row("identical samples", share(report.identical_samples, report.samples))
+    table.add_row("decisions", f"{report.direct} direct, {report.wire} through the driver")
+    table.add_row("identical decisions", share(report.identical, decisions))
+    table.add_row("same labels", share(report.same_label, decisions))
+    table.add_row("same final labels", share(report.finals_same, report.finals))
+    table.add_row(
+        "lost",
+        f"{stats.missing} missing, {stats.corrupt} corrupt, {stats.dropped} dropped, "
+        f"{stats.duplicates} duplicates; {'all' if report.accounted else 'NOT all'} accounted for",
+    )
+    table.add_row("latency", _spread(report.latency_s, 1e3, "ms") or "not in real time")
+    late = _spread(report.stamp_error_s, 1e3, "ms")
+    table.add_row(
+        "clock",
+        (f"host, late by {late}; drift {health.drift_ppm:.1f} ppm" if late else "device")
+        + f"; {health.clock_steps} steps, {health.counter_resets} resets of the counter",
+    )
+    return table
+
+
+def _spread(values: object, scale: float, unit: str) -> str:
+    import numpy as np
+
+    if values is None:
+        return ""
+    p50, p99, worst = np.percentile(values, (50, 99, 100)) * scale  # type: ignore[call-overload]
+    return f"p50 {p50:.2f}, p99 {p99:.2f}, worst {worst:.2f} {unit}"

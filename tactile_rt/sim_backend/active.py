@@ -1,0 +1,205 @@
+"""The simulated array that whisks, as a `Source` without end.
+
+whisking:mouse?frequency_hz=8&amplitude_deg=20&offset_deg=0
+whisking:mouse?object=mug-50&position_mm=25,5,0&size_mm=20&yaw_deg=30&pace=fast&noise_force=1e-5
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.arrays.whiskers import rotation
+from tactile_rt.sim_backend.objects.catalogue import load_object
+from tactile_rt.sim_backend.pacing import CHUNK_SAMPLES, PacedSource, check_pace
+from tactile_rt.sim_backend.sensor import Sensor, SensorModel
+from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
+from tactile_rt.sim_backend.whisking_drive import Drive, Whisking
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
+from tactile_rt.stream import Chunk, ConfigError, EndOfStream
+
+__all__ = ["WhiskingOptions", "WhiskingSource"]
+
+LARGEST_MM = 1e3  # of an object and its position
+
+
+@dataclass(frozen=True)
+class WhiskingOptions(SensorModel):
+    """How the array whisks at first, against what, and what its sensors make of it.
+
+    The fields of `SensorModel` are options too and concern the loads; angles are true.
+
+    Attributes:
+        frequency_hz: cycles per second.
+        amplitude_deg, offset_deg: protraction is offset + amplitude sin(2 pi f t) from rest,
+            rostral positive, degrees. See `Whisking` for the ranges.
+        object: name (``mug-50``), category or mesh file of what stands beside the array; empty:
+            it whisks in air.
+        position_mm: of the object's centre: ``x,y,z``, x lateral (away from the head), y rostral,
+            z up, from the array's origin, mm.
+        size_mm: largest extent of the object, mm.
+        yaw_deg: its rotation about z, degrees.
+        seconds: how long the stream lasts; 0: without end.
+        seed: of the sensors' imperfections.
+        profile: simulation profile, see `world.PROFILES`.
+        pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
+    """
+
+    frequency_hz: float = 8.0
+    amplitude_deg: float = 20.0
+    offset_deg: float = 0.0
+    object: str = ""
+    position_mm: str = "25,5,0"
+    size_mm: float = 20.0
+    yaw_deg: float = 0.0
+    seconds: float = 0.0
+    seed: int = 0
+    profile: str = "realtime"
+    pace: str = "realtime"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_pace(self.pace)
+        if self.profile not in PROFILES:
+            raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
+        if not 0 < self.size_mm <= LARGEST_MM:
+            raise ConfigError(f"size_mm must be above 0, at most {LARGEST_MM:g}: {self.size_mm:g}")
+        if not math.isfinite(self.yaw_deg):
+            raise ConfigError(f"yaw_deg must be a number of degrees, not {self.yaw_deg}")
+        if not 0 <= self.seconds < math.inf:
+            raise ConfigError(f"seconds must be 0 or more, not {self.seconds}")
+        if self.seed < 0:
+            raise ConfigError(f"seed must be 0 or more, not {self.seed}")
+        _ = self.whisking, self.position
+
+    @property
+    def whisking(self) -> Whisking:
+        """The first command."""
+        turns = math.radians(self.amplitude_deg), math.radians(self.offset_deg)
+        return Whisking(self.frequency_hz, *turns)
+
+    @property
+    def position(self) -> tuple[float, float, float]:
+        """`position_mm` as numbers."""
+        try:
+            x, y, z = (float(part) for part in self.position_mm.split(","))
+            if not all(abs(v) <= LARGEST_MM for v in (x, y, z)):
+                raise ValueError
+        except ValueError:
+            raise ConfigError(
+                f"position_mm is three numbers x,y,z of at most {LARGEST_MM:g}, not "
+                f"{self.position_mm!r}"
+            ) from None
+        return x, y, z
+
+
+class WhiskingSource(PacedSource):
+    """An array in MuJoCo that whisks, alone or against an object that stands beside it.
+
+    Its channels are the six base loads, in the frame of each base, which turns, and ``angle``: the
+    protraction of each base from rest, rad, rostral positive; each the mean over its millisecond.
+    Two sources that are given the same commands at the same samples deliver the same.
+
+    Args:
+        array: which array, see `arrays.load_array`: ``mouse`` (also if empty), ``rat-left``, a
+            .csv or .toml file.
+        options: how it whisks, and against what.
+
+    Attributes:
+        commands: (first sample that it concerns, command), in order.
+
+    Raises:
+        ConfigError: no such array or object, or whiskers begin inside the object.
+    """
+
+    Options = WhiskingOptions
+
+    def __init__(self, array: str, options: WhiskingOptions) -> None:
+        animal = load_array(array or "mouse")
+        loads = array_spec(animal.whiskers, animal.name)
+        spec = replace(loads, channels=(*loads.channels, "angle"), units=(*loads.units, "rad"))
+        super().__init__(spec, options.pace)
+        left = all(w.base[0] < 0 for w in animal.whiskers)
+        self._sensor = Sensor(options, loads, options.seed)
+        self._loads = loads
+        self._drive = Drive(options.whisking)
+        profile = PROFILES[options.profile]
+        self._simulation: WhiskSimulation | None = WhiskSimulation(
+            animal.whiskers,
+            self._drive,
+            profile,
+            _pieces(options, left),
+            HEAD.mirrored() if left else HEAD,
+        )
+        steps = np.arange(round(SAMPLE_MS / profile.timestep_ms))
+        self._steps_s = steps * (profile.timestep_ms * 1e-3)
+        self._samples = round(options.seconds * 1e3 / SAMPLE_MS) or None
+        self._sent = 0  # samples simulated so far
+        self._wanted: Whisking | None = None
+        self.commands: list[tuple[int, Whisking]] = [(0, options.whisking)]
+
+    def set_whisking(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> None:
+        """Whisk like this from the next sample that is not yet simulated on; from any thread.
+
+        The motion glides there, see `whisking_drive`.
+
+        Raises:
+            ConfigError: out of range; the array goes on as before.
+        """
+        self._wanted = Whisking(frequency_hz, amplitude_rad, offset_rad)
+
+    def may_whisk(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> bool:
+        """Whether `set_whisking` takes this."""
+        try:
+            Whisking(frequency_hz, amplitude_rad, offset_rad)
+        except ConfigError:
+            return False
+        return True
+
+    def close(self) -> None:
+        super().close()
+        self._simulation = None
+
+    def _simulate(self, start_ns: int) -> Chunk | None:
+        left = CHUNK_SAMPLES if self._samples is None else self._samples - self._sent
+        simulation = self._simulation
+        if left <= 0 or simulation is None:
+            raise EndOfStream
+        wanted, self._wanted = self._wanted, None
+        if wanted is not None:
+            self._drive.command(wanted, self._sent * SAMPLE_MS * 1e-3)
+            self.commands.append((self._sent, wanted))
+        n = min(CHUNK_SAMPLES, left)
+        seq = self._sent + np.arange(n, dtype=np.int64)
+        values, _ = simulation.advance(n)
+        self._sent += n
+        angles = self._angles(seq)
+        valid = np.ones(values.shape[:2], dtype=np.bool_)
+        t_ns = start_ns + seq * round(SAMPLE_MS * 1e6)
+        felt = self._sensor.push(Chunk(seq, t_ns, values.astype(np.float32), valid))
+        self.stats.missing = self._sensor.dropped
+        if felt is None:
+            return None
+        angle = np.empty((len(felt), values.shape[1], 1), dtype=np.float32)
+        angle[:] = angles[felt.seq - seq[0], None, None]
+        return Chunk(felt.seq, felt.t_ns, np.concatenate([felt.values, angle], 2), felt.valid)
+
+    def _angles(self, seq: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(n,) mean protraction over each sample's physics steps, rad."""
+        times = seq[:, None] * (SAMPLE_MS * 1e-3) + self._steps_s
+        means: NDArray[np.float64] = (
+            self._drive.protraction(times.ravel()).reshape(times.shape).mean(axis=1)
+        )
+        return means
+
+
+def _pieces(options: WhiskingOptions, left: bool) -> tuple[NDArray[np.float64], ...]:
+    """Corners (points, 3) of the object's convex pieces in the world, mm."""
+    if not options.object:
+        return ()
+    at = np.array(options.position) * (-1.0 if left else 1.0, 1.0, 1.0)
+    turn = rotation("z", np.radians(options.yaw_deg))
+    pieces = load_object(options.object).pieces
+    return tuple(p.vertices * options.size_mm @ turn.T + at for p in pieces)
