@@ -85,7 +85,8 @@ def mug(sides: int = 24) -> trimesh.Trimesh:
     cup = Manifold.cylinder(40, 14, 14, sides) - Manifold.cylinder(40, 11.5, 11.5, sides).translate(
         [0, 0, 3]
     )
-    ring = CrossSection([[(9 + 2.5 * np.cos(a), 2.5 * np.sin(a)) for a in np.arange(8) * np.pi / 4]])
+    turns = np.arange(8) * np.pi / 4
+    ring = CrossSection([[(9 + 2.5 * np.cos(a), 2.5 * np.sin(a)) for a in turns]])
     handle = Manifold.revolve(ring, 16).rotate([90, 0, 0]).translate([15, 0, 20])
     return as_mesh(cup + (handle - Manifold.cylinder(40, 12.5, 12.5, sides)))
 
@@ -167,8 +168,10 @@ def depths(points: Floats, pieces: Sequence[trimesh.Trimesh]) -> Floats:
         low, high = piece.bounds
         near = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
         if len(near):
-            planes = np.einsum("ij,ij->i", piece.face_normals, piece.triangles[:, 0])
-            depth = (planes[:, None] - piece.face_normals @ points[near].T).min(axis=0)
+            normals = piece.face_normals
+            planes = np.einsum("ij,ij->i", normals, piece.triangles[:, 0])
+            real = normals.any(axis=1)  # a triangle without height has none
+            depth = (planes[real, None] - normals[real] @ points[near].T).min(axis=0)
             deepest[near] = np.maximum(deepest[near], depth)
     return deepest
 

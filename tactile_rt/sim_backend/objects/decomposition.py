@@ -4,10 +4,12 @@ The part that is worst is cut in two, by that plane of some dozens which leaves 
 hulls, until the hull of every part is near enough; then hulls that fit in one are joined. A hull is
 near enough when no point of the solid's surface lies deeper inside it than the tolerance, and no
 point of its own lies farther outside the solid. Concave corners are cut along their own faces (an L
-becomes two boxes exactly); a smooth hollow becomes facets as wide as the tolerance allows.
+becomes two boxes exactly); a smooth hollow becomes facets as wide as the tolerance allows. At last
+the union is measured: two hulls that bulge into a narrow cleft from either side may fill it, and
+are cut further.
 
 CoACD (Wei et al. 2022) bounds the volume that hulls add and a sampled distance instead. It is good
-for few, coarse pieces; a torus to 0.1 mm of 40 takes it 513 pieces and 60 s, and this 41 and 4 s.
+for few, coarse pieces; see docs/objects.md for the same meshes in both ways.
 """
 
 import heapq
@@ -16,21 +18,31 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import count
 
-import manifold3d
 import numpy as np
 import trimesh
 from manifold3d import Manifold
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
-from tactile_rt.sim_backend.objects.deviation import FACES, Surface, shuffled, tiles
+from tactile_rt.sim_backend.objects.deviation import (
+    FACES,
+    TOUCHING,
+    Deviation,
+    Surface,
+    deviation,
+    shuffled,
+    tiles,
+)
+from tactile_rt.sim_backend.objects.manifolds import faces_of, surface_of
 
-__all__ = ["cut_solid", "outer_solid", "surface_of"]
+__all__ = ["cut_solid"]
 
 Floats = NDArray[np.float64]
 Plane = tuple[Floats, float]  # unit normal, distance from the origin along it
 
-DUST = 1e-13  # a part of less volume than this (largest extent cubed) is rounding
+CORNER_DIGITS = 7  # of a largest extent: 4e-6 mm at 40 mm
+THIN = 5e-6  # volume over area, in largest extents; a thinner hull is rounding
+NO_GAIN = 1e-12  # volumes differ by rounding if by less than this
 SLIVER = 1e-5  # a cut that leaves a smaller share of a part's volume is none
 AXIS_CUTS = 5  # planes tried across each axis
 TURNS = 4  # planes tried through the worst point, along the surface's normal there
@@ -39,44 +51,41 @@ CONCAVE = 0.02  # rad; edges flatter than this are part of a smooth surface
 FEW = 500  # points of the surface looked at first
 COARSE = 1 / 60  # tiles of a hull's faces outside the solid
 PARTS = 4  # parts cut for every piece allowed: joining leaves a third of them
+WORK = 20_000_000  # triangles cut in trying planes: a minute; then hulls stay as they are
 MARGIN = 0.85  # of the tolerance: the rest is for what falls between the points
-WIDER = 1.3  # tolerances tried where the pieces allowed are too few
+ROUGH = 0.2  # of a hull's excess and of the part's thickness: details smaller choose no plane
+FINER = (0.5, 0.25)  # of the tolerance: for hulls that are beyond it together
+WIDER = 1.15  # tolerances tried where the pieces allowed are too few
 
 
-def outer_solid(bodies: Sequence[trimesh.Trimesh]) -> Manifold | None:
-    """The union of closed bodies without their inner voids; None if their faces do not match."""
-    solids = [_solid(body) for body in bodies]
-    if any(s.status() != manifold3d.Error.NoError for s in solids):
-        return None
-    union = Manifold.batch_boolean(solids, manifold3d.OpType.Add)
-    # a void's shell is wound inward: nothing can touch it
-    shells = [_solid(s) for s in surface_of(union).split(only_watertight=False, repair=False)]
-    return Manifold.batch_boolean([s for s in shells if s.volume() > 0], manifold3d.OpType.Add)
-
-
-def surface_of(solid: Manifold) -> trimesh.Trimesh:
-    """The solid's surface."""
-    arrays = solid.to_mesh64()
-    return trimesh.Trimesh(
-        arrays.vert_properties[:, :3].copy(), arrays.tri_verts.astype(np.int64), process=False
-    )
-
-
-def cut_solid(solid: Manifold, tolerance: float, max_pieces: int) -> list[trimesh.Trimesh]:
-    """Convex pieces whose union is the solid to within the tolerance, or as near as pieces allow.
+def cut_solid(
+    solid: Manifold, tolerance: float, max_pieces: int
+) -> tuple[list[trimesh.Trimesh], Deviation]:
+    """Convex pieces whose union is the solid to within the tolerance, or as near as they come.
 
     Args:
         solid: of largest extent 1.
         tolerance: largest distance between the surfaces, in largest extents.
         max_pieces: the tolerance is widened until this many do.
+
+    Returns:
+        The pieces, and how far they are from the solid.
     """
-    cutter = _Cutter(solid, MARGIN * tolerance)
-    hulls, reached = cutter.cut(PARTS * max_pieces)
-    hulls = cutter.join(hulls, reached)
+    cutter = _Cutter(solid, tolerance)
+    near = MARGIN * tolerance
+    hulls = cutter.join(cutter.cut(solid, near, PARTS * max_pieces), near)
     while len(hulls) > max_pieces:
-        reached *= WIDER
-        hulls = cutter.join(hulls, reached)
-    return [trimesh.convex.convex_hull(hull.vertices) for hull in hulls]
+        near *= WIDER
+        hulls = cutter.join(hulls, near)
+    found = deviation(cutter.surface, [hull.mesh for hull in hulls])
+    for share in FINER:
+        if found.largest <= tolerance or near > tolerance:
+            break
+        finer = cutter.cut_where(hulls, found, share * tolerance)
+        if len(finer) > max_pieces:
+            break
+        hulls, found = finer, deviation(cutter.surface, [hull.mesh for hull in finer])
+    return [hull.mesh for hull in hulls], found
 
 
 @dataclass(frozen=True)
@@ -96,6 +105,13 @@ class _Hull:
     def solid(self) -> Manifold:
         return Manifold.hull_points(self.vertices).as_original()
 
+    @cached_property
+    def mesh(self) -> trimesh.Trimesh:
+        # corners that rounding doubled would leave faces without area
+        corners = np.unique(np.round(self.vertices, CORNER_DIGITS), axis=0)
+        solid: trimesh.Trimesh = trimesh.convex.convex_hull(corners)
+        return solid
+
 
 def _hull(points: Floats) -> _Hull:
     # not Manifold's: it may leave out corners where slivers meet
@@ -107,44 +123,47 @@ class _Cutter:
     def __init__(self, solid: Manifold, tolerance: float) -> None:
         self.tolerance = tolerance
         self.solid = solid
-        mesh = surface_of(solid)
-        self.surface = Surface(mesh.triangles)
+        self.surface = Surface(surface_of(solid).triangles)
         self.normals = np.cross(*np.diff(self.surface.tiles, axis=1).transpose(1, 0, 2))
-        self.columns = np.concatenate([mesh.vertices, self.surface.middles]).T.copy()
+        self.columns = self.surface.points.T.copy()
+        self.work = 0
 
-    def cut(self, max_parts: int) -> tuple[list[_Hull], float]:
-        """Hulls of the parts, and the farthest out that one is (the tolerance at least)."""
+    def cut(self, solid: Manifold, tolerance: float, parts: int) -> list[_Hull]:
+        """Hulls of the parts that a solid is cut into.
+
+        Args:
+            solid: this one, or a part of it.
+            tolerance: hulls are near enough when no farther out than this.
+            parts: at most so many, and some that fall off with the last.
+        """
         done: list[_Hull] = []
         queue: list[tuple[float, int, Manifold, _Hull, Floats]] = []
         number = count()
 
         def add(part: Manifold) -> None:
             for body in part.decompose():
-                if body.volume() < DUST:
-                    continue
                 try:
                     hull = _hull(surface_of(body).vertices)
                 except QhullError:  # flat
                     continue
-                depth, worst = self.excess(hull, self.tolerance)
-                if depth <= self.tolerance:
+                if hull.volume < THIN * hull.area:
+                    continue
+                depth, worst = self.excess(hull, tolerance)
+                if depth <= tolerance:
                     done.append(hull)
                 else:
                     heapq.heappush(queue, (-depth, next(number), body, hull, worst))
 
-        add(self.solid)
-        reached = self.tolerance
-        while queue and len(done) + len(queue) < max_parts:
+        add(solid)
+        while queue and len(done) + len(queue) < parts and self.work < WORK:
             depth, _, body, hull, worst = heapq.heappop(queue)
-            halves = self.halve(body, worst)
+            halves = self.halve(body, -depth, worst)
             if halves:
                 add(halves[0])
                 add(halves[1])
             else:
                 done.append(hull)
-                reached = max(reached, -depth)
-        left = [hull for _, _, _, hull, _ in queue]
-        return done + left, max([reached, *(-item[0] for item in queue)])
+        return done + [hull for _, _, _, hull, _ in queue]
 
     def excess(self, hull: _Hull, enough: float) -> tuple[float, Floats]:
         """How far a hull is from the solid, and where; 0 if no farther than `enough`."""
@@ -161,7 +180,7 @@ class _Cutter:
                 some, depth = some[:, depth > enough], depth[depth > enough]
             if len(depth):
                 return float(depth.max()), some[:, depth.argmax()]
-        bare = tiles(_faces_of(hull.solid - self.solid, hull.solid.original_id()), COARSE)
+        bare = tiles(faces_of(hull.solid - self.solid, hull.solid.original_id()), COARSE)
         if len(bare):
             points = np.concatenate([bare.mean(axis=1), bare[:, 0]])
             away, _ = self.surface.bound(points)
@@ -172,26 +191,40 @@ class _Cutter:
                 return float(away.max()), points[away.argmax()]
         return 0.0, (low + high) / 2
 
-    def halve(self, part: Manifold, worst: Floats) -> tuple[Manifold, Manifold] | None:
+    def halve(
+        self, part: Manifold, depth: float, worst: Floats
+    ) -> tuple[Manifold, Manifold] | None:
         """The part cut by the plane that leaves the smallest hulls."""
+        thickness = 2 * part.volume() / part.surface_area()
+        plane = self.best_plane(part.simplify(ROUGH * min(depth, thickness)), worst)
+        if plane is None:
+            return None
+        one, two = part.split_by_plane(plane[0].tolist(), plane[1])
+        return (one, two) if min(one.volume(), two.volume()) > 0 else None
+
+    def best_plane(self, part: Manifold, worst: Floats) -> Plane | None:
+        """The plane that leaves the smallest hulls."""
         best, least = None, np.inf
         scale = SLIVER * part.volume()
-        for normal, offset in self.planes(part, worst):
-            one, two = part.split_by_plane(normal.tolist(), offset)
-            if min(one.volume(), two.volume()) < scale:
+        for normal, offset in self.planes(surface_of(part), worst):
+            self.work += part.num_tri()
+            halves = part.split_by_plane(normal.tolist(), offset)
+            if min(half.volume() for half in halves) < scale:
                 continue
-            volume = sum(b.hull().volume() for half in (one, two) for b in half.decompose())
-            if volume < least - 1e-12:
-                best, least = (one, two), volume
+            volume = sum(b.hull().volume() for half in halves for b in half.decompose())
+            if volume < least - NO_GAIN:
+                best, least = (normal, offset), volume
         return best
 
-    def planes(self, part: Manifold, worst: Floats) -> Iterator[Plane]:
+    def planes(self, mesh: trimesh.Trimesh, worst: Floats) -> Iterator[Plane]:
         """Where a part may be cut."""
-        mesh = surface_of(part)
         low, high = mesh.bounds
-        for axis in range(3):
+        shares = np.arange(1, AXIS_CUTS + 1) / (AXIS_CUTS + 1)
+        # of cuts that are as good as each other the first is made: it must not leave ever thinner
+        # slices
+        for axis in np.argsort(low - high):
             normal = np.eye(3)[axis]
-            for share in np.arange(1, AXIS_CUTS + 1) / (AXIS_CUTS + 1):
+            for share in shares[np.argsort(np.abs(shares - 0.5), kind="stable")]:
                 yield normal, float(low[axis] + share * (high[axis] - low[axis]))
             yield normal, float(worst[axis])
         angles = np.where(mesh.face_adjacency_convex, 0.0, mesh.face_adjacency_angles)
@@ -211,6 +244,19 @@ class _Cutter:
         for angle in np.arange(TURNS) * np.pi / TURNS:
             normal = np.cos(angle) * one + np.sin(angle) * np.cross(up, one)
             yield normal, float(normal @ worst)
+
+    def cut_where(self, hulls: Sequence[_Hull], found: Deviation, finer: float) -> list[_Hull]:
+        """The hulls, those of them cut further that are beyond the tolerance somewhere."""
+        far = found.points[found.gaps > self.tolerance]
+        done = []
+        for hull in hulls:
+            depth = hull.planes[:, :3] @ far.T + hull.planes[:, 3:]
+            if (depth.max(axis=0) < TOUCHING).any():
+                parts = self.cut(hull.solid ^ self.solid, finer, PARTS * len(hulls))
+                done += self.join(parts, finer)
+            else:
+                done.append(hull)
+        return done
 
     def join(self, hulls: Sequence[_Hull], tolerance: float) -> list[_Hull]:
         """Neighbours replaced by their common hull where that is within the tolerance."""
@@ -245,19 +291,3 @@ class _Cutter:
             if others:
                 propose(k, others)
         return list(alive.values())
-
-
-def _solid(mesh: trimesh.Trimesh) -> Manifold:
-    return Manifold(
-        manifold3d.Mesh64(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.uint64))
-    )
-
-
-def _faces_of(solid: Manifold, original: int) -> Floats:
-    """(n, 3, 3) those faces of a solid that came from one of those it was made of."""
-    arrays = solid.to_mesh64()
-    faces = np.zeros(len(arrays.tri_verts), bool)
-    for k, run in enumerate(arrays.run_original_id):
-        faces[arrays.run_index[k] // 3 : arrays.run_index[k + 1] // 3] = run == original
-    triangles: Floats = arrays.vert_properties[:, :3][arrays.tri_verts[faces].astype(np.int64)]
-    return triangles

@@ -14,7 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
-__all__ = ["Deviation", "Surface", "outside", "shuffled", "surface_deviation", "tiles"]
+__all__ = ["Deviation", "Surface", "deviation", "gap", "shuffled", "tiles"]
 
 Floats = NDArray[np.float64]
 
@@ -29,20 +29,20 @@ OUTWARD = 1e-4  # how far outside its face a point is tested for lying in anothe
 
 @dataclass(frozen=True)
 class Deviation:
-    """Distances between the pieces' outside and the mesh, in fractions of the largest extent.
+    """Distances between a mesh and the outside of pieces, in fractions of the largest extent.
 
     Attributes:
+        points: (n, 3) the mesh's, then those of the outside of the pieces.
+        gaps: (n,) how far each is from the other surface; large where the mesh has faces buried in
+            its own inside, too.
+        missed: the farthest that the mesh is from the outside of the pieces.
         beyond: the farthest that the outside of the pieces is from the mesh.
-        missed: the farthest that the mesh is from the outside of the pieces; also where narrow
-            clefts are filled, and where the mesh has faces buried in its own inside.
-        p99: 99 % of the area of both surfaces is nearer than this.
-        mean: over the area of both.
     """
 
-    beyond: float
+    points: Floats
+    gaps: Floats
     missed: float
-    p99: float
-    mean: float
+    beyond: float
 
     @property
     def largest(self) -> float:
@@ -71,12 +71,15 @@ class Surface:
     Attributes:
         tiles: (n, 3, 3) corners.
         middles: (n, 3) their centroids.
+        points: (m, 3) the middles, and the corners that the surface came with.
         reach: the farthest that a point of a tile is from its middle.
     """
 
     def __init__(self, triangles: Floats, size: float = TILE) -> None:
         self.tiles = tiles(triangles, size)
         self.middles = self.tiles.mean(axis=1)
+        corners = np.unique(triangles.reshape(-1, 3), axis=0)
+        self.points = np.concatenate([self.middles, corners])
         self.reach = float(np.linalg.norm(self.tiles - self.middles[:, None], axis=2).max())
         self._tree = cKDTree(self.middles)
 
@@ -91,7 +94,7 @@ class Surface:
         Exact for the farthest points; for others at most `reach` too large, and rarely that.
         """
         _, near = self._tree.query(points, k=np.arange(1, min(NEAR, len(self.tiles)) + 1))
-        best: Floats = np.min([_gap(self.tiles[tile], points) for tile in near.T], axis=0)
+        best: Floats = np.min([gap(self.tiles[tile], points) for tile in near.T], axis=0)
         floor, exact = 0.0, np.zeros(len(points), bool)
         while True:
             unsure = np.flatnonzero(~exact & (best > floor))
@@ -102,45 +105,44 @@ class Surface:
             found = self._tree.query_ball_point(points[some], best[some] + self.reach)
             counts = [len(ball) for ball in found]
             tile = np.concatenate(found).astype(int)
-            gaps = _gap(self.tiles[tile], points[some].repeat(counts, axis=0))
+            gaps = gap(self.tiles[tile], points[some].repeat(counts, axis=0))
             best[some] = np.minimum.reduceat(gaps, np.cumsum([0, *counts[:-1]]))
             exact[some] = True
             floor = max(floor, float(best[some].max()))
 
 
-def surface_deviation(mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh]) -> Deviation:
-    """Distance between the mesh's surface and the outside of the union of convex pieces.
+def deviation(drawn: Surface, pieces: Sequence[trimesh.Trimesh]) -> Deviation:
+    """Distance between a surface and the outside of the union of convex pieces.
 
     Args:
-        mesh: of largest extent 1.
+        drawn: of largest extent 1.
         pieces: convex, in the same frame. What of a piece lies inside another is not outside.
     """
-    drawn, made = Surface(mesh.triangles), Surface(outside(pieces))
-    missed, beyond = made.distance(drawn.middles), drawn.distance(made.middles)
-    at_corners = made.distance(mesh.vertices[np.unique(mesh.faces)])
-    gaps = np.concatenate([missed, beyond])
-    areas = trimesh.triangles.area(np.concatenate([drawn.tiles, made.tiles]))
-    order = np.argsort(gaps)
-    share = np.cumsum(areas[order]) / areas.sum()
-    return Deviation(
-        beyond=float(beyond.max()),
-        missed=float(max(missed.max(), at_corners.max())),
-        p99=float(gaps[order][np.searchsorted(share, 0.99)]),
-        mean=float(gaps @ areas / areas.sum()),
-    )
-
-
-def outside(pieces: Sequence[trimesh.Trimesh]) -> Floats:
-    """(n, 3, 3) tiles of the pieces' faces, without those inside another piece."""
     parts = [_broad(tiles(piece.triangles)) for piece in pieces]
     owner = np.repeat(np.arange(len(pieces)), [len(part) for part in parts])
     every = np.concatenate(parts)
     across = np.cross(every[:, 1] - every[:, 0], every[:, 2] - every[:, 0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    columns = np.ascontiguousarray((every.mean(axis=1) + OUTWARD * across).T)
-    inside = np.zeros(len(every), bool)
+    made = Surface(every[~_inside(every.mean(axis=1) + OUTWARD * across, pieces, owner)])
+    missed, beyond = made.distance(drawn.points), drawn.distance(made.middles)
+    # a tile is outside if its middle is; a point that lies in no piece may be nearest to any tile
+    far = np.flatnonzero(missed > missed.max() / 2)
+    far = far[~_inside(drawn.points[far], pieces)]
+    if len(far):
+        missed[far] = np.minimum(missed[far], Surface(every).distance(drawn.points[far]))
+    points = np.concatenate([drawn.points, made.middles])
+    gaps = np.concatenate([missed, beyond])
+    return Deviation(points, gaps, float(missed.max()), float(beyond.max()))
+
+
+def _inside(
+    points: Floats, pieces: Sequence[trimesh.Trimesh], owner: NDArray[np.intp] | None = None
+) -> NDArray[np.bool_]:
+    """(n,) whether points (n, 3) lie in a piece, other than their owner (n,) if they have one."""
+    columns = np.ascontiguousarray(points.T)
+    inside = np.zeros(len(points), bool)
     for j, piece in enumerate(pieces):
-        near = ~inside & (owner != j)
+        near = ~inside if owner is None else ~inside & (owner != j)
         for column, low, high in zip(columns, *piece.bounds, strict=True):
             near &= (column >= low) & (column <= high)
         index = np.flatnonzero(near)
@@ -150,7 +152,7 @@ def outside(pieces: Sequence[trimesh.Trimesh]) -> Floats:
             out = some[:, :3] @ columns[:, index] > TOUCHING - some[:, 3:]
             index = index[~out.any(axis=0)]
         inside[index] = True
-    return every[~inside]
+    return inside
 
 
 def shuffled(planes: Floats) -> Floats:
@@ -165,7 +167,8 @@ def _broad(triangles: Floats) -> Floats:
     return broad
 
 
-def _gap(triangles: Floats, points: Floats) -> Floats:
+def gap(triangles: Floats, points: Floats) -> Floats:
+    """(n,) distance of points (n, 3), each to its own of the triangles (n, 3, 3)."""
     nearest = trimesh.triangles.closest_point(triangles, points)
-    gap: Floats = np.linalg.norm(points - nearest, axis=1)
-    return gap
+    away: Floats = np.linalg.norm(points - nearest, axis=1)
+    return away

@@ -15,14 +15,23 @@ Pieces cost little: a 40 mm bowl in 508 of them (0.1 mm) steps 1.2 times as slow
 """
 
 from dataclasses import astuple, dataclass
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
 
-from tactile_rt.sim_backend.objects.deviation import surface_deviation
+from tactile_rt.sim_backend.objects.decomposition import cut_solid
+from tactile_rt.sim_backend.objects.deviation import Surface, deviation
+from tactile_rt.sim_backend.objects.manifolds import (
+    bodies_of,
+    in_unit_box,
+    outer_solid,
+    surface_of,
+)
 from tactile_rt.sim_backend.objects.piece_cache import Pieces, cache_key, read_pieces, write_pieces
+from tactile_rt.sim_backend.objects.remeshing import LEVEL, closed_round
 from tactile_rt.sim_backend.objects.solids import TactileObject, normalised
 from tactile_rt.stream import ConfigError
 
@@ -30,23 +39,14 @@ __all__ = ["BROKEN", "MESH_SUFFIXES", "MeshDetail", "load_mesh"]
 
 MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 BROKEN = ("refuse", "remesh", "hull")
-RECIPE = 1  # of the pieces; raised when the same file would become others
-MAX_FACES = 50_000  # minutes of cutting
+RECIPE = 2  # of the pieces; raised when the same file would become others
+MAX_FACES = 200_000  # minutes
 MERGE_DIGITS = 6  # vertices closer than 1e-6 of the largest extent are one
 FLAT = 1e-3  # thinner than this fraction of the largest extent is a sheet, not a solid
 SPECK = 1e-6  # a body of less volume than this (largest extent cubed) touches nothing
-
-# CoACD draws the closed surface on a grid; its pieces may keep a concavity of 1 % of the extent.
-# Its search is cut short: half the time for 3 % more volume.
-REMESH = {
-    "preprocess_mode": "on",
-    "preprocess_resolution": 100,
-    "threshold": 0.02,
-    "mcts_iterations": 60,
-    "mcts_nodes": 10,
-    "mcts_max_depth": 2,
-    "seed": 0,
-}
+SHEETS = 1e-3  # of area (largest extent squared) in bodies without volume is part of the object
+FOIL = 1e-5  # nor does one of which this is volume over area, in largest extents
+REMESH_TOLERANCE = 0.5 * LEVEL  # cutting finer than the surface is drawn would show its grid
 
 # glTF is y-up by its standard; the other formats say nothing and are taken as z-up
 _Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
@@ -66,8 +66,8 @@ class MeshDetail:
         max_pieces: at most so many; where they do not suffice, the error is larger (and known).
         hull: one piece only, the convex hull; its error is measured but not bounded.
         broken: what becomes of a mesh that is not closed and cannot be safely: "refuse" it,
-            "remesh" it (a closed surface is drawn round its faces, 0.2 to 1 mm off at 40 mm and so
-            thicker by that), or take its convex "hull".
+            "remesh" it (a closed surface is drawn round its faces, 0.4 mm off at 40 mm, see
+            `remeshing`, and cut with an error of about 1 mm), or take its convex "hull".
 
     Raises:
         ConfigError: a value out of range.
@@ -116,7 +116,7 @@ def load_mesh(
     if not path.is_file():
         raise ConfigError(f"{path}: no such file")
     turned = suffix == ".glb" if y_up is None else y_up
-    makers = [_version(p) for p in ("manifold3d", "coacd", "trimesh", "scipy")]
+    makers = [version(package) for package in ("manifold3d", "trimesh", "scipy")]
     key = cache_key(path.read_bytes(), suffix, turned, astuple(detail), RECIPE, makers)
     pieces = read_pieces(key)
     if pieces is None:
@@ -125,19 +125,15 @@ def load_mesh(
     return TactileObject(path.stem, path.stem, pieces.meshes, pieces.surface_error, pieces.made_by)
 
 
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
-
-
 def _read(path: Path, turned: bool) -> trimesh.Trimesh:
     """All triangles of the file in world coordinates, z-up, scaled into the unit box."""
     if path.stat().st_size == 0:
         raise ConfigError(f"{path}: the file is empty; export it again")
     try:
-        scene = trimesh.load_scene(path, process=False)
+        # materials would be dropped, and pictures that are missing be complained of
+        kinds = (".obj", ".ply")
+        materials: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() in kinds else {}
+        scene = trimesh.load_scene(path, process=False, **materials)
         meshes = [m for m in scene.dump() if isinstance(m, trimesh.Trimesh)]
     except Exception as error:  # the parsers raise whatever their format trips over
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -214,54 +210,38 @@ def _make_pieces(path: Path, detail: MeshDetail, turned: bool) -> Pieces:
     except _NotClosed:
         if detail.broken == "refuse":
             raise
-    hull = detail.hull or detail.broken == "hull"
-    pieces = normalised([mesh.convex_hull] if hull else _remeshed(mesh, path))
-    # faces buried in such a mesh are no fault of the pieces, so not how far they are from these
-    error = surface_deviation(mesh, pieces).beyond
-    return Pieces(pieces, error, "hull" if hull else "remeshed")
+    # Faces buried in such a mesh are no fault of the pieces: it counts how far these are from it,
+    # and not how far it is from these.
+    if detail.hull or detail.broken == "hull":
+        pieces = normalised([mesh.convex_hull])
+        return Pieces(pieces, deviation(Surface(mesh.triangles), pieces).beyond, "hull")
+    tolerance = max(detail.max_error_mm / detail.size_mm, REMESH_TOLERANCE)
+    parts, found = cut_solid(closed_round(mesh), tolerance, detail.max_pieces)
+    pieces = normalised(parts)
+    error = max(deviation(Surface(mesh.triangles), pieces).beyond, found.missed)
+    return Pieces(pieces, error, "remeshed")
 
 
 def _closed_pieces(mesh: trimesh.Trimesh, path: Path, detail: MeshDetail) -> Pieces:
     mesh = _closed(mesh, path)
-    bodies = mesh.split(only_watertight=False, repair=False)
-    if detail.hull:
-        pieces = normalised([mesh.convex_hull])
-        return Pieces(pieces, surface_deviation(mesh, pieces).largest, "hull")
-    if len(bodies) <= detail.max_pieces and all(b.is_convex and b.volume > SPECK for b in bodies):
-        return Pieces(normalised(bodies), 0.0, "bodies")
-    try:
-        from tactile_rt.sim_backend.objects.decomposition import cut_solid, outer_solid, surface_of
-    except ImportError as error:
-        raise ConfigError(
-            f"{path}: not convex, and cutting it into convex pieces needs manifold3d: "
-            "pip install 'tactile-rt[sim]'"
-        ) from error
-    solid = outer_solid(bodies)
-    if solid is None or solid.volume() < SPECK:
+    bodies = [b for b in bodies_of(mesh) if b.volume() > max(SPECK, FOIL * b.surface_area())]
+    if mesh.area - sum(b.surface_area() for b in bodies) > SHEETS:
+        raise _NotClosed(
+            f"{path}: not watertight (parts of it are sheets without thickness); give them some in "
+            "a mesh tool (in Blender: the Solidify modifier) and export it again"
+        )
+    if not bodies:
         raise _NotClosed(
             f"{path}: its faces enclose no solid, though every edge is closed; rebuild its surface "
             "in a mesh tool (in Blender: the Remesh modifier)"
         )
+    if detail.hull:
+        pieces = normalised([mesh.convex_hull])
+        return Pieces(pieces, deviation(Surface(mesh.triangles), pieces).largest, "hull")
+    surfaces = [surface_of(body) for body in bodies]
+    if len(bodies) <= detail.max_pieces and all(surface.is_convex for surface in surfaces):
+        return Pieces(normalised(surfaces), 0.0, "bodies")
     tolerance = detail.max_error_mm / detail.size_mm
-    pieces = normalised(cut_solid(solid, tolerance, detail.max_pieces))
-    return Pieces(pieces, surface_deviation(surface_of(solid), pieces).largest, "cut")
-
-
-def _remeshed(mesh: trimesh.Trimesh, path: Path) -> list[trimesh.Trimesh]:
-    """Convex pieces of a closed surface drawn round the mesh's faces."""
-    try:
-        import coacd
-    except ImportError as error:
-        raise ConfigError(
-            f"{path}: not closed, and remeshing it needs CoACD: pip install 'tactile-rt[sim]'"
-        ) from error
-    coacd.set_log_level("error")
-    try:
-        parts = coacd.run_coacd(coacd.Mesh(mesh.vertices, mesh.faces), **REMESH)
-    except RuntimeError as error:
-        raise ConfigError(f"{path}: not closed, and cannot be remeshed ({error})") from error
-    hulls = [trimesh.convex.convex_hull(vertices) for vertices, _ in parts if len(vertices) > 3]
-    pieces = [piece for piece in hulls if piece.volume > SPECK]
-    if not pieces:
-        raise ConfigError(f"{path}: not closed, and nothing is left of it when remeshed")
-    return pieces
+    solid = in_unit_box(outer_solid(bodies))
+    parts, off = cut_solid(solid, tolerance, detail.max_pieces)
+    return Pieces(normalised(parts), off.largest, "cut")

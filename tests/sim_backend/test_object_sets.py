@@ -1,0 +1,257 @@
+"""Mesh objects: how near their pieces are, where they are kept, and folders of them."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("manifold3d")
+
+import mesh_truth
+import trimesh
+from scipy.spatial import ConvexHull
+
+from tactile_rt.sim_backend.datasets.dataset import make_sweeps
+from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
+from tactile_rt.sim_backend.objects import meshes
+from tactile_rt.sim_backend.objects.meshes import MeshDetail, load_mesh
+from tactile_rt.sim_backend.objects.object_sets import open_objects
+from tactile_rt.stream import ConfigError
+
+MM = 40.0  # largest extent that errors are given at
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Pieces are kept for this test only."""
+    monkeypatch.setenv("TACTILE_RT_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def saved(mesh: trimesh.Trimesh, path: Path) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    mesh.export(path)
+    return path
+
+
+def to_triangles(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
+    """(n,) distance of each point to the nearest triangle, all of them tried."""
+    best = np.full(len(points), np.inf)
+    for triangle in triangles:
+        every = np.broadcast_to(triangle, (len(points), 3, 3))
+        nearest = trimesh.triangles.closest_point(every, points)
+        best = np.minimum(best, np.linalg.norm(nearest - points, axis=1))
+    return best
+
+
+def depth(points: np.ndarray, piece: trimesh.Trimesh) -> np.ndarray:
+    """(n,) how deep inside a convex piece; negative outside."""
+    planes = ConvexHull(piece.vertices).equations
+    return -(points @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+
+
+def sampled(mesh: trimesh.Trimesh, pieces: tuple[trimesh.Trimesh, ...]) -> tuple[float, ...]:
+    """Farthest that the outside of the pieces is from the mesh; that the mesh is from the pieces
+    where outside them; and that it lies deep inside one: each by brute force on random points."""
+    skin = []
+    for k, piece in enumerate(pieces):
+        number = max(10, int(2000 * piece.area / sum(p.area for p in pieces)))
+        points, _ = trimesh.sample.sample_surface(piece, number, seed=k)
+        others = [depth(points, p) for p in pieces if p is not piece]
+        skin.append(points[np.max(others, axis=0) < -1e-6] if others else points)
+    beyond = to_triangles(np.concatenate(skin), mesh.triangles)
+    points, _ = trimesh.sample.sample_surface(mesh, 600, seed=1)
+    points = np.concatenate([points, mesh.vertices[:600]])
+    depths = np.max([depth(points, p) for p in pieces], axis=0)
+    out = points[depths < -1e-7]
+    away = np.full(len(out), np.inf)
+    for piece in pieces:
+        near = ((out > piece.bounds[0] - 0.01) & (out < piece.bounds[1] + 0.01)).all(axis=1)
+        away[near] = np.minimum(away[near], to_triangles(out[near], piece.triangles))
+    return float(beyond.max()), float(away.max(initial=0.0)), float(depths.max())
+
+
+SHAPES = {
+    "bracket": mesh_truth.bracket,
+    "channel": mesh_truth.channel,
+    "gear": mesh_truth.gear,
+    "bowl": mesh_truth.bowl,
+    "torus": lambda: mesh_truth.torus(14, 6),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_pieces_are_within_a_tenth_of_a_millimetre(name: str, tmp_path: Path) -> None:
+    mesh = SHAPES[name]()
+    mesh.apply_translation(-mesh.bounds.mean(axis=0))
+    mesh.apply_scale(1 / mesh.extents.max())
+    thing = load_mesh(saved(mesh, tmp_path / f"{name}.ply"))
+    assert MM * thing.surface_error <= 0.1
+    beyond, outside, deep = sampled(mesh, thing.pieces)
+    # what another measure finds is no farther than what is reported
+    assert max(beyond, outside, deep) <= thing.surface_error + 1e-5
+    if name in ("bowl", "torus"):  # and not much nearer
+        assert max(beyond, outside, deep) >= 0.5 * thing.surface_error
+    assert all(p.is_convex and p.is_watertight and p.volume > 0 for p in thing.pieces)
+    assert thing.made_by == "cut"
+
+
+def test_flat_faced_shapes_are_cut_exactly(tmp_path: Path) -> None:
+    thing = load_mesh(saved(mesh_truth.bracket(), tmp_path / "bracket.stl"))
+    assert len(thing.pieces) == 2
+    assert sum(p.volume for p in thing.pieces) * MM**3 == pytest.approx(
+        (40 * 20 * 6 + 6 * 20 * 24) * (MM / 40) ** 3, rel=1e-5
+    )
+
+
+def test_a_limit_on_pieces_widens_the_error_and_says_so(tmp_path: Path) -> None:
+    path = saved(mesh_truth.torus(14, 6), tmp_path / "torus.ply")
+    few = load_mesh(path, MeshDetail(max_pieces=6))
+    assert len(few.pieces) <= 6
+    assert MM * few.surface_error > 0.1
+    hull = load_mesh(path, MeshDetail(hull=True))
+    assert len(hull.pieces) == 1 and hull.made_by == "hull"
+    assert hull.surface_error > few.surface_error
+
+
+def test_pieces_are_cut_once(tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = saved(mesh_truth.bracket(), tmp_path / "bracket.stl")
+    first = load_mesh(path)
+    (kept,) = cache.glob("*.npz")
+
+    def never(*_: object) -> None:
+        raise AssertionError("cut again")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(meshes, "cut_solid", never)
+        again = load_mesh(path)
+        moved = load_mesh(shutil.copy(path, tmp_path / "other.stl"))  # its content counts
+    for one in (again, moved):
+        assert one.surface_error == first.surface_error and one.made_by == first.made_by
+        for a, b in zip(one.pieces, first.pieces, strict=True):
+            assert np.array_equal(a.vertices, b.vertices) and np.array_equal(a.faces, b.faces)
+    kept.write_bytes(kept.read_bytes()[:200])  # damaged: as if it were not there
+    assert len(load_mesh(path).pieces) == len(first.pieces)
+    assert not list(cache.glob("*.part"))
+
+
+def test_without_a_place_to_keep_pieces_they_are_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("TACTILE_RT_CACHE", str(tmp_path / "file"))
+    path = saved(mesh_truth.bracket(), tmp_path / "bracket.stl")
+    assert len(load_mesh(path).pieces) == 2
+
+
+@pytest.mark.slow
+def test_open_sheets_are_refused_remeshed_or_wrapped(tmp_path: Path) -> None:
+    path = saved(mesh_truth.sheet_chair(), tmp_path / "chair.obj")
+    with pytest.raises(ConfigError, match=r"chair\.obj: not watertight"):
+        load_mesh(path)
+    remeshed = load_mesh(path, MeshDetail(broken="remesh"), y_up=True)
+    assert remeshed.made_by == "remeshed"
+    assert MM * remeshed.surface_error < 2.0
+    extents = np.ptp([c for p in remeshed.pieces for c in p.bounds], axis=0)
+    assert extents[2] == pytest.approx(1.0)  # y-up in the file: it stands
+    assert load_mesh(path, MeshDetail(broken="hull")).made_by == "hull"
+
+
+# folders
+
+
+@pytest.fixture
+def shapenet(tmp_path: Path) -> Path:
+    """Two synsets of ShapeNetCore, three objects, one of them empty."""
+    root = tmp_path / "ShapeNetCore"
+    file = "models/model_normalized.obj"
+    saved(mesh_truth.bracket(), root / "03001627" / "a1" / file)
+    saved(mesh_truth.channel(), root / "03001627" / "b2" / file)
+    broken = root / "02876657" / "c3" / file
+    broken.parent.mkdir(parents=True)
+    broken.write_text("# nothing here\n")
+    taxonomy = [{"synsetId": "03001627", "name": "chair"},
+                {"synsetId": "02876657", "name": "bottle,flask"}]  # fmt: skip
+    (root / "taxonomy.json").write_text(json.dumps(taxonomy))
+    return root
+
+
+def test_a_shapenet_folder(shapenet: Path) -> None:
+    objects = open_objects(shapenet)
+    assert objects.names == ("bottle/c3", "chair/a1", "chair/b2")
+    assert objects.categories["bottle/c3"] == "bottle"
+    thing = objects.load("chair/a1")
+    assert (thing.name, thing.category) == ("chair-a1", "chair")
+    tall = np.ptp([c for p in thing.pieces for c in p.bounds], axis=0)
+    assert tall[2] == pytest.approx(20 / 40, abs=1e-3)  # its y, 20 mm of 40, is up
+    report = objects.check()
+    assert report.made_by == {"cut": 2}
+    assert set(report.surface_error) == {"chair/a1", "chair/b2"}
+    assert list(report.skipped) == ["bottle/c3"] and "no triangles" in report.skipped["bottle/c3"]
+
+
+def test_a_shapenet_folder_without_its_taxonomy(shapenet: Path) -> None:
+    (shapenet / "taxonomy.json").unlink()
+    assert open_objects(shapenet).names[0] == "02876657/c3"
+    (shapenet / "taxonomy.json").write_text('{"not": "a list"}')
+    with pytest.raises(ConfigError, match=r"taxonomy\.json is not ShapeNet's taxonomy"):
+        open_objects(shapenet)
+
+
+def test_a_folder_of_folders(tmp_path: Path) -> None:
+    root = tmp_path / "things"
+    saved(mesh_truth.bracket(), root / "bracket" / "one.stl")
+    saved(mesh_truth.gear(), root / "gear" / "my gear.ply")
+    (root / "gear" / "notes.txt").write_text("not a mesh")
+    objects = open_objects(root)
+    assert objects.names == ("bracket/one", "gear/my_gear")
+    assert objects.load("gear/my_gear").name == "gear-my_gear"
+    with pytest.raises(ConfigError, match="holds no object 'gear/other'"):
+        objects.load("gear/other")
+
+
+def test_wrong_folders_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no such folder of objects"):
+        open_objects(tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match=r"holds no objects: expected category/object\.obj"):
+        open_objects(tmp_path)
+    for suffix in (".obj", ".stl"):
+        saved(mesh_truth.bracket(), tmp_path / "bracket" / f"one{suffix}")
+    with pytest.raises(ConfigError, match="would have the same name: rename one"):
+        open_objects(tmp_path)
+
+
+RECIPE = """
+name = "mine"
+array = "mouse"
+profile = "realtime"
+[objects]
+from = "{folder}"
+validation = 1
+test = 1
+[sweeps]
+draws = 1
+height_mm = 0
+speed_mm_s = 40
+yaw_deg = 0
+distance_mm = 6.5
+gap_mm = 1
+"""
+
+
+def test_a_recipe_sweeps_a_folder_and_lists_what_is_broken(tmp_path: Path) -> None:
+    root = tmp_path / "things"
+    for k in range(3):
+        saved(mesh_truth.bracket(), root / "bracket" / f"b{k}.stl")
+        saved(mesh_truth.channel(), root / "channel" / f"c{k}.stl")
+    (root / "channel" / "c1.stl").write_bytes(b"")
+    recipe = tmp_path / "mine.toml"
+    recipe.write_text(RECIPE.format(folder=root))
+    out = tmp_path / "set"
+    made = list(make_sweeps(read_recipe(str(recipe)), out, processes=1))
+    assert len(made) == 6  # with the one that could not be
+    skipped = json.loads((out / "skipped.json").read_text())
+    assert "channel-c1" in json.dumps(skipped) and "empty" in json.dumps(skipped)
+    assert len(list(out.glob("*.npz"))) == 5
