@@ -12,18 +12,19 @@ def main() -> int:
     """Print a line for each codec; 1 if one raised, kept too much or depends on cuts."""
     size = int(sys.argv[1]) if len(sys.argv) > 1 else WHOLE
     bad = 0
-    print(f"{'codec':<22}{'bytes':>12}{'exceptions':>12}{'most held':>11}{'cuts':>7}{'CPU s':>8}")
+    say = sys.stdout.write
+    say(f"{'codec':<22}{'bytes':>12}{'exceptions':>12}{'most held':>11}{'cuts':>7}{'CPU s':>8}\n")
     with all_codecs() as codecs:
         for name, make in codecs.items():
             if sys.argv[2:] and name not in sys.argv[2:]:
                 continue
             found = fuzz(name, make, size)
             cuts = "differ" if found.uneven else "same"
-            print(
+            say(
                 f"{name:<22}{found.bytes:>12}{found.exceptions:>12}{found.held:>11}{cuts:>7}"
-                f"{found.seconds:>8.1f}",
-                flush=True,
+                f"{found.seconds:>8.1f}\n"
             )
+            sys.stdout.flush()
             bad += bool(found.exceptions or found.held > HELD_MOST or found.uneven)
     return min(bad, 1)
 

@@ -66,7 +66,8 @@ class DeviceClock:
         for tick, arrived in zip(ticks.tolist(), arrived_ns.tolist(), strict=True):
             step = self._step(tick, arrived)
             x = self._x + step
-            if self._tick is None or arrived - self._base - x < self._line(x) - EARLY_NS:
+            early = arrived - self._base - x - self._a - self.drift * x < -EARLY_NS
+            if self._tick is None or early:
                 told += self._tell(waiting)
                 waiting, x, step = [], 0.0, 0.0
                 self._begin(arrived, self._arrived)
@@ -84,8 +85,8 @@ class DeviceClock:
         """Host times of these samples, by what is known of the clock now."""
         told = []
         for x, step, arrived in waiting:
+            t = min(self._base + round(x + self._a + self.drift * x), arrived)
             room = min(LEAST_STEP * step, arrived - self._told)
-            t = min(self._base + round(x + self._line(x)), arrived)
             self._told = max(t, self._told + max(1, round(room)))
             told.append(self._told)
         return told
@@ -96,8 +97,9 @@ class DeviceClock:
             return 0.0
         ticks = (tick - self._tick) % self._wrap
         # a short counter may have wrapped more than once meanwhile
-        waited = (arrived - self._arrived) / self._tick_ns
-        ticks += self._wrap * max(0, round((waited - ticks) / self._wrap))
+        missed = (arrived - self._arrived) / self._tick_ns - ticks
+        if missed > self._wrap / 2:
+            ticks += self._wrap * round(missed / self._wrap)
         return ticks * self._tick_ns
 
     def _begin(self, arrived: int, before: int) -> None:
@@ -110,12 +112,10 @@ class DeviceClock:
         self._late_since: int | None = None  # host time
         self._late_best = (0.0, 0.0)
 
-    def _line(self, x: float) -> float:
-        return self._a + self.drift * x
-
     def _observe(self, x: float, arrived: int) -> None:
         d = float(arrived - self._base - x)
-        late = d - self._line(x)
+        below = d - self.drift * x
+        late = below - self._a
         if late < 0:
             self._a += late  # the line is under all points, now
         if late < LATE_NS:
@@ -123,7 +123,7 @@ class DeviceClock:
         elif self._late_since is None:
             self._late_since, self._late_best = arrived, (x, d)
         else:
-            if d - self.drift * x < self._late_best[1] - self.drift * self._late_best[0]:
+            if below < self._late_best[1] - self.drift * self._late_best[0]:
                 self._late_best = (x, d)
             if arrived - self._late_since > LATE_FOR_NS:
                 best_x, best_d = self._late_best
@@ -137,7 +137,7 @@ class DeviceClock:
             self._opened, self._best = x, (x, d)
             self._forget_old()
             self._fit()
-        elif d - self.drift * x < self._best[1] - self.drift * self._best[0]:
+        elif below < self._best[1] - self.drift * self._best[0]:
             self._best = (x, d)
 
     def _forget_old(self) -> None:

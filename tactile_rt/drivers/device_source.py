@@ -204,7 +204,10 @@ class DeviceSource(Source):
             return None
         if found is None:
             return None
-        samples = self._feed(*found)
+        packet, t_ns = found
+        if self._tap is not None:
+            self._tap(packet, t_ns)
+        samples = self.codec.feed(packet, t_ns)
         return None if samples is None else self._chunk(samples)
 
     def _feed(self, packet: Any, t_ns: int) -> Samples | None:

@@ -82,6 +82,8 @@ class SerialLink(Link[bytes]):
             raise SourceError(f"{port}: {_why(port, error)}") from None
         try:
             self._fd: int | None = self._port.fileno()
+            self._poll = select.poll()
+            self._poll.register(self._fd, select.POLLIN)
         except Exception:  # each pyserial handler without one says so in its own way
             self._fd = None
 
@@ -89,7 +91,7 @@ class SerialLink(Link[bytes]):
         try:
             if self._fd is None:
                 return self._receive_slowly(timeout_s)
-            if not select.select((self._fd,), (), (), max(timeout_s, 0.0))[0]:
+            if not self._poll.poll(1e3 * max(timeout_s, 0.0)):
                 return None
             data = os.read(self._fd, READ_BYTES)
         except BlockingIOError:

@@ -35,7 +35,7 @@ class Stamper:
     """
 
     def __init__(self, codec: Codec[Any], spec: ArraySpec, stats: SourceStats) -> None:
-        self.spec = spec
+        self.spec, self._shape = spec, spec.shape
         self.newest_ns = self.status = 0
         self._period_ns = round(NS_PER_S / spec.rate_hz)
         ticks = None if codec.tick_ns is None else self._period_ns / codec.tick_ns
@@ -54,7 +54,7 @@ class Stamper:
 
     def chunk(self, samples: Samples) -> Chunk | None:
         """The samples that have not come before, or None."""
-        if samples.values.shape[1:] != self.spec.shape:
+        if samples.values.shape[1:] != self._shape:
             return None  # the codec has counted it
         seq, keep = self.sequencer.number(samples)
         arrived, ticks, count = samples.arrived_ns, samples.ticks, samples.count

@@ -86,6 +86,7 @@ def test_every_sample_is_accounted_for(kind):
         open_source(fake.url) as source,
     ):
         chunks = take(source, len(values), lambda: fake.emulator.done)
+        assert fake.wait(PATIENCE_S)  # what has come may not be in its log yet
         log, stats = fake.emulator.log, source.stats
         assert log.sent == len(values)
         received = stats.delivered + stats.corrupt + stats.missing + stats.dropped

@@ -212,8 +212,10 @@ class NativeSerial(SerialCodec):
                     self._refuse()
                     continue
                 bits = -(-shape[0] // 8)
-                part = np.frombuffer(payload, _TYPES[head[2]], offset=bits).reshape(1, *shape)
-                parts.append(part * self._scale() if head[2] == FORMATS["int16"] else part)
+                part: NDArray[Any] = np.ndarray((1, *shape), _TYPES[head[2]], payload, bits)
+                if head[2] == FORMATS["int16"]:
+                    part = (part * self._scale()).astype(np.float32)
+                parts.append(part)
                 flags += payload[:bits]
                 rows.append((t_ns, self._damaged, head[5], head[6], head[4]))
                 self._damaged = 0
@@ -228,7 +230,7 @@ class NativeSerial(SerialCodec):
                 self._described, self.spec = found, found.spec
         if not rows:
             return None
-        values = np.concatenate(parts, dtype=np.float32, casting="same_kind")
+        values = np.concatenate(parts)
         valid = self._valid_of(flags, len(rows))
         # what is not finite is no measurement, whatever the device says
         finite = np.isfinite(values)
