@@ -13,7 +13,7 @@ from tactile_rt.stream import ConfigError
 # area: (module with `run(quick) -> list[Record]`, extra that it needs), None: no figures yet
 AREAS: dict[str, tuple[str, str] | None] = {
     "sim": ("tactile_rt.benchmarks.sim", "sim"),
-    "drivers": ("tactile_rt.benchmarks.drivers.area", ""),
+    "drivers": ("tactile_rt.benchmarks.drivers.area", "record"),
     "models": ("tactile_rt.benchmarks.models", "train"),
     "inference": ("tactile_rt.benchmarks.inference", ""),
     "daemon": None,

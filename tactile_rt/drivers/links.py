@@ -72,8 +72,8 @@ class SerialLink(Link[bytes]):
             parity = "N"
         try:
             self._port: Any = serial.serial_for_url(
-                port, baudrate=baud, parity=parity, timeout=WAIT_S, write_timeout=1.0,
-                do_not_open=True, **({} if "://" in port else {"exclusive": True}),
+                port, baudrate=baud, parity=parity, timeout=WAIT_S, do_not_open=True,
+                **({} if "://" in port else {"exclusive": True, "write_timeout": 1.0}),
             )  # fmt: skip
             if not dtr:
                 self._port.dtr = False

@@ -4,13 +4,14 @@ from tactile_rt.benchmarks.drivers.clocks import clocks
 from tactile_rt.benchmarks.drivers.consumers import consumers
 from tactile_rt.benchmarks.drivers.fuzzing import fuzzing
 from tactile_rt.benchmarks.drivers.losses import losses
+from tactile_rt.benchmarks.drivers.recordings import recordings
 from tactile_rt.benchmarks.drivers.unplugging import unplugging
 from tactile_rt.benchmarks.drivers.wires import can, serial
 from tactile_rt.benchmarks.records import Record
 
 __all__ = ["run"]
 
-PARTS = (serial, can, losses, unplugging, clocks, consumers, fuzzing)
+PARTS = (serial, can, losses, unplugging, clocks, consumers, recordings, fuzzing)
 
 
 def run(quick: bool) -> list[Record]:
