@@ -212,7 +212,8 @@ def test_any_mcap_reader_reads_it_by_the_schemas_in_the_file(path):
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
         topics = {c.topic: c.message_encoding for c in summary.channels.values()}
-        assert topics == {"samples": "cdr", "health": "json"}
+        json = dict.fromkeys(("health", "decisions", "events"), "json")
+        assert topics == {"samples": "cdr", **json}
         found = list(reader.iter_messages(topics=["samples"]))
         names = [m.name for m in reader.iter_metadata()]
     assert len(found) == len(chunks)

@@ -7,13 +7,16 @@
     samples   chunks, bit for bit
     wire      raw packets as they came, to be decoded again
     health    how source and recorder are doing, at every change
+    decisions, events    what the daemon decided and told meanwhile
 
 The layout is described in docs/recording.md. It needs the extra ``record``.
 """
 
 from tactile_rt.stream_recording.description import Description
 from tactile_rt.stream_recording.reader import (
+    read_decisions,
     read_description,
+    read_events,
     read_health,
     read_packets,
     read_stream,
@@ -24,7 +27,9 @@ from tactile_rt.stream_recording.writer import StreamWriter
 __all__ = [
     "Description",
     "StreamWriter",
+    "read_decisions",
     "read_description",
+    "read_events",
     "read_health",
     "read_packets",
     "read_stream",

@@ -18,6 +18,8 @@ from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = [
     "CHANNELS",
+    "DECISIONS",
+    "EVENTS",
     "HEALTH",
     "SAMPLES",
     "WIRE",
@@ -31,6 +33,7 @@ __all__ = [
 ]
 
 SAMPLES, WIRE, HEALTH = "samples", "wire", "health"
+DECISIONS, EVENTS = "decisions", "events"  # of the daemon, in its messages
 
 Packet = bytes | Sequence[Frame] | None  # None: the line was opened here
 
@@ -76,6 +79,16 @@ HEALTH_SCHEMA: dict[str, Any] = {
         "recorder": {"type": "object", "description": "what was recorded, and dropped"},
     },
 }
+EVENT_SCHEMA: dict[str, Any] = {
+    "title": "tactile_rt decision, contact or health message",
+    "type": "object",
+    "properties": {
+        "type": {"type": "string", "description": "decision, contact or health"},
+        "version": {"type": "integer", "description": "of the messages, see docs/messages.md"},
+        "t_ns": {"type": "integer", "description": "host monotonic time, ns"},
+        "utc_ns": {"type": "integer", "description": "UTC, ns"},
+    },
+}
 
 
 @dataclass(frozen=True)
@@ -94,6 +107,13 @@ CHANNELS = {
     (WIRE, "can"): Schema("tactile_rt/msg/CanPacket", "ros2msg", CAN_MSG, "cdr"),
     (HEALTH, ""): Schema(
         "tactile_rt.Health", "jsonschema", msgspec.json.encode(HEALTH_SCHEMA).decode(), "json"
+    ),
+    # At the end: a recording whose first piece is damaged is recovered by the order of these.
+    (DECISIONS, ""): Schema(
+        "tactile_rt.Decision", "jsonschema", msgspec.json.encode(EVENT_SCHEMA).decode(), "json"
+    ),
+    (EVENTS, ""): Schema(
+        "tactile_rt.Event", "jsonschema", msgspec.json.encode(EVENT_SCHEMA).decode(), "json"
     ),
 }
 

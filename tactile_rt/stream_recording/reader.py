@@ -11,6 +11,8 @@ import msgspec
 from tactile_rt.stream import Chunk, ConfigError, RecordingError, TactileError
 from tactile_rt.stream_recording.description import METADATA, RECOVERED, SESSION, Description
 from tactile_rt.stream_recording.layout import (
+    DECISIONS,
+    EVENTS,
     HEALTH,
     SAMPLES,
     WIRE,
@@ -23,7 +25,17 @@ from tactile_rt.stream_recording.layout import (
 if TYPE_CHECKING:
     from mcap.records import McapRecord
 
-__all__ = ["Raw", "read_description", "read_health", "read_packets", "read_raw", "read_stream"]
+__all__ = [
+    "Raw",
+    "is_finished",
+    "read_decisions",
+    "read_description",
+    "read_events",
+    "read_health",
+    "read_packets",
+    "read_raw",
+    "read_stream",
+]
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER = b"\x02" + (20).to_bytes(8, "little")  # its opcode and length
@@ -83,7 +95,29 @@ def read_health(path: str | Path) -> Iterator[dict[str, Any]]:
     Raises:
         ConfigError, RecordingError: as `read_stream`.
     """
-    for _, raw in read_raw(path, HEALTH):
+    return _read_json(path, HEALTH)
+
+
+def read_decisions(path: str | Path) -> Iterator[dict[str, Any]]:
+    """What the daemon's models decided, as it published it.
+
+    Raises:
+        ConfigError, RecordingError: as `read_stream`.
+    """
+    return _read_json(path, DECISIONS)
+
+
+def read_events(path: str | Path) -> Iterator[dict[str, Any]]:
+    """What changed in the daemon while it recorded: contacts, and states of its parts.
+
+    Raises:
+        ConfigError, RecordingError: as `read_stream`.
+    """
+    return _read_json(path, EVENTS)
+
+
+def _read_json(path: str | Path, topic: str) -> Iterator[dict[str, Any]]:
+    for _, raw in read_raw(path, topic):
         with _naming(Path(path)):
             fields = msgspec.json.decode(raw.data, type=dict[str, Any])
         yield fields
@@ -162,16 +196,29 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
     with file:
         if file.read(len(MAGIC)) != MAGIC:
             raise RecordingError(f"{path} is not an MCAP file")
-        end = file.seek(0, 2)
-        file.seek(max(0, end - FOOTER_BYTES))
-        tail = file.read()
-        if not (tail.startswith(FOOTER) and tail.endswith(MAGIC)):
+        if not _has_end(file):
             raise RecordingError(
                 f"{path} is cut short, or still being written: "
                 f"`tactile-rt recover {path}` makes a whole one of it"
             )
         file.seek(0)
         yield file
+
+
+def is_finished(path: Path) -> bool:
+    """Whether the file has the end that is written last; nothing else of it is looked at."""
+    try:
+        with path.open("rb") as file:
+            return _has_end(file)
+    except OSError:
+        return False
+
+
+def _has_end(file: BinaryIO) -> bool:
+    end = file.seek(0, 2)
+    file.seek(max(0, end - FOOTER_BYTES))
+    tail = file.read()
+    return tail.startswith(FOOTER) and tail.endswith(MAGIC)
 
 
 @contextmanager

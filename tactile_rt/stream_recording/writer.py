@@ -4,7 +4,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self
@@ -26,7 +26,7 @@ from tactile_rt.stream_recording.layout import (
 )
 from tactile_rt.stream_recording.mcap_file import McapFile
 
-__all__ = ["StreamWriter", "WriterStats"]
+__all__ = ["HealthTeller", "StreamWriter", "WriterStats", "describe", "utc_offset_ns"]
 
 WAKE_S = 0.05  # how often the thread looks: what a recording is late by, at most
 FLUSH_S = 0.5  # with the wake and a slow write still well under the second that may be lost
@@ -90,8 +90,8 @@ class StreamWriter:
         need_mcap()
         self.path, self.stats = Path(path), WriterStats()
         self._source = source
-        self._device, calibration = _device_of(source)
-        self.about = _described(source, self._device, calibration, url, session or {})
+        self._device = _device_of(source)[0]
+        self.about = describe(source, url, session or {})
         self._flush_s, self._limit = flush_s, queue_bytes
         self._lock = threading.Lock()
         self._queue: deque[tuple[str, Any, int, int]] = deque()  # topic, what, time, size
@@ -99,11 +99,11 @@ class StreamWriter:
         self._stop = threading.Event()
         self._error: Exception | None = None
         self._closed = False
-        self._told: tuple[Any, ...] = ()  # of health, when it was last written
+        self._health = HealthTeller(source)
         self._raw = _create(self.path, force)
         try:
             self._file = McapFile(self._raw, self.about)
-            self._tell_health(always=True)
+            self._health.tell(self._file, self.stats, always=True)
             self.stats.bytes = self._file.flush()  # whatever happens now, it can be recovered
         except BaseException:
             self._raw.close()
@@ -144,7 +144,7 @@ class StreamWriter:
         self._thread.join()
         try:
             if self._error is None:
-                self._tell_health(always=True, closed=True)
+                self._health.tell(self._file, self.stats, always=True, closed=True)
                 summary = {k: str(v) for k, v in asdict(self.stats).items() if k != "bytes"}
                 self._file.note(SUMMARY, summary)
                 self.stats.bytes = self._file.finish()
@@ -213,7 +213,7 @@ class StreamWriter:
                         flush_at = self._flush()
                 if time.monotonic() >= flush_at:
                     flush_at = self._flush()
-                self._tell_health()
+                self._health.tell(self._file, self.stats)
             except Exception as error:  # whatever it is, it belongs to the user's thread
                 self._error = error
                 with self._lock:
@@ -244,27 +244,6 @@ class StreamWriter:
         self.stats.bytes = self._file.flush()
         return time.monotonic() + self._flush_s
 
-    def _tell_health(self, always: bool = False, closed: bool = False) -> None:
-        """Record how source and recorder are, if that has changed."""
-        health = self._device.health if self._device is not None else None
-        mine = self.stats
-        told = (_changing(health), mine.dropped_samples, mine.dropped_packets)
-        if told == self._told and not always:
-            return
-        self._told = told
-        now = time.monotonic_ns()
-        state = "streaming" if health is None else str(health.state)
-        fields = {
-            "t_ns": now,
-            "utc_offset_ns": utc_offset_ns(),
-            "state": "closed" if closed else state,
-            "reason": "" if health is None else health.reason,
-            "device": health,
-            "stats": asdict(self._source.stats),
-            "recorder": mine,
-        }
-        self._file.add(HEALTH, msgspec.json.encode(fields), now)
-
 
 def utc_offset_ns() -> int:
     """UTC less monotonic time, now, ns."""
@@ -289,14 +268,12 @@ def _device_of(source: Source) -> tuple[DeviceSource | None, Calibration | None]
     return (source if isinstance(source, DeviceSource) else None), None
 
 
-def _described(
-    source: Source,
-    device: DeviceSource | None,
-    calibration: Calibration | None,
-    url: str,
-    session: Mapping[str, str],
+def describe(
+    source: Source, url: str = "", session: Mapping[str, str] | None = None
 ) -> Description:
-    about = Description(source.spec, utc_offset_ns(), url, session=dict(session))
+    """What a recording of this source is of; its UTC offset is that of now."""
+    device, calibration = _device_of(source)
+    about = Description(source.spec, utc_offset_ns(), url, session=dict(session or {}))
     if device is None:
         return about
     options = {
@@ -304,10 +281,44 @@ def _described(
         name: str(Path(value).resolve()) if value and Path(value).is_file() else value
         for name, value in device.codec_options.items()
     }
-    return Description(
-        source.spec, about.utc_offset_ns, url or device.name, device.codec.wire,
-        device.options.codec, options, device.options.clock, calibration, dict(session),
+    return replace(
+        about, source=url or device.name, wire=device.codec.wire, codec=device.options.codec,
+        codec_options=options, clock=device.options.clock, calibration=calibration,
     )  # fmt: skip
+
+
+class HealthTeller:
+    """Writes into a recording how source and recorder are, when that has changed.
+
+    Args:
+        source: the source that is recorded.
+    """
+
+    def __init__(self, source: Source) -> None:
+        self._source, self._device = source, _device_of(source)[0]
+        self._told: tuple[Any, ...] = ()  # what was last written
+
+    def tell(
+        self, file: McapFile, mine: WriterStats, always: bool = False, closed: bool = False
+    ) -> None:
+        """Write it, if it has changed or `always`; `mine` is what the recorder did."""
+        health = self._device.health if self._device is not None else None
+        told = (_changing(health), mine.dropped_samples, mine.dropped_packets)
+        if told == self._told and not always:
+            return
+        self._told = told
+        now = time.monotonic_ns()
+        state = "streaming" if health is None else str(health.state)
+        fields = {
+            "t_ns": now,
+            "utc_offset_ns": utc_offset_ns(),
+            "state": "closed" if closed else state,
+            "reason": "" if health is None else health.reason,
+            "device": health,
+            "stats": asdict(self._source.stats),
+            "recorder": mine,
+        }
+        file.add(HEALTH, msgspec.json.encode(fields), now)
 
 
 def _create(path: Path, force: bool) -> BinaryIO:
