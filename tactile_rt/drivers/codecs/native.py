@@ -191,7 +191,8 @@ class NativeSerial(SerialCodec):
         self._described: Description | None = None
         self._rest = b""  # of a frame that is not complete
         self._synchronised = True
-        self._damaged = 0
+        self._damaged = 0  # samples, since the last intact one
+        self._lost = self._framed = 0  # bytes skipped since then, and frames known by their header
         self._flags, self._valid = b"", np.empty((0, 0), np.bool_)  # of the last packet
         self.streaming = False
         self.whisking: tuple[float, float, float] | None = None  # as last commanded, Hz and rad
@@ -338,14 +339,14 @@ class NativeSerial(SerialCodec):
             if begin < 0:  # at the end there may be half of one
                 begin = len(data) - data.endswith(SYNC[:1], at)
             if begin > at:
-                self.stats.skipped += begin - at
+                self._lose_sync(begin - at)  # where a frame should have begun
                 at = begin
-                self._lose_sync()  # where a frame should have begun
             if len(data) - at < HEADER.size:
                 break
             head = HEADER.unpack_from(data, at)
             if crc_hqx(data[at + 2 : at + HEADER.size - 2], 0) != head[-1]:  # XMODEM
-                at = self._skip(at)
+                self._lose_sync(1)
+                at += 1
                 continue
             end = at + HEADER.size + head[3]
             if len(data) < end + CRC.size:
@@ -353,8 +354,12 @@ class NativeSerial(SerialCodec):
             whole = data[at:end]
             if zlib.crc32(whole) != CRC.unpack_from(data, end)[0]:
                 self._synchronised = True  # this was a frame
-                at = self._skip(at)
+                self._lose_sync(1)
+                self._framed += 1
+                at += 1
                 continue
+            if self._lost:
+                self._settle(end + CRC.size - at)
             at = end + CRC.size
             self._synchronised = True
             kind = head[1] & 15
@@ -365,17 +370,20 @@ class NativeSerial(SerialCodec):
             yield kind, head, whole[HEADER.size :]
         self._rest = data[at:]
 
-    def _skip(self, at: int) -> int:
-        """Here no frame begins; where to look on."""
-        self._lose_sync()
-        self.stats.skipped += 1
-        return at + 1
-
-    def _lose_sync(self) -> None:
-        """Count one damaged frame, however many pieces of it pass for a beginning."""
-        if self._synchronised:
-            self._refuse()
+    def _lose_sync(self, n: int) -> None:
+        """Skip n bytes; count one damaged frame, however many pieces pass for a beginning."""
+        self.stats.skipped += n
+        self._lost += n
+        self.stats.corrupt += self._synchronised
         self._synchronised = False
+
+    def _settle(self, length: int) -> None:
+        """How many samples what was skipped has cost: as many as its headers, or its length, say.
+
+        A burst of noise between frames costs none, two damaged frames in a row cost two.
+        """
+        self._damaged += max(self._framed, round(self._lost / length))
+        self._lost = self._framed = 0
 
     def _refuse(self) -> None:
         self.stats.corrupt += 1
