@@ -30,6 +30,7 @@ __all__ = [
     "WITHHELD",
     "SweepManifest",
     "Sweeps",
+    "contacts_of",
     "has_object",
     "object_path",
     "read_object",
@@ -44,6 +45,7 @@ __all__ = [
 SET_VERSION = 2
 READABLE = (1, 2)  # version 1 knew neither withheld categories nor objects out of files
 MANIFEST, SKIPPED = "manifest.json", "skipped.json"
+CONTACTS = "contacts"  # in an object's file, and in the recipe that asks for them
 SPLITS = ("train", "validation", "test")
 WITHHELD = "withheld"  # a further split: categories that training never sees, labelled -1
 
@@ -179,14 +181,30 @@ class Sweeps:
         values: (sweep, sample, element, channel) float32, SI, on the set's period.
         labels: (sweep,) int64 index into the manifest's categories; -1: withheld from training.
         objects: (sweep,) str object name; sweeps of one object share it.
+        contacts: (sweep, sample, element) float32, arc length (m) from the whisker's base to where
+            it touches, NaN where it does not; None: the set was made without.
     """
 
     values: NDArray[np.float32]
     labels: NDArray[np.int64]
     objects: NDArray[np.str_]
+    contacts: NDArray[np.float32] | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
+
+
+def contacts_of(sweeps: Sweeps) -> NDArray[np.float32]:
+    """The contacts of sweeps that must have them.
+
+    Raises:
+        ConfigError: their set was made without.
+    """
+    if sweeps.contacts is None:
+        raise ConfigError(
+            "the sweep set holds no contacts: make one with `tactile-rt sweep --contacts`"
+        )
+    return sweeps.contacts
 
 
 def object_path(folder: Path, name: str) -> Path:
@@ -200,7 +218,11 @@ def has_object(folder: Path, name: str) -> bool:
 
 
 def write_object(
-    folder: Path, name: str, values: NDArray[np.float32], parameters: dict[str, NDArray[Any]]
+    folder: Path,
+    name: str,
+    values: NDArray[np.float32],
+    parameters: dict[str, NDArray[Any]],
+    contacts: NDArray[np.float32] | None = None,
 ) -> None:
     """Write all sweeps of one object, whole or not at all.
 
@@ -209,8 +231,11 @@ def write_object(
         name: ``category-index``.
         values: (sweep, sample, element, channel) SI.
         parameters: (sweep,) arrays that describe each sweep, stored beside the values.
+        contacts: (sweep, sample, element), see `Sweeps`; None stores none.
     """
     arrays: dict[str, Any] = {"values": values.astype(np.float32), **parameters}
+    if contacts is not None:
+        arrays[CONTACTS] = contacts.astype(np.float32)
     write_whole(object_path(folder, name), lambda file: np.savez(file, **arrays))
 
 
@@ -242,11 +267,20 @@ def read_sweeps(folder: Path, split: str) -> Sweeps:
     counts = [shape[0] for shape in shapes]
     # Filled in place: a large set fits into memory once, not twice.
     values = np.empty((sum(counts), *shapes[0][1:]), dtype=np.float32)
+    contacts = (
+        np.empty(values.shape[:3], dtype=np.float32) if manifest.recipe.get(CONTACTS) else None
+    )
     at = 0
     for name, count in zip(names, counts, strict=True):
-        values[at : at + count] = _read_arrays(object_path(folder, name), "values")["values"]
+        path = object_path(folder, name)
+        values[at : at + count] = _read_arrays(path, "values")["values"]
+        if contacts is not None:
+            stored = _read_arrays(path, CONTACTS)[CONTACTS]
+            if stored.shape != contacts[at : at + count].shape:
+                raise _damaged(path, ValueError(f"contacts {stored.shape} beside other values"))
+            contacts[at : at + count] = stored
         at += count
-    return Sweeps(values, np.repeat(np.array(labels), counts), np.repeat(names, counts))
+    return Sweeps(values, np.repeat(np.array(labels), counts), np.repeat(names, counts), contacts)
 
 
 def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str, NDArray[Any]]]:
@@ -254,12 +288,14 @@ def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str,
 
     Returns:
         (sweep, sample, element, channel) values, SI, and the (sweep,) arrays that describe each.
+        Contacts, if any, are `read_sweeps`'s to read.
 
     Raises:
         RecordingError: the file is damaged.
     """
     path = object_path(folder, name)
     arrays = _read_arrays(path)
+    arrays.pop(CONTACTS, None)
     if "values" not in arrays:
         raise _damaged(path, KeyError("no values"))
     return arrays.pop("values"), arrays

@@ -33,6 +33,9 @@ def sweep(
         str | None, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Of the drawn sweep parameters.")] = None,
+    contacts: Annotated[
+        bool, typer.Option("--contacts", help="Store where along each whisker it touches, too.")
+    ] = False,
     split: Annotated[
         str | None, typer.Option(help="Only these splits, comma-separated: test,withheld.")
     ] = None,
@@ -70,7 +73,7 @@ def sweep(
         _recipe(folder, recipe),
         {"per_category": objects, "validation": validation, "test": test},
         {"draws": sweeps},
-        {"profile": profile, "seed": seed},
+        {"profile": profile, "seed": seed, "contacts": contacts or None},
     )
     splits = tuple(dict.fromkeys(s.strip() for s in split.split(","))) if split else ()
     if address is not None and engine != "ray":

@@ -6,6 +6,7 @@ onset on the noisy signal, and carries the tare that the detector had measured b
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactile_rt.contact import CHANNEL_FLOOR, ContactDetector
+from tactile_rt.contact import CHANNEL_FLOOR
+from tactile_rt.models.onsets import Onsets, find_onsets
 from tactile_rt.recording import SweepManifest, Sweeps, read_sweeps
 from tactile_rt.stream import ArraySpec, ConfigError
 
@@ -32,6 +34,7 @@ __all__ = [
 STEPS, SUBSTEPS = 22, 5  # 22 steps of 45 ms, each of five 9 ms samples (Chung et al. 2025)
 RATED_NOISE = {"N": 10e-6, "N m": 5e-8}  # sensor noise per sample, one standard deviation, SI
 NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0)  # of the rated noise, at which training finds onsets
+CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others are in between
 GAIN_ERROR = 0.1
 DROPOUT = 0.05  # of whole whiskers
 JITTER = 5  # samples either side of the onset
@@ -47,20 +50,6 @@ def channel_values(spec: ArraySpec, table: dict[str, float]) -> NDArray[np.float
     if unknown:
         raise ConfigError(f"channels in {', '.join(unknown)} cannot be learnt from yet")
     return np.array([table[u] for u in spec.units], dtype=np.float32)
-
-
-@dataclass(frozen=True)
-class Onsets:
-    """Where the detector found contact in every sweep, and its baseline there.
-
-    Attributes:
-        start: (sweep,) sample of onset; -1 where none was found.
-        offset, sigma: (sweep, element, channel) tare and noise, SI.
-    """
-
-    start: NDArray[np.int64]
-    offset: NDArray[np.float32]
-    sigma: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -87,27 +76,16 @@ class SweepSet:
             channel_values(manifest.spec, CHANNEL_FLOOR),
         )
 
-
-def find_onsets(values: NDArray[np.float32], floor: NDArray[np.float32]) -> Onsets:
-    """Run the contact detector over sweeps.
-
-    Args:
-        values: (sweep, sample, element, channel), noise included, SI.
-        floor: (channel,) smallest sigma of the detector, SI.
-    """
-    n, _, *shape = values.shape
-    start = np.full(n, -1, dtype=np.int64)
-    offset = np.zeros((n, *shape), dtype=np.float32)
-    sigma = np.zeros((n, *shape), dtype=np.float32)
-    valid = np.ones(shape[0], dtype=np.bool_)
-    for i, sweep in enumerate(values):
-        detector = ContactDetector((shape[0], shape[1]), floor)
-        for k, sample in enumerate(sweep):
-            if detector.update(sample, valid):
-                start[i] = k
-                break
-        offset[i], sigma[i] = detector.offset, detector.sigma
-    return Onsets(start, offset, sigma)
+    @cached_property
+    def noisy_starts(self) -> NDArray[np.int64]:
+        """(level, sweep) onsets with noise of each of `NOISE_LEVELS`; -1 where none was found."""
+        rng = np.random.default_rng(0)
+        starts = []
+        for values in np.array_split(self.sweeps.values, max(len(self.sweeps) // 256, 1)):
+            noise = rng.normal(size=values.shape).astype(np.float32) * self.noise
+            noisy = (values + np.float32(level) * noise for level in NOISE_LEVELS)
+            starts.append(np.stack([find_onsets(v, self.floor).start for v in noisy]))
+        return np.concatenate(starts, axis=1)
 
 
 def windows(
@@ -124,20 +102,18 @@ def windows(
     return shaped
 
 
-def _onsets_at(data: SweepSet, level: float, seed: int) -> NDArray[np.int64]:
-    rng = np.random.default_rng(seed)
-    starts = []
-    for values in np.array_split(data.sweeps.values, max(len(data.sweeps) // 256, 1)):
-        noise = rng.normal(size=values.shape).astype(np.float32) * data.noise
-        starts.append(find_onsets(values + np.float32(level) * noise, data.floor).start)
-    return np.concatenate(starts)
+def _noise_levels(n: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    """(n,) noise in units of the rated: exactly none, exactly the rated, or uniform between."""
+    between = (rng.random(n) - CLEAN_SHARE) / (1 - CLEAN_SHARE - RATED_SHARE)
+    levels: NDArray[np.float32] = np.clip(between, 0.0, 1.0).astype(np.float32)
+    return levels
 
 
 class TrainingBatches:
     """Epochs of augmented training windows, each drawn afresh from (seed, epoch).
 
-    Half of the windows are clean and half carry sensor noise of a level drawn up to the rated
-    one; every whisker's gain is off by a few percent, and some whiskers are dead.
+    A third of the windows are clean, a third carry the rated sensor noise, and a third a level
+    drawn between; every whisker's gain is off by a few percent, and some whiskers are dead.
 
     Raises:
         ConfigError: not even one batch of sweeps with a touch.
@@ -145,11 +121,9 @@ class TrainingBatches:
 
     def __init__(self, data: SweepSet, batch: int, seed: int) -> None:
         self._data, self._batch, self._seed = data, batch, seed
-        self._starts = np.stack(
-            [_onsets_at(data, level, seed) for level in NOISE_LEVELS]
-        )  # (level, sweep)
+        starts = data.noisy_starts
         # Too faint to be found at its noise level: learn it from where it is found without.
-        self._starts = np.where(self._starts < 0, self._starts[0], self._starts)
+        self._starts = np.where(starts < 0, starts[0], starts)  # (level, sweep)
         self._usable = np.flatnonzero(self._starts[0] >= 0)
         if len(self._usable) < batch:
             raise ConfigError(
@@ -172,7 +146,7 @@ class TrainingBatches:
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         data, n = self._data, len(at)
         elements, channels = data.manifest.spec.shape
-        level = np.where(rng.random(n) < 0.5, 0.0, rng.random(n)).astype(np.float32)
+        level = _noise_levels(n, rng)
         nearest = np.abs(level[:, None] - np.array(NOISE_LEVELS)).argmin(axis=1)
         start = self._starts[nearest, at] + rng.integers(-JITTER, JITTER + 1, n)
         samples = windows(data.sweeps.values[at], start)

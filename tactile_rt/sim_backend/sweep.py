@@ -24,6 +24,7 @@ from tactile_rt.sim_backend.approach import (
 from tactile_rt.sim_backend.arrays.head import add_head
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray, load_animals
 from tactile_rt.sim_backend.arrays.whiskers import rotation
+from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, ContactProbe
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.world import (
     OBJECT_BIT,
@@ -121,6 +122,9 @@ class SweepSimulation:
         start[1] += sweep.gap_mm - way
         self._simulated = np.flatnonzero(met | whole)
         self._elements = len(whiskers)
+        self._felt = [whiskers[i] for i in self._simulated]
+        self._profile = profile
+        self._probe: ContactProbe | None = None  # made when contacts are first asked for
 
         world = empty_world(profile)
         names = {whiskers[i].name for i in self._simulated}
@@ -164,16 +168,46 @@ class SweepSimulation:
             SourceError: the simulation has become unstable: whiskers too stiff for the profile
                 jam against the object.
         """
+        return self._advance(samples)[0]
+
+    def advance_with_contacts(self, samples: int, every: int = 1) -> tuple[Floats, Floats]:
+        """As `advance`, and where each whisker touches at the end of each sample.
+
+        Args:
+            samples: as for `advance`.
+            every: look only at every so many samples, from the first, and take what is seen to
+                last until the next look, which costs as much as a step.
+
+        Returns:
+            The loads, and (samples, element, 3) contacts, see `contacts.CONTACT_CHANNELS`.
+
+        Raises:
+            SourceError: as `advance`.
+        """
+        done, steps = self._steps_done, self._steps_per_sample
+        loads, states = self._advance(samples)
+        contacts = np.zeros((samples, self._elements, len(CONTACT_CHANNELS)))
+        if len(self._simulated):
+            self._probe = self._probe or ContactProbe(self.model, self._felt, self._profile)
+            for k in range(0, samples, every):
+                step = (k + 1) * steps
+                place = self._start + (done + step) * self._step_mm
+                seen = self._probe.read(states[step - 1], place)
+                contacts[k : k + every, self._simulated] = seen
+        return loads, contacts
+
+    def _advance(self, samples: int) -> tuple[Floats, Floats]:
+        """The loads, and the (step, ...) states that the steps began with."""
         steps = samples * self._steps_per_sample
         when = self._steps_done + np.arange(1, steps + 1)
         self._steps_done += steps
         loads = np.zeros((samples, self._elements, 6))
         if not len(self._simulated):
-            return loads
+            return loads, np.zeros((steps, 0))
         spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
         state = np.empty(mujoco.mj_stateSize(self.model, spec))
         mujoco.mj_getState(self.model, self.data, state, spec)
-        _, sensors = rollout.rollout(
+        states, sensors = rollout.rollout(
             self.model,
             self.data,
             state[None],
@@ -188,7 +222,7 @@ class SweepSimulation:
             )
         sampled = sensors[0].reshape(samples, self._steps_per_sample, -1).mean(axis=1)
         loads[:, self._simulated] = read_base_loads(sampled)
-        return loads
+        return loads, np.concatenate([state[None], states[0, :-1]])
 
     def loads(self, samples_at_once: int = 50) -> Iterator[Floats]:
         """Advance in pieces until the object has passed."""

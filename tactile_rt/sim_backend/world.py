@@ -29,6 +29,7 @@ __all__ = [
     "add_whiskers",
     "array_spec",
     "empty_world",
+    "link_nodes",
     "quaternion",
     "read_base_loads",
     "set_damping",
@@ -191,8 +192,7 @@ def _add_whisker(
 ) -> None:
     n = profile.links(whisker)
     cell = whisker.length / n
-    # Nodes: the base, the n joints at the cells' midpoints, the tip.
-    s = np.concatenate([[0.0], (np.arange(n) + 0.5) * cell, [whisker.length]])
+    s = link_nodes(whisker, profile)
     nodes = whisker.centreline(s)
     middle = (s[:-1] + s[1:]) / 2
     radii = whisker.radius(middle)
@@ -244,6 +244,13 @@ def _add_whisker(
             group=WHISKER_BIT,
             rgba=(0.25, 0.2, 0.15, 1.0),
         )
+
+
+def link_nodes(whisker: Whisker, profile: Profile) -> NDArray[np.float64]:
+    """(link + 1,) arc lengths (mm) of the links' ends: base, joints in mid-cell, tip."""
+    n = profile.links(whisker)
+    joints = (np.arange(n) + 0.5) * (whisker.length / n)
+    return np.concatenate([[0.0], joints, [whisker.length]])
 
 
 def _joint_stiffness(whisker: Whisker, start: float, stop: float) -> float:

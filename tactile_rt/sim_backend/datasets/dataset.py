@@ -28,6 +28,7 @@ from tactile_rt.recording import (
     write_skipped,
 )
 from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, contact_distances
 from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
 from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove_leftovers
 from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObjects, choose_objects
@@ -46,6 +47,7 @@ __all__ = ["describe_set", "fingerprint", "finished_objects", "make_sweeps", "si
 # Of a sweep's parameters; the others are numbers.
 KINDS: dict[str, type] = {"draw": np.int64, "touches": np.bool_, "unstable": np.bool_}
 RANDOMISATION, SENSOR = 1, 2  # streams of random numbers beside that of the sweep's parameters
+LOOKS = 3  # for contacts in each stored sample's period
 SPARE = 2  # stored samples simulated beyond the last, which the resampler's kernel needs
 DRAWS = 20  # tries to draw parameters with which an object meets the array at all
 
@@ -192,7 +194,14 @@ def _write(folder: Path, name: str, journal: Journal, target: TactileObject) -> 
         for key in records[0].parameters
     }
     parameters["geometry"] = np.repeat(fingerprint(target), len(records))
-    write_object(folder, name, np.stack([r.values for r in records]), parameters)
+    contacts = [r.contacts for r in records if r.contacts is not None]
+    write_object(
+        folder,
+        name,
+        np.stack([r.values for r in records]),
+        parameters,
+        np.stack(contacts) if contacts else None,
+    )
 
 
 def fingerprint(target: TactileObject) -> str:
@@ -218,7 +227,8 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
     Returns:
         (sample, element, channel) values, SI, and the parameters of `sweep.Sweep` with `draw`, the
         sweep's number among those of its combination, `touches`, 0 when it misses the array, and
-        `unstable`, 1 when it could not be simulated at this profile: its values are 0 then.
+        `unstable`, 1 when it could not be simulated at this profile: its values are 0 then. With
+        contacts if the recipe asks for them: they are the truth, whatever the sensors make of it.
     """
     rng, profile = recipe.rng(target.name, index), PROFILES[recipe.profile]
     ideal = load_animals(recipe.array)
@@ -229,28 +239,40 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
     for _ in range(1 if recipe.sweeps.is_grid else DRAWS):
         sweep = recipe.sweeps.draw(rng, index)
         simulation = SweepSimulation(animals, target, sweep, profile)
-        chunk = _with_lead(recipe, simulation) if simulation.touches else None
-        if chunk is not None:
+        made = _with_lead(recipe, simulation) if simulation.touches else None
+        if made is not None:
             break
     parameters = {
         **asdict(sweep),
         "draw": recipe.sweeps.draw_index(index),
         "touches": float(simulation.touches),
-        "unstable": float(simulation.touches and chunk is None),
+        "unstable": float(simulation.touches and made is None),
     }
-    if chunk is None:
-        chunk = _chunk(recipe, np.zeros((0, *spec.shape)))
+    nothing = np.zeros((0, len(spec.elements), len(CONTACT_CHANNELS)))
+    chunk, felt = made or (_chunk(recipe, np.zeros((0, *spec.shape))), _chunk(recipe, nothing))
     if recipe.sensor != SensorModel():
         sensor = Sensor(recipe.sensor, spec, recipe.key(target.name, index, SENSOR))
         chunk = sensor.push(chunk) or chunk
-    return SweepRecord(_resampled(recipe, chunk), parameters)
+    # Through the loads' own resampler, so that a contact is of the same time as what it causes.
+    contacts = contact_distances(_resampled(recipe, felt)) if recipe.contacts else None
+    return SweepRecord(_resampled(recipe, chunk), parameters, contacts)
 
 
-def _with_lead(recipe: SweepRecipe, simulation: SweepSimulation) -> Chunk | None:
-    """A lead at rest, then the sweep, at the simulator's own rate; None: it went unstable."""
+def _with_lead(recipe: SweepRecipe, simulation: SweepSimulation) -> tuple[Chunk, Chunk] | None:
+    """A lead at rest, then the sweep, at the simulator's own rate; None: it went unstable.
+
+    Returns:
+        Loads and contacts; of these, nothing unless the recipe asks for them.
+    """
     lead, total = _lengths(recipe)
     try:
-        return _chunk(recipe, simulation.advance(total - lead))
+        if recipe.contacts:
+            every = max(1, int(recipe.period_ms / LOOKS / SAMPLE_MS))
+            loads, contacts = simulation.advance_with_contacts(total - lead, every)
+        else:
+            loads = simulation.advance(total - lead)
+            contacts = np.zeros((0, loads.shape[1], len(CONTACT_CHANNELS)))
+        return _chunk(recipe, loads), _chunk(recipe, contacts)
     except SourceError:
         return None
 

@@ -37,17 +37,20 @@ class SweepRecord:
     Attributes:
         values: (sample, element, channel) SI.
         parameters: what the sweep was, by name.
+        contacts: (sample, element) see `recording.Sweeps`; None when they are not kept.
     """
 
     values: NDArray[np.float32]
     parameters: dict[str, float]
+    contacts: NDArray[np.float32] | None = None
 
 
-class _Stored(msgspec.Struct):
+class _Stored(msgspec.Struct, omit_defaults=True):
     index: int
     shape: tuple[int, ...]
     parameters: dict[str, float]
     values: bytes
+    contacts: bytes | None = None
 
 
 class Journal:
@@ -77,7 +80,8 @@ class Journal:
     def append(self, index: int, record: SweepRecord) -> None:
         """Keep a finished sweep."""
         values = np.ascontiguousarray(record.values, dtype=np.float32)
-        stored = _Stored(index, values.shape, record.parameters, values.tobytes())
+        contacts = None if record.contacts is None else record.contacts.astype("<f4").tobytes()
+        stored = _Stored(index, values.shape, record.parameters, values.tobytes(), contacts)
         payload = msgspec.msgpack.encode(stored)
         whole = memoryview(HEADER.pack(len(payload), zlib.crc32(payload)) + payload)
         while whole:
@@ -114,7 +118,10 @@ def _parse(content: bytes) -> tuple[dict[int, SweepRecord], int]:
         except msgspec.MsgspecError:  # a run of zeros has the right checksum of nothing
             break
         values = np.frombuffer(stored.values, dtype=np.float32).reshape(stored.shape)
-        records[stored.index] = SweepRecord(values, stored.parameters)
+        contacts = None
+        if stored.contacts is not None:
+            contacts = np.frombuffer(stored.contacts, dtype=np.float32).reshape(stored.shape[:2])
+        records[stored.index] = SweepRecord(values, stored.parameters, contacts)
         at += HEADER.size + length
     return records, at
 

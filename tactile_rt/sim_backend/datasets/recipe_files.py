@@ -129,6 +129,7 @@ def recipe_from_dict(raw: dict[str, Any], where: str = "recipe") -> SweepRecipe:
         "period_ms": top.number("period_ms", SweepRecipe.period_ms),
         "lead_ms": top.number("lead_ms", SweepRecipe.lead_ms),
         "length_ms": top.number("length_ms", SweepRecipe.length_ms),
+        "contacts": top.flag("contacts"),
         "objects": ObjectChoice(
             source=_absolute(source) if source != SHAPES else source,
             categories=objects.names("categories"),

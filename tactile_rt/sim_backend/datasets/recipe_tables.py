@@ -68,6 +68,13 @@ class Table:
             raise self.wrong(key, value, "a whole number")
         return value
 
+    def flag(self, key: str) -> bool:
+        """Whether a key is true; false if it is not there."""
+        value = self.take(key)
+        if not isinstance(value, bool | None):
+            raise self.wrong(key, value, "true or false")
+        return bool(value)
+
     def number(self, key: str, default: float) -> float:
         """A finite number."""
         value = self.take(key)

@@ -7,6 +7,7 @@
     profile = "realtime"
     seed = 0
     period_ms = 9             # of the stored samples; 1 keeps the simulator's own 1 kHz
+    contacts = true           # keep where each whisker touches, too; left out, it is not kept
     [objects]
     from = "shapes"           # the parametric ones, or a folder of meshes
     per_category = 60
@@ -71,6 +72,7 @@ class SweepRecipe:
         period_ms: of the stored samples, ms.
         lead_ms: at rest, before the simulation starts, ms: enough for a tare.
         length_ms: of one sweep, the lead included, ms.
+        contacts: store where along each whisker it touches, beside the loads.
         objects: what is swept.
         sweeps: how it is swept.
         sensor: what the sensors make of the loads; perfect ones unless it says otherwise.
@@ -88,6 +90,7 @@ class SweepRecipe:
     period_ms: float = 9.0  # five of them make one network step (Chung et al. 2025)
     lead_ms: float = 216.0
     length_ms: float = 1476.0  # 22 network steps from onset and to spare
+    contacts: bool = False
     objects: ObjectChoice = OBJECTS
     sweeps: SweepChoice = SWEEPS
     sensor: SensorModel = PERFECT
@@ -134,8 +137,11 @@ class SweepRecipe:
             for key, value in asdict(self.objects).items()
         }
         sweeps = {name: _written(getattr(self.sweeps, name)) for name in PARAMETERS}
+        top = {f.name: getattr(self, f.name) for f in fields(self)}
+        if not self.contacts:  # unsaid, as in sets of releases that knew of none
+            del top["contacts"]
         return {
-            **{f.name: getattr(self, f.name) for f in fields(self)},
+            **top,
             "objects": {"from": objects.pop("source"), **objects},
             "sweeps": {
                 "draws": self.sweeps.draws,

@@ -1,0 +1,176 @@
+"""Where a whisker touches, from its base loads by mechanics alone: the classical estimates.
+
+A contact at r from the base that pushes with F is felt there as F and M = r x F. So the contact
+lies on a known line, and the shape of the whisker tells where on it:
+
+- straight: where a straight whisker crosses the line (Birdwell et al. 2007, J. Neurophysiol. 98:
+  2439; Solomon & Hartmann 2006, Nature 443: 525): transverse moment over transverse force;
+- resting: the point of the undeflected, curved whisker that comes nearest to the line;
+- bent: the whisker as these loads bend it, integrated from the base to where its bending moment
+  has fallen to nothing (Scholz & Rahn 2004, IEEE Trans. Robot. Autom. 20: 124; in three dimensions
+  as Huet et al. 2017, IEEE Trans. Robot. 33: 1031). It needs the stiffness as well.
+
+All take the force as it is, friction included, and inertia as none.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.stream import ConfigError
+
+__all__ = ["ESTIMATES", "WhiskerShapes", "bent", "resting", "straight"]
+
+Floats = NDArray[np.float64]
+
+POINTS = 64  # pieces that a whisker is cut into
+TWICE = 0.02  # of the moment: a line that misses by less has been met, and may be met again
+AT_ONCE = 20_000  # loads worked on together, for the sake of memory
+SHARPEST = 0.3  # rad that a piece may bend: beyond it noise winds a thin tip up
+
+
+@dataclass(frozen=True)
+class WhiskerShapes:
+    """Shapes and stiffnesses of an array's whiskers: (element,) arrays in SI units.
+
+    The whisker leaves its base along x of its frame and follows y = curvature x^2.
+
+    Attributes:
+        length: arc length, m.
+        curvature: 1/m.
+        base_radius, tip_radius: of the cone, m.
+        young_modulus: Pa.
+
+    Raises:
+        ConfigError: not one value of each for every whisker, or one that is not finite.
+    """
+
+    length: Floats
+    curvature: Floats
+    base_radius: Floats
+    tip_radius: Floats
+    young_modulus: Floats
+
+    def __post_init__(self) -> None:
+        for name in ("length", "curvature", "base_radius", "tip_radius", "young_modulus"):
+            values = np.asarray(getattr(self, name), dtype=np.float64)
+            object.__setattr__(self, name, values)
+            if values.shape != np.shape(self.length) or not np.isfinite(values).all():
+                raise ConfigError(f"whisker shapes: {name} needs a finite value for each whisker")
+
+    def __len__(self) -> int:
+        return len(self.length)
+
+    def abscissae(self, points: int = POINTS) -> Floats:
+        """(element, points + 1) x of the resting whisker at equal steps of arc length, m."""
+        share = np.linspace(0.0, 1.0, points + 1)
+        fine = np.linspace(0.0, 1.0, 1001) * self.length[:, None]
+        slope = 2 * self.curvature[:, None] * fine
+        pieces = np.sqrt(1 + ((slope[:, 1:] + slope[:, :-1]) / 2) ** 2) * np.diff(fine)
+        arc = np.concatenate([np.zeros((len(self), 1)), np.cumsum(pieces, axis=1)], axis=1)
+        return np.stack(
+            [np.interp(share * s, a, x) for s, a, x in zip(self.length, arc, fine, strict=True)]
+        )
+
+
+def straight(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -> Floats:
+    """Distance (n,) from the base, m, taking the whisker for straight; within its length.
+
+    Args:
+        loads: (n, 6) force (N) and moment (N m) at the base in the whisker's frame.
+        element: (n,) whose.
+        shapes: of the array.
+    """
+    force, moment = loads[:, 1:3], loads[:, 4:6]
+    squared = (force**2).sum(axis=1)
+    across = moment[:, 1] * force[:, 0] - moment[:, 0] * force[:, 1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.where(squared > 0, across / squared, 0.0)
+    distance: Floats = np.clip(ratio, 0.0, shapes.length[element])
+    return distance
+
+
+def resting(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -> Floats:
+    """Arc length (n,) to the point of the resting whisker nearest to the force's line, m.
+
+    Args:
+        loads, element, shapes: as for `straight`.
+    """
+    x = shapes.abscissae()
+    nodes = np.stack([x, shapes.curvature[:, None] * x**2, np.zeros_like(x)], axis=2)
+    found = []
+    for start in range(0, len(loads), AT_ONCE):
+        some, who = loads[start : start + AT_ONCE], element[start : start + AT_ONCE]
+        best, where = np.full(len(some), np.inf), np.zeros(len(some))
+        for k in range(POINTS):
+            left, at = _left_over(some, nodes[who, k], nodes[who, k + 1])
+            where = np.where(left < best, k + at, where)
+            best = np.minimum(best, left)
+        found.append(where / POINTS * shapes.length[who])
+    return np.concatenate(found) if found else np.zeros(0)
+
+
+def bent(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -> Floats:
+    """Arc length (n,) to where the whisker, bent by these very loads, meets the force's line, m.
+
+    Args:
+        loads, element, shapes: as for `straight`.
+    """
+    x = shapes.abscissae()
+    headings = np.arctan(2 * shapes.curvature[:, None] * x)
+    found = []
+    for start in range(0, len(loads), AT_ONCE):
+        some, who = loads[start : start + AT_ONCE], element[start : start + AT_ONCE]
+        force, moment = some[:, :3], some[:, 3:]
+        step = shapes.length[who] / POINTS
+        place, frame = np.zeros((len(some), 3)), np.tile(np.eye(3), (len(some), 1, 1))
+        best, where = np.full(len(some), np.inf), np.zeros(len(some))
+        nearing = np.ones(len(some), dtype=np.bool_)
+        met = TWICE**2 * (moment**2).sum(axis=1)
+        for k in range(POINTS):
+            share = (k + 0.5) / POINTS
+            radius = (shapes.base_radius + share * (shapes.tip_radius - shapes.base_radius))[who]
+            stiffness = shapes.young_modulus[who] * np.pi * radius**4 / 4
+            halfway = place + frame[:, :, 0] * step[:, None] / 2
+            inside = np.einsum("nij,ni->nj", frame, moment - np.cross(halfway, force))
+            turn = inside * (step / stiffness)[:, None]
+            turn[:, 0] = 0.0  # the sensors' whiskers do not twist
+            size = np.linalg.norm(turn, axis=1, keepdims=True)
+            turn *= np.minimum(1.0, SHARPEST / np.maximum(size, SHARPEST))
+            turn[:, 2] += headings[who, k + 1] - headings[who, k]
+            middle = frame @ _rotations(turn / 2)
+            further = place + middle[:, :, 0] * step[:, None]
+            left, at = _left_over(some, place, further)
+            # Beyond the contact the curve goes on as nothing does, and may cross the line again.
+            nearing = (left < best) & (nearing | (left + met < best))
+            where = np.where(nearing, k + at, where)
+            best = np.where(nearing, left, best)
+            place, frame = further, frame @ _rotations(turn)
+        found.append(where / POINTS * shapes.length[who])
+    return np.concatenate(found) if found else np.zeros(0)
+
+
+ESTIMATES = {"straight": straight, "resting": resting, "bent": bent}
+
+
+def _left_over(loads: Floats, near: Floats, far: Floats) -> tuple[Floats, Floats]:
+    """Least |M - r x F|^2 (n,) on the segments from near to far (n, 3), and how far along it is."""
+    force, moment = loads[:, :3], loads[:, 3:]
+    missing, gained = moment - np.cross(near, force), np.cross(far - near, force)
+    squared = np.maximum((gained**2).sum(axis=1), np.finfo(float).tiny)
+    at = np.clip((missing * gained).sum(axis=1) / squared, 0.0, 1.0)
+    return ((missing - at[:, None] * gained) ** 2).sum(axis=1), at
+
+
+def _rotations(turn: Floats) -> Floats:
+    """(n, 3, 3) rotations by the vectors turn (n, 3), rad (Rodrigues)."""
+    angle = np.linalg.norm(turn, axis=1)[:, None, None]
+    x, y, z = turn.T
+    none = np.zeros_like(x)
+    cross = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=1).reshape(-1, 3, 3)
+    with np.errstate(invalid="ignore"):
+        once = np.where(angle > 0, np.sin(angle) / angle, 1.0)
+        twice = np.where(angle > 0, (1 - np.cos(angle)) / angle**2, 0.5)
+    rotations: Floats = np.eye(3) + once * cross + twice * (cross @ cross)
+    return rotations

@@ -1,0 +1,197 @@
+"""The contact network on a set whose answer is known in closed form: straight, stiff whiskers."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+import torch
+from sklearn.metrics import f1_score, roc_auc_score
+
+from tactile_rt.benchmarks.locating import (
+    contact_records,
+    weighted_auroc,
+    weighted_quantile,
+)
+from tactile_rt.contact_point import WhiskerShapes
+from tactile_rt.models.contact_regression import (
+    ContactConfig,
+    ContactNetwork,
+    load_contacts,
+    predict_contacts,
+    tared,
+    train_contacts,
+)
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.recording import SPLITS, SweepManifest, write_object
+from tactile_rt.stream import ArraySpec, ConfigError
+
+SHAPES = WhiskerShapes(*(np.array(v) for v in (
+    [0.02, 0.01, 0.005], [0.0] * 3, [5e-5, 4e-5, 3e-5], [5e-6] * 3, [5e9] * 3
+)))  # fmt: skip
+SPEC = ArraySpec(
+    name="three",
+    elements=("A0", "B0", "C0"),
+    grid=((0, 0), (1, 0), (2, 0)),
+    positions=((0.0, 0.0, 0.0),) * 3,
+    orientations=((1.0, 0.0, 0.0, 0.0),) * 3,
+    channels=("fx", "fy", "fz", "mx", "my", "mz"),
+    units=("N",) * 3 + ("N m",) * 3,
+    rate_hz=1000.0,
+    frame="head",
+)
+LEAD, SAMPLES, SWEEPS = 6, 40, 12
+
+
+def write_set(folder: Path, contacts: bool = True) -> Path:
+    """Objects that slide along the whiskers and push across them, with some friction."""
+    names = {split: tuple(f"mug-{3 * k + i}" for i in range(3)) for k, split in enumerate(SPLITS)}
+    recipe = {"contacts": True} if contacts else {}
+    manifest = SweepManifest(SPEC, 9_000_000, LEAD, ("mug",), names, recipe)
+    manifest.write(folder)
+    for name in manifest.names():
+        rng = np.random.default_rng(list(name.encode()))
+        shape = (SWEEPS, SAMPLES, 3)
+        t = np.arange(SAMPLES)[:, None]
+        start, stop = rng.integers(LEAD, 20, (SWEEPS, 1, 3)), rng.integers(22, 40, (SWEEPS, 1, 3))
+        touching = (t >= start) & (t < stop)
+        share = rng.uniform(0.2, 0.9, (SWEEPS, 1, 3)) + rng.normal(0, 2e-3, shape) * t
+        distance = np.clip(share, 0.05, 1) * SHAPES.length
+        angle = rng.uniform(0, 2 * np.pi, (SWEEPS, 1, 3)) + np.zeros(shape)
+        size = 10 ** rng.uniform(-5, -3, (SWEEPS, 1, 3)) * touching
+        force = np.stack([0.3 * size, size * np.cos(angle), size * np.sin(angle)], axis=-1)
+        at = np.stack([distance, np.zeros(shape), np.zeros(shape)], axis=-1)
+        values = np.concatenate([force, np.cross(at, force)], axis=-1).astype(np.float32)
+        truth = np.where(touching, distance, np.nan) if contacts else None
+        write_object(folder, name, values, {}, truth)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_set(tmp_path_factory.mktemp("sets") / "with")
+
+
+@pytest.fixture(scope="module")
+def trained(folder: Path) -> Path:
+    checkpoint = folder.parent / "locate.pt"
+    train_contacts(
+        SweepSet.read(folder, "train"),
+        SweepSet.read(folder, "validation"),
+        SHAPES,
+        ContactConfig(hidden=16, epochs=12, batch=8, learning_rate=1e-2),
+        checkpoint,
+    )
+    return checkpoint
+
+
+def test_it_finds_touches_and_places_better_than_the_mean(folder: Path, trained: Path) -> None:
+    test = SweepSet.read(folder, "test")
+    touch, distance = predict_contacts(load_contacts(trained, test), tared(test))
+    truth = test.sweeps.contacts
+    assert truth is not None
+    touching = np.isfinite(truth)
+    assert roc_auc_score(touching.ravel(), touch.ravel()) > 0.97
+    assert f1_score(touching.ravel(), touch.ravel() > 0.5) > 0.9
+    share, known = (x[touching] for x in (distance / SHAPES.length, truth / SHAPES.length))
+    middle = np.abs(known - known.mean()).mean()
+    assert np.abs(share - known).mean() < 0.4 * middle
+    noisy = predict_contacts(load_contacts(trained, test), tared(test, 1.0))[1]
+    worse = np.abs(noisy / SHAPES.length - truth / SHAPES.length)[touching].mean()
+    assert np.abs(share - known).mean() < worse < middle
+
+
+def test_training_is_repeatable(folder: Path, tmp_path: Path) -> None:
+    train, held = SweepSet.read(folder, "train"), SweepSet.read(folder, "validation")
+    first, second, other = (
+        train_contacts(train, held, SHAPES, ContactConfig(8, 1, 64, seed=seed), tmp_path / "x.pt")
+        for seed in (0, 0, 1)
+    )
+    a, b, c = (n.state_dict()["leave.0.weight"] for n in (first, second, other))
+    assert torch.equal(a, b) and not torch.equal(a, c)
+
+
+def test_a_stream_step_by_step_is_the_whole(folder: Path, trained: Path) -> None:
+    network, data = load_contacts(trained), SweepSet.read(folder, "test")
+    felt, every = tared(data, 1.0), torch.arange(3)
+    loads, sigma = (torch.from_numpy(x[0]) for x in (felt.loads, felt.sigma))
+    loads = loads.transpose(0, 1)
+    state, steps = None, []
+    with torch.no_grad():
+        whole = network(loads, sigma, every)
+        for t in range(loads.shape[1]):
+            touch, share, state = network(loads[:, t : t + 1], sigma, every, state)
+            steps.append(torch.cat([touch, share], dim=1))
+        later = loads.clone()
+        later[:, 20:] += 1e-3
+        assert torch.equal(network(later, sigma, every)[1][:, :20], whole[1][:, :20])
+    together = torch.stack(steps, dim=1)
+    assert torch.allclose(together[..., 0], whole[0], atol=1e-5)
+    assert torch.allclose(together[..., 1], whole[1], atol=1e-6)
+
+
+def test_the_tare_takes_an_offset_away(folder: Path) -> None:
+    data = SweepSet.read(folder, "test")
+    felt = tared(data, 1.0)
+    quiet = felt.loads[:, :LEAD]
+    assert np.abs(quiet.mean(axis=1)).max() < 1e-9
+    noise = np.repeat([1e-5, 5e-8], 3)
+    assert felt.sigma.mean(axis=(0, 1)) / noise == pytest.approx(0.95, abs=0.1)
+    assert np.array_equal(tared(data).loads, data.sweeps.values)
+
+
+def test_the_figures_hold_what_they_say(folder: Path, trained: Path) -> None:
+    records = {r.name: r for r in contact_records(trained, folder)}
+    assert all(np.isfinite(r.value) for r in records.values())
+    # Straight and stiff: mechanics knows the answer, but for what "bent" makes of the stiffness.
+    for who in ("straight", "resting"):
+        assert records[f"contact.clean.{who}.all.p95"].value < 0.1
+    network, middle = (
+        records[f"contact.clean.{who}.all.median"].value for who in ("network", "middle")
+    )
+    assert 0.1 < network < 0.5 * middle
+    assert records["contact.noisy.straight.all.median"].value > 1
+    assert records["contact.clean.loads.auroc"].value == pytest.approx(1)
+    assert "touches" in records["contact.noisy.network.felt.p95"].how
+
+
+def test_weighted_figures_are_those_of_repeated_samples() -> None:
+    rng = np.random.default_rng(0)
+    score = np.round(rng.normal(size=200), 1).astype(np.float32)
+    true = rng.random(200) < 0.3 + 0.3 * (score > 0)
+    weights = rng.integers(0, 4, (3, 200)).astype(float)
+    for w, area, middle in zip(
+        weights,
+        weighted_auroc(score, true, weights),
+        weighted_quantile(score.astype(float), weights, 0.5),
+        strict=True,
+    ):
+        times = w.astype(int)
+        repeated = np.repeat(score, times)
+        assert area == pytest.approx(roc_auc_score(np.repeat(true, times), repeated))
+        assert middle == np.quantile(repeated.astype(float), 0.5, method="inverted_cdf")
+
+
+def test_what_does_not_fit_is_told(folder: Path, trained: Path, tmp_path: Path) -> None:
+    train, held = SweepSet.read(folder, "train"), SweepSet.read(folder, "validation")
+    two = WhiskerShapes(*(np.ones(2),) * 5)
+    with pytest.raises(ConfigError, match="2 whisker shapes for a set of 3 whiskers"):
+        train_contacts(train, held, two, ContactConfig(), tmp_path / "x.pt")
+    plain = SweepSet.read(write_set(tmp_path / "plain", contacts=False), "train")
+    with pytest.raises(ConfigError, match="holds no contacts"):
+        train_contacts(plain, plain, SHAPES, ContactConfig(), tmp_path / "x.pt")
+    assert not (tmp_path / "x.pt").exists()
+    with pytest.raises(ConfigError, match="hidden must be positive, not 0"):
+        ContactConfig(hidden=0)
+    (tmp_path / "bad.pt").write_bytes(b"nothing")
+    with pytest.raises(ConfigError, match=r"bad\.pt is no network of `tactile-rt locate train`"):
+        load_contacts(tmp_path / "bad.pt")
+
+
+def test_the_length_scales_the_distance() -> None:
+    torch.manual_seed(0)
+    network = ContactNetwork(SHAPES, 4)
+    assert network.length.tolist() == pytest.approx(SHAPES.length.tolist())
+    assert sum(p.numel() for p in network.parameters()) < 400

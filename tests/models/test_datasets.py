@@ -1,0 +1,149 @@
+"""Training windows: the detector's onsets, noise of three kinds, and nothing lost on the way."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tactile_rt.contact import ContactDetector
+from tactile_rt.models.datasets import (
+    RATED_NOISE,
+    STEPS,
+    SUBSTEPS,
+    SweepSet,
+    TrainingBatches,
+    channel_values,
+    find_onsets,
+    windows,
+)
+from tactile_rt.recording import SweepManifest, Sweeps
+from tactile_rt.stream import ArraySpec, ConfigError
+
+ELEMENTS, CHANNELS, SAMPLES, LEAD = 4, 6, 170, 30
+SPEC = ArraySpec(
+    name="four",
+    elements=tuple(f"w{i}" for i in range(ELEMENTS)),
+    grid=tuple((0, i) for i in range(ELEMENTS)),
+    positions=((0.0, 0.0, 0.0),) * ELEMENTS,
+    orientations=((1.0, 0.0, 0.0, 0.0),) * ELEMENTS,
+    channels=("fx", "fy", "fz", "mx", "my", "mz"),
+    units=("N", "N", "N", "N m", "N m", "N m"),
+    rate_hz=1000 / 9,
+    frame="mount",
+)
+RATED = np.array([10e-6] * 3 + [5e-8] * 3, dtype=np.float32)
+FLOOR = np.array([2e-6] * 3 + [1e-8] * 3, dtype=np.float32)
+
+
+def touches(n: int, size: float = 100.0) -> np.ndarray:
+    """(sweep, sample, element, channel) silent until `LEAD`, then a load that tells the sweep."""
+    values = np.zeros((n, SAMPLES, ELEMENTS, CHANNELS), dtype=np.float32)
+    values[:, LEAD:] = size * RATED * (1 + np.arange(n)[:, None, None, None])
+    return values
+
+
+def sweeps(values: np.ndarray) -> SweepSet:
+    names = np.array([f"mug-{i}" for i in range(len(values))])
+    manifest = SweepManifest(SPEC, 9_000_000, LEAD, ("mug",), {"train": tuple(names)})
+    return SweepSet(manifest, Sweeps(values, np.arange(len(values)), names), RATED, FLOOR)
+
+
+def drawn(batches: TrainingBatches, epochs: int = 1) -> list[np.ndarray]:
+    """Samples, offset, sigma and labels of whole epochs."""
+    parts = [[a.numpy() for a in batch] for k in range(epochs) for batch in batches.epoch(k)]
+    return [np.concatenate(part) for part in zip(*parts, strict=True)]
+
+
+def noise_level(samples: np.ndarray) -> np.ndarray:
+    """(window,) noise in units of the rated, by the spread of what is constant late in it."""
+    late = samples.reshape(len(samples), -1, ELEMENTS, CHANNELS)[:, 40:100].astype(np.float64)
+    return (late.std(axis=1) / RATED).mean(axis=(1, 2))
+
+
+def test_rated_noise_by_channel() -> None:
+    assert channel_values(SPEC, RATED_NOISE) == pytest.approx(RATED)
+    with pytest.raises(ConfigError, match="channels in N m cannot be learnt from"):
+        channel_values(SPEC, {"N": 1.0})
+
+
+def test_onsets_are_those_of_the_detector_one_sweep_at_a_time() -> None:
+    rng = np.random.default_rng(3)
+    samples = 300
+    values = np.zeros((40, samples, ELEMENTS, CHANNELS))
+    for sweep in values[4:]:  # the first four are never touched
+        begin = rng.integers(0, 250)
+        load = RATED * 10 ** rng.uniform(-0.5, 2) * rng.normal(size=CHANNELS)
+        sweep[begin:, rng.integers(ELEMENTS)] += load
+    values += RATED * rng.choice([0.0, 0.3, 1.0], (40, 1, 1, 1)) * rng.normal(size=values.shape)
+    values = values.astype(np.float32)
+    found = find_onsets(values, FLOOR)
+    trusted = np.ones(ELEMENTS, dtype=bool)
+    for i, sweep in enumerate(values):
+        detector = ContactDetector((ELEMENTS, CHANNELS), FLOOR)
+        begins = (k for k, sample in enumerate(sweep) if detector.update(sample, trusted))
+        assert found.start[i] == next(begins, -1)
+        assert np.array_equal(found.offset[i], detector.offset)
+        assert np.array_equal(found.sigma[i], detector.sigma)
+    assert (found.start[:4] == -1).all() and (found.start > 150).any()
+
+
+def test_windows_are_cut_where_they_start_and_repeat_the_last_sample() -> None:
+    values = np.arange(2 * SAMPLES, dtype=np.float32).reshape(2, SAMPLES, 1, 1)
+    cut = windows(values, np.array([7, SAMPLES - 3]))
+    assert cut.shape == (2, STEPS, SUBSTEPS, 1, 1)
+    assert cut[0].ravel().tolist() == list(range(7, 7 + STEPS * SUBSTEPS))
+    last = 2 * SAMPLES - 1
+    assert cut[1].ravel()[:4].tolist() == [last - 2, last - 1, last, last]
+    assert (cut[1].ravel()[2:] == last).all()
+
+
+def test_an_epoch_has_every_sweep_once_and_depends_on_seed_and_number_alone() -> None:
+    data = sweeps(touches(12))
+    batches = TrainingBatches(data, 4, seed=1)
+    assert len(batches) == 3
+    first = drawn(batches)
+    assert sorted(first[3]) == list(range(12))
+    for a, b in zip(first, drawn(TrainingBatches(data, 4, seed=1)), strict=True):
+        assert np.array_equal(a, b)
+    other = [a.numpy() for a in next(batches.epoch(1))]
+    assert not np.array_equal(other[0], first[0][:4])
+    seeded = [a.numpy() for a in next(TrainingBatches(data, 4, seed=2).epoch(0))]
+    assert not np.array_equal(seeded[0], first[0][:4])
+
+
+def test_a_third_is_clean_a_third_rated_and_a_third_between() -> None:
+    samples = drawn(TrainingBatches(sweeps(touches(60)), 20, seed=0), epochs=20)[0]
+    level = noise_level(samples)
+    assert len(level) == 1200
+    clean, rated = level < 1e-9, abs(level - 1) < 0.06
+    assert np.mean(clean) == pytest.approx(1 / 3, abs=0.05)
+    assert np.mean(rated) == pytest.approx(1 / 3 + 0.06 / 3, abs=0.05)
+    between = level[~clean & ~rated]
+    assert between.max() < 1 and np.mean(between < 0.47) == pytest.approx(0.5, abs=0.08)
+
+
+def test_the_tare_is_as_wrong_as_one_of_few_noisy_samples() -> None:
+    samples, offset, sigma, _ = drawn(TrainingBatches(sweeps(touches(60)), 20, seed=0), epochs=20)
+    level = noise_level(samples)
+    clean, rated = level < 1e-9, abs(level - 1) < 0.06
+    assert (offset[clean] == 0).all() and (sigma[clean] == FLOOR).all()
+    error = offset[rated] / RATED
+    quiet = np.arange(20, 60)
+    assert error.mean() == pytest.approx(0, abs=0.01)
+    assert error.std() == pytest.approx(np.sqrt((1 / quiet).mean()), rel=0.05)
+    assert (sigma[rated] / RATED).mean() == pytest.approx(1, abs=0.03)
+
+
+def test_a_touch_that_noise_hides_is_learnt_where_it_is_found_without() -> None:
+    data = sweeps(touches(8, size=0.25)[:1].repeat(8, axis=0))
+    assert (data.noisy_starts[0] >= LEAD).all(), "found in silence, above the assumed floor"
+    assert (data.noisy_starts[-1] == -1).any(), "but not in noise"
+    assert sorted(drawn(TrainingBatches(data, 4, seed=0))[3]) == list(range(8))
+
+
+def test_sweeps_without_a_touch_are_left_out_and_too_few_are_refused() -> None:
+    values = touches(6)
+    values[[1, 4]] = 0
+    assert sorted(drawn(TrainingBatches(sweeps(values), 2, seed=0))[3]) == [0, 2, 3, 5]
+    with pytest.raises(ConfigError, match="a batch of 5 is more than the 4 sweeps"):
+        TrainingBatches(sweeps(values), 5, seed=0)

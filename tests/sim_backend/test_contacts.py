@@ -1,0 +1,188 @@
+"""The record of contacts against the elastica, and the loads against themselves without it."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("trimesh")
+
+import beams as theory
+import mujoco
+
+from tactile_rt.benchmarks.beams import flat
+from tactile_rt.benchmarks.pegs import PEG_RADIUS_MM, SLIDE_MM_S, _window, presses
+from tactile_rt.recording import SweepManifest, contacts_of, read_object, read_sweeps
+from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.contacts import ContactProbe, contact_distances
+from tactile_rt.sim_backend.datasets.dataset import make_sweeps, simulate_sweep
+from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict
+from tactile_rt.sim_backend.datasets.recipes import (
+    Between,
+    Each,
+    ObjectChoice,
+    SweepChoice,
+    SweepRecipe,
+)
+from tactile_rt.sim_backend.objects.catalogue import make_object
+from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.world import PROFILES, link_nodes
+from tactile_rt.stream import ConfigError, RecordingError
+
+PLAIN = SweepRecipe(
+    lead_ms=45,
+    length_ms=270,
+    objects=ObjectChoice(categories=("mug",), per_category=3, validation=1, test=1),
+    sweeps=SweepChoice(yaw_deg=Between(0, 360), gap_mm=Between(0.5, 1), draws=2),
+)
+RECIPE = replace(PLAIN, contacts=True)
+
+
+@pytest.mark.parametrize("case", presses()[2::21], ids=lambda c: f"{c.whisker} {c.bend}")
+def test_a_peg_is_recorded_where_the_elastica_has_it(case) -> None:
+    """Arc length and force from the solver of `beams.py`, which knows no links."""
+    profile = PROFILES["dataset"]
+    whisker = replace(flat(case.whisker, case.bend), friction=abs(case.friction))
+    peg = theory.Peg(
+        case.side,
+        case.place * whisker.length,
+        case.depth * whisker.length,
+        case.friction,
+        PEG_RADIUS_MM,
+    )
+    truth = theory.press(whisker, peg)
+    kind, probe, seen = mujoco.mjtState.mjSTATE_FULLPHYSICS, None, []
+    for model, data in _window(case, profile, SLIDE_MM_S):
+        probe = probe or ContactProbe(model, [whisker], profile)
+        state = np.empty(mujoco.mj_stateSize(model, kind))
+        mujoco.mj_getState(model, data, state, kind)
+        seen.append(probe.read(state, data.mocap_pos[0])[0])
+    touching, force, moment = np.mean(seen, axis=0)
+    assert touching == 1
+    assert moment / force * 1e3 == pytest.approx(truth.s, abs=0.02 * whisker.length)
+    assert force == pytest.approx(truth.normal, rel=0.06)
+
+
+def test_links_tile_the_whisker_by_arc_length() -> None:
+    whisker, profile = flat("C2"), PROFILES["realtime"]
+    nodes = link_nodes(whisker, profile)
+    assert (nodes[0], nodes[-1], len(nodes)) == (0, whisker.length, profile.links(whisker) + 2)
+    assert (np.diff(nodes) > 0).all()
+
+
+def test_looking_at_contacts_changes_no_load() -> None:
+    def simulation() -> SweepSimulation:
+        sweep = Sweep(gap_mm=0.5)
+        return SweepSimulation(
+            load_array("mouse"), make_object("mug", 0), sweep, PROFILES["realtime"]
+        )
+
+    loads = simulation().advance(240)
+    looking = simulation()
+    pieces = [looking.advance_with_contacts(n) for n in (100, 1, 139)]
+    assert np.array_equal(np.concatenate([p[0] for p in pieces]), loads)
+    contacts = np.concatenate([p[1] for p in pieces])
+    assert contacts.shape == (240, 30, 3)
+    touching = contacts[..., 0] > 0
+    assert set(np.unique(contacts[..., 0])) == {0, 1}
+    assert np.array_equal(touching, contacts[..., 1] > 0)
+    # whiskers carry loads where they touch, and only whiskers that touched do
+    assert 0.01 < touching.mean() < 0.9
+    assert not loads[:, ~touching.any(axis=0)].any()
+    lengths = np.array([w.length for w in load_array("mouse").whiskers]) * 1e-3
+    arc = contacts[..., 2] / np.where(touching, contacts[..., 1], 1)
+    assert (arc <= lengths * (1 + 1e-9)).all() and arc[touching].min() > 0
+    held = simulation().advance_with_contacts(240, 3)
+    assert np.array_equal(held[1][1::3], held[1][::3])
+    assert np.array_equal(held[1][::3, :, 0], contacts[::3, :, 0])
+    # The solver starts from what it saw last, and stops within its tolerance.
+    assert held[1][::3, :, 1] == pytest.approx(contacts[::3, :, 1], rel=0.01, abs=1e-7)
+    both = touching[::3]
+    held_arc = held[1][::3][both][:, 2] / held[1][::3][both][:, 1]
+    assert held_arc == pytest.approx(arc[::3][both], rel=2e-3)
+
+
+def test_distances_are_of_what_touches_most_of_the_time() -> None:
+    felt = np.array([[0.5, 2, 6], [0.49, 2, 6], [1, 0, 0], [0, 0, 0]], dtype=np.float32)
+    assert contact_distances(felt)[0] == 3
+    assert np.isnan(contact_distances(felt)[1:]).all()
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("sets") / "with"
+    list(make_sweeps(RECIPE, folder, processes=1))
+    return folder
+
+
+def test_a_set_with_contacts_holds_the_loads_of_one_without(made: Path) -> None:
+    sweeps, manifest = read_sweeps(made, "train"), SweepManifest.read(made)
+    assert manifest.recipe["contacts"] is True
+    assert recipe_from_dict(manifest.recipe) == RECIPE
+    contacts = contacts_of(sweeps)
+    assert contacts.shape == sweeps.values.shape[:3] and contacts.dtype == np.float32
+    for index in range(2):
+        plain = simulate_sweep(PLAIN, make_object("mug", 0), index)
+        assert plain.contacts is None
+        assert np.array_equal(plain.values, sweeps.values[index])
+        again = simulate_sweep(RECIPE, make_object("mug", 0), index)
+        assert again.parameters == plain.parameters
+        assert np.array_equal(again.contacts, contacts[index], equal_nan=True)
+    assert np.isnan(contacts[:, : manifest.lead]).all()
+    touching = np.isfinite(contacts)
+    assert 0.01 < touching.mean() < 0.9
+    force = np.linalg.norm(sweeps.values[..., :3], axis=-1)
+    assert force[touching].mean() > 20 * force[~touching].mean()
+    assert "contacts" not in read_object(made, "mug-0")[1]
+
+
+def test_a_set_without_is_as_before(tmp_path: Path) -> None:
+    assert "contacts" not in PLAIN.to_dict()
+    list(make_sweeps(PLAIN, tmp_path, processes=1, splits=("test",)))
+    with np.load(tmp_path / "mug-2.npz") as arrays:
+        assert "contacts" not in arrays.files
+    assert read_sweeps(tmp_path, "test").contacts is None
+    with pytest.raises(ConfigError, match="holds no contacts: make one with `tactile-rt sweep"):
+        contacts_of(read_sweeps(tmp_path, "test"))
+    with pytest.raises(ConfigError, match=r"other recipe\.contacts"):
+        list(make_sweeps(RECIPE, tmp_path, processes=1))
+
+
+def test_contacts_survive_the_journal(tmp_path: Path) -> None:
+    from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord
+
+    contacts = np.array([[0.01, np.nan]], dtype=np.float32)
+    values = np.ones((1, 2, 6), dtype=np.float32)
+    with Journal(tmp_path, "mug-0") as journal:
+        journal.append(0, SweepRecord(values, {}, contacts))
+        journal.append(1, SweepRecord(values, {}))
+    with Journal(tmp_path, "mug-0") as journal:
+        assert np.array_equal(journal.records[0].contacts, contacts, equal_nan=True)
+        assert journal.records[1].contacts is None
+
+
+def test_a_miss_touches_nothing() -> None:
+    grid = replace(RECIPE, sweeps=SweepChoice(distance_mm=Each((60.0,))))
+    record = simulate_sweep(grid, make_object("mug", 0), 0)
+    assert record.contacts is not None and np.isnan(record.contacts).all()
+
+
+def test_damaged_contacts_are_told(made: Path, tmp_path: Path) -> None:
+    for path in made.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    with np.load(tmp_path / "mug-1.npz") as arrays:
+        kept = dict(arrays)
+    np.savez(tmp_path / "mug-1.npz", **{**kept, "contacts": kept["contacts"][:, :3]})
+    with pytest.raises(RecordingError, match=r"mug-1\.npz is damaged \(contacts"):
+        read_sweeps(tmp_path, "validation")
+    del kept["contacts"]
+    np.savez(tmp_path / "mug-1.npz", **kept)
+    with pytest.raises(RecordingError, match=r"mug-1\.npz is damaged"):
+        read_sweeps(tmp_path, "validation")
+
+
+def test_a_recipe_says_true_or_false() -> None:
+    with pytest.raises(ConfigError, match="contacts must be true or false"):
+        recipe_from_dict({"contacts": 1}, "mine.toml")
