@@ -1,4 +1,4 @@
-"""Benchmark area `models`: the shipped model on a sweep set of unseen objects."""
+"""Benchmark area `models`: the shipped model on unseen objects, and the speed of training."""
 
 import tempfile
 from dataclasses import replace
@@ -6,6 +6,7 @@ from pathlib import Path
 
 from tactile_rt.benchmarks.classification import evaluate_model
 from tactile_rt.benchmarks.records import Record
+from tactile_rt.benchmarks.training_speed import training_speed
 from tactile_rt.model_file import load_model, shipped_model
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
@@ -14,7 +15,7 @@ __all__ = ["run"]
 
 
 def run(quick: bool) -> list[Record]:
-    """Sweep test objects of the shipped model afresh and classify them.
+    """Sweep test objects of the shipped model afresh and classify them; time training steps.
 
     Quick: one sweep of each object, enough to see a broken model but not to quote; the full run
     makes the very test set that the model's card names.
@@ -26,4 +27,5 @@ def run(quick: bool) -> list[Record]:
     with tempfile.TemporaryDirectory() as folder:
         for _ in make_sweeps(recipe, Path(folder), splits=("test",)):
             pass
-        return evaluate_model(shipped_model(), Path(folder))
+        accuracy = evaluate_model(shipped_model(), Path(folder))
+    return [*accuracy, *training_speed(quick)]

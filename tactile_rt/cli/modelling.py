@@ -1,29 +1,65 @@
-"""`tactile-rt train`, `export` and `eval`: from a sweep set to a model file with its figures."""
+"""`tactile-rt train`, `recipes`, `probe` and `export`: from a sweep set to a model file."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from rich.table import Table
 
-from tactile_rt.cli import app, check_output, needs
+from tactile_rt.cli import app, needs
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.stream import ConfigError
+
+if TYPE_CHECKING:
+    from tactile_rt.models.training import Progress
+
+WAITING = 0.1  # share of an epoch: less says nothing that one could do something about
 
 
 @app.command()
 def train(
     data: Annotated[Path, typer.Argument(help="A sweep set.")],
     folder: Annotated[Path, typer.Argument(help="The run; an interrupted one goes on.")],
-    attender: Annotated[str, typer.Option(help="gpt or none.")] = "none",
-    decoder: Annotated[str, typer.Option(help="linear or mlp.")] = "mlp",
+    recipe: Annotated[
+        str, typer.Option(help="See `tactile-rt recipes`; or a TOML file. Options override it.")
+    ] = "default",
+    encoder: Annotated[str | None, typer.Option(help="zhuang-CELL, resnet18, s4, ...")] = None,
+    graph: Annotated[
+        Path | None, typer.Option(help="TOML file of nodes and edges, for --encoder graph.")
+    ] = None,
+    attender: Annotated[str | None, typer.Option(help="gpt, mamba or none.")] = None,
+    decoder: Annotated[str | None, typer.Option(help="linear, mlp or mlp-all.")] = None,
     width: Annotated[
-        float, typer.Option(help="Scales every channel count; a multiple of 1/32.")
-    ] = 0.125,
-    epochs: Annotated[int, typer.Option(min=1, help="Passes over the training split.")] = 14,
-    batch: Annotated[int, typer.Option(min=1, help="Sweeps per update.")] = 32,
-    learning_rate: Annotated[float, typer.Option(help="Peak, after a warm-up.")] = 5e-3,
-    seed: Annotated[int, typer.Option(help="Of weights, windows and noise.")] = 0,
+        float | None, typer.Option(help="Scales every channel count; a multiple of 1/32.")
+    ] = None,
+    objective: Annotated[
+        str | None, typer.Option(help="supervised, simclr, simsiam or autoencoder.")
+    ] = None,
+    augmentation: Annotated[
+        str | None, typer.Option(help="none, tactile, tactile-paper or image.")
+    ] = None,
+    masking: Annotated[float | None, typer.Option(help="Share of steps to blank.")] = None,
+    optimizer: Annotated[
+        str | None, typer.Option(help="sgd, adam, adamw, lars or lars-paper.")
+    ] = None,
+    schedule: Annotated[
+        str | None, typer.Option(help="step, constant, cosine, cosine-annealing or one-cycle.")
+    ] = None,
+    epochs: Annotated[
+        int | None, typer.Option(min=1, help="Passes over the training split.")
+    ] = None,
+    updates: Annotated[
+        int | None, typer.Option(min=0, help="Stop after so many updates instead; 0: epochs.")
+    ] = None,
+    batch: Annotated[int | None, typer.Option(min=1, help="Sweeps per update.")] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="The peak.")] = None,
+    precision: Annotated[str | None, typer.Option(help="bf16 or fp32.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of weights, windows and noise.")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda ...")] = "auto",
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Write logs for TensorBoard, too.")
+    ] = False,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
 ) -> None:
     """Train an Encoder-Attender-Decoder network on a sweep set."""
@@ -34,35 +70,118 @@ def train(
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     torch.set_num_threads(threads)
-    config = training.TrainingConfig(
-        data=str(data),
-        attender=attender,
-        decoder=decoder,
-        width=width,
-        epochs=epochs,
-        batch=batch,
-        learning_rate=learning_rate,
-        seed=seed,
-    )
+    asked = {
+        "encoder": encoder,
+        "graph": None if graph is None else _text(graph),
+        "attender": attender,
+        "decoder": decoder,
+        "width": width,
+        "objective": objective,
+        "augmentation": augmentation,
+        "masking": masking,
+        "optimizer": optimizer,
+        "schedule": schedule,
+        "epochs": epochs,
+        "updates": updates,
+        "batch": batch,
+        "learning_rate": learning_rate,
+        "precision": precision,
+        "seed": seed,
+    }
+    given = {name: value for name, value in asked.items() if value is not None}
+    config = training.read_recipe(recipe, str(data), **given)
     console = Console(stderr=True)
     with progress_bar(console, "finding onsets") as update:
 
-        def show(at: training.Progress) -> None:
+        def show(at: "training.Progress") -> None:
             update(
                 total=at.updates,
                 completed=at.update,
                 description=f"epoch {at.epoch}/{at.epochs} loss {at.loss:.3f}",
             )
             if at.metrics:
-                m = at.metrics
-                console.print(
-                    f"epoch {at.epoch}: loss {m['loss']:.3f}, validation top-1 "
-                    f"{100 * m['validation_top1']:.1f} % clean, "
-                    f"{100 * m['validation_top1_noisy']:.1f} % at rated noise"
-                )
+                console.print(_in_words(at))
 
-        best = training.train(config, folder, show)
+        try:
+            best = training.train(config, folder, show, tensorboard=tensorboard, device=device)
+        except ModuleNotFoundError as error:
+            raise needs("train", error) from None
     console.print(f"best network: {best}")
+
+
+def _in_words(at: "Progress") -> str:
+    """What came of an epoch."""
+    m = at.metrics
+    if "validation_top1" in m:
+        found = (
+            f"validation top-1 {100 * m['validation_top1']:.1f} % clean, "
+            f"{100 * m['validation_top1_noisy']:.1f} % at rated noise"
+        )
+    else:
+        found = f"validation loss {m['validation_loss']:.3f}"
+    waited = f" ({100 * m['waiting']:.0f} % of the time waiting for data)"
+    return f"epoch {at.epoch}: loss {m['loss']:.3f}, {found}" + waited * (m["waiting"] >= WAITING)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path} is no text file") from None
+
+
+@app.command()
+def recipes() -> None:
+    """List the training recipes that ship."""
+    try:
+        from tactile_rt.models.training.recipes import load_recipe, shipped_recipes
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    table = Table(box=None, pad_edge=False)
+    for column in ("recipe", "what", "tried"):
+        table.add_column(column, no_wrap=column == "recipe")
+    for name in shipped_recipes():
+        recipe = load_recipe(name)
+        tried = (f"{key} {', '.join(map(str, v))}" for key, v in recipe.search.items())
+        table.add_row(name, recipe.about, "; ".join(tried))
+    Console().print(table)
+
+
+@app.command()
+def probe(
+    checkpoint: Annotated[Path, typer.Argument(help="best.pt of a training run.")],
+    folder: Annotated[Path, typer.Argument(help="Where the probed network goes.")],
+    data: Annotated[
+        Path | None, typer.Option(help="Sweep set; default: the one it was trained on.")
+    ] = None,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the features.")] = 100,
+    learning_rate: Annotated[float, typer.Option(help="Of SGD.")] = 0.1,
+    standardise: Annotated[
+        bool, typer.Option(help="Fit on standardised features; the paper did not.")
+    ] = True,
+    seed: Annotated[int, typer.Option(help="Of the layer and the windows.")] = 0,
+) -> None:
+    """Fit a linear layer on a frozen network's features: how much of the category do they hold?"""
+    try:
+        from tactile_rt.models import training
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    config = training.ProbeConfig(
+        data=str(data or ""),
+        epochs=epochs,
+        learning_rate=learning_rate,
+        standardise=standardise,
+        seed=seed,
+    )
+    console = Console(stderr=True)
+    with console.status("probing"):
+        shown: list[training.Progress] = []
+        best = training.probe(checkpoint, folder, config, shown.append)
+    m = shown[-1].metrics
+    console.print(
+        f"{best}: validation top-1 {100 * m['validation_top1']:.1f} % clean, "
+        f"{100 * m['validation_top1_noisy']:.1f} % at rated noise"
+    )
 
 
 @app.command()
@@ -85,32 +204,3 @@ def export(
         f"{model}: {model.stat().st_size / 1e6:.1f} MB, parity {card.figures['parity']:.1e}, "
         f"temperature {card.temperature:.2f}"
     )
-
-
-@app.command(name="eval")
-def evaluate(
-    model: Annotated[Path, typer.Argument(help="An .onnx model.")],
-    data: Annotated[Path, typer.Argument(help="A sweep set.")],
-    accurate: Annotated[
-        Path | None, typer.Option(help="The same sweeps at another profile, to compare with.")
-    ] = None,
-    svm: Annotated[bool, typer.Option(help="Fit an RBF SVM on the same windows too.")] = False,
-    pictures: Annotated[
-        Path | None, typer.Option(help="Folder for confusion.png, accuracy_over_time.png.")
-    ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
-) -> None:
-    """Measure a model on the test objects of a sweep set: accuracy, noise, fusion, calibration."""
-    try:
-        from tactile_rt.benchmarks.classification import evaluate_model
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
-    from tactile_rt.benchmarks.records import show, write
-
-    check_output(json)
-    console = Console(stderr=True)
-    with console.status("evaluating"):
-        records = evaluate_model(model, data, accurate, svm, pictures)
-    show(records, Console())
-    if json:
-        write(records, json)

@@ -1,26 +1,138 @@
-"""Decoders: from what a step means to the classes' logits, `(..., feature)` -> `(..., class)`.
+"""Decoders: from what a step means to the classes' logits.
 
-Both act on each step alone, so that a decision can be read off at any step.
+Every decoder maps features `(batch, step, feature)` to logits `(batch, step, class)`, where a
+step's logits use no later step, and has a `step` that gives the same one by one.
 """
 
 from __future__ import annotations
 
-from torch import nn
+import math
 
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tactile_rt.stream import ConfigError
+
+__all__ = ["DECODERS", "HIDDEN", "LinearDecoder", "MLPAllDecoder", "MLPDecoder", "make"]
+
+DECODERS = ("linear", "mlp", "mlp-all")
 HIDDEN = (1024, 512)  # at width 1
 
 
-def linear(features: int, classes: int) -> nn.Module:
-    return nn.Linear(features, classes)
+class LinearDecoder(nn.Linear):
+    """Each step alone: one layer."""
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        return {}
+
+    def step(
+        self, features: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """features (batch, feature) -> logits (batch, class), {}"""
+        return self(features), {}
 
 
-def mlp(features: int, classes: int, width: float) -> nn.Module:
-    """512-1024-512-classes at width 1 (paper, appendix "Model Training")."""
-    wide, narrow = (round(hidden * width) for hidden in HIDDEN)
-    return nn.Sequential(
-        nn.Linear(features, wide),
-        nn.ReLU(),
-        nn.Linear(wide, narrow),
-        nn.ReLU(),
-        nn.Linear(narrow, classes),
-    )
+class MLPDecoder(nn.Sequential):
+    """Each step alone: feature-1024-512-class at width 1 (Chung et al. 2025, model training)."""
+
+    def __init__(self, features: int, classes: int, width: float = 1.0) -> None:
+        wide, narrow = hidden(width)
+        super().__init__(
+            nn.Linear(features, wide),
+            nn.ReLU(),
+            nn.Linear(wide, narrow),
+            nn.ReLU(),
+            nn.Linear(narrow, classes),
+        )
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        return {}
+
+    def step(
+        self, features: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """features (batch, feature) -> logits (batch, class), {}"""
+        return self(features), {}
+
+
+class MLPAllDecoder(nn.Module):
+    """All steps of an episode: (steps * feature)-1024-512-class at width 1.
+
+    At step t the features of later steps count as zero, so the last step's logits are the
+    paper's, and the first layer is a running sum of one product a step.
+    """
+
+    def __init__(self, features: int, classes: int, width: float = 1.0, steps: int = 22) -> None:
+        super().__init__()
+        wide, narrow = hidden(width)
+        self.weight = nn.Parameter(torch.empty(steps, wide, features))
+        self.bias = nn.Parameter(torch.empty(wide))
+        bound = 1 / math.sqrt(steps * features)  # of one layer that reads all steps
+        nn.init.uniform_(self.weight, -bound, bound)
+        nn.init.uniform_(self.bias, -bound, bound)
+        self.layer2 = nn.Linear(wide, narrow)
+        self.layer3 = nn.Linear(narrow, classes)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """features (batch, step, feature) -> logits (batch, step, class)
+
+        Raises:
+            ValueError: more steps than the decoder has weights for.
+        """
+        steps = features.shape[1]
+        if steps > len(self.weight):
+            raise ValueError(f"{steps} steps, but this decoder ends at {len(self.weight)}")
+        products = torch.einsum("btf,thf->bth", features, self.weight[:steps])
+        # At least single precision: sums of many steps would stall in autocast's types.
+        exact = torch.promote_types(products.dtype, torch.float32)
+        return self._rest(products.cumsum(1, dtype=exact))
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        """Zero: the first layer's running sum, (batch, hidden)."""
+        return {"decoder_sum": self.bias.new_zeros(batch, len(self.bias))}
+
+    def step(
+        self, features: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """features (batch, feature), index (batch,) int64 -> logits (batch, class), state
+
+        Steps past the last weight change nothing.
+        """
+        weight = self.weight[index.clamp(max=len(self.weight) - 1)]  # (batch, hidden, feature)
+        product = torch.matmul(weight, features[:, :, None])[:, :, 0]
+        inside = (index < len(self.weight))[:, None]
+        total = state["decoder_sum"] + torch.where(inside, product, 0.0)
+        return self._rest(total), {"decoder_sum": total}
+
+    def _rest(self, total: Tensor) -> Tensor:
+        logits: Tensor = self.layer3(F.relu(self.layer2(F.relu(total + self.bias))))
+        return logits
+
+
+def hidden(width: float) -> tuple[int, int]:
+    wide, narrow = (round(units * width) for units in HIDDEN)
+    return wide, narrow
+
+
+def make(
+    name: str, features: int, classes: int, width: float = 1.0, steps: int = 22
+) -> LinearDecoder | MLPDecoder | MLPAllDecoder:
+    """The decoder of that name.
+
+    Args:
+        name: one of `DECODERS`.
+        features: what a step brings.
+        width: scales the hidden layers.
+        steps: an episode's steps, which "mlp-all" has weights for.
+
+    Raises:
+        ConfigError: no decoder has that name.
+    """
+    if name == "linear":
+        return LinearDecoder(features, classes)
+    if name == "mlp":
+        return MLPDecoder(features, classes, width)
+    if name == "mlp-all":
+        return MLPAllDecoder(features, classes, width, steps)
+    raise ConfigError(f"decoder is {name!r}, not one of {', '.join(DECODERS)}")

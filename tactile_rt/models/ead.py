@@ -12,25 +12,49 @@ for streaming, and gives the same logits. The logits of a step use no later fram
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from tactile_rt.models import attenders, decoders
 from tactile_rt.models.encoders.cells import CELLS
-from tactile_rt.models.encoders.zhuang import LAG, ZhuangEncoder
 from tactile_rt.stream import ConfigError
 
-ENCODERS = tuple(f"zhuang-{cell}" for cell in CELLS)
-ATTENDERS = ("gpt", "none")
-DECODERS = ("linear", "mlp")
+__all__ = [
+    "ATTENDERS",
+    "DECODERS",
+    "EAD",
+    "ENCODERS",
+    "READOUTS",
+    "EADConfig",
+    "count_parameters",
+]
+
+# name: (module in `encoders`, class), imported when a network needs it
+ENCODERS: dict[str, tuple[str, str]] = {
+    **{f"zhuang-{cell}": ("zhuang", "ZhuangEncoder") for cell in CELLS},
+    "resnet18": ("resnet", "ResNet18Encoder"),
+    "s4": ("s4", "S4Encoder"),
+    "mamba": ("mamba", "MambaEncoder"),
+    "gru": ("gru", "GRUEncoder"),
+    "graph": ("graph_encoder", "GraphEncoder"),
+}
+ATTENDERS = ("gpt", "mamba", "none")
+DECODERS = decoders.DECODERS
 READOUTS = ("last", "mean")
 WIDTH_UNIT = 32  # every channel count is a multiple of this at width 1
+GPT_OF_RESNET = 256  # the paper's GPT is narrower than its features there, and only there
 
 
 @dataclass(frozen=True)
 class EADConfig:
-    """Which network. The defaults are the paper's Intersection-LN + GPT, 63.8 M parameters."""
+    """Which network. The defaults are the paper's Intersection-LN + GPT, 63.8 M parameters.
+
+    Raises:
+        ConfigError: a field that names or measures nothing possible.
+    """
 
     classes: int
     encoder: str = "zhuang-intersection-ln"
@@ -42,10 +66,11 @@ class EADConfig:
     readout: str = "last"
     dropout: float = 0.1
     max_steps: int = 22  # an episode; the GPT's positions end here
+    graph: str = ""  # of encoder "graph": the text of a TOML file, see `encoders.graph_files`
 
     def __post_init__(self) -> None:
         for field, known in (
-            ("encoder", ENCODERS),
+            ("encoder", tuple(ENCODERS)),
             ("attender", ATTENDERS),
             ("decoder", DECODERS),
             ("readout", READOUTS),
@@ -54,7 +79,7 @@ class EADConfig:
                 raise ConfigError(f"{field} is {value!r}, not one of {', '.join(known)}")
         if self.classes < 1:
             raise ConfigError(f"classes is {self.classes}, must be at least 1")
-        if self.width <= 0 or self.width * WIDTH_UNIT % 1:
+        if not 0 < self.width < float("inf") or self.width * WIDTH_UNIT % 1:
             raise ConfigError(
                 f"width is {self.width}, must be a positive multiple of 1/{WIDTH_UNIT}"
             )
@@ -62,65 +87,99 @@ class EADConfig:
             raise ConfigError(f"dropout is {self.dropout}, must be in [0, 1)")
         if not 1 <= self.max_steps <= attenders.MAX_STEPS:
             raise ConfigError(f"max_steps is {self.max_steps}, must be 1 to {attenders.MAX_STEPS}")
+        if bool(self.graph) != (self.encoder == "graph"):
+            raise ConfigError("graph must be given with encoder 'graph', and only then")
 
 
 class EAD(nn.Module):
-    """The network of one `EADConfig`; see the module's docstring."""
+    """The network of one `EADConfig`; see the module's docstring.
+
+    `others`, where a method takes them, are the further inputs of encoder "graph", each
+    (batch, step, channel[, row, column]) for a window, without the step for one step.
+
+    Attributes:
+        lag: the first `lag` steps of a window know of no frame, the last `lag` frames do not count.
+    """
 
     def __init__(self, config: EADConfig) -> None:
         super().__init__()
         self.config = config
-        self.encoder = ZhuangEncoder(config.width, cell=config.encoder.removeprefix("zhuang-"))
-        features = self.encoder.features
-        self.attender: attenders.GPT | attenders.NoAttender
+        self.encoder: Any = _encoder(config)
+        self.lag: int = self.encoder.lag
+        width: int = self.encoder.features
+        self.attender: attenders.GPT | attenders.MambaAttender | attenders.NoAttender
         if config.attender == "gpt":
-            self.attender = attenders.GPT(features, config.dropout, config.max_steps)
+            inputs = width
+            if config.encoder == "resnet18":
+                width = round(GPT_OF_RESNET * config.width)
+            self.attender = attenders.GPT(width, config.dropout, config.max_steps, inputs)
+        elif config.attender == "mamba":
+            self.attender = attenders.MambaAttender(width)
         else:
             self.attender = attenders.NoAttender()
-        if config.decoder == "mlp":
-            self.decoder = decoders.mlp(features, config.classes, config.width)
-        else:
-            self.decoder = decoders.linear(features, config.classes)
+        self.decoder = decoders.make(
+            config.decoder, width, config.classes, config.width, config.max_steps
+        )
 
-    def forward(self, frames: Tensor) -> Tensor:
+    def features(self, frames: Tensor, *others: Tensor) -> Tensor:
+        """What the decoder reads. frames (batch, step, 30, 5, 7) -> (batch, step, feature)"""
+        features: Tensor = self.attender(self.encoder(frames, *others))
+        return features
+
+    def forward(self, frames: Tensor, *others: Tensor) -> Tensor:
         """frames (batch, step, 30, 5, 7) -> logits (batch, step, class)"""
-        logits: Tensor = self.decoder(self.attender(self.encoder(frames)))
+        logits: Tensor = self.decoder(self.features(frames, *others))
         if self.config.readout == "last":
             return logits
         # At least single precision: sums of many steps would stall in autocast's types.
         exact = torch.promote_types(logits.dtype, torch.float32)
-        total = logits[:, LAG:].cumsum(dim=1, dtype=exact)
+        total = logits[:, self.lag :].cumsum(dim=1, dtype=exact)
         counts = torch.arange(1, total.shape[1] + 1, device=total.device)
-        return torch.cat([logits[:, :LAG], total / counts[:, None]], dim=1)
+        return torch.cat([logits[:, : self.lag], total / counts[:, None]], dim=1)
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
         """The state before the first step: zeros, each with a leading batch axis, in order."""
-        weight = self.encoder.fc8.weight
+        weight = next(self.parameters())
         state = {
             "index": torch.zeros(batch, dtype=torch.int64, device=weight.device),
             **self.encoder.initial_state(batch),
             **self.attender.initial_state(batch),
+            **self.decoder.initial_state(batch),
         }
         if self.config.readout == "mean":
             state["logits_sum"] = weight.new_zeros(batch, self.config.classes)
         return state
 
-    def step(self, frame: Tensor, state: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
+    def step(
+        self, frame: Tensor, state: dict[str, Tensor], *others: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
         """One 45 ms step. frame (batch, 30, 5, 7) -> logits (batch, class), the next state.
 
         A lane is reset by putting its rows of `initial_state` back.
         """
         index = state["index"]
-        features, encoder = self.encoder.step(frame, state)
+        features, encoder = self.encoder.step(frame, index, state, *others)
         features, attender = self.attender.step(features, index, state)
-        logits: Tensor = self.decoder(features)
-        new = {"index": index + 1, **encoder, **attender}
+        logits, decoder = self.decoder.step(features, index, state)
+        new = {"index": index + 1, **encoder, **attender, **decoder}
         if self.config.readout == "mean":
-            count = index[:, None] - LAG + 1  # steps in the mean; none before the lag is over
+            count = index[:, None] - self.lag + 1  # steps in the mean; none before the lag is over
             total = state["logits_sum"] + torch.where(count > 0, logits, 0.0)
             logits = torch.where(count > 0, total / count.clamp(min=1), logits)
             new["logits_sum"] = total
         return logits, {name: new[name] for name in state}
+
+
+def _encoder(config: EADConfig) -> Any:
+    module, name = ENCODERS[config.encoder]
+    kind = getattr(import_module(f"tactile_rt.models.encoders.{module}"), name)
+    if config.encoder == "graph":
+        from tactile_rt.models.encoders.graph_files import parse_graph
+
+        return kind(parse_graph(config.graph).scaled(config.width))
+    if config.encoder.startswith("zhuang-"):
+        return kind(config.width, cell=config.encoder.removeprefix("zhuang-"))
+    return kind(config.width)
 
 
 def count_parameters(module: nn.Module) -> int:

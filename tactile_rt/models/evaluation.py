@@ -5,20 +5,26 @@ decision, and counts as wrong everywhere.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier import fuse
-from tactile_rt.models.datasets import STEPS, SweepSet, find_onsets, windows
+from tactile_rt.models.datasets import STEPS, SweepSet, windows
+from tactile_rt.models.disturbances import CLEAN, Disturbance
+from tactile_rt.models.intervals import Interval, accuracy, bootstrap
+from tactile_rt.models.onsets import find_onsets
 
 __all__ = [
     "Interval",
     "accuracy",
     "accuracy_over_time",
+    "at_temperature",
     "auroc",
+    "bootstrap",
     "confusion",
+    "deciding_step",
     "expected_calibration_error",
     "fused_accuracy",
     "hits",
@@ -30,47 +36,51 @@ Step = Callable[
 ]
 
 
-@dataclass(frozen=True)
-class Interval:
-    """An estimate with its 95 % interval."""
-
-    value: float
-    low: float
-    high: float
-
-    def __str__(self) -> str:
-        return f"{100 * self.value:.1f} % [{100 * self.low:.1f}, {100 * self.high:.1f}]"
-
-
 def predict(
-    data: SweepSet, run: Step, noise_level: float = 0.0, seed: int = 0, batch: int = 64
+    data: SweepSet,
+    run: Step,
+    noise_level: float = 0.0,
+    seed: int = 0,
+    batch: int = 64,
+    disturbance: Disturbance = CLEAN,
 ) -> NDArray[np.float32]:
     """Posteriors of every sweep at every step, from where the detector finds its onset.
 
     Args:
         data: the sweeps.
         run: (samples, offset, sigma) of windows to (batch, step, class) logits.
-        noise_level: white sensor noise added to every stored sample, in units of the rated noise.
-        seed: of the noise.
+        noise_level: white sensor noise added to every stored sample, in units of the rated noise;
+            short for a `disturbance` of only that.
+        seed: of the noise and of what else is drawn.
         batch: windows per call of `run`.
+        disturbance: what is wrong with the sensor.
 
     Returns:
         (sweep, step, class) posteriors; NaN where no contact was detected.
     """
+    if noise_level:
+        disturbance = replace(disturbance, noise=noise_level)
     rng = np.random.default_rng(seed)
     parts = []
     for i in range(0, len(data.sweeps), batch):
-        values = data.sweeps.values[i : i + batch]
-        if noise_level:
-            noise = rng.normal(size=values.shape).astype(np.float32)
-            values = values + noise * data.noise * np.float32(noise_level)
+        values = disturbance.of_samples(data.sweeps.values[i : i + batch], data, rng)
         found = find_onsets(values, data.floor)
-        logits = run(windows(values, found.start, STEPS), found.offset, found.sigma)
+        cut = disturbance.of_windows(windows(values, found.start, STEPS), data, rng)
+        logits = run(cut, found.offset, found.sigma)
         posterior = np.exp(logits - logits.max(axis=-1, keepdims=True))
         posterior /= posterior.sum(axis=-1, keepdims=True)
         posterior[found.start < 0] = np.nan
         parts.append(posterior)
     return np.concatenate(parts)
+
+
+def at_temperature(posteriors: NDArray[np.float32], temperature: float) -> NDArray[np.float32]:
+    """(..., class) posteriors as they would be with their logits divided by a temperature."""
+    with np.errstate(divide="ignore"):
+        logits = np.log(posteriors) / np.float32(temperature)
+    scaled = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    out: NDArray[np.float32] = scaled / scaled.sum(axis=-1, keepdims=True)
+    return out
 
 
 def hits(
@@ -95,30 +105,24 @@ def auroc(known: NDArray[np.float32], unknown: NDArray[np.float32]) -> float:
     return float((below + ties).mean() / (2 * len(low)))
 
 
-def accuracy(
-    correct: NDArray[np.bool_], objects: NDArray[np.str_], resamples: int = 2000
-) -> Interval:
-    """Accuracy with a percentile bootstrap over objects: sweeps of one object are not independent.
-
-    Args:
-        correct: (sweep,).
-        objects: (sweep,) object of each sweep.
-        resamples: bootstrap resamples.
-    """
-    _, which = np.unique(objects, return_inverse=True)
-    right = np.bincount(which, weights=correct)
-    count = np.bincount(which)
-    drawn = np.random.default_rng(0).integers(0, len(count), (resamples, len(count)))
-    means = right[drawn].sum(axis=1) / count[drawn].sum(axis=1)
-    low, high = np.percentile(means, [2.5, 97.5])
-    return Interval(float(correct.mean()), float(low), float(high))
-
-
 def accuracy_over_time(
     posteriors: NDArray[np.float32], labels: NDArray[np.int64]
 ) -> NDArray[np.float64]:
     """(step,) top-1 accuracy if one decided at that step."""
     return np.array([hits(posteriors[:, t], labels).mean() for t in range(posteriors.shape[1])])
+
+
+def deciding_step(posteriors: NDArray[np.float32], labels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(sweep,) the step, from 1, from which the decision is right and stays so; 0: it never does.
+
+    Args:
+        posteriors: (sweep, step, class).
+        labels: (sweep,).
+    """
+    steps = posteriors.shape[1]
+    right = np.stack([hits(posteriors[:, t], labels) for t in range(steps)], axis=1)
+    kept = np.logical_and.accumulate(right[:, ::-1], axis=1).sum(axis=1)  # right steps at the end
+    return np.where(kept > 0, steps - kept + 1, 0).astype(np.int64)
 
 
 def fused_accuracy(

@@ -16,7 +16,7 @@ def test_an_unknown_area_lists_the_areas(call):
 
 
 def test_an_area_without_figures_says_so(call):
-    assert call("bench", "align") == (0, "no figures yet for: align\n", "")
+    assert call("bench", "daemon") == (0, "no figures yet for: daemon\n", "")
 
 
 def test_a_folder_that_is_not_there_is_named_before_measuring(call, tmp_path):

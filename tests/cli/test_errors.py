@@ -156,7 +156,7 @@ def torch():
     ("options", "said"),
     [
         (("--width", 0.1), "width is 0.1, must be a positive multiple of 1/32"),
-        (("--attender", "lstm"), "attender is 'lstm', not one of gpt, none"),
+        (("--attender", "lstm"), "attender is 'lstm', not one of gpt, mamba, none"),
         (("--seed", -1), "seed must be 0 to 4294967295"),
         (("--learning-rate", "nan"), "learning_rate must be positive, not nan"),
     ],
@@ -266,10 +266,12 @@ def test_a_model_is_evaluated_only_on_what_it_was_made_for(
     assert "is a folder" in refused("eval", path, sweep_set, "--json", tmp_path)
     assert "is not a folder" in refused("eval", path, sweep_set, "--pictures", a_file)
     assert "not a sweep set" in refused("eval", path, sweep_set, "--accurate", tmp_path / "none")
-    code, out, err = call("eval", path, sweep_set, "--pictures", tmp_path / "not" / "yet")
+    pictures = tmp_path / "not" / "yet"
+    code, out, err = call("eval", path, sweep_set, "--quick", "--pictures", pictures)
     assert (code, err) == (0, "")
     assert "nan" not in out  # one sweep of each object: there is nothing to fuse
-    assert len(list((tmp_path / "not" / "yet").iterdir())) == 2
+    assert "dead whiskers" in out
+    assert len(list(pictures.iterdir())) == 3
 
     spec = describe_set(tiny_recipe()).spec.to_json()
     changed = tiny_model(spec=spec.replace('"fx"', '"gx"'))

@@ -1,13 +1,17 @@
 """Recurrent cells on the whisker map.
 
 A cell takes its node's convolution `x` and its own state, maps `(row, column, lane, channel)`,
-and returns the node's output and the new state. Both are convolved together.
+and returns the node's output and the new state. Input and state are convolved together; `*` below
+is that convolution. With `layer_norm` each gate is normalised over its channels, per site, before
+the non-linearity; constants such as the forget bias come after it, or they would be normalised
+away. States begin at zero.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -15,73 +19,204 @@ from torch.nn import functional as F
 
 from tactile_rt.models.encoders.convolution import Convolution, convolve
 
+__all__ = [
+    "CELLS",
+    "FORGET_BIAS",
+    "NORM_EPSILON",
+    "Cell",
+    "GRUCell",
+    "IntersectionCell",
+    "LSTMCell",
+    "TimeDecayCell",
+    "UGRNNCell",
+    "VanillaCell",
+]
+
 FORGET_BIAS = 1.0
 # Where nothing is touched the gates have no variance, and the gradient through a norm grows by
-# 1 / sqrt(epsilon) with every step: at the usual 1e-5 it reaches 1e29 in a window of 22.
-NORM_EPSILON = 0.1
+# 1 / sqrt(epsilon) with every step: at the usual 1e-5 it reaches 1e29 in a window of 22. At 1 it
+# stays below 10 with every cell. The Intersection's x passes beside the norms: it bears 0.1.
+NORM_EPSILON = 1.0
+
+State = tuple[Tensor, ...]
 
 
-class IntersectionCell(nn.Module):
-    """IntersectionRNN (paper, appendix "IntersectionRNN"; Collins et al. 2017).
+class Cell(nn.Module):
+    """What all cells share: one convolution to `gates` maps, and the norm of each.
 
-    With `layer_norm` each gate is normalised over its channels, per site, before the
-    non-linearity. The forget bias comes after it: a constant before it would be normalised away.
+    Attributes:
+        gates: maps that `conv` makes.
+        norms: maps that the layer norm, where used, is for.
+        states: names of the state's tensors, each shaped like x.
+        epsilon: of the layer norm.
     """
 
-    GATES = 4  # m, n, p, y
+    gates: ClassVar[int]
+    norms: ClassVar[int]
+    states: ClassVar[tuple[str, ...]] = ("s",)
+    epsilon: ClassVar[float] = NORM_EPSILON
+    gamma: nn.Parameter | None
+    beta: nn.Parameter | None
 
     def __init__(self, channels: int, layer_norm: bool) -> None:
         super().__init__()
         self.channels = channels
-        self.conv = Convolution(2 * channels, self.GATES * channels)
-        self.gamma: nn.Parameter | None = None
-        self.beta: nn.Parameter | None = None
+        if self.gates:
+            self.conv = Convolution(2 * channels, self.gates * channels)
+        self.gamma = self.beta = None
         if layer_norm:
-            self.gamma = nn.Parameter(torch.ones(self.GATES, channels))
-            self.beta = nn.Parameter(torch.zeros(self.GATES, channels))
+            self.gamma = nn.Parameter(torch.ones(self.norms, channels))
+            self.beta = nn.Parameter(torch.zeros(self.norms, channels))
 
-    def drive(self, x: Tensor) -> Tensor:
+    def drive(self, x: Tensor) -> Tensor | None:
         """W*x + b alone, for an x that is known for many steps at once."""
         return convolve(self.conv.weight[..., : self.channels], self.conv.bias, x)
 
-    def forward(
-        self, x: Tensor, state: Tensor, drive: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """One step: output h and new state s', shaped like x. `drive` saves convolving x."""
+    def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
+        """One step: the output h, shaped like x, and the new state. `drive` saves convolving x."""
+        raise NotImplementedError
+
+    def convolved(self, x: Tensor, recurrent: Tensor, drive: Tensor | None) -> Tensor:
+        """The gates before their non-linearity, (..., gate * channel), in the state's type.
+
+        Autocast rounds the convolutions, but not the memory.
+        """
         if drive is None:
-            gates = self.conv(x, state)
+            gates = self.conv(x, recurrent)
         else:
-            gates = drive + convolve(self.conv.weight[..., self.channels :], None, state)
-        return intersect(gates, x, state.expand_as(x), self.gamma, self.beta)
+            gates = drive + convolve(self.conv.weight[..., self.channels :], None, recurrent)
+        return self.normal(gates.to(recurrent.dtype))
+
+    def normal(self, gates: Tensor, first: int = 0) -> Tensor:
+        """Layer norm of maps (..., n * channel), the `first`th to `first + n`th of the cell."""
+        if self.gamma is None or self.beta is None:
+            return gates
+        n = gates.shape[-1] // self.channels
+        gamma, beta = self.gamma[first : first + n], self.beta[first : first + n]
+        normal = F.layer_norm(gates.unflatten(-1, gamma.shape), gamma.shape[1:], eps=self.epsilon)
+        return torch.addcmul(beta, normal, gamma).flatten(-2)
 
 
-def intersect(
-    gates: Tensor, x: Tensor, state: Tensor, gamma: Tensor | None, beta: Tensor | None
-) -> tuple[Tensor, Tensor]:
-    """The cell after its convolution.
+class TimeDecayCell(Cell):
+    """s' = x + tau s, h = s', with one learned tau, at first 0 (Zhuang et al. 2017).
 
-        m = tanh(W_m*x + U_m*s + b_m)        p = sigmoid(W_p*x + U_p*s + b_p + 1)
-        n = relu(W_n*x + U_n*s + b_n)        y = sigmoid(W_y*x + U_y*s + b_y + 1)
-        s' = p s + (1 - p) m                 h = y x + (1 - y) n
-
-    Computed in the state's type: autocast rounds the convolutions, but not the memory.
-
-    gates        (..., 4 * channel), m to y before their non-linearity
-    x, state     (..., channel)
-    gamma, beta  (4, channel) of the layer norm, or None
-    ->           h, s' (..., channel)
+    With `layer_norm`, x is normalised: there is no gate.
     """
-    gates = gates.to(state.dtype)
-    if gamma is not None and beta is not None:
-        normal = F.layer_norm(gates.unflatten(-1, gamma.shape), gamma.shape[1:], eps=NORM_EPSILON)
-        gates = torch.addcmul(beta, normal, gamma).flatten(-2)
-    m, n, p, y = gates.chunk(4, dim=-1)
-    m, n = torch.tanh(m), torch.relu(n)
-    p, y = torch.sigmoid(p + FORGET_BIAS), torch.sigmoid(y + FORGET_BIAS)
-    return (n + y * (x - n)).to(x.dtype), m + p * (state - m)
+
+    gates, norms = 0, 1
+
+    def __init__(self, channels: int, layer_norm: bool) -> None:
+        super().__init__(channels, layer_norm)
+        self.tau = nn.Parameter(torch.zeros(()))
+
+    def drive(self, x: Tensor) -> None:
+        return None
+
+    def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
+        s = torch.addcmul(self.normal(x.to(state[0].dtype)), self.tau, state[0])
+        return s, (s,)
 
 
-CELLS: dict[str, Callable[[int], IntersectionCell]] = {
-    "intersection": partial(IntersectionCell, layer_norm=False),
-    "intersection-ln": partial(IntersectionCell, layer_norm=True),
+class VanillaCell(Cell):
+    """s' = tanh(W*x + U*s + b), h = s' (Nayebi et al. 2022, appendix)."""
+
+    gates, norms = 1, 1
+
+    def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
+        s = torch.tanh(self.convolved(x, state[0], drive))
+        return s, (s,)
+
+
+class UGRNNCell(Cell):
+    """UGRNN (paper, appendix "UGRNN"; Collins et al. 2017).
+
+    c = tanh(W_c*x + U_c*s + b_c)        g = sigmoid(W_g*x + U_g*s + b_g + 1)
+    s' = g s + (1 - g) c                 h = s'
+    """
+
+    gates, norms = 2, 2
+
+    def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
+        c, g = self.convolved(x, state[0], drive).chunk(2, dim=-1)
+        s = torch.lerp(torch.tanh(c), state[0], torch.sigmoid(g + FORGET_BIAS))
+        return s, (s,)
+
+
+class IntersectionCell(Cell):
+    """IntersectionRNN (paper, appendix "IntersectionRNN"; Collins et al. 2017).
+
+    m = tanh(W_m*x + U_m*s + b_m)        p = sigmoid(W_p*x + U_p*s + b_p + 1)
+    n = relu(W_n*x + U_n*s + b_n)        y = sigmoid(W_y*x + U_y*s + b_y + 1)
+    s' = p s + (1 - p) m                 h = y x + (1 - y) n
+    """
+
+    gates, norms = 4, 4
+    epsilon = 0.1
+
+    def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
+        (s,) = state
+        m, n, p, y = self.convolved(x, s, drive).chunk(4, dim=-1)
+        m, n = torch.tanh(m), torch.relu(n)
+        p, y = torch.sigmoid(p + FORGET_BIAS), torch.sigmoid(y + FORGET_BIAS)
+        return (n + y * (x - n)).to(x.dtype), (m + p * (s - m),)
+
+
+class GRUCell(Cell):
+    """GRU (Nayebi et al. 2022, appendix; Cho et al. 2014).
+
+    r = sigmoid(W_r*x + U_r*s + b_r + 1)     c = tanh(W_c*x + U_c*(r s) + b_c)
+    u = sigmoid(W_u*x + U_u*s + b_u)         s' = u s + (1 - u) c,  h = s'
+    """
+
+    gates, norms = 2, 3
+
+    def __init__(self, channels: int, layer_norm: bool) -> None:
+        super().__init__(channels, layer_norm)
+        self.candidate = Convolution(2 * channels, channels)
+
+    def drive(self, x: Tensor) -> None:
+        return None
+
+    def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
+        (s,) = state
+        r, u = self.convolved(x, s, drive).chunk(2, dim=-1)
+        c = self.candidate(x, torch.sigmoid(r + FORGET_BIAS) * s)
+        c = torch.tanh(self.normal(c.to(s.dtype), first=2))
+        s = torch.lerp(c, s, torch.sigmoid(u))
+        return s, (s,)
+
+
+class LSTMCell(Cell):
+    """LSTM (Nayebi et al. 2022, appendix; Hochreiter & Schmidhuber 1997).
+
+    i = sigmoid(W_i*x + U_i*h + b_i)         f = sigmoid(W_f*x + U_f*h + b_f + 1)
+    j = tanh(W_j*x + U_j*h + b_j)            o = sigmoid(W_o*x + U_o*h + b_o)
+    c' = f c + i j                           h' = o tanh(c')
+
+    With `layer_norm`, also c' inside the last tanh (Ba et al. 2016, equation 31). The h that it
+    keeps is the one before the node's ReLU.
+    """
+
+    gates, norms = 4, 5
+    states = ("c", "s")
+
+    def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
+        c, h = state
+        i, j, f, o = self.convolved(x, h, drive).chunk(4, dim=-1)
+        c = torch.sigmoid(f + FORGET_BIAS) * c + torch.sigmoid(i) * torch.tanh(j)
+        h = torch.sigmoid(o) * torch.tanh(self.normal(c, first=4))
+        return h, (c, h)
+
+
+CELLS: dict[str, Callable[[int], Cell]] = {
+    f"{name}{suffix}": partial(cell, layer_norm=bool(suffix))
+    for name, cell in (
+        ("timedecay", TimeDecayCell),
+        ("vanilla", VanillaCell),
+        ("ugrnn", UGRNNCell),
+        ("intersection", IntersectionCell),
+        ("gru", GRUCell),
+        ("lstm", LSTMCell),
+    )
+    for suffix in ("", "-ln")
 }

@@ -1,8 +1,4 @@
-"""Attenders: what a step's features mean in the light of the steps before it.
-
-Every attender maps features `(batch, step, feature)` to the same shape, causally, and has a
-`step` that gives the same one by one.
-"""
+"""The GPT attender: a causal transformer over a step's features and an action token."""
 
 from __future__ import annotations
 
@@ -12,26 +8,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+__all__ = ["BLOCK", "GPT", "HEADS", "LAYERS", "MAX_STEPS", "TOKENS", "Block"]
+
 HEADS = 4
 LAYERS = 8
 BLOCK = 65  # positions the table has; two tokens a step, so 32 steps
 MAX_STEPS = BLOCK // 2
 TOKENS = 2  # a step's observation, then the action token
-
-
-class NoAttender(nn.Module):
-    """Each step on its own."""
-
-    def forward(self, features: Tensor) -> Tensor:
-        return features
-
-    def initial_state(self, batch: int) -> dict[str, Tensor]:
-        return {}
-
-    def step(
-        self, features: Tensor, index: Tensor, state: dict[str, Tensor]
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        return features, {}
 
 
 class Block(nn.Module):
@@ -75,14 +58,25 @@ class GPT(nn.Module):
     """Causal transformer over (observation, action token) pairs (paper, section "EAD"; GPT-2).
 
     A learned action token follows every step's features; its outputs are the attender's.
+
+    Args:
+        width: of the tokens inside, and of what comes out.
+        dropout: share of the activations, while training.
+        max_steps: an episode's; at most `MAX_STEPS`.
+        inputs: features per step that come in, `width` unless told. The paper's ResNet18 has
+            512 and its GPT 256.
     """
 
-    def __init__(self, width: int, dropout: float, max_steps: int) -> None:
+    def __init__(
+        self, width: int, dropout: float, max_steps: int, inputs: int | None = None
+    ) -> None:
         super().__init__()
+        inputs = width if inputs is None else inputs
+        self.features = width
         self.max_steps = max_steps
         self.dropout = dropout
-        self.action = nn.Parameter(torch.randn(width))
-        self.project_in = nn.Linear(width, width)
+        self.action = nn.Parameter(torch.randn(inputs))
+        self.project_in = nn.Linear(inputs, width)
         self.positions = nn.Parameter(torch.empty(BLOCK, width))
         self.blocks = nn.ModuleList(Block(width, dropout) for _ in range(LAYERS))
         self.norm = nn.LayerNorm(width)
@@ -98,7 +92,7 @@ class GPT(nn.Module):
                     nn.init.zeros_(module.bias)
 
     def forward(self, features: Tensor) -> Tensor:
-        """features (batch, step, width) -> (batch, step, width)"""
+        """features (batch, step, inputs) -> (batch, step, width)"""
         steps = features.shape[1]
         if steps > self.max_steps:
             raise ValueError(f"{steps} steps, but this attender ends at {self.max_steps}")
@@ -119,7 +113,7 @@ class GPT(nn.Module):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step. features (batch, width); index (batch,) int64, steps since the reset.
+        """One step. features (batch, inputs); index (batch,) int64, steps since the reset.
 
         Past `max_steps` the last position is overwritten again and again: reset before.
         """
@@ -146,7 +140,7 @@ class GPT(nn.Module):
         return out, {"gpt_k": torch.stack(keys, 1), "gpt_v": torch.stack(values, 1)}
 
     def _embed(self, features: Tensor) -> Tensor:
-        """features (..., width) -> (..., token, width): the observation, then the action token."""
+        """features (..., inputs) -> (..., token, width): the observation, then the action token."""
         action = self.action.expand_as(features)
         out: Tensor = self.project_in(torch.stack([features, action], dim=-2))
         return out

@@ -1,0 +1,47 @@
+"""Alignment with barrel cortex: representational similarity to recorded animals. Needs no torch.
+
+rdm           RDMs of the six stimuli and their comparison
+reliability   split halves, Spearman-Brown, the correction for noise
+neural, nwb, nwb_parts, published   recordings: from NWB files, and in the published layout
+strict, pooling, paper_code, building   the two protocols: recordings -> a frozen benchmark
+benchmark, benchmark_file   the frozen benchmark and its file
+scoring, statistics      a model's layers -> score, exact p-value
+"""
+
+from tactile_rt.models.alignment.benchmark import (
+    PROTOCOLS,
+    Benchmark,
+    Consistency,
+    Frozen,
+    Target,
+)
+from tactile_rt.models.alignment.benchmark_file import (
+    benchmark_sha256,
+    load_benchmark,
+    save_benchmark,
+)
+from tactile_rt.models.alignment.building import build
+from tactile_rt.models.alignment.neural import Animal, Session
+from tactile_rt.models.alignment.rdm import STIMULI, rsa, stimulus_index
+from tactile_rt.models.alignment.scoring import Score, layer_rdms, score, score_rdms
+
+__all__ = [
+    "PROTOCOLS",
+    "STIMULI",
+    "Animal",
+    "Benchmark",
+    "Consistency",
+    "Frozen",
+    "Score",
+    "Session",
+    "Target",
+    "benchmark_sha256",
+    "build",
+    "layer_rdms",
+    "load_benchmark",
+    "rsa",
+    "save_benchmark",
+    "score",
+    "score_rdms",
+    "stimulus_index",
+]

@@ -1,0 +1,130 @@
+"""A frozen benchmark: what scoring a model needs, without any animal's raw data.
+
+A deterministic model's score against an animal is r_xy times a factor that depends on the animal
+alone, so 15 numbers and that factor per animal are enough.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.models.alignment.rdm import STIMULI
+from tactile_rt.models.alignment.statistics import standard_error
+
+__all__ = ["PROTOCOLS", "Benchmark", "Consistency", "Frozen", "Target"]
+
+Floats = NDArray[np.float64]
+
+PROTOCOLS = ("strict", "paper-code")
+
+
+@dataclass(frozen=True, eq=False)
+class Frozen:
+    """An RDM and how far it can be relied on.
+
+    Attributes:
+        rdm: (15,), of the mean over trials.
+        reliability: Spearman-Brown corrected mean split-half correlation.
+        factor: K; a model's r_xy times it is its score. NaN if the RDM is too noisy to score on.
+        units: that it was made from.
+    """
+
+    rdm: Floats
+    reliability: float
+    factor: float
+    units: int
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What models are compared to: an animal, or all of them pooled.
+
+    Attributes:
+        name: of the animal.
+        chosen: as the protocol has it; for strict, of reliable units only.
+        unfiltered: the same without its filter.
+        reliable: enough to count in a mean over animals.
+        trials: that were used; for paper-code rows of the padded array.
+        sha256: of the rates that it was made from.
+    """
+
+    name: str
+    chosen: Frozen
+    unfiltered: Frozen
+    reliable: bool
+    trials: int
+    sha256: str
+
+
+@dataclass(frozen=True, eq=False)
+class Consistency:
+    """How well animals predict each other.
+
+    Attributes:
+        animals: their names.
+        pooled: (animal,), score of all other animals' units pooled against each; NaN where none.
+        pairwise: (animal, animal), score of a row's animal against a column's; NaN on the diagonal.
+    """
+
+    animals: tuple[str, ...]
+    pooled: Floats
+    pairwise: Floats
+
+    @property
+    def mean(self) -> float:
+        """Mean of the pooled scores; NaN without any."""
+        return _or_nan(self.pooled, np.mean)
+
+    @property
+    def sem(self) -> float:
+        """Standard error of that mean."""
+        return standard_error(self.pooled)
+
+    @property
+    def highest(self) -> float:
+        """Highest pooled score."""
+        return _or_nan(self.pooled, np.max)
+
+
+@dataclass(frozen=True, eq=False)
+class Benchmark:
+    """A frozen benchmark.
+
+    Attributes:
+        protocol: ``strict`` or ``paper-code``.
+        targets: the animals.
+        pooled: all animals as one target, which paper-code scores on as well; else None.
+        a2a: animal-to-animal consistency.
+        bootstraps, seed: of the splits.
+        sources: names of the files that were read.
+        notes: what was left out, and why.
+        stimuli: names along the stimulus axis.
+    """
+
+    protocol: str
+    targets: tuple[Target, ...]
+    pooled: Target | None
+    a2a: Consistency
+    bootstraps: int
+    seed: int
+    sources: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    stimuli: tuple[str, ...] = STIMULI
+
+    @property
+    def all_targets(self) -> tuple[Target, ...]:
+        """Animals, and the pooled target where there is one."""
+        return self.targets + ((self.pooled,) if self.pooled else ())
+
+    @property
+    def reliable(self) -> tuple[Target, ...]:
+        """Animals that count in a mean."""
+        return tuple(target for target in self.targets if target.reliable)
+
+
+def _or_nan(values: Floats, reduce: Callable[[Floats], np.floating]) -> float:
+    finite = values[np.isfinite(values)]
+    return float(reduce(finite)) if finite.size else math.nan

@@ -1,0 +1,110 @@
+"""Recordings as both protocols take them: animals, their sessions, rates and stimuli per trial."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.models.alignment.rdm import STIMULI
+from tactile_rt.stream import ConfigError
+
+__all__ = ["Animal", "Session", "by_animal", "pad", "published_layout", "rates_sha256"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """One recording of one animal.
+
+    Attributes:
+        animal: whose.
+        name: of the session.
+        rates: (trial, unit), spikes per second, in the order of the trials.
+        stimulus: (trial,), index into `STIMULI`.
+    """
+
+    animal: str
+    name: str
+    rates: Floats
+    stimulus: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        rates, stimulus = self.rates, self.stimulus
+        if rates.ndim != 2 or stimulus.shape != rates.shape[:1]:
+            raise ConfigError(
+                f"session {self.name}: rates {rates.shape} and stimuli {stimulus.shape} do not fit"
+            )
+        if not np.isfinite(rates).all():
+            raise ConfigError(f"session {self.name}: a rate is not finite")
+
+    @property
+    def trials(self) -> NDArray[np.int64]:
+        """(6,), trials of every stimulus."""
+        return np.bincount(self.stimulus, minlength=len(STIMULI))
+
+
+@dataclass(frozen=True)
+class Animal:
+    """An animal and its sessions; every session recorded units of its own."""
+
+    name: str
+    sessions: tuple[Session, ...]
+
+
+def by_animal(sessions: Sequence[Session]) -> tuple[Animal, ...]:
+    """Sessions gathered by animal, animals in the order of their names."""
+    names = sorted({session.animal for session in sessions})
+    return tuple(Animal(n, tuple(s for s in sessions if s.animal == n)) for n in names)
+
+
+def published_layout(animal: Animal) -> Floats:
+    """An animal's rates as the published analysis arranges them, two mistakes included.
+
+    - The stimulus axis follows the order in which stimuli first appear in each session, so that
+      the same index means different stimuli in different sessions.
+    - A trial is zero, not missing, for the five stimuli that it did not show: means over trials
+      are rates times how often a stimulus was shown.
+
+    Returns:
+        (row, 6, unit): row k holds the k-th trial of every session, NaN after a session's last.
+
+    Raises:
+        ConfigError: a session lacks a stimulus, where the published code stops.
+    """
+    blocks = []
+    for session in animal.sessions:
+        missing = [name for name, n in zip(STIMULI, session.trials, strict=True) if not n]
+        if missing:
+            raise ConfigError(
+                f"session {session.name} has no correct trial of {', '.join(missing)}: paper-code "
+                "cannot place it; leave the session out or build with protocol strict"
+            )
+        _, first = np.unique(session.stimulus, return_index=True)
+        place = np.argsort(np.argsort(first))  # of each stimulus, by first appearance
+        trials, units = session.rates.shape
+        block = np.zeros((trials, len(STIMULI), units))
+        block[np.arange(trials), place[session.stimulus]] = session.rates
+        blocks.append(block)
+    return pad(blocks)
+
+
+def pad(blocks: Sequence[Floats]) -> Floats:
+    """Arrays (row, 6, unit) side by side along units, NaN below the shorter ones."""
+    rows = max(block.shape[0] for block in blocks)
+    return np.concatenate(
+        [np.pad(b, ((0, rows - len(b)), (0, 0), (0, 0)), constant_values=np.nan) for b in blocks],
+        axis=2,
+    )
+
+
+def rates_sha256(arrays: Mapping[str, NDArray[np.generic]]) -> str:
+    """Hash of named arrays: names, shapes, types and values."""
+    digest = hashlib.sha256()
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,143 @@
+"""Scores of a model's layers against a frozen benchmark."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tactile_rt.models.alignment.benchmark import Benchmark
+from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, pearson, rdm
+from tactile_rt.models.alignment.statistics import (
+    held_out,
+    highest,
+    max_statistic,
+    mean_held_out,
+    standard_error,
+)
+from tactile_rt.stream import ConfigError
+
+__all__ = ["Score", "layer_rdms", "score", "score_rdms"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Score:
+    """How well a model's layers fit a benchmark's targets.
+
+    Attributes:
+        protocol: of the benchmark.
+        layers: names.
+        targets: names; for paper-code the pooled animals are the last.
+        r: (layer, target), correlations before the correction for noise.
+        corrected: (layer, target), after it; NaN where a layer has no RDM or a target is too noisy.
+        unfiltered: (layer, target), the same without the protocol's filter.
+        reliable: (target,), whether it counts in the score.
+        chosen: for strict, per target the layer that is best on all other animals, "" where none;
+            for paper-code the one layer of the score.
+        per_target: (target,), the chosen layer's corrected score; NaN for unreliable targets.
+        score: strict: mean of `per_target`; paper-code: highest of `corrected`.
+        sem: of it, over targets.
+        null: (720,), the score for every relabelling of the stimuli, choices of layers made anew.
+        p: share of `null` that reaches the score.
+        null_95: 95th percentile of `null`.
+    """
+
+    protocol: str
+    layers: tuple[str, ...]
+    targets: tuple[str, ...]
+    r: Floats
+    corrected: Floats
+    unfiltered: Floats
+    reliable: NDArray[np.bool_]
+    chosen: tuple[str, ...]
+    per_target: Floats
+    score: float
+    sem: float
+    null: Floats
+    p: float
+    null_95: float
+
+
+def layer_rdms(layers: Mapping[str, ArrayLike]) -> Floats:
+    """RDMs (layer, 15) of responses (6, unit) in the order of `STIMULI`.
+
+    Raises:
+        ConfigError: a layer of another shape.
+    """
+    rdms = np.empty((len(layers), len(PAIRS)))
+    for i, (name, values) in enumerate(layers.items()):
+        patterns = np.asarray(values, dtype=np.float64)
+        if patterns.ndim != 2 or patterns.shape[0] != len(STIMULI) or patterns.shape[1] < 2:
+            raise ConfigError(
+                f"layer {name}: responses {patterns.shape}, not ({len(STIMULI)} stimuli, 2 or "
+                "more units)"
+            )
+        rdms[i] = rdm(patterns)
+    return rdms
+
+
+def score(benchmark: Benchmark, layers: Mapping[str, ArrayLike]) -> Score:
+    """Score layers, given as responses (6, unit) in the order of `STIMULI`.
+
+    Raises:
+        ConfigError: no layer, or one of another shape.
+    """
+    return score_rdms(benchmark, tuple(layers), layer_rdms(layers))
+
+
+def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> Score:
+    """Score layers, given as RDMs (layer, 15); a layer with a NaN scores NaN.
+
+    Raises:
+        ConfigError: no layer, or names and RDMs that do not fit.
+    """
+    rdms = np.asarray(rdms, dtype=np.float64)
+    if not names or rdms.shape != (len(names), len(PAIRS)):
+        raise ConfigError(f"{len(names)} layers and RDMs {rdms.shape} do not fit")
+    targets = benchmark.all_targets
+    goal = np.array([t.chosen.rdm for t in targets])
+    factor = np.array([t.chosen.factor for t in targets])
+    r = pearson(rdms[:, None], goal)
+    corrected = r * factor
+    other = np.array([t.unfiltered.rdm for t in targets])
+    unfiltered = pearson(rdms[:, None], other) * [t.unfiltered.factor for t in targets]
+    reliable = np.array([t.reliable for t in targets])
+    finite = np.flatnonzero(np.isfinite(rdms).all(axis=1) & np.isfinite(r).any(axis=1))
+
+    strict = benchmark.protocol == "strict"
+    values = corrected[np.ix_(finite, reliable)]
+    chosen = np.full(len(targets), -1, dtype=np.intp)
+    if strict:
+        _, best = held_out(values)
+        chosen[reliable] = np.where(best >= 0, finite[best] if finite.size else -1, -1)
+    elif values.size:
+        chosen[:] = finite[np.unravel_index(np.argmax(values), values.shape)[0]]
+    there = (chosen >= 0) & reliable
+    per_target = np.full(len(targets), np.nan)
+    per_target[there] = corrected[chosen[there], np.flatnonzero(there)]
+    test = max_statistic(
+        rdms, goal[reliable], factor[reliable], mean_held_out if strict else highest
+    )
+    return Score(
+        protocol=benchmark.protocol,
+        layers=tuple(names),
+        targets=tuple(t.name for t in targets),
+        r=r,
+        corrected=corrected,
+        unfiltered=unfiltered,
+        reliable=reliable,
+        chosen=tuple(names[i] if i >= 0 else "" for i in chosen.tolist()),
+        per_target=per_target,
+        score=test.statistic,
+        sem=standard_error(per_target) if strict else _published_error(per_target),
+        null=test.null,
+        p=test.p,
+        null_95=test.percentile_95,
+    )
+
+
+def _published_error(values: Floats) -> float:
+    values = values[np.isfinite(values)]
+    return float(values.std() / np.sqrt(values.size)) if values.size else float("nan")

@@ -1,0 +1,118 @@
+"""Choosing a layer without looking at the animal it is scored on, and what chance would give.
+
+With six stimuli there are 720 ways to relabel them, so the null distribution is exact: every step
+that looks at the neural data, the choice of a layer included, is done again for each.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tactile_rt.models.alignment.rdm import normalised, relabellings
+
+__all__ = [
+    "Permutations",
+    "held_out",
+    "highest",
+    "max_statistic",
+    "mean_held_out",
+    "standard_error",
+]
+
+Floats = NDArray[np.float64]
+Statistic = Callable[[Floats], Floats]
+
+# Relabellings that leave an RDM as it is give its statistic again, but for rounding.
+TIE = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Permutations:
+    """A statistic among those of all relabelled stimuli.
+
+    Attributes:
+        statistic: of the stimuli as they are; NaN if it cannot be made.
+        null: (720,) of all relabellings, the identity first.
+        p: share of relabellings that reach the statistic; at least 1/720.
+        percentile_95: of the null.
+    """
+
+    statistic: float
+    null: Floats
+    p: float
+    percentile_95: float
+
+
+def held_out(values: ArrayLike) -> tuple[Floats, NDArray[np.intp]]:
+    """For each animal the layer that is best on the mean of all others, and its score there.
+
+    Args:
+        values: (..., layer, animal), finite.
+
+    Returns:
+        Scores (..., animal) and chosen layers (..., animal), the first of equals. With fewer than
+        two animals or no layer there is no choice: NaN and -1.
+    """
+    values = np.asarray(values, dtype=np.float64)
+    layers, animals = values.shape[-2:]
+    shape = (*values.shape[:-2], animals)
+    if animals < 2 or layers == 0:
+        return np.full(shape, np.nan), np.full(shape, -1, dtype=np.intp)
+    others = (values.sum(axis=-1, keepdims=True) - values) / (animals - 1)
+    chosen = np.argmax(others, axis=-2)
+    scores = np.take_along_axis(values, chosen[..., None, :], axis=-2)[..., 0, :]
+    return np.asarray(scores), np.asarray(chosen)
+
+
+def mean_held_out(values: Floats) -> Floats:
+    """Mean over animals of `held_out` scores: (..., layer, animal) -> (...)."""
+    return np.asarray(held_out(values)[0].mean(axis=-1))
+
+
+def highest(values: Floats) -> Floats:
+    """The highest of all layers and targets, as published: (..., layer, target) -> (...)."""
+    if values.shape[-1] * values.shape[-2] == 0:
+        return np.full(values.shape[:-2], np.nan)
+    return np.asarray(values.max(axis=(-2, -1)))
+
+
+def max_statistic(
+    rdms: ArrayLike, targets: ArrayLike, factors: ArrayLike, statistic: Statistic = mean_held_out
+) -> Permutations:
+    """Exact permutation test of a statistic that chooses among layers.
+
+    Args:
+        rdms: (layer, 15) of a model; a layer with a NaN takes no part.
+        targets: (target, 15), finite.
+        factors: (target,) that correct a target's correlations for its noise, finite.
+        statistic: of corrected correlations (..., layer, target).
+    """
+    unit = normalised(rdms)  # (layer, 15): relabelling keeps mean and length
+    unit = unit[np.isfinite(unit).all(axis=-1)]
+    goal = normalised(targets) * np.asarray(factors, dtype=np.float64)[:, None]
+    if unit.size and goal.size:
+        relabelled = unit[:, relabellings()].swapaxes(0, 1)  # (720, layer, 15)
+        null = statistic(np.matmul(relabelled, goal.T))
+    else:
+        null = np.full(len(relabellings()), np.nan)
+    if np.isnan(null).any():
+        nan = float("nan")
+        return Permutations(nan, null, nan, nan)
+    observed = float(null[0])
+    return Permutations(
+        statistic=observed,
+        null=null,
+        p=float((null >= observed - TIE).mean()),
+        percentile_95=float(np.percentile(null, 95)),
+    )
+
+
+def standard_error(values: ArrayLike) -> float:
+    """s.e.m. over animals (one degree of freedom for the mean); NaN with fewer than two."""
+    there = np.asarray(values, dtype=np.float64)
+    there = there[np.isfinite(there)]
+    if there.size < 2:
+        return float("nan")
+    return float(there.std(ddof=1) / np.sqrt(there.size))

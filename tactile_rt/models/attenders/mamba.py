@@ -1,0 +1,154 @@
+"""Mamba: a selective state-space attender (Gu & Dao 2023), in plain torch.
+
+A block projects to a signal x and a gate z, convolves x over the last steps, and runs for every
+channel d and state n
+
+    h_t[d, n] = exp(dt_t[d] A[d, n]) h_{t-1}[d, n] + dt_t[d] B_t[n] x_t[d]
+    y_t[d] = sum_n C_t[n] h_t[d, n] + D[d] x_t[d]
+
+where dt, B and C are read off x itself: so what is kept and what is forgotten is chosen by what
+is felt. The output is y silu(z), projected back.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tactile_rt.models.attenders.scan import selective_scan
+
+__all__ = ["MambaAttender", "MambaBlock", "MambaStack"]
+
+LAYERS = 4
+STATES = 16
+TAPS = 4  # of the causal convolution
+EXPAND = 2
+RANK = 16  # the step size dt has one rank per so many features
+DT_RANGE = (1e-3, 1e-1)
+
+
+class MambaBlock(nn.Module):
+    """One layer: features (batch, step, width) to the same shape, without the residual."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        inner, self.rank = EXPAND * width, math.ceil(width / RANK)
+        self.in_proj = nn.Linear(width, 2 * inner, bias=False)
+        self.conv_weight = nn.Parameter(torch.empty(inner, TAPS))
+        self.conv_bias = nn.Parameter(torch.empty(inner))
+        self.x_proj = nn.Linear(inner, self.rank + 2 * STATES, bias=False)
+        self.dt_proj = nn.Linear(self.rank, inner)
+        self.A_log = nn.Parameter(torch.arange(1.0, STATES + 1).log().repeat(inner, 1))
+        self.D = nn.Parameter(torch.ones(inner))
+        self.out_proj = nn.Linear(inner, width, bias=False)
+
+        for parameter in (self.conv_weight, self.conv_bias):
+            nn.init.uniform_(parameter, -1 / math.sqrt(TAPS), 1 / math.sqrt(TAPS))
+        nn.init.uniform_(self.dt_proj.weight, -(self.rank**-0.5), self.rank**-0.5)
+        low, high = map(math.log, DT_RANGE)
+        dt = torch.exp(low + (high - low) * torch.rand(inner))
+        with torch.no_grad():
+            self.dt_proj.bias.copy_(dt + torch.log(-torch.expm1(-dt)))  # softplus gives dt back
+            self.out_proj.weight /= math.sqrt(LAYERS)  # the residual sums as many
+        # Decay would pull the time scales away from where the state space is well conditioned.
+        for parameter in (self.A_log, self.D, self.dt_proj.bias):
+            parameter._optim = {"lr_scale": 1.0, "weight_decay": 0.0}  # type: ignore[attr-defined]
+
+    def forward(self, features: Tensor) -> Tensor:
+        """All steps at once, from a zero state."""
+        x, gate = self.in_proj(features).chunk(2, dim=-1)
+        steps = x.shape[1]
+        padded = F.pad(x, (0, 0, TAPS - 1, 0))
+        conv = self.conv_bias + sum(
+            padded[:, k : k + steps] * self.conv_weight[:, k] for k in range(TAPS)
+        )
+        x = F.silu(conv)
+        y = selective_scan(*self._select(x))
+        return self._out(y, x, gate)
+
+    def step(self, features: Tensor, taps: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """One step.
+
+        features (batch, width), taps (batch, TAPS - 1, inner): the last x, oldest first,
+        h (batch, inner, STATES) -> the output and the new taps and h
+        """
+        x, gate = self.in_proj(features).chunk(2, dim=-1)
+        taps = torch.cat([taps, x[:, None]], dim=1)
+        x = F.silu(self.conv_bias + (taps * self.conv_weight.t()).sum(1))
+        dt, signal, a, b, c = self._select(x)
+        h = torch.exp(dt[..., None] * a) * h + (dt * signal)[..., None] * b[:, None]
+        return self._out((h * c[:, None]).sum(-1), x, gate), taps[:, 1:], h
+
+    def _select(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """What `selective_scan` takes, of x (..., inner)."""
+        dt, b, c = self.x_proj(x).split([self.rank, STATES, STATES], dim=-1)
+        dt = F.softplus(self.dt_proj(dt))
+        # In the parameters' type whatever autocast says: the state is a long product.
+        exact = self.A_log.dtype
+        return dt.to(exact), x.to(exact), -torch.exp(self.A_log), b.to(exact), c.to(exact)
+
+    def _out(self, y: Tensor, x: Tensor, gate: Tensor) -> Tensor:
+        out: Tensor = self.out_proj((y + self.D * x) * F.silu(gate))
+        return out
+
+
+class MambaStack(nn.Module):
+    """Pre-norm residual Mamba blocks and a last norm.
+
+    Args:
+        width: features per step.
+        prefix: of the names in the state, so that an encoder's and an attender's differ.
+    """
+
+    def __init__(self, width: int, prefix: str = "mamba") -> None:
+        super().__init__()
+        self.features, self.prefix = width, prefix
+        self.blocks = nn.ModuleList(MambaBlock(width) for _ in range(LAYERS))
+        self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(LAYERS))
+        self.norm = nn.LayerNorm(width)
+
+    def forward(self, features: Tensor) -> Tensor:
+        """features (batch, step, width) -> (batch, step, width)"""
+        x = features
+        for block, norm in zip(self.blocks, self.norms, strict=True):
+            x = x + block(norm(x))
+        out: Tensor = self.norm(x)
+        return out
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        """Zeros: the convolutions' last inputs (batch, layer, TAPS - 1, inner) and the states
+        (batch, layer, inner, STATES)."""
+        inner = EXPAND * self.features
+        zeros = self.norm.weight.new_zeros
+        return {
+            f"{self.prefix}_taps": zeros(batch, LAYERS, TAPS - 1, inner),
+            f"{self.prefix}_h": zeros(batch, LAYERS, inner, STATES),
+        }
+
+    def step(
+        self, features: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """One step. features (batch, width) -> (batch, width), the new state."""
+        old_taps, old_h = state[f"{self.prefix}_taps"], state[f"{self.prefix}_h"]
+        x, new_taps, new_h = features, [], []
+        for layer, (block, norm) in enumerate(zip(self.blocks, self.norms, strict=True)):
+            assert isinstance(block, MambaBlock)
+            out, taps, h = block.step(norm(x), old_taps[:, layer], old_h[:, layer])
+            x = x + out
+            new_taps.append(taps)
+            new_h.append(h)
+        new = {
+            f"{self.prefix}_taps": torch.stack(new_taps, 1),
+            f"{self.prefix}_h": torch.stack(new_h, 1),
+        }
+        return self.norm(x), new
+
+
+class MambaAttender(MambaStack):
+    """Four Mamba blocks over the encoder's features: 6,784,000 parameters at 512."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__(width, "mamba")

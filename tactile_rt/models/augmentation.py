@@ -1,0 +1,199 @@
+"""Augmentations of tactile windows: what else the same touch could have looked like.
+
+- "tactile": the array is mirrored across its columns or rows, turned by a quarter, time reversed;
+  drawn for every window, on the loads in SI units. Whiskers are only permuted, and force and
+  moment vectors are mirrored and turned with the array.
+- "tactile-paper": the published variant (Chung et al. 2025, Fig. 2b) on the frames: one draw for
+  a whole batch, vectors left as they are, and a turned 5 x 7 grid loses its outer columns.
+- "image": the control: colour jitter, greyscale, blur and noise (Chen et al. 2020), the loads of a
+  cell taken for its colours.
+
+The paper gives no probabilities: mirroring, turning and reversal happen in half of the windows
+each; the image operations as in SimCLR. Temporal masking blanks whole steps.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Generator, Tensor
+
+from tactile_rt.models.array_symmetries import Symmetry, compose, symmetries
+from tactile_rt.stream import ArraySpec
+
+__all__ = ["AUGMENTATIONS", "Augmentation", "build", "image", "mask_steps", "tactile_paper"]
+
+AUGMENTATIONS = ("none", "tactile", "tactile-paper", "image")
+HALF = 0.5
+JITTER, JITTER_CHANCE, GREY_CHANCE, NOISE = 0.8, 0.8, 0.2, 0.1  # SimCLR's, and a noise of the log
+BLUR = (1.0, 2.0, 1.0)
+
+T = TypeVar("T")
+Loads = tuple[Tensor, Tensor, Tensor]  # samples, offset, sigma as `InputStage` takes them
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What happens to a batch before and after the input stage; draws come from a generator.
+
+    Attributes:
+        loads: (samples, offset, sigma) in SI units, and a CPU generator, to the same.
+        frames: (batch, step, sub-step * channel, row, column), and a generator on their device.
+    """
+
+    loads: Callable[[Loads, Generator], Loads]
+    frames: Callable[[Tensor, Generator], Tensor]
+
+
+def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
+    """An augmentation by name.
+
+    Args:
+        name: one of `AUGMENTATIONS`.
+        spec: the array.
+        masking: share of steps that are blanked, too.
+
+    Raises:
+        ConfigError: the array has no symmetries ("tactile").
+    """
+    loads: Callable[[Loads, Generator], Loads] = _as_is
+    frames: Callable[[Tensor, Generator], Tensor] = _as_is
+    if name == "tactile":
+        loads = Tactile(spec)
+    elif name == "tactile-paper":
+        frames = tactile_paper
+    elif name == "image":
+        frames = partial(image, colours=len(spec.channels))
+
+    def then_mask(x: Tensor, generator: Generator) -> Tensor:
+        return mask_steps(frames(x, generator), masking, generator)
+
+    return Augmentation(loads, then_mask if masking else frames)
+
+
+def _as_is(x: T, _: Generator) -> T:
+    return x
+
+
+class Tactile:
+    """Mirroring, turning and time reversal of the loads themselves, drawn for every window.
+
+    Args:
+        spec: the array.
+
+    Raises:
+        ConfigError: its channels are neither forces nor moments, or it is no grid.
+    """
+
+    def __init__(self, spec: ArraySpec) -> None:
+        every = [compose(spec)]
+        for symmetry in symmetries(spec):
+            every += [compose(spec, symmetry, known) for known in every]
+        self._source, self._matrix = _tables(every)
+
+    def __call__(self, loads: Loads, generator: Generator) -> Loads:
+        n = len(loads[0])
+        which = torch.randint(len(self._source), (n,), generator=generator)
+        reverse = torch.rand(n, generator=generator) < HALF
+        return self.transform(loads, which, reverse)
+
+    def transform(self, loads: Loads, which: Tensor, reverse: Tensor) -> Loads:
+        """Windows as the array's symmetry `which` (batch,) would have them, `reverse` (batch,)d.
+
+        A reversed movement bends a whisker the other way: its loads change their sign.
+        """
+        samples, offset, sigma = loads
+        source, matrix = self._source[which], self._matrix[which]
+        each = torch.arange(len(which))[:, None]
+        sign = 1.0 - 2.0 * reverse.float()
+        flat = samples.flatten(1, 2).transpose(1, 2)[each, source]  # (batch, element, sample, c)
+        moved = torch.einsum("besj,beij->besi", flat, matrix * sign[:, None, None, None])
+        moved = torch.where(reverse[:, None, None, None], moved.flip(2), moved)
+        offset = torch.einsum("bej,beij->bei", offset[each, source], matrix)
+        # Independent noises of several channels add up in one.
+        variance = torch.einsum("bej,beij->bei", sigma[each, source] ** 2, matrix**2)
+        return (
+            moved.transpose(1, 2).reshape(samples.shape),
+            offset * sign[:, None, None],
+            variance.sqrt(),
+        )
+
+
+def _tables(every: list[Symmetry]) -> tuple[Tensor, Tensor]:
+    source: NDArray[np.int64] = np.stack([s.source for s in every])
+    matrix: NDArray[np.float64] = np.stack([s.matrix for s in every])
+    return torch.from_numpy(source), torch.from_numpy(matrix.astype(np.float32))
+
+
+def tactile_paper(frames: Tensor, generator: Generator) -> Tensor:
+    """The published variant: one draw for the batch; (batch, step, channel, row, column)."""
+    device = generator.device
+    drawn = torch.rand(4, generator=generator, device=device) < HALF
+    columns, rows, turn, reverse = drawn.tolist()
+    if columns:
+        frames = frames.flip(-1)
+    if rows:
+        frames = frames.flip(-2)
+    if turn:
+        frames = quarter_turn(frames)
+    return -frames.flip(1) if reverse else frames
+
+
+def quarter_turn(frames: Tensor) -> Tensor:
+    """An image turned by 90 degrees in its own frame: what leaves it is lost."""
+    side = min(frames.shape[-2:])
+    top, left = (frames.shape[-2] - side) // 2, (frames.shape[-1] - side) // 2
+    turned = torch.zeros_like(frames)
+    square = frames[..., top : top + side, left : left + side]
+    turned[..., top : top + side, left : left + side] = square.rot90(1, (-2, -1))
+    return turned
+
+
+def image(frames: Tensor, generator: Generator, colours: int = 6) -> Tensor:
+    """What SimCLR does to pictures, drawn for every window.
+
+    Args:
+        frames: (batch, step, sub-step * colour, row, column).
+        generator: on their device.
+        colours: channels of a sub-step.
+    """
+    n, device = len(frames), frames.device
+    x = frames.unflatten(2, (-1, colours))  # (batch, step, sub-step, colour, row, column)
+
+    def draw() -> Tensor:
+        return torch.rand(n, 1, 1, 1, 1, 1, generator=generator, device=device)
+
+    def factor() -> Tensor:
+        return 1 + JITTER * (2 * draw() - 1)
+
+    brightness = x * factor()
+    mean = brightness.mean(dim=(1, 2, 3, 4, 5), keepdim=True)
+    contrast = mean + (brightness - mean) * factor()
+    grey = contrast.mean(3, keepdim=True)
+    saturated = grey + (contrast - grey) * factor()
+    x = torch.where(draw() < JITTER_CHANCE, saturated, x)
+    x = torch.where(draw() < GREY_CHANCE, x.mean(3, keepdim=True).expand_as(x), x)
+    x = torch.where(draw() < HALF, _blurred(x), x)
+    noise = torch.randn(x.shape, generator=generator, device=device)
+    x = x + NOISE * (draw() < HALF) * noise
+    return x.flatten(2, 3)
+
+
+def _blurred(x: Tensor) -> Tensor:
+    kernel = torch.outer(torch.tensor(BLUR), torch.tensor(BLUR)).to(x)
+    kernel = (kernel / kernel.sum())[None, None]
+    cells = x.flatten(0, 3)[:, None]
+    padded = torch.nn.functional.pad(cells, (1, 1, 1, 1), mode="replicate")
+    return torch.nn.functional.conv2d(padded, kernel)[:, 0].view(x.shape)
+
+
+def mask_steps(frames: Tensor, share: float, generator: Generator) -> Tensor:
+    """Blank this share of every window's steps, drawn for each; the others stay."""
+    n, steps = frames.shape[:2]
+    order = torch.rand(n, steps, generator=generator, device=frames.device).argsort(1).argsort(1)
+    kept = order >= round(share * steps)
+    return frames * kept[:, :, None, None, None]

@@ -1,0 +1,121 @@
+"""What is trained and shipped as one, and its checkpoints."""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from tactile_rt.models.datasets import SUBSTEPS, channel_values
+from tactile_rt.models.ead import EAD, EADConfig
+from tactile_rt.models.inputs import InputStage
+from tactile_rt.stream import ArraySpec, ModelError
+
+__all__ = [
+    "CLIP",
+    "SCALE",
+    "TactileClassifier",
+    "load_checkpoint",
+    "reason",
+    "run_on",
+    "save_whole",
+]
+
+# What is believed of a sensor, and the smallest scale of the logarithm: a third of the median
+# load of a touching whisker in passive sweeps.
+CLIP = {"N": 5e-3, "N m": 5e-6}
+SCALE = {"N": 1e-5, "N m": 1e-7}
+
+
+class TactileClassifier(nn.Module):
+    """Samples in SI units to logits: the input stage and the network, trained and shipped as one.
+
+    Args:
+        spec: the array.
+        network: the EAD's configuration.
+    """
+
+    def __init__(self, spec: ArraySpec, network: EADConfig) -> None:
+        super().__init__()
+        self.inputs = InputStage(
+            spec.grid,
+            spec.grid_shape,
+            channel_values(spec, CLIP).tolist(),
+            channel_values(spec, SCALE).tolist(),
+        )
+        self.network = EAD(network)
+
+    def forward(self, samples: Tensor, offset: Tensor, sigma: Tensor) -> Tensor:
+        """(batch, step, sub-step, element, channel) SI -> logits (batch, step, class)"""
+        logits: Tensor = self.network(self.inputs(samples, offset, sigma))
+        return logits
+
+    def features(self, frames: Tensor) -> Tensor:
+        """(batch, step, 30, row, column) -> (batch, step, feature): encoder and attender."""
+        return self.network.features(frames)
+
+    @torch.no_grad()
+    def feature_size(self) -> int:
+        """How many features a step has; the attender may change the encoder's number."""
+        frame = torch.zeros(1, 1, SUBSTEPS * len(self.inputs.clip), *self.inputs.shape)
+        mode = self.training
+        size = self.eval().features(frame.to(self.inputs.clip)).shape[-1]
+        self.train(mode)
+        return size
+
+
+def run_on(
+    model: TactileClassifier,
+) -> Callable[[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]:
+    """The function that `evaluation.predict` wants, of a torch model."""
+
+    def run(
+        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        model.eval()
+        device = model.inputs.clip.device
+        with torch.inference_mode():
+            logits = model(*(torch.from_numpy(a).to(device) for a in (samples, offset, sigma)))
+        out: NDArray[np.float32] = logits.float().cpu().numpy()
+        return out
+
+    return run
+
+
+def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
+    """The network of a `best.pt`, in evaluation mode on the CPU, with what it was trained on.
+
+    Raises:
+        ModelError: not there, or not such a checkpoint.
+    """
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        spec = ArraySpec.from_json(saved["spec"])
+        model = TactileClassifier(spec, EADConfig(**saved["network"]))
+        model.load_state_dict(saved["model"])
+    except FileNotFoundError:
+        raise ModelError(f"no checkpoint {path}") from None
+    except Exception as error:  # torch raises many unrelated types for a damaged file
+        raise ModelError(
+            f"{path} is not a checkpoint of `tactile-rt train`: {reason(error)}"
+        ) from None
+    return model.eval(), saved
+
+
+def reason(error: Exception) -> str:
+    """An error in one line."""
+    return str(error).splitlines()[0] if str(error) else type(error).__name__
+
+
+def save_whole(path: Path, state: dict[str, Any]) -> None:
+    """Write a checkpoint whole or not at all, also if the machine stops a moment later."""
+    partial = path.with_suffix(".partial")
+    with partial.open("wb") as file:
+        torch.save(state, file)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)

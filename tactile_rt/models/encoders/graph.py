@@ -1,0 +1,186 @@
+"""A network as data: inputs, nodes and the edges between them, feedback included.
+
+Time is unrolled as in biology: a step costs every edge the same delay, so at step t a node reads
+what its predecessors put out at step t-1 (nothing at t = 0); only inputs are read at step t itself.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from tactile_rt.models.encoders.cells import CELLS
+from tactile_rt.stream import ConfigError
+
+__all__ = ["FUSIONS", "KINDS", "Edge", "Graph", "Input", "Node"]
+
+FUSIONS = ("concatenate", "sum", "gate")
+KINDS = ("valid", "same", "dense")
+DENSE_CELLS = ("none", "timedecay", "timedecay-ln")
+
+
+@dataclass(frozen=True)
+class Input:
+    """What enters at every step: a map, or a vector (1 x 1), such as whisker angles."""
+
+    name: str
+    channels: int
+    rows: int = 1
+    columns: int = 1
+
+
+@dataclass(frozen=True)
+class Edge:
+    """What a node reads, and how it joins what the node reads besides.
+
+    "concatenate": beside the others, on channels (the paper). "sum": projected to the channels of
+    those that are concatenated, and added. "gate": the same, times a learned attention per site,
+    0 to 1, to what is being added in the light of what is there. A vector is the same at all sites.
+    """
+
+    source: str
+    fusion: str = "concatenate"
+
+
+@dataclass(frozen=True)
+class Node:
+    """One area: what it reads -> convolution -> cell -> ReLU.
+
+    Attributes:
+        name: an identifier.
+        channels: of its output.
+        reads: edges, in the order of their channels; the first is concatenated.
+        kind: "valid" or "same", 2 x 2 convolutions of maps; "dense" reads every site.
+        cell: one of `CELLS`, or "none". A dense node has none or time decay.
+    """
+
+    name: str
+    channels: int
+    reads: tuple[Edge, ...]
+    kind: str = "same"
+    cell: str = "none"
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Inputs, of which the first is the frame, nodes, and the dense node that is read out.
+
+    Raises:
+        ConfigError: from the constructor, in one line that names the node and what is wrong.
+    """
+
+    inputs: tuple[Input, ...]
+    nodes: tuple[Node, ...]
+    readout: str
+
+    def __post_init__(self) -> None:
+        parts: tuple[Input | Node, ...] = (*self.inputs, *self.nodes)
+        names = [part.name for part in parts]
+        if not self.inputs:
+            raise ConfigError("the graph has no input")
+        for part in parts:
+            if not part.name.isidentifier() or names.count(part.name) > 1:
+                raise ConfigError(f"{part.name!r} must be a name of its own, of letters and digits")
+            if part.channels < 1:
+                raise ConfigError(f"{part.name}: channels is {part.channels}, must be at least 1")
+        for i in self.inputs:
+            if i.rows < 1 or i.columns < 1:
+                raise ConfigError(f"{i.name}: {i.rows} x {i.columns} sites, must be at least 1 x 1")
+        for node in self.nodes:
+            _check_node(node, names)
+        if self.readout not in {node.name for node in self.nodes if node.kind == "dense"}:
+            raise ConfigError(f"readout is {self.readout!r}, not a dense node")
+        self.sizes  # noqa: B018  maps must fit each other
+        idle = sorted(n.name for n in self.nodes if n.name not in self.remaining)
+        if idle:
+            raise ConfigError(f"{', '.join(idle)} cannot reach the readout {self.readout}")
+        if self.inputs[0].name not in self.remaining:
+            raise ConfigError(f"no path from {self.inputs[0].name} to the readout {self.readout}")
+
+    @property
+    def sizes(self) -> dict[str, tuple[int, int]]:
+        """Rows and columns of every input and node; 1 x 1 for a vector."""
+        sizes = {i.name: (i.rows, i.columns) for i in self.inputs}
+        sizes |= {node.name: (1, 1) for node in self.nodes if node.kind == "dense"}
+        for _ in self.nodes:  # feedback may come from a node whose size is not known yet
+            for node in self.nodes:
+                maps = {sizes[e.source] for e in node.reads if e.source in sizes} - {(1, 1)}
+                if node.name not in sizes and maps:
+                    rows, columns = min(maps)
+                    sizes[node.name] = _less(node, rows, columns)
+        for node in self.nodes:
+            if node.name not in sizes:
+                raise ConfigError(f"{node.name}: reads no map, but is {node.kind!r}; make it dense")
+        for node in self.nodes:
+            maps = {sizes[e.source] for e in node.reads} - {(1, 1)}
+            fits = node.kind == "dense" or {_less(node, *m) for m in maps} == {sizes[node.name]}
+            if len(maps) > 1 or not fits:
+                found = ", ".join(f"{e.source} {_by(sizes[e.source])}" for e in node.reads)
+                raise ConfigError(f"{node.name}: the maps that it reads differ in size ({found})")
+            if min(sizes[node.name]) < 1:
+                raise ConfigError(f"{node.name}: no site is left for a 'valid' convolution")
+        return sizes
+
+    @property
+    def remaining(self) -> dict[str, int]:
+        """Steps from each node's output to the readout's, for inputs as if the reader's own."""
+        distance = {self.readout: 0}
+        inputs, nodes = {i.name for i in self.inputs}, {node.name: node for node in self.nodes}
+        queue = [self.readout]
+        for name in queue:  # breadth first, against the edges
+            for edge in nodes[name].reads:
+                if edge.source in inputs:
+                    distance.setdefault(edge.source, distance[name])
+                elif edge.source not in distance:
+                    distance[edge.source] = distance[name] + 1
+                    queue.append(edge.source)
+        return distance
+
+    @property
+    def lag(self) -> int:
+        """Steps from the frame to the readout, by the shortest path."""
+        return self.remaining[self.inputs[0].name]
+
+    @property
+    def components(self) -> tuple[tuple[Node, ...], ...]:
+        """Nodes that hear each other (strongly connected), each group after those it reads."""
+        reads = {n.name: {e.source for e in n.reads} for n in self.nodes}
+        above = {name: set(sources) & set(reads) for name, sources in reads.items()}
+        for _ in self.nodes:
+            above = {n: a.union(*(above[s] for s in a)) for n, a in above.items()}
+        groups: dict[frozenset[str], list[Node]] = {}
+        for node in self.nodes:
+            loop = {m for m in above[node.name] if node.name in above[m]} | {node.name}
+            groups.setdefault(frozenset(loop), []).append(node)
+        return tuple(
+            tuple(group)
+            for _, group in sorted(groups.items(), key=lambda g: len(above[g[1][0].name] | g[0]))
+        )
+
+    def scaled(self, width: float) -> Graph:
+        """The same graph with every node's channel count times `width`."""
+        scale = [replace(n, channels=max(round(n.channels * width), 1)) for n in self.nodes]
+        return replace(self, nodes=tuple(scale))
+
+
+def _check_node(node: Node, names: list[str]) -> None:
+    for what, value, known in (
+        ("kind", node.kind, KINDS),
+        ("cell", node.cell, (("none", *CELLS) if node.kind != "dense" else DENSE_CELLS)),
+        *(("reads", edge.source, tuple(names)) for edge in node.reads),
+        *(("fusion", edge.fusion, FUSIONS) for edge in node.reads),
+    ):
+        if value not in known:
+            raise ConfigError(f"{node.name}: {what} is {value!r}, not one of {', '.join(known)}")
+    sources = [edge.source for edge in node.reads]
+    if not sources or node.reads[0].fusion != "concatenate":
+        raise ConfigError(f"{node.name}: the first edge that it reads must be concatenated")
+    if len(set(sources)) < len(sources):
+        raise ConfigError(f"{node.name}: reads the same node twice")
+
+
+def _less(node: Node, rows: int, columns: int) -> tuple[int, int]:
+    return (rows - 1, columns - 1) if node.kind == "valid" else (rows, columns)
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

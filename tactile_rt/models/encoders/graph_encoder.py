@@ -1,0 +1,260 @@
+"""Any `Graph` as a network: a whole window at once for training, or step by step.
+
+Inside, maps are `(row, column, lane, channel)`, vectors maps of one site; in the state a map is
+`(lane, row, column, channel)` and a vector `(lane, channel)`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tactile_rt.models.encoders.cells import CELLS, Cell
+from tactile_rt.models.encoders.convolution import Convolution, convolve, convolve_valid
+from tactile_rt.models.encoders.graph import Graph, Input, Node
+
+__all__ = ["GraphEncoder"]
+
+
+class Fusion(nn.Module):
+    """The edges of a node that are summed or gated into those that are concatenated.
+
+    gate: sigmoid(w . [there, added] + b), a scalar per site and edge (gated attention).
+    """
+
+    def __init__(self, base: int, sources: Sequence[int], gated: Sequence[bool]) -> None:
+        super().__init__()
+        self.projections = nn.ModuleList(nn.Linear(c, base, bias=False) for c in sources)
+        self.gates = nn.ModuleList(nn.Linear(2 * base, 1) if g else nn.Identity() for g in gated)
+
+    def forward(self, base: Tensor, maps: Sequence[Tensor]) -> Tensor:
+        out = base
+        for project, gate, m in zip(self.projections, self.gates, maps, strict=True):
+            added = project(m)
+            if isinstance(gate, nn.Linear):
+                shape = torch.broadcast_shapes(base.shape, added.shape)
+                both = torch.cat([base.expand(shape), added.expand(shape)], dim=-1)
+                added = added * torch.sigmoid(gate(both))
+            out = out + added
+        return out
+
+
+class GraphEncoder(nn.Module):
+    """Frames `(batch, step, channel, row, column)`, and what else the graph takes, to features.
+
+    Args:
+        graph: what to build; its channel counts are final (see `Graph.scaled`).
+
+    Attributes:
+        features: channels of the graph's readout.
+        lag: the first `lag` steps of a window cannot depend on any frame.
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        super().__init__()
+        self.graph = graph
+        self.lag = graph.lag
+        self.sizes = graph.sizes
+        self.remaining = graph.remaining
+        self.inputs = [i.name for i in graph.inputs]
+        self.heard = {edge.source for node in graph.nodes for edge in node.reads}
+        parts: tuple[Input | Node, ...] = (*graph.inputs, *graph.nodes)
+        channels = {part.name: part.channels for part in parts}
+        self.convs = nn.ModuleDict()
+        self.cells = nn.ModuleDict()
+        self.dense = nn.ModuleDict()
+        self.fusions = nn.ModuleDict()
+        for node in graph.nodes:
+            inputs = {e.source: channels[e.source] for e in node.reads}
+            if node.kind == "dense":
+                for source in inputs:
+                    rows, columns = self.sizes[source]
+                    inputs[source] *= rows * columns
+            base = sum(inputs[e.source] for e in node.reads if e.fusion == "concatenate")
+            if node.kind == "dense":
+                linear = nn.Linear(base, node.channels)
+                nn.init.kaiming_normal_(linear.weight, nonlinearity="relu")
+                nn.init.constant_(linear.bias, 0.1)
+                self.dense[node.name] = linear
+            else:
+                self.convs[node.name] = Convolution(base, node.channels)
+            if node.cell != "none":
+                self.cells[node.name] = CELLS[node.cell](node.channels)
+            added = [e for e in node.reads if e.fusion != "concatenate"]
+            if added:
+                self.fusions[node.name] = Fusion(
+                    base, [inputs[e.source] for e in added], [e.fusion == "gate" for e in added]
+                )
+        self.features = channels[graph.readout]
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        """Zeros: each node's cell state and, where a node hears it, its output `_h`."""
+        zeros = next(self.parameters()).new_zeros
+        state = {}
+        for node in self.graph.nodes:
+            sites = () if node.kind == "dense" else self.sizes[node.name]
+            for key in self._keys(node):
+                state[key] = zeros(batch, *sites, node.channels)
+        return state
+
+    def step(
+        self, frame: Tensor, index: Tensor, state: dict[str, Tensor], *others: Tensor
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """One step. frame (batch, channel, row, column) -> features (batch, feature), new state.
+
+        others: the graph's further inputs, (batch, channel) or (batch, channel, row, column);
+        index does not matter to a network without positions.
+        """
+        now = {name: _inside(x) for name, x in zip(self.inputs, (frame, *others), strict=True)}
+        keys = [key for node in self.graph.nodes for key in self._keys(node)]
+        old = {key: _from_state(state[key]) for key in keys}
+        new: dict[str, Tensor] = {}
+        for node in self.graph.nodes:
+            read = [now[s] if s in now else old[f"{s}_h"] for s in (e.source for e in node.reads)]
+            memory = tuple(old[key] for key in self._memory(node))
+            new[f"{node.name}_h"], memory = self._cell(node, self._drive(node, read), memory)
+            new |= dict(zip(self._memory(node), memory, strict=True))
+        features = new[f"{self.graph.readout}_h"][0, 0]
+        return features, {key: _to_state(new[key], state[key].dim()) for key in keys}
+
+    def forward(self, frames: Tensor, *others: Tensor) -> Tensor:
+        """A whole window at once: the features that `step` gives one by one.
+
+        frames (batch, step, channel, row, column); others (batch, step, channel[, row, column])
+        -> (batch, step, feature)
+
+        What does not depend on a loop of the graph is computed for all steps in one product, and
+        what cannot reach a feature of this window is not computed. A node has one lane until the
+        first frame reaches it: until then all lanes are equal.
+        """
+        batch, steps = frames.shape[:2]
+        # What can be heard of every part of the graph, by the step in which it is read.
+        heard: dict[str, list[Tensor]] = {}
+        for name, x in zip(self.inputs, (frames, *others), strict=True):
+            heard[name] = list(_inside(x.transpose(0, 1).flatten(0, 1)).split(batch, 2))
+        state = {key: _from_state(value) for key, value in self.initial_state(1).items()}
+        for node in self.graph.nodes:
+            heard[node.name] = [state[f"{node.name}_h"]] if node.name in self.heard else []
+        for component in self.graph.components:
+            first = component[0]
+            if len(component) == 1 and all(e.source != first.name for e in first.reads):
+                self._sequence(first, heard, state, batch, steps)
+                continue
+            for t in range(steps):
+                for node in component:
+                    if t >= steps - self.remaining[node.name]:
+                        continue
+                    x = self._drive(node, [heard[e.source][t] for e in node.reads])
+                    memory = tuple(state[key] for key in self._memory(node))
+                    h, memory = self._cell(node, x, memory)
+                    state |= dict(zip(self._memory(node), memory, strict=True))
+                    heard[node.name].append(h)
+        out = [h.expand(-1, -1, batch, -1)[0, 0] for h in heard[self.graph.readout][-steps:]]
+        return torch.stack(out, dim=1)
+
+    def _sequence(
+        self,
+        node: Node,
+        heard: dict[str, list[Tensor]],
+        state: dict[str, Tensor],
+        batch: int,
+        steps: int,
+    ) -> None:
+        """Append all outputs of a node that is in no loop, from all that it will hear."""
+        steps -= self.remaining[node.name]
+        if steps <= 0:
+            return
+        maps = []
+        for edge in node.reads:
+            lanes = [m.expand(-1, -1, batch, -1) for m in heard[edge.source][:steps]]
+            maps.append(torch.cat(lanes, dim=2))
+        x = self._drive(node, maps)
+        if node.cell == "none":
+            heard[node.name] += F.relu(x).split(batch, 2)
+            return
+        cell = self.cells[node.name]
+        assert isinstance(cell, Cell)
+        drive = cell.drive(x)
+        drives = [None] * steps if drive is None else drive.split(batch, 2)
+        memory = tuple(state[key] for key in self._memory(node))
+        for now, driven in zip(x.split(batch, 2), drives, strict=True):
+            h, memory = self._cell(node, now, memory, driven)
+            heard[node.name].append(h)
+
+    def _drive(self, node: Node, maps: Sequence[Tensor]) -> Tensor:
+        """The node's convolution of what it reads, in the order of its edges."""
+        fused = [edge.fusion != "concatenate" for edge in node.reads]
+        if node.kind == "dense":
+            beside = _flat([m for m, f in zip(maps, fused, strict=True) if not f])
+            added = [_flat([m]) for m, f in zip(maps, fused, strict=True) if f]
+            out: Tensor = self.dense[node.name](self._fuse(node, beside, added))
+            return out
+        conv = self.convs[node.name]
+        assert isinstance(conv, Convolution)
+        rows, columns = self.sizes[node.name]
+        if node.kind == "valid":
+            rows, columns = rows + 1, columns + 1
+        maps = [m.expand(rows, columns, -1, -1) for m in maps]
+        if node.kind == "same" and not any(fused):
+            return convolve(conv.weight, conv.bias, *maps)
+        beside = _cat([m for m, f in zip(maps, fused, strict=True) if not f])
+        added = [m for m, f in zip(maps, fused, strict=True) if f]
+        joined = self._fuse(node, beside, added)
+        if node.kind == "valid":
+            return convolve_valid(conv.weight, conv.bias, joined)
+        return convolve(conv.weight, conv.bias, joined)
+
+    def _fuse(self, node: Node, beside: Tensor, added: Sequence[Tensor]) -> Tensor:
+        if not added:
+            return beside
+        out: Tensor = self.fusions[node.name](beside, added)
+        return out
+
+    def _cell(
+        self, node: Node, x: Tensor, memory: tuple[Tensor, ...], drive: Tensor | None = None
+    ) -> tuple[Tensor, tuple[Tensor, ...]]:
+        """The node's output and its cell's new memory."""
+        if node.cell == "none":
+            return F.relu(x), ()
+        h, memory = self.cells[node.name](x, tuple(m.expand_as(x) for m in memory), drive)
+        return F.relu(h), memory
+
+    def _memory(self, node: Node) -> list[str]:
+        """Names in the state of the node's cell's memory."""
+        if node.cell == "none":
+            return []
+        cell = self.cells[node.name]
+        assert isinstance(cell, Cell)
+        return [f"{node.name}_{kind}" for kind in cell.states]
+
+    def _keys(self, node: Node) -> list[str]:
+        return self._memory(node) + [f"{node.name}_h"] * (node.name in self.heard)
+
+
+def _inside(x: Tensor) -> Tensor:
+    """(lane, channel[, row, column]) -> (row, column, lane, channel)"""
+    return x[None, None] if x.dim() == 2 else x.permute(2, 3, 0, 1)
+
+
+def _from_state(x: Tensor) -> Tensor:
+    """(lane, [row, column,] channel) -> (row, column, lane, channel)"""
+    return x[None, None] if x.dim() == 2 else x.movedim(0, 2)
+
+
+def _to_state(x: Tensor, dimensions: int) -> Tensor:
+    return x[0, 0] if dimensions == 2 else x.movedim(2, 0)
+
+
+def _cat(maps: Sequence[Tensor]) -> Tensor:
+    lanes = max(m.shape[2] for m in maps)
+    return torch.cat([m.expand(-1, -1, lanes, -1) for m in maps], dim=-1)
+
+
+def _flat(maps: Sequence[Tensor]) -> Tensor:
+    """Every site's channels, then those of vectors: (1, 1, lane, site * channel + ...)."""
+    sites = [m for m in maps if m.shape[:2] != (1, 1)]
+    parts = [_cat(sites).movedim(2, 0).flatten(1)[None, None]] if sites else []
+    return _cat(parts + [m for m in maps if m.shape[:2] == (1, 1)])

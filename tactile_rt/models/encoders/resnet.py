@@ -1,0 +1,216 @@
+"""ResNet18 on the whisker map: the feed-forward control (He et al. 2016), time in the batch.
+
+On a 5 x 7 grid the maps shrink to 3 x 4, 2 x 2 and then 1 x 1, where most of a 3 x 3 kernel lies
+on padding: of 11,523,840 parameters only 1,914,624 can ever reach the output. Every convolution
+is therefore one product with the matrix of its taps that lie inside the map, which computes
+nothing else. Maps are `(frame, site * channel)`, sites row by row.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+__all__ = ["FoldedResNet18", "ResNet18Encoder"]
+
+CHANNELS, GRID = 30, (5, 7)
+STAGES = (64, 128, 256, 512)  # channels at width 1
+FEATURES = 512
+
+Shape = tuple[int, int]
+
+
+def output_shape(shape: Shape, kernel: int, stride: int) -> Shape:
+    """Rows and columns behind a kernel that is padded by half its size."""
+    rows, columns = ((n + 2 * (kernel // 2) - kernel) // stride + 1 for n in shape)
+    return rows, columns
+
+
+def site_taps(shape: Shape, kernel: int, stride: int) -> Tensor:
+    """Which tap joins two sites: (site out, site in), row-major taps; kernel**2 where none does."""
+
+    def along(size_in: int, size_out: int) -> Tensor:
+        centre = stride * torch.arange(size_out)[:, None]
+        return torch.arange(size_in)[None, :] - centre + kernel // 2
+
+    out = output_shape(shape, kernel, stride)
+    row = along(shape[0], out[0])[:, None, :, None]
+    column = along(shape[1], out[1])[None, :, None, :]
+    inside = (row >= 0) & (row < kernel) & (column >= 0) & (column < kernel)
+    taps = torch.where(inside, kernel * row + column, kernel**2)
+    return taps.reshape(out[0] * out[1], shape[0] * shape[1])
+
+
+class ConvNorm(nn.Module):
+    """Convolution without bias, then batch norm.
+
+    Args:
+        inputs, outputs: channels.
+        kernel, stride: square; padded by kernel // 2.
+        shape: rows and columns of the map that comes in.
+    """
+
+    taps: Tensor
+
+    def __init__(self, inputs: int, outputs: int, kernel: int, stride: int, shape: Shape) -> None:
+        super().__init__()
+        self.shape = output_shape(shape, kernel, stride)
+        self.weight = nn.Parameter(torch.empty(outputs, inputs, kernel, kernel))
+        self.norm = nn.BatchNorm1d(outputs)
+        self.register_buffer("taps", site_taps(shape, kernel, stride), persistent=False)
+        nn.init.kaiming_normal_(self.weight, mode="fan_out", nonlinearity="relu")
+
+    def forward(self, x: Tensor) -> Tensor:
+        """x (frame, site in * inputs) -> (frame, site out * outputs)"""
+        y = F.linear(x, self.matrix())
+        y = self.norm(y.view(-1, len(self.weight)))  # statistics over frames and sites
+        out: Tensor = y.view(len(x), -1)
+        return out
+
+    def matrix(self) -> Tensor:
+        """(site out * outputs, site in * inputs)"""
+        taps = F.pad(self.weight.flatten(2).permute(2, 0, 1), (0, 0, 0, 0, 0, 1))
+        matrix = taps[self.taps]  # (site out, site in, output, input)
+        matrix = matrix.transpose(1, 2).flatten(2).flatten(0, 1)
+        return matrix
+
+    def folded(self) -> tuple[Tensor, Tensor]:
+        """Matrix and bias with the norm's running statistics multiplied in."""
+        norm = self.norm
+        assert norm.running_var is not None and norm.running_mean is not None
+        gain = norm.weight / torch.sqrt(norm.running_var + norm.eps)
+        bias = norm.bias - gain * norm.running_mean
+        sites = len(self.taps)
+        return self.matrix() * gain.repeat(sites)[:, None], bias.repeat(sites)
+
+
+class Block(nn.Module):
+    """relu(x + norm(conv(relu(norm(conv(x)))))), with x projected where its shape changes."""
+
+    def __init__(self, inputs: int, outputs: int, stride: int, shape: Shape) -> None:
+        super().__init__()
+        self.first = ConvNorm(inputs, outputs, 3, stride, shape)
+        self.shape = self.first.shape
+        self.second = ConvNorm(outputs, outputs, 3, 1, self.shape)
+        same = inputs == outputs and stride == 1
+        self.shortcut = None if same else ConvNorm(inputs, outputs, 1, stride, shape)
+
+    def forward(self, x: Tensor) -> Tensor:
+        short = x if self.shortcut is None else self.shortcut(x)
+        out: Tensor = F.relu(short + self.second(F.relu(self.first(x))))
+        return out
+
+
+class ResNet18Encoder(nn.Module):
+    """Frames `(batch, step, 30, 5, 7)` to features `(batch, step, 512 * width)`; no memory."""
+
+    lag = 0
+
+    def __init__(self, width: float = 1.0) -> None:
+        super().__init__()
+        channels = [round(stage * width) for stage in STAGES]
+        self.features = round(FEATURES * width)
+        self.stem = ConvNorm(CHANNELS, channels[0], 7, 2, GRID)
+        shape = output_shape(self.stem.shape, 3, 2)  # the maximum
+        inputs, blocks = channels[0], []
+        for i, outputs in enumerate(channels):
+            for stride in (1 if i == 0 else 2, 1):
+                blocks.append(Block(inputs, outputs, stride, shape))
+                inputs, shape = outputs, blocks[-1].shape
+        assert shape == (1, 1)  # so there is nothing left to average
+        self.blocks = nn.ModuleList(blocks)
+        self.fc = nn.Linear(inputs, self.features)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        features: Tensor = self._encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
+        return features
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        return {}
+
+    def step(
+        self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """One step. frame (batch, 30, 5, 7) -> features (batch, feature), {}"""
+        return self._encode(frame), {}
+
+    def deployed(self) -> FoldedResNet18:
+        """The same outputs from only the taps that matter, batch norm folded in; for inference."""
+        return FoldedResNet18(self)
+
+    def _encode(self, frames: Tensor) -> Tensor:
+        """frames (frame, 30, 5, 7) -> (frame, feature)"""
+        x = maximum(F.relu(self.stem(sites_first(frames))), self.stem.shape)
+        for block in self.blocks:
+            x = block(x)
+        features: Tensor = self.fc(x)
+        return features
+
+
+class FoldedResNet18(nn.Module):
+    """A trained `ResNet18Encoder` as plain products: 2 M numbers at width 1 instead of 11.5 M."""
+
+    lag = 0
+
+    def __init__(self, encoder: ResNet18Encoder) -> None:
+        super().__init__()
+        self.features, self.shape = encoder.features, encoder.stem.shape
+        self.layers = nn.ModuleDict()
+        self._add("stem", encoder.stem)
+        self.count = len(encoder.blocks)
+        for i, block in enumerate(encoder.blocks):
+            assert isinstance(block, Block)
+            self._add(f"{i}_first", block.first)
+            self._add(f"{i}_second", block.second)
+            if block.shortcut is not None:
+                self._add(f"{i}_shortcut", block.shortcut)
+        self.layers["fc"] = _linear(encoder.fc.weight, encoder.fc.bias)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """frames (batch, step, 30, 5, 7) -> features (batch, step, feature)"""
+        features: Tensor = self._encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
+        return features
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        return {}
+
+    def step(
+        self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """One step. frame (batch, 30, 5, 7) -> features (batch, feature), {}"""
+        return self._encode(frame), {}
+
+    def _encode(self, frames: Tensor) -> Tensor:
+        layers = self.layers
+        x = maximum(F.relu(layers["stem"](sites_first(frames))), self.shape)
+        for i in range(self.count):
+            short = layers[f"{i}_shortcut"](x) if f"{i}_shortcut" in layers else x
+            x = F.relu(short + layers[f"{i}_second"](F.relu(layers[f"{i}_first"](x))))
+        features: Tensor = layers["fc"](x)
+        return features
+
+    def _add(self, name: str, layer: ConvNorm) -> None:
+        self.layers[name] = _linear(*layer.folded())
+
+
+def sites_first(frames: Tensor) -> Tensor:
+    """(frame, channel, row, column) -> (frame, site * channel)"""
+    return frames.flatten(2).transpose(1, 2).flatten(1)
+
+
+def maximum(x: Tensor, shape: Shape) -> Tensor:
+    """Largest of 3 x 3 sites, stride 2, padded by 1: (frame, site * channel) to the same layout."""
+    x = x.view(len(x), *shape, -1)
+    for axis in (1, 2):
+        size = x.shape[axis]
+        ranges = [(max(c - 1, 0), min(c + 2, size)) for c in range(0, size, 2)]
+        x = torch.stack([x.narrow(axis, a, b - a).amax(axis) for a, b in ranges], axis)
+    return x.flatten(1)
+
+
+def _linear(weight: Tensor, bias: Tensor) -> nn.Linear:
+    layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
+    layer.weight = nn.Parameter(weight.detach().clone(), requires_grad=False)
+    layer.bias = nn.Parameter(bias.detach().clone(), requires_grad=False)
+    return layer

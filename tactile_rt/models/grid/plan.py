@@ -1,0 +1,226 @@
+"""What a grid trains: a TOML file of encoder x attender x objective under one budget.
+
+data = "data/mouse24"
+updates = 600
+[[cell]]
+encoder = "zhuang-gru"
+"""
+
+import tomllib
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tactile_rt.models.ead import EADConfig
+from tactile_rt.models.training import TrainingConfig
+from tactile_rt.stream import ConfigError
+
+__all__ = ["Cell", "Grid", "Pair", "Question", "Sweeps", "Task", "read_grid", "shipped_grids"]
+
+SHIPPED = resources.files("tactile_rt.models.grid")
+SUPERVISED, RANDOM, SVM = "supervised", "random", "svm"
+
+
+class Cell(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One network and how it learns.
+
+    Attributes:
+        encoder, attender: as in `EADConfig`.
+        objective: "supervised", or a self-supervised one, whose features a linear probe reads.
+        augmentation: of the views of a self-supervised objective.
+        masking: share of the steps of a view that is blanked.
+        width: of this network; 0: the grid's.
+        options: further fields of `TrainingConfig`, for this cell alone.
+    """
+
+    encoder: str
+    attender: str = "none"
+    objective: str = SUPERVISED
+    augmentation: str = "none"
+    masking: float = 0.0
+    width: float = 0.0
+    options: dict[str, Any] = {}
+
+    @property
+    def network(self) -> str:
+        """Encoder, attender and a width of its own: ``zhuang-gru+gpt@0.125``."""
+        attender = f"+{self.attender}" if self.attender != "none" else ""
+        return self.encoder + attender + (f"@{self.width:g}" if self.width else "")
+
+    @property
+    def learning(self) -> str:
+        """Objective and views: ``simclr tactile+masking``."""
+        views = [self.augmentation] if self.augmentation != "none" else []
+        views += ["masking"] if self.masking else []
+        return " ".join([self.objective, "+".join(views)]).strip()
+
+    @property
+    def name(self) -> str:
+        """Unique in a grid; a supervised cell goes by its network alone."""
+        return self.network + ("" if self.objective == SUPERVISED else f" {self.learning}")
+
+
+class Sweeps(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How many sweeps of each object are taken; 0: all."""
+
+    train: int = 0
+    validation: int = 0
+    test: int = 0
+
+
+class Pair(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Two cells to compare, by name; "svm" and "random NETWORK" are names too."""
+
+    better: str
+    than: str
+
+
+class Question(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A question to the grid and the comparisons that answer it."""
+
+    text: str
+    pairs: tuple[Pair, ...]
+
+
+class Task(msgspec.Struct, frozen=True):
+    """One thing to do: a cell with a seed, a network's random initialisation, or the SVM.
+
+    Attributes:
+        name: of the cell, "random NETWORK" or "svm".
+        seed: of weights, windows and noise.
+        cell: None for the SVM.
+    """
+
+    name: str
+    seed: int
+    cell: Cell | None
+
+    @property
+    def slug(self) -> str:
+        """A name for files."""
+        return f"{self.name.replace(' ', '_')}_seed{self.seed}"
+
+    @property
+    def random(self) -> bool:
+        """Whether the network stays as it was initialised."""
+        return self.name.startswith(RANDOM)
+
+
+class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A whole grid.
+
+    Attributes:
+        data: the sweep set.
+        cells: in the order in which they are trained.
+        width: of every network that has none of its own.
+        updates, batch: the budget of every cell.
+        seeds: how many; all cells are trained with the first before any with the second.
+        sweeps: of each object that are used.
+        supervised, self_supervised: fields of `TrainingConfig` for cells of either kind.
+        probe: fields of `ProbeConfig`.
+        svm: fit a support vector machine too.
+        questions: what the report answers.
+    """
+
+    data: str
+    cells: tuple[Cell, ...] = msgspec.field(name="cell")
+    width: float = 0.125
+    updates: int = 600
+    batch: int = 32
+    seeds: int = 3
+    sweeps: Sweeps = Sweeps()
+    supervised: dict[str, Any] = {}
+    self_supervised: dict[str, Any] = {}
+    probe: dict[str, Any] = {}
+    svm: bool = True
+    questions: tuple[Question, ...] = msgspec.field(name="question", default=())
+
+    def config(self, task: Task, data: Path) -> TrainingConfig:
+        """How a task is trained on the sweep set at `data`.
+
+        Raises:
+            ConfigError: an option that there is not, or a value that it cannot have.
+        """
+        cell = task.cell
+        assert cell is not None
+        common = self.supervised if cell.objective == SUPERVISED else self.self_supervised
+        options: dict[str, Any] = {
+            "data": str(data),
+            "encoder": cell.encoder,
+            "attender": cell.attender,
+            "objective": cell.objective,
+            "augmentation": cell.augmentation,
+            "masking": cell.masking,
+            "width": cell.width or self.width,
+            "updates": self.updates,
+            "batch": self.batch,
+            "seed": task.seed,
+            **common,
+            **cell.options,
+        }
+        try:
+            return TrainingConfig(**options)
+        except TypeError as error:
+            raise ConfigError(f"cell {cell.name!r}: {error}") from None
+
+    def tasks(self) -> list[Task]:
+        """Everything to do, the first seed of all first."""
+        tasks = [Task(SVM, 0, None)] if self.svm else []
+        for seed in range(self.seeds):
+            seen: set[str] = set()
+            for cell in self.cells:
+                tasks.append(Task(cell.name, seed, cell))
+                if cell.network not in seen:
+                    seen.add(cell.network)
+                    bare = Cell(cell.encoder, cell.attender, width=cell.width)
+                    tasks.append(Task(f"{RANDOM} {cell.network}", seed, bare))
+        return tasks
+
+
+def shipped_grids() -> tuple[str, ...]:
+    """Names that `read_grid` takes in place of a path."""
+    files = (entry.name for entry in SHIPPED.iterdir())
+    return tuple(sorted(name.removesuffix(".toml") for name in files if name.endswith(".toml")))
+
+
+def read_grid(name: str | Path) -> Grid:
+    """Read a grid file, or a shipped one by its name, and check every cell of it.
+
+    Raises:
+        ConfigError: there is none, or it is not such a file.
+    """
+    path = Path(name)
+    try:
+        if str(name) in shipped_grids():
+            text = (SHIPPED / f"{name}.toml").read_text()
+        else:
+            text = path.read_text()
+    except FileNotFoundError:
+        raise ConfigError(
+            f"no grid {name}: name a TOML file, or one of {', '.join(shipped_grids())}"
+        ) from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{name} is not a text file: {error}") from None
+    try:
+        grid = msgspec.convert(tomllib.loads(text), Grid)
+    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
+        raise ConfigError(f"{name}: {error}") from None
+    names = [cell.name for cell in grid.cells]
+    for cell in grid.cells:
+        if names.count(cell.name) > 1:
+            raise ConfigError(f"{name}: two cells are {cell.name!r}")
+        try:
+            config = grid.config(Task(cell.name, 0, cell), Path(grid.data))
+            EADConfig(2, cell.encoder, cell.attender, config.decoder, config.width)
+        except ConfigError as error:
+            raise ConfigError(f"{name}: cell {cell.name!r}: {error}") from None
+    known = {task.name for task in grid.tasks()}
+    for question in grid.questions:
+        for one in (name for pair in question.pairs for name in (pair.better, pair.than)):
+            if one not in known:
+                raise ConfigError(f"{name}: {question.text!r} compares {one!r}, which no cell is")
+    if not grid.cells or grid.seeds < 1 or grid.updates < 1:
+        raise ConfigError(f"{name}: a grid needs a cell, a seed and an update")
+    return grid

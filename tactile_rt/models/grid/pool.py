@@ -1,0 +1,116 @@
+"""A grid's tasks over processes: a task that is done is not done again, whenever it was killed."""
+
+import multiprocessing
+import os
+import queue
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tactile_rt.models.grid.plan import Grid, Task
+from tactile_rt.models.grid.subset import write_subset
+from tactile_rt.models.grid.work import SUBSET, Outcome, Workbench, read_outcome
+from tactile_rt.stream import TactileError
+
+__all__ = ["run_grid"]
+
+PATIENCE_S = 1.0
+
+
+def run_grid(
+    grid: Grid,
+    folder: Path,
+    processes: int = 1,
+    report: Callable[[Outcome, int, int], None] = lambda found, done, total: None,
+) -> None:
+    """Do everything that a grid has not done yet.
+
+    Args:
+        grid: the grid.
+        folder: where its sweeps, runs and outcomes go.
+        processes: to share the tasks; one works in this process.
+        report: called with each outcome as it comes, and how many of all there are.
+
+    Raises:
+        ConfigError: the folder holds outcomes of another grid.
+        RecordingError: the sweep set cannot be read.
+    """
+    tasks = grid.tasks()
+    folder.mkdir(parents=True, exist_ok=True)
+    waiting = [task for task in tasks if read_outcome(grid, folder, task) is None]
+    if not waiting:
+        return
+    write_subset(Path(grid.data), folder / SUBSET, grid.sweeps)
+    done = len(tasks) - len(waiting)
+    if processes == 1:
+        bench = Workbench(grid, folder)
+        for task in waiting:
+            done += 1
+            report(bench.do(task), done, len(tasks))
+        return
+    # Spawned: torch does not survive a fork in every state.
+    context = multiprocessing.get_context("spawn")
+    todo: Any = context.Queue()
+    outcomes: Any = context.Queue()
+    for task in waiting:
+        todo.put(task)
+    count = min(processes, len(waiting))
+    for _ in range(count):
+        todo.put(None)
+    workers = [
+        context.Process(target=_work, args=(grid, folder, todo, outcomes), daemon=True)
+        for _ in range(count)
+    ]
+    for worker in workers:
+        worker.start()
+    try:
+        for _ in waiting:
+            found = _next(outcomes, workers)
+            if isinstance(found, TactileError):
+                raise found
+            done += 1
+            report(found, done, len(tasks))
+    finally:
+        for worker in workers:
+            worker.terminate()
+            worker.join()
+
+
+def _next(outcomes: Any, workers: list[Any]) -> Any:
+    while True:
+        try:
+            return outcomes.get(timeout=PATIENCE_S)
+        except queue.Empty:
+            dead = [w for w in workers if w.exitcode not in (None, 0)]
+            if dead:  # killed for memory, for one; what it was at is done again next time
+                raise TactileError(
+                    f"a process of the grid ended with {dead[0].exitcode}: run the grid again to "
+                    "go on, with fewer processes if memory ran out"
+                ) from None
+
+
+def _work(grid: Grid, folder: Path, todo: Any, outcomes: Any) -> None:
+    import torch
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent says when to stop
+    torch.set_num_threads(1)
+    parent = os.getppid()
+
+    def orphaned(_: object = None) -> None:
+        if os.getppid() != parent:  # it was killed: nobody would hear of what this one does
+            os._exit(1)
+
+    try:
+        bench = Workbench(grid, folder)
+        while True:
+            orphaned()
+            try:
+                task: Task | None = todo.get(timeout=PATIENCE_S)
+            except queue.Empty:
+                continue
+            if task is None:
+                return
+            outcomes.put(bench.do(task, orphaned))
+    except TactileError as error:
+        outcomes.put(error)

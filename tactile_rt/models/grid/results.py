@@ -1,0 +1,237 @@
+"""What a grid found: accuracies with honest intervals, comparisons, and tables of both."""
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.grid.plan import RANDOM, SVM, Grid
+from tactile_rt.models.grid.work import SUBSET, Outcome, read_outcome
+from tactile_rt.models.intervals import Interval, accuracy
+from tactile_rt.recording import write_whole
+from tactile_rt.stream import ConfigError
+
+__all__ = ["Answer", "Results", "Row", "gather", "put_into", "table", "write_results"]
+
+BEGIN, END = "<!-- grid: begin -->", "<!-- grid: end -->"
+
+
+@dataclass(frozen=True)
+class Row:
+    """A cell over its seeds, beside its network's random initialisation.
+
+    Attributes:
+        name: of the cell, or "svm".
+        network, learning: of the cell; empty for the SVM.
+        seeds: that are done.
+        top1, top5, noisy: accuracies on the test sweeps; `noisy` at the rated noise. None where
+            there is none.
+        random: top-1 of a linear probe on the untrained network.
+        parameters: of the network.
+        seconds: mean CPU time.
+        failed: why seeds are missing; empty if none did.
+    """
+
+    name: str
+    network: str
+    learning: str
+    seeds: int
+    top1: Interval | None = None
+    top5: Interval | None = None
+    noisy: Interval | None = None
+    random: Interval | None = None
+    parameters: int = 0
+    seconds: float = 0.0
+    failed: str = ""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One comparison: by how much `better` is above `than` on the same test sweeps."""
+
+    question: str
+    better: str
+    than: str
+    difference: Interval
+
+    @property
+    def verdict(self) -> str:
+        """In a word."""
+        if self.difference.low > 0:
+            return "yes"
+        return "no" if self.difference.high < 0 else "cannot tell"
+
+
+@dataclass(frozen=True)
+class Results:
+    """Everything that a grid has found so far."""
+
+    rows: tuple[Row, ...]
+    answers: tuple[Answer, ...]
+    objects: int
+    sweeps: int
+    classes: int
+
+
+def gather(grid: Grid, folder: Path) -> Results:
+    """Read the outcomes that there are.
+
+    Raises:
+        ConfigError: there is none yet, or those of another grid.
+        RecordingError: the grid's sweeps cannot be read.
+    """
+    found: dict[str, list[Outcome]] = {}
+    for task in grid.tasks():
+        outcome = read_outcome(grid, folder, task)
+        if outcome is not None:
+            found.setdefault(task.name, []).append(outcome)
+    if not found:
+        raise ConfigError(f"{folder} has no outcome yet: run the grid first")
+    test = SweepSet.read(folder / SUBSET, "test")
+    objects = test.sweeps.objects
+    rows = []
+    if SVM in found:
+        rows.append(_row(SVM, "", "", found[SVM], [], objects))
+    for cell in grid.cells:
+        if cell.name in found:
+            random = found.get(f"{RANDOM} {cell.network}", [])
+            rows.append(
+                _row(cell.name, cell.network, cell.learning, found[cell.name], random, objects)
+            )
+    answers = []
+    for question in grid.questions:
+        for pair in question.pairs:
+            difference = _difference(found.get(pair.better), found.get(pair.than), objects)
+            if difference is not None:
+                answers.append(Answer(question.text, pair.better, pair.than, difference))
+    return Results(
+        tuple(rows),
+        tuple(answers),
+        len(set(objects.tolist())),
+        len(objects),
+        len(test.manifest.categories),
+    )
+
+
+def _row(
+    name: str,
+    network: str,
+    learning: str,
+    outcomes: list[Outcome],
+    random: list[Outcome],
+    objects: NDArray[np.str_],
+) -> Row:
+    def estimate(these: list[Outcome], which: str) -> Interval | None:
+        right = [one.right(which) for one in these if getattr(one, which)]
+        return accuracy(np.stack(right), objects) if right else None
+
+    return Row(
+        name,
+        network,
+        learning,
+        sum(not one.failed for one in outcomes),
+        estimate(outcomes, "top1"),
+        estimate(outcomes, "top5"),
+        estimate(outcomes, "noisy"),
+        estimate(random, "top1"),
+        outcomes[0].parameters,
+        float(np.mean([one.seconds for one in outcomes])),
+        "; ".join(sorted({one.failed for one in outcomes if one.failed})),
+    )
+
+
+def _difference(
+    better: list[Outcome] | None, than: list[Outcome] | None, objects: NDArray[np.str_]
+) -> Interval | None:
+    """Of top-1, over the seeds that both have; the SVM has one for all."""
+    mine = {one.seed: one.right() for one in better or () if one.top1}
+    theirs = {one.seed: one.right() for one in than or () if one.top1}
+    seeds = sorted(set(mine) & set(theirs))
+    if than and than[0].name == SVM and theirs:
+        seeds, theirs = sorted(mine), dict.fromkeys(mine, theirs[0])
+    if not seeds:
+        return None
+    return accuracy(np.stack([mine[s].astype(np.float64) - theirs[s] for s in seeds]), objects)
+
+
+def table(results: Results) -> str:
+    """Markdown: every cell, then every comparison."""
+    lines = [
+        f"Top-1 on {results.objects} objects that no network trained on ({results.sweeps} sweeps, "
+        f"{results.classes} categories, chance {100 / results.classes:.1f} %); in brackets 95 %, "
+        "by object and seed. Untrained: a linear probe on the network as it was initialised.",
+        "",
+        "| network | learning | parameters | top-1 (%) | untrained (%) | top-5 (%) "
+        "| at rated noise (%) | seeds | CPU s |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in results.rows:
+        cells = [
+            row.network or "RBF SVM",
+            row.learning or "on the same windows",
+            f"{row.parameters:,}" if row.parameters else "",
+            _percent(row.top1) if row.top1 else "failed" if row.failed else "",
+            *(_percent(one) for one in (row.random, row.top5, row.noisy)),
+            str(row.seeds),
+            f"{row.seconds:.0f}",
+        ]
+        lines.append("| " + " | ".join(cells) + " |")
+    failed = [row for row in results.rows if row.failed]
+    lines += ["", *(f"`{row.name}`: {row.failed}" for row in failed)] if failed else []
+    if results.answers:
+        lines += ["", "| question | compared | points | |", "|---|---|---|---|"]
+    asked = ""
+    for answer in results.answers:
+        d = answer.difference
+        lines.append(
+            f"| {answer.question if answer.question != asked else ''} "
+            f"| {answer.better} - {answer.than} "
+            f"| {100 * d.value:+.1f} [{100 * d.low:+.1f}, {100 * d.high:+.1f}] "
+            f"| {answer.verdict} |"
+        )
+        asked = answer.question
+    return "\n".join(lines) + "\n"
+
+
+def _percent(one: Interval | None) -> str:
+    if one is None:
+        return ""
+    return f"{100 * one.value:.1f} [{100 * one.low:.1f}, {100 * one.high:.1f}]"
+
+
+def write_results(results: Results, folder: Path) -> None:
+    """Write `results.json` and `results.csv` into a grid's folder."""
+    text = msgspec.json.format(msgspec.json.encode(results), indent=1)
+    write_whole(folder / "results.json", lambda file: file.write(text))
+    out = io.StringIO()
+    columns = ("top1", "top5", "noisy", "random")
+    writer = csv.writer(out)
+    plain = ("name", "network", "learning", "seeds", "parameters", "seconds", "failed")
+    writer.writerow([*plain, *(f"{c}{end}" for c in columns for end in ("", "_low", "_high"))])
+    for row in results.rows:
+        intervals = [getattr(row, c) for c in columns]
+        values = [(i.value, i.low, i.high) if i else ("", "", "") for i in intervals]
+        writer.writerow(
+            [*(getattr(row, p) for p in plain), *(v for three in values for v in three)]
+        )
+    write_whole(folder / "results.csv", lambda file: file.write(out.getvalue().encode()))
+
+
+def put_into(page: Path, text: str) -> None:
+    """Replace what stands between the grid's marks on a page.
+
+    Raises:
+        ConfigError: the page has no such marks.
+    """
+    old = page.read_text() if page.exists() else f"{BEGIN}\n{END}\n"
+    before, begin, rest = old.partition(BEGIN)
+    _, end, after = rest.partition(END)
+    if not (begin and end):
+        raise ConfigError(f"{page} has no {BEGIN} and {END} to put the table between")
+    new = f"{before}{BEGIN}\n{text}{END}{after}"
+    write_whole(page, lambda file: file.write(new.encode()))

@@ -1,0 +1,139 @@
+"""What to train and how: one frozen dataclass, the whole of a run's `config.json`."""
+
+from dataclasses import dataclass, field
+from math import isfinite
+
+from tactile_rt.models.augmentation import AUGMENTATIONS
+from tactile_rt.models.ead import EADConfig
+from tactile_rt.stream import ConfigError
+
+__all__ = [
+    "LOSSES",
+    "OBJECTIVES",
+    "OPTIMIZERS",
+    "PRECISIONS",
+    "SCHEDULES",
+    "Progress",
+    "TrainingConfig",
+]
+
+OBJECTIVES = ("supervised", "simclr", "simsiam", "autoencoder")
+LOSSES = ("anytime", "last")
+OPTIMIZERS = ("sgd", "adam", "adamw", "lars", "lars-paper")
+SCHEDULES = ("step", "constant", "cosine", "cosine-annealing", "one-cycle")
+PRECISIONS = ("bf16", "fp32")
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """What to train and how; the defaults are the shipped model's recipe.
+
+    Attributes:
+        data: the sweep set's folder.
+        encoder, attender, decoder, width, readout, dropout, graph: the network, as in `EADConfig`.
+        objective: "supervised", or self-supervised: "simclr", "simsiam", "autoencoder".
+        loss: of the supervised objective: "anytime" (half of it on the last step, half on all
+            steps that can know anything) or "last" (the paper's: the last step alone).
+        augmentation: as in `augmentation.build`; self-supervised views differ by it alone.
+        masking: share of the steps of a window that are blanked.
+        optimizer, schedule: as in `optimizers`.
+        learning_rate: the peak.
+        warmup: share of all updates in which the rate rises; 10 of the paper's 100 epochs are 0.1.
+        drop_every: share of all updates between tenfold drops of the schedule "step"; StepLR(30)
+            of 100 epochs is 0.3.
+        epochs: passes over the training split.
+        updates: if positive, stop after exactly as many, whatever `epochs` says.
+        batch: sweeps per update, of all devices together.
+        clip_norm: largest norm of the gradient; 0: no clipping.
+        precision: "bf16" (mixed) or "fp32".
+        seed: of the weights, windows, noise and augmentation.
+
+    Raises:
+        ConfigError: a value that cannot be.
+    """
+
+    data: str
+    encoder: str = "zhuang-intersection-ln"
+    attender: str = "none"
+    decoder: str = "mlp"
+    width: float = 0.125
+    readout: str = "mean"
+    dropout: float = 0.1
+    graph: str = ""
+    objective: str = "supervised"
+    loss: str = "anytime"
+    augmentation: str = "none"
+    masking: float = 0.0
+    optimizer: str = "adamw"
+    schedule: str = "one-cycle"
+    learning_rate: float = 5e-3
+    weight_decay: float = 1e-4
+    warmup: float = 0.05
+    drop_every: float = 0.3
+    epochs: int = 14
+    updates: int = 0
+    batch: int = 32
+    label_smoothing: float = 0.05
+    clip_norm: float = 1.0
+    precision: str = "bf16"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name, known in (
+            ("objective", OBJECTIVES),
+            ("loss", LOSSES),
+            ("augmentation", AUGMENTATIONS),
+            ("optimizer", OPTIMIZERS),
+            ("schedule", SCHEDULES),
+            ("precision", PRECISIONS),
+        ):
+            if (value := getattr(self, name)) not in known:
+                raise ConfigError(f"{name} is {value!r}, not one of {', '.join(known)}")
+        for name in ("epochs", "batch", "learning_rate", "drop_every"):
+            if not 0 < getattr(self, name) < float("inf"):  # which NaN is not either
+                raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
+        for name in ("updates", "clip_norm", "weight_decay"):
+            if not (getattr(self, name) >= 0 and isfinite(getattr(self, name))):
+                raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
+        for name in ("masking", "warmup", "label_smoothing"):
+            if not 0 <= getattr(self, name) < 1:
+                raise ConfigError(f"{name} must be in [0, 1), not {getattr(self, name)}")
+        if self.objective in ("simclr", "simsiam") and self.batch < 2:
+            raise ConfigError(
+                f"{self.objective} compares sweeps of a batch: batch must be 2 or more"
+            )
+        if not 0 <= self.seed < 2**32:
+            raise ConfigError(f"seed must be 0 to {2**32 - 1}, not {self.seed}")
+
+    def network(self, classes: int) -> EADConfig:
+        """The network's configuration for so many classes.
+
+        Raises:
+            ConfigError: there is no such network.
+        """
+        return EADConfig(
+            classes=classes,
+            encoder=self.encoder,
+            attender=self.attender,
+            decoder=self.decoder,
+            width=self.width,
+            readout=self.readout,
+            dropout=self.dropout,
+            graph=self.graph,
+        )
+
+
+@dataclass
+class Progress:
+    """What a run reports after every update and every epoch.
+
+    `metrics`, after an epoch: what a line of `history.csv` holds, and `waiting`, the share of the
+    epoch that was spent waiting for data.
+    """
+
+    epoch: int
+    epochs: int
+    update: int
+    updates: int
+    loss: float
+    metrics: dict[str, float] = field(default_factory=dict)

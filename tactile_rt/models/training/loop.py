@@ -1,0 +1,298 @@
+"""Train an EAD network on a sweep set, from top to bottom.
+
+A run that is killed goes on from its last finished epoch and ends with the same numbers as one
+that was not. Under torchrun every process has a share of each batch:
+
+    torchrun --nproc-per-node 2 --no-python tactile-rt train data/mouse24 runs/mouse24
+"""
+
+import os
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from itertools import islice
+from math import ceil, inf
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+import torch
+from torch.optim.lr_scheduler import LRScheduler
+
+from tactile_rt.models.augmentation import build
+from tactile_rt.models.checkpoints import TactileClassifier, reason, save_whole
+from tactile_rt.models.data_checks import check_sets, check_split
+from tactile_rt.models.datasets import SweepSet, TrainingBatches
+from tactile_rt.models.objectives import Autoencoder, Objective, SimCLR, SimSiam, Supervised
+from tactile_rt.models.training.config import Progress, TrainingConfig
+from tactile_rt.models.training.feeding import Feed, Share, generator_of
+from tactile_rt.models.training.logs import Board, log_epoch
+from tactile_rt.models.training.optimizers import build_optimizer, build_schedule
+from tactile_rt.models.training.validation import Validation
+from tactile_rt.recording import SweepManifest, write_whole
+from tactile_rt.stream import ConfigError, ModelError
+
+if TYPE_CHECKING:
+    from lightning.fabric import Fabric
+
+__all__ = ["build_objective", "initialise", "read_splits", "train"]
+
+Report = Callable[[Progress], None]
+Splits = tuple[SweepSet, SweepSet]  # to train and to validate on
+AUGMENTED = 1  # tells the draws of frames from those of loads
+
+
+def train(
+    config: TrainingConfig,
+    folder: Path,
+    report: Report = lambda _: None,
+    *,
+    tensorboard: bool = False,
+    device: str = "auto",
+    splits: Splits | None = None,
+) -> Path:
+    """Train, or go on with a run that was interrupted; returns the best checkpoint.
+
+    Args:
+        config: what to train and how.
+        folder: of the run.
+        report: is told of every update and every epoch.
+        tensorboard: write its files beside `history.csv`.
+        device: "auto" (an accelerator if there is one), "cpu", "cuda", ...
+        splits: what `read_splits` gives, where many runs share it.
+
+    Raises:
+        ConfigError: the folder holds a run of another configuration, or the configuration cannot
+            be trained.
+        RecordingError: the sweep set is missing, unfinished, damaged or unfit.
+        ModelError: `last.pt` is damaged, or the training diverged.
+    """
+    fabric = _launched(config, device)
+    torch.manual_seed(config.seed)
+    training, validating = splits or read_splits(Path(config.data), config)
+    objective = build_objective(config, training.manifest)
+    if fabric.is_global_zero:
+        _begin_run(config, folder)
+    board = Board(folder, tensorboard and fabric.is_global_zero)
+
+    share = Share(fabric.global_rank, fabric.world_size)
+    batches = TrainingBatches(training, config.batch, config.seed)
+    augmentation = objective.augmentation
+    feed = Feed(batches, augmentation, objective.views, config.seed, share, fabric.device)
+    validate = Validation(config, validating, augmentation, share, fabric.device)
+    optimizer = build_optimizer(objective, config)
+    run = _Run(objective, optimizer, config, len(batches))
+    fabric.barrier()
+    run.resume(folder / "last.pt")
+    wrapped, _ = fabric.setup(objective, optimizer)
+    bf16 = config.precision == "bf16"
+
+    while run.done < run.updates:
+        epoch, began, losses = run.epoch, time.monotonic(), []
+        # Dropout: a resumed epoch is the same epoch, and no two devices drop the same.
+        torch.manual_seed(config.seed * 1000 + epoch + 2**40 * share.rank)
+        objective.train()
+        with closing(feed.epoch(epoch)) as drawn:
+            for batch in islice(drawn, run.updates - run.done):
+                generator = generator_of(
+                    fabric.device, config.seed, epoch, batch.index, share.rank, AUGMENTED
+                )
+                # Not Fabric's, which casts a recurrent network's weights anew at every step.
+                with torch.autocast(fabric.device.type, torch.bfloat16, enabled=bf16):
+                    loss = wrapped(batch.views, batch.labels, generator)
+                optimizer.zero_grad()
+                fabric.backward(loss)
+                norm = fabric.clip_gradients(
+                    wrapped,
+                    optimizer,
+                    max_norm=config.clip_norm or inf,
+                    error_if_nonfinite=False,
+                )
+                if norm is None or not torch.isfinite(
+                    norm
+                ):  # clipping would turn it into silence or NaN
+                    raise ModelError(
+                        f"{folder}: training diverged in epoch {epoch + 1} (gradient norm {norm}); "
+                        f"try a learning rate below {config.learning_rate:g}"
+                    )
+                optimizer.step()
+                run.schedule.step()
+                run.done += 1
+                losses.append(loss.item())
+                rate = float(run.schedule.get_last_lr()[0])
+                board.write(run.done, {"loss": losses[-1], "rate": rate})
+                report(Progress(epoch, run.epochs, run.done, run.updates, losses[-1]))
+        run.epoch += 1
+        if share.devices > 1:
+            for buffer in objective.buffers():  # batch norm's means are each device's own
+                torch.distributed.broadcast(buffer, 0)
+        found, score = fabric.broadcast(validate(objective))
+        metrics = {
+            "epoch": epoch + 1,
+            "loss": float(np.mean(losses)),
+            **found,
+            "seconds": time.monotonic() - began,
+        }
+        better, run.best = score >= run.best, max(score, run.best)
+        if fabric.is_global_zero:
+            if better:
+                save_whole(folder / "best.pt", _card(config, objective, training, metrics))
+            log_epoch(folder / "history.csv", metrics)
+            board.write(run.done, {k: v for k, v in metrics.items() if k != "epoch"})
+            save_whole(folder / "last.pt", run.state())
+        shown = {**metrics, "waiting": feed.waited / metrics["seconds"]}
+        report(Progress(epoch + 1, run.epochs, run.done, run.updates, metrics["loss"], shown))
+    board.close()
+    fabric.barrier()
+    return folder / "best.pt"
+
+
+def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = None) -> Path:
+    """A run's network as it is before its first update, as a `best.pt`; of the same seed.
+
+    Raises:
+        ConfigError, RecordingError: as `train`.
+    """
+    torch.manual_seed(config.seed)
+    training, _ = splits or read_splits(Path(config.data), config)
+    objective = build_objective(config, training.manifest)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_whole(folder / "best.pt", _card(config, objective, training, {"epoch": 0}))
+    return folder / "best.pt"
+
+
+def read_splits(folder: Path, config: TrainingConfig) -> tuple[SweepSet, SweepSet]:
+    """The splits to train and to validate on, held against `data_checks`.
+
+    Raises:
+        ConfigError: the configuration names no network.
+        RecordingError: the set is missing, unfinished, damaged or unfit.
+    """
+    manifest = SweepManifest.read(folder)
+    config.network(len(manifest.categories))  # a slip of the pen is told before a set is read
+    check_split(folder, manifest)
+    splits = SweepSet.read(folder, "train"), SweepSet.read(folder, "validation")
+    check_sets(folder, splits)
+    return splits
+
+
+def build_objective(config: TrainingConfig, manifest: SweepManifest) -> Objective:
+    """The network of a configuration and what it is trained for.
+
+    Raises:
+        ConfigError: there is no such network, or the array cannot be augmented so.
+    """
+    model = TactileClassifier(manifest.spec, config.network(len(manifest.categories)))
+    augmentation = build(config.augmentation, manifest.spec, config.masking)
+    if config.objective == "supervised":
+        return Supervised(model, augmentation, config.loss, config.label_smoothing)
+    model.network.decoder.requires_grad_(False)  # it has no part in these
+    kinds: dict[str, type[Any]] = {
+        "simclr": SimCLR,
+        "simsiam": SimSiam,
+        "autoencoder": Autoencoder,
+    }
+    objective: Objective = kinds[config.objective](model, augmentation)
+    return objective
+
+
+@dataclass
+class _Run:
+    """How far a run is, and all that it takes to go on."""
+
+    objective: Objective
+    optimizer: torch.optim.Optimizer
+    config: TrainingConfig
+    per_epoch: int
+    epoch: int = 0
+    done: int = 0
+    best: float = -inf
+
+    def __post_init__(self) -> None:
+        self.updates = self.config.updates or self.config.epochs * self.per_epoch
+        self.epochs = ceil(self.updates / self.per_epoch)
+        self.schedule: LRScheduler = build_schedule(self.optimizer, self.config, self.updates)
+
+    def state(self) -> dict[str, Any]:
+        return {
+            "model": self.objective.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "schedule": self.schedule.state_dict(),
+            "epoch": self.epoch,
+            "done": self.done,
+            "best": self.best,
+        }
+
+    def resume(self, last: Path) -> None:
+        if not last.exists():
+            return
+        try:
+            saved = torch.load(last, map_location="cpu", weights_only=True)
+            self.objective.load_state_dict(saved["model"])
+            self.optimizer.load_state_dict(saved["optimizer"])
+            self.schedule.load_state_dict(saved["schedule"])
+            self.epoch, self.done, self.best = saved["epoch"], saved["done"], saved["best"]
+        except Exception as error:  # torch raises many unrelated types for a damaged file
+            raise ModelError(
+                f"{last} is damaged ({reason(error)}): delete it to begin the run anew"
+            ) from None
+
+
+def _launched(config: TrainingConfig, device: str) -> "Fabric":
+    # Imported here: seconds that whoever only loads a checkpoint need not spend.
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from lightning.fabric import Fabric
+        from lightning.fabric.strategies.ddp import DDPStrategy
+
+    size = int(os.environ.get("WORLD_SIZE", "1"))
+    local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    if (config.batch < 2 * size and config.objective != "supervised") or config.batch < size:
+        raise ConfigError(f"a batch of {config.batch} is too small to be shared by {size} devices")
+    fabric = Fabric(
+        accelerator=device,
+        devices=local,
+        num_nodes=size // local,
+        # Some layers of some networks (a position never reached) have no part in a window.
+        strategy=DDPStrategy(find_unused_parameters=True) if size > 1 else "auto",
+    )
+    fabric.launch()
+    return fabric
+
+
+def _card(
+    config: TrainingConfig, objective: Objective, data: SweepSet, metrics: dict[str, float]
+) -> dict[str, Any]:
+    return {
+        "model": objective.model.state_dict(),
+        "config": asdict(config),
+        "network": asdict(objective.model.network.config),
+        "spec": data.manifest.spec.to_json(),
+        "metrics": metrics,
+    }
+
+
+def _begin_run(config: TrainingConfig, folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    path, mine = folder / "config.json", asdict(config)
+    # Before its first epoch is finished a run has nothing to lose: correct its options and go on.
+    if not (folder / "last.pt").exists() or not path.exists():
+        text = msgspec.json.format(msgspec.json.encode(mine), indent=1)
+        write_whole(path, lambda file: file.write(text))
+        return
+    try:
+        theirs = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is damaged ({error}): choose another folder") from None
+    defaults = asdict(TrainingConfig(config.data))  # a run of before a key was thought of
+    differing = [
+        key for key in {**mine, **theirs} if theirs.get(key, defaults.get(key)) != mine.get(key)
+    ]
+    if differing:
+        raise ConfigError(
+            f"{folder} holds a run of another configuration (other {', '.join(differing)}): choose "
+            "another folder, or repeat the options that began it"
+        )

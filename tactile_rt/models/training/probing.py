@@ -1,0 +1,197 @@
+"""Linear probe: how much of the category a frozen network's features hold.
+
+The network stays in evaluation mode, so its features are computed once and the probe takes
+seconds. (The published probe left dropout and batch norm in training mode.)
+"""
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
+from tactile_rt.models.data_checks import check_sets, check_split
+from tactile_rt.models.datasets import SweepSet, TrainingBatches, find_onsets, windows
+from tactile_rt.models.evaluation import hits, predict
+from tactile_rt.models.training.config import Progress
+from tactile_rt.models.training.logs import log_epoch
+from tactile_rt.recording import SweepManifest
+from tactile_rt.stream import ConfigError, SpecMismatch
+
+__all__ = ["ProbeConfig", "linear_probe", "probe"]
+
+WINDOWS = 32  # at a time, through the frozen network
+
+
+@dataclass(frozen=True)
+class ProbeConfig:
+    """The paper's probe, but for `standardise`.
+
+    Attributes:
+        data: sweep set; empty: what the network was trained on.
+        epochs, batch, learning_rate, momentum: of SGD.
+        drop_epochs: epochs between tenfold drops of the rate (StepLR).
+        standardise: fit on features of zero mean and unit variance, folded into the layer
+            afterwards; the paper does not, and features that are small then hardly train.
+        seed: of the layer, the windows and their order.
+    """
+
+    data: str = ""
+    epochs: int = 100
+    batch: int = 256
+    learning_rate: float = 0.1
+    momentum: float = 0.9
+    drop_epochs: int = 30
+    standardise: bool = True
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "batch", "learning_rate", "drop_epochs"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
+
+
+def probe(
+    checkpoint: Path,
+    folder: Path,
+    config: ProbeConfig | None = None,
+    report: Callable[[Progress], None] = lambda _: None,
+    splits: tuple[SweepSet, SweepSet] | None = None,
+) -> Path:
+    """Fit a linear layer on a frozen network's last step; returns a classifier's `best.pt`.
+
+    The layer of the best epoch by the validation split is kept.
+
+    Args:
+        checkpoint: the network.
+        folder: of the probe.
+        config: how.
+        report: is told of the end.
+        splits: what `read_splits` gives, where many runs share it.
+
+    Raises:
+        ModelError: no checkpoint.
+        SpecMismatch: the set is of another array.
+        RecordingError, ConfigError: the set cannot be used, as in `train`.
+    """
+    config = config or ProbeConfig()
+    trained, saved = load_checkpoint(checkpoint)
+    path = Path(config.data or saved["config"]["data"])
+    manifest = SweepManifest.read(path)
+    from_spec = type(manifest.spec).from_json(saved["spec"])
+    if differences := from_spec.differences(manifest.spec, ("name", "rate_hz")):
+        raise SpecMismatch(f"{checkpoint} was made for another array: {differences[0]}")
+    if splits is None:
+        check_split(path, manifest)
+        splits = SweepSet.read(path, "train"), SweepSet.read(path, "validation")
+        check_sets(path, splits)
+    data, validation = splits
+    torch.manual_seed(config.seed)
+    batches = TrainingBatches(data, min(WINDOWS, len(data.sweeps)), config.seed)
+    drawn = [(_features(trained, *loads), labels) for *loads, labels in batches.epoch(0)]
+    features, labels = (torch.cat(part) for part in zip(*drawn, strict=True))
+    layer, history = linear_probe(
+        features, labels, *_validation(trained, validation), len(manifest.categories), config
+    )
+    network = replace(
+        trained.network.config,
+        classes=len(manifest.categories),
+        decoder="linear",
+        readout="last",
+    )
+    model = TactileClassifier(manifest.spec, network)
+    kept = {k: v for k, v in trained.state_dict().items() if not k.startswith("network.decoder.")}
+    kept |= {f"network.decoder.{name}": value for name, value in layer.state_dict().items()}
+    model.load_state_dict(kept)
+    answers = validation.sweeps.labels
+    metrics = {
+        "epoch": config.epochs,
+        "loss": history[-1]["loss"],
+        "validation_top1": float(hits(predict(validation, run_on(model))[:, -1], answers).mean()),
+        "validation_top1_noisy": float(
+            hits(predict(validation, run_on(model), 1.0)[:, -1], answers).mean()
+        ),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    for line in history:
+        log_epoch(folder / "history.csv", line)
+    card = {
+        "model": model.state_dict(),
+        "config": {**saved["config"], "data": str(path), "probe": asdict(config)},
+        "network": asdict(network),
+        "spec": manifest.spec.to_json(),
+        "metrics": metrics,
+    }
+    save_whole(folder / "best.pt", card)
+    report(Progress(config.epochs, config.epochs, 1, 1, metrics["loss"], metrics))
+    return folder / "best.pt"
+
+
+def linear_probe(
+    features: Tensor,
+    labels: Tensor,
+    validation: Tensor,
+    answers: Tensor,
+    classes: int,
+    config: ProbeConfig,
+) -> tuple[nn.Linear, list[dict[str, float]]]:
+    """Fit a linear layer.
+
+    Args:
+        features, labels: (window, feature), (window,) to fit on.
+        validation, answers: the same, to choose the epoch by.
+        classes: how many.
+        config: how.
+
+    Returns:
+        The layer of the best epoch, for features as they come, and the history by epoch.
+    """
+    torch.manual_seed(config.seed)
+    mean, scale = torch.zeros(features.shape[1]), torch.ones(features.shape[1])
+    if config.standardise:
+        mean, scale = features.mean(0), features.std(0).clamp(min=1e-6)
+    inputs, held_out = (features - mean) / scale, (validation - mean) / scale
+    layer = nn.Linear(features.shape[1], classes)
+    optimizer = torch.optim.SGD(layer.parameters(), config.learning_rate, momentum=config.momentum)
+    schedule = torch.optim.lr_scheduler.StepLR(optimizer, config.drop_epochs)
+    best, kept, history = -1.0, layer.state_dict(), []
+    for epoch in range(config.epochs):
+        total = 0.0
+        for at in torch.randperm(len(inputs)).split(config.batch):
+            loss = F.cross_entropy(layer(inputs[at]), labels[at])
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            total += loss.item() * len(at) / len(inputs)
+        schedule.step()
+        with torch.no_grad():
+            top1 = float((layer(held_out).argmax(1) == answers).float().mean())
+        history.append({"epoch": epoch + 1, "loss": total, "validation_top1": top1})
+        if top1 >= best:
+            best, kept = top1, {k: v.clone() for k, v in layer.state_dict().items()}
+    weight = kept["weight"] / scale
+    layer.load_state_dict({"weight": weight, "bias": kept["bias"] - weight @ mean})
+    return layer, history
+
+
+def _features(model: TactileClassifier, samples: Tensor, offset: Tensor, sigma: Tensor) -> Tensor:
+    """(window, feature) of the last step."""
+    with torch.inference_mode():
+        return model.features(model.inputs(samples, offset, sigma))[:, -1].float().clone()
+
+
+def _validation(model: TactileClassifier, data: SweepSet) -> tuple[Tensor, Tensor]:
+    """Features and labels of the clean sweeps in which contact is found."""
+    found = find_onsets(data.sweeps.values, data.floor)
+    usable = torch.from_numpy(found.start >= 0).nonzero().flatten()
+    if not len(usable):
+        raise ConfigError("no touch was found in the validation sweeps: there is nothing to probe")
+    parts = []
+    for at in usable.split(WINDOWS):
+        k = at.numpy()
+        arrays = windows(data.sweeps.values[k], found.start[k]), found.offset[k], found.sigma[k]
+        parts.append(_features(model, *(torch.from_numpy(a) for a in arrays)))
+    return torch.cat(parts), torch.from_numpy(data.sweeps.labels)[usable]

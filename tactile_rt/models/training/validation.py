@@ -1,0 +1,92 @@
+"""How good a network is by the validation split: what chooses the checkpoint that is kept."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from tactile_rt.models.augmentation import Augmentation
+from tactile_rt.models.checkpoints import run_on
+from tactile_rt.models.datasets import SweepSet, find_onsets, windows
+from tactile_rt.models.evaluation import hits, predict
+from tactile_rt.models.objectives import Objective
+from tactile_rt.models.training.config import TrainingConfig
+from tactile_rt.models.training.feeding import Share, generator_of
+
+__all__ = ["Validation"]
+
+VIEWS, FRAMES = 2**32, 2**32 + 1  # epochs that no training reaches: their draws are others
+
+Score = tuple[dict[str, float], float]
+
+
+class Validation:
+    """Measures an objective on the validation split.
+
+    Supervised: top-1 without and with rated noise; the score is their mean, since a robot's
+    sensor is somewhere between. Self-supervised: the loss, augmented alike every time; the score
+    is its negative.
+
+    Args:
+        config: of the run.
+        data: the split.
+        augmentation: of the objective.
+        share: this device's of every batch.
+        device: where the network is.
+    """
+
+    def __init__(
+        self,
+        config: TrainingConfig,
+        data: SweepSet,
+        augmentation: Augmentation,
+        share: Share,
+        device: torch.device,
+    ) -> None:
+        self._config, self._data, self._augmentation = config, data, augmentation
+        self._share, self._device = share, device
+        supervised = config.objective == "supervised"
+        self._measure: Callable[[Objective], Score] = self._top1 if supervised else self._loss
+        if not supervised:
+            self._found = find_onsets(data.sweeps.values, data.floor)
+            self._usable = np.flatnonzero(self._found.start >= 0)
+
+    def __call__(self, objective: Objective) -> Score:
+        """Metrics by name, and the score: the higher the better."""
+        objective.eval()
+        return self._measure(objective)
+
+    def _top1(self, objective: Objective) -> Score:
+        data, run = self._data, run_on(objective.model)
+        labels = data.sweeps.labels
+        clean = hits(predict(data, run)[:, -1], labels).mean()
+        noisy = hits(predict(data, run, 1.0)[:, -1], labels).mean()
+        metrics = {"validation_top1": float(clean), "validation_top1_noisy": float(noisy)}
+        return metrics, float(clean + noisy) / 2
+
+    @torch.inference_mode()
+    def _loss(self, objective: Objective) -> Score:
+        data, config = self._data, self._config
+        # Whole batches, as far as there are any: a contrast is as hard as its batch is large.
+        parts = max(len(self._usable) // config.batch, 1)
+        total = torch.zeros((), device=self._device)
+        for index, at in enumerate(np.array_split(self._usable, parts)):
+            cut = windows(data.sweeps.values[at], self._found.start[at])
+            arrays = cut, self._found.offset[at], self._found.sigma[at]
+            samples, offset, sigma = (self._share.of(torch.from_numpy(a)) for a in arrays)
+            place = index, self._share.rank
+            drawn = generator_of(torch.device("cpu"), config.seed, VIEWS, *place)
+            views = [
+                self._augmentation.loads((samples, offset, sigma), drawn)
+                for _ in range(objective.views)
+            ]
+            views = [
+                (a.to(self._device), b.to(self._device), c.to(self._device)) for a, b, c in views
+            ]
+            frames = generator_of(self._device, config.seed, FRAMES, *place)
+            labels = self._share.of(torch.from_numpy(data.sweeps.labels[at])).to(self._device)
+            total += objective(views, labels, frames) / parts
+        if self._share.devices > 1:
+            torch.distributed.all_reduce(total)
+            total /= self._share.devices
+        return {"validation_loss": float(total)}, -float(total)

@@ -1,0 +1,47 @@
+"""`tactile-rt grid` refuses what it cannot do in one line."""
+
+import pytest
+
+for module in ("torch", "lightning", "matplotlib"):
+    pytest.importorskip(module)
+
+
+@pytest.fixture
+def refused(call):
+    """Call what must fail: the one line that says why."""
+
+    def run(*arguments):
+        code, out, err = call(*arguments)
+        assert (code, out) == (2, "")
+        assert err.startswith("tactile-rt: ")
+        return err.strip()
+
+    return run
+
+
+def test_no_such_grid(refused, tmp_path):
+    assert "no grid none: name a TOML file, or one of mouse24" in refused("grid", "none", tmp_path)
+
+
+def test_a_damaged_grid_makes_nothing(refused, tmp_path):
+    plan = tmp_path / "grid.toml"
+    plan.write_text('data = "x"\n[[cell]]\nencoder = "gru"\nattender = "gptt"\n')
+    assert "attender is 'gptt', not one of" in refused("grid", plan, tmp_path / "out")
+    plan.write_bytes(b"\xff\xfe")
+    assert "is not a text file" in refused("grid", plan, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_report_of_nothing_writes_nothing(refused, tmp_path):
+    page = tmp_path / "page.md"
+    assert "has no outcome yet" in refused("grid", "mouse24", tmp_path / "o", "--report", page)
+    assert f"no folder {tmp_path / 'docs'}" in refused(
+        "grid", "mouse24", tmp_path / "o", "--report", tmp_path / "docs" / "page.md"
+    )
+    assert not page.exists()
+
+
+def test_a_set_that_is_not_there(refused, tmp_path):
+    plan = tmp_path / "grid.toml"
+    plan.write_text(f'data = "{tmp_path}/none"\n[[cell]]\nencoder = "gru"\n')
+    assert "is not a sweep set" in refused("grid", plan, tmp_path / "out")

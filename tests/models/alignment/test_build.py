@@ -1,0 +1,102 @@
+"""Benchmarks from rates in the published layout, and requests that cannot be met."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from brains import geometry, padded
+
+from tactile_rt.models.alignment import build
+from tactile_rt.models.alignment.published import read_published, write_published
+from tactile_rt.stream import ConfigError
+
+
+@pytest.fixture
+def rates():
+    rng = np.random.default_rng(0)
+    shared = geometry(rng)
+    return {f"sub-{i}": padded(rng, (20, 16), (9, 8), 3, shared) for i in range(3)}
+
+
+def test_a_published_file_builds_a_paper_code_benchmark(rates, tmp_path):
+    # As the published file: with an option that was saved as if it were an animal.
+    np.savez(tmp_path / "rates.npz", allow_pickle_=np.array(True), **rates)
+    with np.load(tmp_path / "rates.npz") as file:
+        entries = {k.rstrip("_"): file[k] for k in file.files}
+    write_published(entries, tmp_path / "rates.npz")
+    made = build([tmp_path / "rates.npz"], "paper-code", bootstraps=30)
+    assert [t.name for t in made.all_targets] == [*rates, "concatenated"]
+    assert made.sources == ("rates.npz",)
+    for name, array in read_published(tmp_path / "rates.npz").items():
+        np.testing.assert_array_equal(array, rates[name])
+
+
+def test_its_stimuli_have_no_names_so_strict_refuses_it(rates, tmp_path):
+    write_published(rates, tmp_path / "rates.npz")
+    with pytest.raises(ConfigError, match="its stimuli have no names"):
+        build([tmp_path / "rates.npz"])
+    with pytest.raises(ConfigError, match="name nothing beside it"):
+        build([tmp_path / "rates.npz", tmp_path], "paper-code")
+
+
+@pytest.mark.parametrize(
+    ("array", "message"),
+    [
+        (np.zeros((4, 5, 3)), r"m is float64 \(4, 5, 3\), not numbers \(row, 6 stimuli, unit\)"),
+        (np.zeros((4, 6)), r"not numbers \(row, 6 stimuli, unit\)"),
+        (np.zeros((4, 6, 3), dtype="U1"), "not numbers"),
+        (np.zeros((1, 6, 3)), "fewer than two rows or units"),
+        (np.full((4, 6, 3), np.inf), "infinite rate"),
+    ],
+)
+def test_arrays_of_another_shape_are_refused(tmp_path, array, message):
+    write_published({"m": array}, tmp_path / "rates.npz")
+    with pytest.raises(ConfigError, match=message):
+        read_published(tmp_path / "rates.npz")
+
+
+def test_files_of_another_kind_are_refused(tmp_path):
+    (tmp_path / "text.npz").write_text("hello")
+    with pytest.raises(ConfigError, match=r"text\.npz: not an npz file of numbers"):
+        read_published(tmp_path / "text.npz")
+    np.savez(tmp_path / "objects.npz", m=np.array([None]))
+    with pytest.raises(ConfigError, match="not an npz file of numbers"):
+        read_published(tmp_path / "objects.npz")
+    np.savez(tmp_path / "empty.npz")
+    with pytest.raises(ConfigError, match="holds no animal"):
+        read_published(tmp_path / "empty.npz")
+    with pytest.raises(ConfigError, match="no file"):
+        read_published(tmp_path / "none.npz")
+
+
+def test_requests_that_cannot_be_met(tmp_path):
+    with pytest.raises(ConfigError, match="no protocol 'loose': there are strict, paper-code"):
+        build([tmp_path], "loose")
+    with pytest.raises(ConfigError, match="name NWB files"):
+        build([])
+    with pytest.raises(ConfigError, match="0 bootstraps"):
+        build([tmp_path], bootstraps=0)
+
+
+def test_without_h5py_it_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    (tmp_path / "a.nwb").touch()
+    with pytest.raises(ConfigError, match=r"pip install 'tactile-rt\[align\]'"):
+        build([tmp_path / "a.nwb"])
+
+
+def test_a_gate_needs_neither_h5py_nor_torch():
+    code = (
+        "import sys\n"
+        "import types, tactile_rt\n"
+        "from pathlib import Path\n"
+        # The package above imports torch for the networks; alignment itself must not.
+        "models = types.ModuleType('tactile_rt.models')\n"
+        "models.__path__ = [str(Path(tactile_rt.__file__).parent / 'models')]\n"
+        "sys.modules['tactile_rt.models'] = models\n"
+        "import tactile_rt.models.alignment\n"
+        "print(sorted({'torch', 'h5py', 'scipy', 'mujoco'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.stdout.strip() == "[]", done.stderr

@@ -1,0 +1,285 @@
+"""Both protocols on synthetic animals whose geometry is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from brains import animals, geometry, loop, padded, responses, session
+
+from tactile_rt.models.alignment.neural import Animal, Session, pad, published_layout
+from tactile_rt.models.alignment.paper_code import freeze_paper_code
+from tactile_rt.models.alignment.rdm import STIMULI
+from tactile_rt.models.alignment.scoring import score, score_rdms
+from tactile_rt.models.alignment.strict import disjoint_trials, freeze_strict
+from tactile_rt.stream import ConfigError
+
+BOOTSTRAPS = 200
+
+
+def plain_filtered(results):
+    _, r_xx, r_yy, corrected = results
+    kept = (r_xx >= 0.5) & (r_yy >= 0.5) & np.isfinite(corrected)
+    return corrected[kept].mean() if kept.any() else np.nan
+
+
+# strict
+
+
+def test_animals_of_one_geometry_agree_and_scrambled_ones_do_not():
+    rng = np.random.default_rng(0)
+    shared = freeze_strict(animals(rng), BOOTSTRAPS)
+    assert len(shared.reliable) == 6
+    assert shared.a2a.mean > 0.9
+    assert np.nanmin(shared.a2a.pairwise) > 0.9
+    scrambled = freeze_strict(animals(rng, number=24, scrambled=True), 50)
+    assert len(scrambled.reliable) == 24
+    assert abs(scrambled.a2a.mean) < 0.2
+    assert abs(np.nanmean(scrambled.a2a.pairwise)) < 0.2
+
+
+def test_the_order_of_appearance_destroys_what_animals_share():
+    """The same animals, arranged as published: the consistency is gone."""
+    made = animals(np.random.default_rng(1), number=8, sessions=3)
+    published = freeze_paper_code({a.name: published_layout(a) for a in made}, 50)
+    assert freeze_strict(made, 50).a2a.mean > 0.9
+    assert all(target.reliable for target in published.targets)
+    assert abs(np.nanmean(published.a2a.pairwise)) < 0.2
+    assert published.a2a.mean < 0.3
+
+
+def test_neither_the_order_of_trials_nor_of_sessions_nor_of_animals_matters():
+    rng = np.random.default_rng(2)
+    made = animals(rng, number=3, sessions=3, noise=3)
+    shuffled = []
+    for animal in rng.permutation(np.array(made, dtype=object)):
+        sessions = []
+        for one in rng.permutation(np.array(animal.sessions, dtype=object)):
+            order = rng.permutation(len(one.stimulus))
+            sessions.append(replace(one, rates=one.rates[order], stimulus=one.stimulus[order]))
+        shuffled.append(Animal(animal.name, tuple(sessions)))
+    one, other = freeze_strict(made, BOOTSTRAPS), freeze_strict(shuffled, BOOTSTRAPS)
+    np.testing.assert_array_equal(one.a2a.pooled, other.a2a.pooled)
+    for a, b in zip(one.targets, other.targets, strict=True):
+        assert (a.name, a.sha256, a.chosen.factor) == (b.name, b.sha256, b.chosen.factor)
+        np.testing.assert_array_equal(a.chosen.rdm, b.chosen.rdm)
+        np.testing.assert_array_equal(a.unfiltered.rdm, b.unfiltered.rdm)
+
+
+def test_units_that_respond_to_nothing_are_left_out():
+    rng = np.random.default_rng(3)
+    made = animals(rng, number=2, noise=3, units=40, idle=40)
+    for target in freeze_strict(made, BOOTSTRAPS).targets:
+        assert target.unfiltered.units == 160
+        assert 70 < target.chosen.units < 95  # 80 respond
+        assert target.trials == 240
+
+
+def test_units_are_chosen_on_other_trials_than_are_scored():
+    rng = np.random.default_rng(4)
+    one = session(rng, "mouse", "s", geometry(rng), trials=9)
+    choosing, scoring = disjoint_trials(one, rng)
+    assert [len(rows) for rows in choosing] == [4] * 6
+    assert [len(rows) for rows in scoring] == [5] * 6
+    for stimulus, rows in enumerate(zip(choosing, scoring, strict=True)):
+        expected = np.flatnonzero(one.stimulus == stimulus)
+        assert sorted(np.concatenate(rows)) == expected.tolist()
+
+
+def test_choosing_units_on_noise_makes_no_reliability():
+    made = animals(np.random.default_rng(4), number=8, sessions=4, shared=np.zeros((6, 8)), noise=4)
+    targets = freeze_strict(made, BOOTSTRAPS).targets
+    assert all(10 < t.chosen.units < 50 for t in targets)  # of 160, by chance
+    assert abs(np.median([t.chosen.reliability for t in targets])) < 0.2
+    assert not any(t.reliable for t in targets)
+
+
+def test_an_animal_at_or_below_zero_is_not_scored():
+    made = animals(np.random.default_rng(5), number=10, sessions=1, shared=np.zeros((6, 8)))
+    frozen = freeze_strict(made, BOOTSTRAPS)
+    below = [t for t in frozen.targets if not t.unfiltered.reliability > 0]
+    assert below
+    assert all(np.isnan(t.unfiltered.factor) for t in below)
+    assert np.isfinite([t.unfiltered.factor for t in frozen.targets if t not in below]).all()
+
+
+def test_the_factor_corrects_for_noise_once():
+    target = freeze_strict(animals(np.random.default_rng(6), number=2, noise=4)).targets[0]
+    assert target.chosen.factor == pytest.approx(1 / np.sqrt(target.chosen.reliability))
+    assert target.chosen.factor > 1
+
+
+def test_of_two_animals_the_other_is_the_pool():
+    frozen = freeze_strict(animals(np.random.default_rng(6), number=2, noise=5), BOOTSTRAPS)
+    one, other = (t.chosen for t in frozen.targets)
+    expected = np.corrcoef(one.rdm, other.rdm)[0, 1] / np.sqrt(one.reliability * other.reliability)
+    assert min(one.factor, other.factor) > 1.03
+    np.testing.assert_allclose(frozen.a2a.pooled, expected, rtol=1e-10)
+    np.testing.assert_allclose(frozen.a2a.pairwise[[0, 1], [1, 0]], expected, rtol=1e-10)
+
+
+def test_the_correction_recovers_what_noise_takes():
+    """With noise r_xy falls; corrected, it is what it is for the same units without noise."""
+    shared = geometry(np.random.default_rng(7))
+    model = responses(np.random.default_rng(8), shared, 300)
+    quiet, loud = (
+        score(
+            freeze_strict(
+                animals(np.random.default_rng(9), shared=shared, noise=noise), BOOTSTRAPS
+            ),
+            {"layer": model},
+        )
+        for noise in (0.01, 9)
+    )
+    assert loud.reliable.sum() >= 4
+    assert np.mean(loud.r) < np.mean(quiet.r) - 0.1
+    assert loud.score == pytest.approx(quiet.score, abs=0.05)
+
+
+def test_a_session_that_lacks_a_stimulus_is_left_out_and_named():
+    rng = np.random.default_rng(8)
+    made = animals(rng, number=2)
+    one = made[0].sessions[0]
+    shown = one.stimulus != 4
+    poor = Session(one.animal, "poor", one.rates[shown], one.stimulus[shown])
+    frozen = freeze_strict([Animal(made[0].name, (*made[0].sessions, poor)), made[1]], 20)
+    assert frozen.notes == (
+        "session poor left out: it has 0 of concave-medium, "
+        "and every stimulus needs 4 correct trials",
+    )
+    without = freeze_strict(made, 20)
+    assert [t.sha256 for t in frozen.targets] == [t.sha256 for t in without.targets]
+    with pytest.raises(ConfigError, match="no animal can be used: session poor left out"):
+        freeze_strict([Animal("mouse", (poor,))], 20)
+
+
+def test_a_session_given_twice_is_refused():
+    made = animals(np.random.default_rng(9), number=1)
+    copy = replace(made[0].sessions[1], name="copy")
+    with pytest.raises(ConfigError, match="mouse-0-1 and copy hold the same trials"):
+        freeze_strict([Animal("mouse-0", (*made[0].sessions, copy))], 20)
+
+
+def test_too_few_reliable_units_make_no_rdm():
+    rng = np.random.default_rng(10)
+    one = session(rng, "mouse", "s", geometry(rng), units=3, idle=1)
+    (target,) = freeze_strict([Animal("mouse", (one,))], 50).targets
+    assert target.chosen.units <= 4
+    assert not target.reliable
+    assert np.isnan(target.chosen.factor)
+
+
+def test_progress_ends_at_one():
+    shares = []
+    freeze_strict(animals(np.random.default_rng(0), number=2), 5, progress=shares.append)
+    assert shares == [0.5, 1.0]
+    shares.clear()
+    rng = np.random.default_rng(0)
+    freeze_paper_code({"a": padded(rng), "b": padded(rng)}, 5, progress=shares.append)
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_layers_are_chosen_on_the_other_animals():
+    rng = np.random.default_rng(11)
+    shared = geometry(rng)
+    frozen = freeze_strict(animals(rng, shared=shared, number=6), BOOTSTRAPS)
+    layers = {
+        "random": rng.normal(size=(6, 30)),
+        "constant": np.ones((6, 30)),
+        "aligned": responses(rng, shared, 200),
+    }
+    result = score(frozen, layers)
+    assert set(result.chosen) == {"aligned"}
+    assert result.score > 0.8
+    assert result.score == pytest.approx(np.mean(result.per_target))
+    assert result.sem == pytest.approx(np.std(result.per_target, ddof=1) / np.sqrt(6))
+    assert result.p < 0.01
+    assert np.isnan(result.corrected[1]).all()
+    assert result.null_95 < result.score
+    factors = [t.chosen.factor for t in frozen.targets]
+    np.testing.assert_allclose(result.corrected[0], result.r[0] * factors)
+
+
+def test_one_animal_has_no_score():
+    frozen = freeze_strict(animals(np.random.default_rng(12), number=1), 50)
+    result = score(frozen, {"a": np.random.default_rng(0).normal(size=(6, 9))})
+    assert np.isnan([result.score, result.p, result.sem]).all()
+    assert result.chosen == ("",)
+    assert np.isfinite(result.corrected).all()
+    assert np.isnan(frozen.a2a.mean)
+
+
+def test_layers_that_do_not_fit_are_refused():
+    frozen = freeze_strict(animals(np.random.default_rng(13), number=2), 20)
+    with pytest.raises(ConfigError, match=r"layer fc: responses \(5, 9\)"):
+        score(frozen, {"fc": np.zeros((5, 9))})
+    with pytest.raises(ConfigError, match="0 layers"):
+        score(frozen, {})
+    with pytest.raises(ConfigError, match="do not fit"):
+        score_rdms(frozen, ["a"], np.zeros((2, 15)))
+
+
+# paper-code
+
+
+def test_paper_code_is_the_plain_loop_with_the_published_aggregates():
+    rng = np.random.default_rng(20)
+    shared = geometry(rng)
+    rates = {f"m{i}": padded(rng, (30, 24 + i), (12, 9), 7 + 2 * i, shared) for i in range(3)}
+    frozen = freeze_paper_code(rates, 60)
+    assert all(t.reliable for t in frozen.targets)
+    layers = {"a": rng.normal(size=(6, 20)), "b": shared @ rng.normal(size=(8, 20))}
+    result = score(frozen, layers)
+    assert result.targets == ("m0", "m1", "m2", "concatenated")
+    everything = {**rates, "concatenated": pad(list(rates.values()))}
+    for j, target in enumerate(everything.values()):
+        for i, layer in enumerate(layers.values()):
+            expected = loop(layer, target, 60)
+            assert result.corrected[i, j] == pytest.approx(plain_filtered(expected), abs=1e-10)
+            assert result.unfiltered[i, j] == pytest.approx(np.nanmedian(expected[3]), abs=1e-10)
+    assert result.score == pytest.approx(np.nanmax(result.corrected))
+    best = np.unravel_index(np.nanargmax(result.corrected), result.corrected.shape)[0]
+    assert set(result.chosen) == {tuple(layers)[best]}
+    spread = result.corrected[best][np.isfinite(result.corrected[best])]
+    assert result.sem == pytest.approx(spread.std() / np.sqrt(len(spread)))
+
+    for i, name in enumerate(rates):
+        others = pad([r for n, r in rates.items() if n != name])
+        expected = plain_filtered(loop(others, rates[name], 60))
+        assert frozen.a2a.pooled[i] == pytest.approx(expected, abs=1e-10)
+    expected = plain_filtered(loop(rates["m0"], rates["m2"], 60))
+    assert frozen.a2a.pairwise[0, 2] == pytest.approx(expected, abs=1e-10)
+
+
+def test_the_published_layout_has_the_published_mistakes():
+    rates = np.arange(1.0, 15.0).reshape(7, 2)
+    first = Session("m", "first", rates, np.array([4, 0, 4, 1, 2, 3, 5]))
+    second = Session("m", "second", -rates[:6, :1], np.array([5, 4, 3, 2, 1, 0]))
+    made = published_layout(Animal("m", (first, second)))
+    assert made.shape == (7, 6, 3)
+    # By first appearance: 4 is index 0 in one session, 1 in the other.
+    assert made[0, :, 0].tolist() == [1, 0, 0, 0, 0, 0]
+    assert made[1, :, 1].tolist() == [0, 4, 0, 0, 0, 0]
+    assert made[2, :, 0].tolist() == [5, 0, 0, 0, 0, 0]
+    assert made[1, :, 2].tolist() == [0, -3, 0, 0, 0, 0]
+    assert np.isnan(made[6, :, 2]).all()  # padding
+    poor = Session("m", "poor", rates[:3], np.array([4, 0, 1]))
+    with pytest.raises(ConfigError, match="poor has no correct trial of convex-far, concave-close"):
+        published_layout(Animal("m", (poor,)))
+
+
+def test_an_animal_without_an_rdm_is_named():
+    rates = padded(np.random.default_rng(21))
+    rates[:, 3] = np.nan
+    with pytest.raises(
+        ConfigError, match="animal m: no RDM, since the mean response to stimulus 3"
+    ):
+        freeze_paper_code({"m": rates}, 5)
+
+
+def test_sessions_check_themselves():
+    with pytest.raises(ConfigError, match="do not fit"):
+        Session("m", "s", np.zeros((3, 2)), np.zeros(4, dtype=np.int64))
+    with pytest.raises(ConfigError, match="not finite"):
+        Session("m", "s", np.full((3, 2), np.nan), np.zeros(3, dtype=np.int64))
+    assert len(STIMULI) == 6

@@ -1,0 +1,94 @@
+"""Attenders keep the old names, the paper's counts, and stream as they see a window."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tactile_rt.models import attenders
+from tactile_rt.models.attenders import GPT, MambaAttender, NoAttender
+
+TOLERANCE = 2e-6
+MAKERS = {
+    "gpt": lambda: GPT(32, 0.1, 22),
+    "gpt-narrow": lambda: GPT(16, 0.1, 22, inputs=32),
+    "mamba": lambda: MambaAttender(32),
+    "none": NoAttender,
+}
+
+
+def count(module: nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def build(name: str) -> nn.Module:
+    torch.manual_seed(1)
+    return MAKERS[name]().eval()
+
+
+def features(steps: int = 22) -> Tensor:
+    return torch.randn(2, steps, 32, generator=torch.Generator().manual_seed(0))
+
+
+def test_published_counts():
+    with torch.device("meta"):
+        assert count(GPT(512, 0.1, 22)) == 25_778_688
+        # ResNet18's 512 features enter a GPT of 256, action token included: the csv's total is
+        # 11,523,840 + 6,532,608 + a linear decoder of 256 -> 117.
+        assert count(GPT(256, 0.1, 22, inputs=512)) == 6_532_608
+        assert 11_523_840 + 6_532_608 + 256 * 117 + 117 == 18_086_517
+        assert count(MambaAttender(512)) == 6_784_000
+        assert count(NoAttender()) == 0
+
+
+def test_names_in_old_checkpoints():
+    names = set(dict(GPT(32, 0.1, 22).named_parameters()))
+    top = {"action", "positions", "project_in.weight", "project_in.bias", "project_out.weight"}
+    layers = ("norm1", "qkv", "proj", "norm2", "mlp_in", "mlp_out")
+    blocks = {
+        f"blocks.{i}.{layer}.{kind}"
+        for i in range(8)
+        for layer in layers
+        for kind in ("weight", "bias")
+    }
+    assert names == top | blocks | {"norm.weight", "norm.bias"}
+
+
+def test_all():
+    assert all(hasattr(attenders, name) for name in attenders.__all__)
+    assert attenders.MAX_STEPS == 32
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_stream_is_the_window(name):
+    attender, x = build(name), features()
+    window, state = attender(x), attender.initial_state(2)
+    assert window.shape == (2, 22, getattr(attender, "features", 32))
+    for t in range(x.shape[1]):
+        out, new = attender.step(x[:, t], torch.full((2,), t), state)
+        assert new.keys() == state.keys()
+        assert all(new[k].shape == state[k].shape for k in new)
+        torch.testing.assert_close(out, window[:, t], rtol=0, atol=TOLERANCE)
+        state = new
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_no_step_sees_a_later_one(name):
+    attender, x = build(name), features(6).requires_grad_()
+    (gradient,) = torch.autograd.grad(attender(x)[:, 3].square().sum(), x)
+    assert (gradient[:, 3] != 0).any()
+    assert (gradient[:, 4:] == 0).all()
+
+
+@pytest.mark.parametrize("name", ["gpt", "gpt-narrow", "mamba"])
+def test_past_steps_count_and_gradients_are_finite(name):
+    attender, x = build(name).train(), features(6).requires_grad_()
+    attender(x)[:, 5].square().sum().backward()
+    assert (x.grad[:, 0] != 0).any()
+    assert all(torch.isfinite(p.grad).all() for p in attender.parameters())
+
+
+def test_gpt_refuses_a_window_past_its_positions():
+    with pytest.raises(ValueError, match="5 steps, but this attender ends at 4"):
+        GPT(32, 0.1, 4)(features(5))

@@ -1,0 +1,121 @@
+"""Bad data stops with one line before training starts, through the command line."""
+
+import sys
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from tiny_sweeps import write_tiny_set
+
+from tactile_rt.cli import main
+from tactile_rt.recording import SweepManifest, object_path, read_object, write_object
+
+
+@pytest.fixture
+def folder(tmp_path):
+    write_tiny_set(tmp_path / "set", objects=3)
+    return tmp_path / "set"
+
+
+@pytest.fixture
+def refused(folder, tmp_path, capsys, monkeypatch):
+    """Train on the set, expect one line and no run, and return the line."""
+
+    def run():
+        arguments = ("train", folder, tmp_path / "run", "--batch", 2, "--encoder", "gru")
+        monkeypatch.setattr(sys, "argv", ["tactile-rt", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            main()
+        out, err = capsys.readouterr()
+        assert (left.value.code, out) == (2, "")
+        assert err.startswith("tactile-rt: ")
+        assert err.count("\n") == 1, err
+        assert not (tmp_path / "run").exists()
+        return err
+
+    return run
+
+
+def rewrite(folder, name, change):
+    values, _ = read_object(folder, name)
+    object_path(folder, name).unlink()
+    write_object(folder, name, change(values), {})
+
+
+def resplit(folder, **changed):
+    path = folder / "manifest.json"
+    manifest = SweepManifest.read(folder)
+    path.write_bytes(msgspec.json.encode(replace(manifest, **changed)))
+
+
+@pytest.mark.parametrize("name", ["cube-0", "cone-1"])  # of the training and validation split
+def test_values_that_are_no_number(folder, refused, name):
+    def spoil(values):
+        values[0, 70, 12, 3] = np.nan
+        return values
+
+    rewrite(folder, name, spoil)
+    said = refused()
+    assert f"{name}.npz: sweep 0 holds values that are not finite" in said
+
+
+def test_another_shape(folder, refused):
+    rewrite(folder, "cube-0", lambda values: values[:, :, :29])
+    assert "cube-0.npz holds (1, 136, 29, 6), not (sweep, sample, *(30, 6))" in refused()
+
+
+def test_sweeps_of_another_length(folder, refused):
+    rewrite(folder, "cube-0", lambda values: values[:, :120])
+    assert "cube-0.npz holds sweeps of 120 samples, not 136" in refused()
+
+
+def test_sweeps_shorter_than_a_window(folder, refused):
+    for name in SweepManifest.read(folder).names():
+        rewrite(folder, name, lambda values: values[:, :100])
+    assert "sweeps of 100 samples are shorter than a window of 110" in refused()
+
+
+@pytest.mark.parametrize("kept", [0, 200, 20_000])
+def test_a_file_cut_short(folder, refused, kept):
+    path = object_path(folder, "ball-0")
+    path.write_bytes(path.read_bytes()[:kept])
+    assert "ball-0.npz is damaged" in refused()
+
+
+def test_a_missing_file(folder, refused):
+    object_path(folder, "ball-0").unlink()
+    assert "ball-0" in refused()
+
+
+def test_a_label_that_is_none(folder, refused):
+    resplit(folder, categories=("ball", "cube"), withheld=("cone",))
+    assert "cone-0 of 'train' is of the withheld category 'cone', which has no label" in refused()
+    resplit(folder, categories=("ball", "cube"), withheld=())
+    assert "cone-0 is of no category it names" in refused()
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [("test", "in 'train' and in 'test'"), ("validation", "in 'train' and in 'validation'")],
+)
+def test_an_object_on_two_sides_of_the_split(folder, refused, other, said):
+    split = SweepManifest.read(folder).split
+    resplit(folder, split={**split, other: (*split[other], "cube-0")})
+    assert f"the object cube-0 is {said}" in refused()
+
+
+def test_an_object_on_two_sides_under_two_names(folder, refused):
+    values, _ = read_object(folder, "cube-0")
+    rewrite(folder, "cube-1", lambda _: values)
+    assert "cube-1 is cube-0 by another name, on another side of the split" in refused()
+
+
+def test_good_data_is_trained_on(folder, tmp_path, monkeypatch, capsys):
+    options = ("--batch", 2, "--encoder", "gru", "--width", 1 / 32, "--updates", 1)
+    arguments = ("tactile-rt", "train", folder, tmp_path / "run", *options)
+    monkeypatch.setattr(sys, "argv", list(map(str, arguments)))
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert not left.value.code, capsys.readouterr().err
+    assert (tmp_path / "run" / "best.pt").exists()

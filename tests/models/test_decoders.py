@@ -1,0 +1,90 @@
+"""Decoders: published sizes, old names, and the decoder of all steps adds up as it should."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tactile_rt.models import decoders
+from tactile_rt.stream import ConfigError
+
+
+def count(module: nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def features(steps: int = 22) -> Tensor:
+    return torch.randn(3, steps, 16, generator=torch.Generator().manual_seed(0))
+
+
+def test_published_counts():
+    with torch.device("meta"):
+        assert count(decoders.make("linear", 512, 117)) == 60_021
+        assert count(decoders.make("linear", 256, 117)) == 18_086_517 - 11_523_840 - 6_532_608
+        assert count(decoders.make("mlp", 512, 117)) == 39_038_933 - 37_928_800
+        assert count(decoders.make("mlp-all", 512, 117)) == 23_644_021 - 11_523_840
+
+
+def test_names_in_old_checkpoints():
+    assert list(decoders.make("linear", 16, 7).state_dict()) == ["weight", "bias"]
+    names = [f"{i}.{kind}" for i in (0, 2, 4) for kind in ("weight", "bias")]
+    assert list(decoders.make("mlp", 16, 7, 1 / 32).state_dict()) == names
+
+
+@pytest.mark.parametrize("name", decoders.DECODERS)
+@pytest.mark.parametrize("steps", [22, 5])
+def test_stream_is_the_window(name, steps):
+    torch.manual_seed(1)
+    decoder, x = decoders.make(name, 16, 7, 1 / 32), features(steps)
+    window, state = decoder(x), decoder.initial_state(3)
+    for t in range(steps):
+        out, state = decoder.step(x[:, t], torch.full((3,), t), state)
+        torch.testing.assert_close(out, window[:, t], rtol=0, atol=2e-6)
+
+
+def test_all_steps_is_one_layer_over_the_flattened_window():
+    torch.manual_seed(1)
+    decoder, x = decoders.make("mlp-all", 16, 7, 1 / 32), features()
+    first = nn.Linear(22 * 16, 32)
+    with torch.no_grad():
+        first.weight.copy_(decoder.weight.permute(1, 0, 2).flatten(1))
+        first.bias.copy_(decoder.bias)
+    for t in (0, 9, 21):
+        known = x * (torch.arange(22)[:, None] <= t)
+        hidden = F.relu(decoder.layer2(F.relu(first(known.flatten(1)))))
+        torch.testing.assert_close(decoder(x)[:, t], decoder.layer3(hidden), rtol=0, atol=2e-6)
+
+
+def test_all_steps_in_lanes_of_different_age():
+    """Lanes that were reset at different times read different weights."""
+    torch.manual_seed(1)
+    decoder, x = decoders.make("mlp-all", 16, 7, 1 / 32), features(4)
+    state = decoder.initial_state(2)
+    state["decoder_sum"][1] = decoder.step(
+        x[:1, 0], torch.zeros(1).long(), decoder.initial_state(1)
+    )[1]["decoder_sum"]
+    out, _ = decoder.step(x[:1, [0, 1]][0], torch.tensor([0, 1]), state)
+    torch.testing.assert_close(out, decoder(x[:1])[0, :2], rtol=0, atol=2e-6)
+
+
+def test_all_steps_ends():
+    decoder, x = decoders.make("mlp-all", 16, 7, 1 / 32, steps=4), features(5)
+    with pytest.raises(ValueError, match="5 steps, but this decoder ends at 4"):
+        decoder(x)
+    state = {"decoder_sum": torch.randn(3, 32)}
+    _, new = decoder.step(x[:, 4], torch.full((3,), 4), state)
+    assert torch.equal(new["decoder_sum"], state["decoder_sum"])
+
+
+@pytest.mark.parametrize("name", decoders.DECODERS)
+def test_gradients_are_finite(name):
+    decoder = decoders.make(name, 16, 7, 1 / 32)
+    decoder(1000 * features()).square().mean().backward()
+    assert all(torch.isfinite(p.grad).all() for p in decoder.parameters())
+
+
+def test_unknown_name():
+    with pytest.raises(ConfigError, match="decoder is 'tree', not one of linear, mlp, mlp-all"):
+        decoders.make("tree", 16, 7)

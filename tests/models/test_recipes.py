@@ -1,0 +1,150 @@
+"""Recipes: those of the paper's tables, and what is said to a mistake in one's own."""
+
+from dataclasses import asdict
+
+import pytest
+
+from tactile_rt.models.training import TrainingConfig, read_recipe, shipped_recipes
+from tactile_rt.models.training.recipes import load_recipe
+from tactile_rt.stream import ConfigError
+
+E4 = [0.1, 0.01, 0.001, 0.0001]
+GATED = {"zhuang-ugrnn", "zhuang-intersection", "zhuang-gru", "zhuang-lstm"}
+WITH_GPT = {
+    "resnet18",
+    "zhuang-timedecay",
+    "zhuang-ugrnn",
+    "zhuang-intersection-ln",
+    "zhuang-gru",
+    "zhuang-lstm",
+    "s4",
+}
+WITH_MAMBA = {"resnet18", "zhuang-timedecay", "s4"}
+
+# Table A3: name: (encoders, attender, optimizers, schedule, rates)
+SUPERVISED = {
+    "paper-resnet": ({"resnet18"}, "none", {"sgd"}, "step", E4[:3]),
+    "paper-zhuang-step": ({"zhuang-timedecay"}, "none", {"sgd"}, "step", E4),
+    "paper-zhuang-constant": ({"zhuang-timedecay"}, "none", {"sgd"}, "constant", [0.01, 0.005]),
+    "paper-gated": (GATED, "none", {"sgd", "adam", "adamw"}, "step", E4),
+    "paper-gated-ln": ({f"{e}-ln" for e in GATED}, "none", {"adamw"}, "step", E4),
+    "paper-gpt-cosine": (WITH_GPT, "gpt", {"adamw"}, "cosine", [1e-4]),
+    "paper-gpt-step": (WITH_GPT, "gpt", {"sgd", "adamw"}, "step", E4[:3]),
+    "paper-mamba-cosine": (WITH_MAMBA, "mamba", {"adamw"}, "cosine", [1e-4]),
+    "paper-mamba-step": (WITH_MAMBA, "mamba", {"sgd", "adamw"}, "step", E4[:3]),
+}
+# Table A4: loss: (optimizer, schedule, warm-up, batch); Table A5: attender: encoders
+LOSSES = {
+    "simclr": ("lars", "cosine-annealing", 0.1, 256),
+    "simsiam": ("sgd", "cosine-annealing", 0.0, 1024),
+    "simsiam-warmup": ("sgd", "cosine-annealing", 0.1, 1024),
+    "autoencoder": ("sgd", "step", None, 256),
+}
+NETWORKS = {
+    "none": {
+        "zhuang-timedecay",
+        "zhuang-ugrnn",
+        "zhuang-intersection-ln",
+        "zhuang-gru",
+        "zhuang-lstm",
+    },
+    "gpt": {"resnet18", "zhuang-intersection-ln", "zhuang-timedecay", "s4"},
+    "mamba": WITH_MAMBA,
+}
+
+
+def choices(recipe, key):
+    return recipe.search.get(key, [recipe.train[key]])
+
+
+@pytest.mark.parametrize("name", shipped_recipes())
+def test_every_combination_of_a_recipe_names_a_network(name):
+    recipe = load_recipe(name)
+    assert recipe.about
+    for values in recipe.searched():
+        recipe.config("set", **values).network(classes=117)
+        assert set(values) <= set(recipe.train)
+    for key, values in recipe.search.items():
+        assert values[0] == recipe.train[key]
+
+
+def test_the_default_recipe_is_the_default():
+    assert read_recipe("default", "set") == TrainingConfig("set")
+
+
+@pytest.mark.parametrize("name", SUPERVISED)
+def test_supervised_recipes_are_those_of_the_table(name):
+    encoders, attender, optimizers, schedule, rates = SUPERVISED[name]
+    recipe = load_recipe(name)
+    config = recipe.config("set")
+    assert set(choices(recipe, "encoder")) == encoders
+    assert set(choices(recipe, "optimizer")) == optimizers
+    assert choices(recipe, "learning_rate") == rates
+    assert (config.attender, config.schedule, config.objective) == (
+        attender,
+        schedule,
+        "supervised",
+    )
+    assert (config.batch, config.epochs, config.weight_decay) == (256, 100, 1e-4)
+    assert (config.width, config.readout, config.loss) == (1, "last", "last")
+    assert config.schedule != "cosine" or config.warmup * config.epochs == 10
+    assert config.drop_every * config.epochs == 30
+
+
+@pytest.mark.parametrize("attender", NETWORKS)
+@pytest.mark.parametrize("loss", LOSSES)
+def test_self_supervised_recipes_are_those_of_the_tables(loss, attender):
+    optimizer, schedule, warmup, batch = LOSSES[loss]
+    recipe = load_recipe(f"paper-{loss}" + (f"-{attender}" if attender != "none" else ""))
+    config = recipe.config("set")
+    assert set(choices(recipe, "encoder")) == NETWORKS[attender]
+    assert choices(recipe, "learning_rate") == E4
+    assert config.attender == attender
+    assert config.objective == loss.removesuffix("-warmup")
+    assert (config.optimizer, config.schedule, config.batch) == (optimizer, schedule, batch)
+    assert warmup is None or config.warmup == warmup
+    assert config.augmentation == ("none" if loss == "autoencoder" else "tactile")
+
+
+def test_overrides_come_last():
+    config = read_recipe("paper-simclr", "set", width=0.125, encoder="gru")
+    assert (config.width, config.encoder, config.objective) == (0.125, "gru", "simclr")
+    rest = {k: v for k, v in asdict(config).items() if k not in ("width", "encoder")}
+    whole = asdict(read_recipe("paper-simclr", "set"))
+    assert rest == {k: v for k, v in whole.items() if k in rest}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[train]\nlerning_rate = 1.0", "no key train.lerning_rate; did you mean learning_rate?"),
+        ("[tarin]\nbatch = 3", "no key tarin; did you mean train?"),
+        ("[search]\nencodr = ['gru']", "no key search.encodr; did you mean encoder?"),
+        ("[train]\nbatch = 'many'", "batch: expected `int`, got `str`"),
+        ("[train]\noptimizer = 'sdg'", "optimizer is 'sdg', not one of sgd, adam"),
+        ("[search]\noptimizer = ['sgd', 'sdg']", "optimizer is 'sdg', not one of"),
+        ("[train]\nbatch = 0", "batch must be positive"),
+        ("[train]\ndata = 'set'", "no key train.data"),
+        ("[search]\nbatch = 3", "expected `array`, got `int`"),
+        ("train = ]", "is not TOML"),
+        ("train = 3", "train: expected `object`, got `int`"),
+    ],
+)
+def test_a_mistake_is_one_line_that_names_file_and_key(tmp_path, text, said):
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    with pytest.raises(ConfigError) as error:
+        read_recipe(str(path), "set")
+    assert said in str(error.value)
+    assert str(path) in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_recipe_that_is_not_there(tmp_path):
+    with pytest.raises(ConfigError, match="no recipe 'paper-simclar'; did you mean paper-simclr"):
+        read_recipe("paper-simclar", "set")
+    with pytest.raises(ConfigError, match=r"none\.toml: No such file"):
+        read_recipe(str(tmp_path / "none.toml"), "set")
+    (tmp_path / "b.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match="is no text"):
+        read_recipe(str(tmp_path / "b.toml"), "set")

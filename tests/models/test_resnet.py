@@ -1,0 +1,117 @@
+"""ResNet18 is the published one: counts and convolutions; and a stream is the window."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tactile_rt.models.encoders.resnet import Block, ConvNorm, ResNet18Encoder
+
+TOLERANCE = 2e-6
+
+
+def count(module: nn.Module) -> int:
+    return sum(p.numel() for p in module.parameters())
+
+
+def build(width: float = 1 / 16) -> ResNet18Encoder:
+    """A small network in evaluation mode whose norms are not the identity."""
+    torch.manual_seed(1)
+    encoder = ResNet18Encoder(width)
+    for module in encoder.modules():
+        if isinstance(module, nn.BatchNorm1d):
+            nn.init.uniform_(module.weight, 0.5, 1.5)
+            nn.init.normal_(module.bias, std=0.1)
+            nn.init.normal_(module.running_mean, std=0.1)
+            nn.init.uniform_(module.running_var, 0.5, 1.5)
+    return encoder.eval()
+
+
+def frames(batch: int = 3, steps: int = 4) -> Tensor:
+    return torch.randn(batch, steps, 30, 5, 7, generator=torch.Generator().manual_seed(0))
+
+
+def oracle(encoder: ResNet18Encoder, x: Tensor) -> Tensor:
+    """He et al. 2016, table 1, with convolutions on padded maps. x (frame, 30, 5, 7)"""
+
+    def layer(conv: ConvNorm, x: Tensor, stride: int) -> Tensor:
+        norm, padding = conv.norm, conv.weight.shape[-1] // 2
+        x = F.conv2d(x, conv.weight, stride=stride, padding=padding)
+        return F.batch_norm(
+            x,
+            None if norm.training else norm.running_mean,
+            None if norm.training else norm.running_var,
+            norm.weight,
+            norm.bias,
+            norm.training,
+        )
+
+    x = F.max_pool2d(F.relu(layer(encoder.stem, x, 2)), 3, 2, 1)
+    for i, block in enumerate(encoder.blocks):
+        assert isinstance(block, Block)
+        stride = 2 if i in (2, 4, 6) else 1
+        short = x if block.shortcut is None else layer(block.shortcut, x, stride)
+        x = F.relu(short + layer(block.second, F.relu(layer(block.first, x, stride)), 1))
+    return encoder.fc(x.mean((2, 3)))
+
+
+def test_published_count():
+    with torch.device("meta"):
+        assert count(ResNet18Encoder()) == 11_523_840
+
+
+def test_what_a_5_by_7_grid_can_train():
+    encoder = ResNet18Encoder()
+    encoder(frames(8, 4)).square().sum().backward()
+    # Per channel: a unit that no frame in the batch excites says nothing about its tap.
+    reached = 0
+    for parameter in encoder.parameters():
+        assert parameter.grad is not None
+        if parameter.dim() == 4:
+            taps = (parameter.grad != 0).flatten(2).any(0).any(0).sum().item()
+            reached += int(taps) * parameter.shape[0] * parameter.shape[1]
+        else:
+            reached += parameter.numel()
+    assert reached == 1_914_624
+
+
+@pytest.mark.parametrize("training", [False, True])
+def test_convolutions(training):
+    encoder, x = build().train(training).double(), frames().double()
+    expected = oracle(encoder, x.flatten(0, 1)).unflatten(0, x.shape[:2])
+    torch.testing.assert_close(encoder(x), expected, rtol=1e-9, atol=1e-10)
+
+
+def test_gradients_are_those_of_the_convolutions():
+    encoder, x = build(), frames()
+    parameters = list(encoder.parameters())
+    ours = torch.autograd.grad(encoder(x).square().sum(), parameters)
+    theirs = torch.autograd.grad(oracle(encoder, x.flatten(0, 1)).square().sum(), parameters)
+    for a, b in zip(ours, theirs, strict=True):
+        assert torch.isfinite(a).all()
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * b.abs().max().item())
+
+
+def test_stream_is_the_window():
+    encoder, x = build(), frames()
+    state = encoder.initial_state(len(x))
+    for t in range(x.shape[1]):
+        out, state = encoder.step(x[:, t], torch.full((len(x),), t), state)
+        torch.testing.assert_close(out, encoder(x)[:, t], rtol=0, atol=TOLERANCE)
+    assert state == {}
+
+
+def test_deployed_gives_the_same():
+    encoder, x = build(), frames()
+    folded = encoder.deployed()
+    torch.testing.assert_close(folded(x), encoder(x), rtol=0, atol=TOLERANCE)
+    out, _ = folded.step(x[:, 0], torch.zeros(len(x), dtype=torch.int64), {})
+    torch.testing.assert_close(out, encoder(x)[:, 0], rtol=0, atol=TOLERANCE)
+    assert (folded.features, folded.lag) == (encoder.features, encoder.lag)
+    assert not any(p.requires_grad for p in folded.parameters())
+
+
+def test_deployed_is_small():
+    assert count(ResNet18Encoder().deployed()) < 3_000_000

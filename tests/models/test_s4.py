@@ -1,0 +1,166 @@
+"""S4 is its equations, by dense matrices in double precision; and a stream is the window."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from tactile_rt.models.encoders.s4 import S4Block, S4Encoder, hippo_legs, kernels
+
+TOLERANCE = 2e-6
+
+
+def build(width: float = 1 / 16, **more) -> S4Encoder:
+    torch.manual_seed(1)
+    return S4Encoder(width, **more).eval()
+
+
+def frames(batch: int = 2, steps: int = 22) -> Tensor:
+    return torch.randn(batch, steps, 30, 5, 7, generator=torch.Generator().manual_seed(0))
+
+
+def dense(block: S4Block) -> tuple[Tensor, Tensor, Tensor]:
+    """A (channel, N, N), B and C (channel, N) of a block, complex128, both of each pair."""
+
+    def both(x: Tensor) -> Tensor:
+        x = x.detach().double()
+        half = torch.complex(x[:, 0], x[:, 1])
+        return torch.cat([half, half.conj()], 1)
+
+    eigenvalues = both(torch.stack([-block.log_decay.double().exp(), block.frequency.double()], 1))
+    p = both(block.P)
+    a = torch.diag_embed(eigenvalues) - p[:, :, None] * p[:, None, :].conj()
+    return a, both(block.B), both(block.C)
+
+
+def kernel_oracle(block: S4Block, steps: int) -> Tensor:
+    """Gu et al. 2022, equations 3 and 4, by inverting dense matrices. (channel, step)"""
+    a, b, c = dense(block)
+    dt = block.log_dt.detach().double().exp()[:, None, None]
+    eye = torch.eye(a.shape[1], dtype=a.dtype)
+    inverse = torch.linalg.inv(eye - dt / 2 * a)
+    a_bar, x = inverse @ (eye + dt / 2 * a), (inverse * dt) @ b[:, :, None]
+    taps = []
+    for _ in range(steps):
+        y = (c[:, None, :] @ x)[:, 0, 0]
+        assert y.imag.abs().max() < 1e-9 * y.real.abs().max()
+        taps.append(y.real)
+        x = a_bar @ x
+    out = torch.stack(taps, 1)
+    out[:, 0] += block.D.detach().double()
+    return out
+
+
+def disturb(block: S4Block) -> S4Block:
+    """As training would: every state space parameter moves."""
+    with torch.no_grad():
+        for parameter in (block.log_dt, block.log_decay, block.frequency, block.P, block.B):
+            parameter += 0.1 * torch.randn_like(parameter) * (1 + parameter.abs())
+    return block
+
+
+def test_published_count():
+    assert sum(p.numel() for p in S4Encoder().parameters()) == 3_434_496
+
+
+def test_hippo_legs_is_similar_to_its_matrix():
+    """Λ - P P* is HiPPO's matrix in other coordinates: y of e^(At) B under a shared C agrees."""
+    eigenvalues, p, b = hippo_legs(64)
+    full = torch.cat([eigenvalues, eigenvalues.conj()])
+    p, b = torch.cat([p, p.conj()]), torch.cat([b, b.conj()])
+    ours = torch.diag(full) - p[:, None] * p[None, :].conj()
+    n = torch.arange(64, dtype=torch.float64)
+    a = torch.zeros(64, 64, dtype=torch.float64)
+    for i in range(64):
+        for k in range(i + 1):
+            a[i, k] = -(i + 1) if i == k else -math.sqrt((2 * i + 1) * (2 * k + 1))
+    # Coordinates do not show in the Markov parameters B* A^k B of a unitary change.
+    x, y = (2 * n + 1).sqrt(), b
+    for _ in range(4):
+        expected = ((2 * n + 1).sqrt() @ x).item()
+        found = torch.vdot(b, y)
+        assert found.real.item() == pytest.approx(expected, rel=1e-9)
+        x, y = a @ x, ours @ y
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_kernel_is_the_dense_recurrence(moved):
+    torch.manual_seed(3)
+    block = S4Block(16)
+    if moved:
+        disturb(block)
+    expected = kernel_oracle(block, 22)
+    error = (kernels([block], 22)[0].double() - expected).abs().max()
+    assert error < 3e-6 * expected.abs().max()
+    exact = kernels([block.double()], 22)[0]
+    torch.testing.assert_close(exact, expected, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("log_dt", [-12.0, 3.0])
+def test_kernel_and_gradient_stay_finite_at_any_step_size(log_dt):
+    block = disturb(S4Block(8))
+    with torch.no_grad():
+        block.log_dt.fill_(log_dt)
+    kernel = kernels([block], 22)[0]
+    kernel.square().sum().backward()
+    assert torch.isfinite(kernel).all()
+    assert all(torch.isfinite(p.grad).all() for p in (block.log_dt, block.P, block.C, block.B))
+
+
+def test_convolution_is_a_sum_over_the_past():
+    block, x = disturb(S4Block(8)).eval(), torch.randn(2, 9, 8)
+    kernel = kernels([block], 5)[0]
+    past = torch.zeros_like(x)
+    for t in range(9):
+        for k in range(min(t + 1, 5)):
+            past[:, t] += kernel[:, k] * x[:, t - k]
+    torch.testing.assert_close(block(x, kernel), block.merge(x, past), rtol=0, atol=TOLERANCE)
+
+
+@pytest.mark.parametrize(("taps", "steps"), [(22, 22), (4, 9), (22, 5)])
+@pytest.mark.parametrize("deployed", [False, True])
+def test_stream_is_the_window(taps, steps, deployed):
+    encoder, x = build(taps=taps), frames(steps=steps)
+    for block in encoder.blocks:
+        disturb(block)
+    window, runner = encoder(x), encoder.deployed() if deployed else encoder
+    state = runner.initial_state(len(x))
+    for t in range(steps):
+        out, state = runner.step(x[:, t], torch.full((len(x),), t), state)
+        torch.testing.assert_close(out, window[:, t], rtol=0, atol=TOLERANCE)
+
+
+class RefuseComplex(TorchDispatchMode):
+    """ONNX has no complex numbers."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        for tensor in out if isinstance(out, tuple | list) else [out]:
+            assert not (isinstance(tensor, Tensor) and tensor.is_complex()), func
+        return out
+
+
+@pytest.mark.parametrize("deployed", [False, True])
+def test_step_has_no_complex_numbers(deployed):
+    encoder = build().deployed() if deployed else build()
+    with RefuseComplex():
+        encoder.step(frames()[:, 0], torch.zeros(2, dtype=torch.int64), encoder.initial_state(2))
+
+
+def test_gradients_are_finite_on_raw_loads():
+    encoder = build().train()
+    encoder(1000 * frames()).square().mean().backward()
+    for name, parameter in encoder.named_parameters():
+        assert parameter.grad is not None, name
+        assert torch.isfinite(parameter.grad).all(), name
+
+
+def test_state_space_parameters_tell_the_optimizer():
+    block = S4Block(8)
+    told = {name for name, p in block.named_parameters() if hasattr(p, "_optim")}
+    assert told == {"log_dt", "log_decay", "frequency", "P", "B"}
+    assert block.log_dt._optim["weight_decay"] == 0.0

@@ -1,0 +1,378 @@
+"""Training: optimizers and schedules against their definitions, runs that are killed or shared."""
+
+import csv
+import hashlib
+import json
+import math
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tiny_sweeps import write_tiny_set
+from torch import nn
+
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.evaluation import hits, predict
+from tactile_rt.models.training import (
+    ProbeConfig,
+    TrainingConfig,
+    initialise,
+    load_checkpoint,
+    probe,
+    run_on,
+    train,
+)
+from tactile_rt.models.training.feeding import prefetched
+from tactile_rt.models.training.optimizers import (
+    LARS,
+    build_optimizer,
+    build_schedule,
+    parameter_groups,
+)
+from tactile_rt.models.training.probing import linear_probe
+from tactile_rt.stream import ConfigError, ModelError
+
+SMALL = {"encoder": "gru", "decoder": "linear", "width": 1 / 32, "batch": 6}
+CHILD = Path(__file__).parent / "train_child.py"
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    """12 training, 3 validation sweeps of three categories."""
+    folder = tmp_path_factory.mktemp("data") / "set"
+    write_tiny_set(folder)
+    return str(folder)
+
+
+def weights(path):
+    return torch.load(path, weights_only=True)["model"]
+
+
+def equal(a, b):
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+# Configuration
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"objective": "contrast"}, "objective is 'contrast', not one of supervised"),
+        ({"optimizer": "lamb"}, "optimizer is 'lamb'"),
+        ({"schedule": "cosin"}, "schedule is 'cosin'"),
+        ({"augmentation": "mixup"}, "augmentation is 'mixup'"),
+        ({"precision": "fp8"}, "precision is 'fp8'"),
+        ({"learning_rate": math.nan}, "learning_rate must be positive"),
+        ({"updates": -1}, "updates must be 0 or more"),
+        ({"masking": 1.0}, r"masking must be in \[0, 1\)"),
+        ({"objective": "simclr", "batch": 1}, "batch must be 2 or more"),
+    ],
+)
+def test_what_cannot_be_is_refused(changed, said):
+    with pytest.raises(ConfigError, match=said):
+        TrainingConfig("set", **changed)
+
+
+# Optimizers
+
+
+def test_optimizers_are_those_of_table_a2():
+    model = nn.Linear(3, 2)
+    kinds = {"sgd": torch.optim.SGD, "adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
+    for name, kind in kinds.items():
+        optimizer = build_optimizer(model, TrainingConfig("set", optimizer=name))
+        assert type(optimizer) is kind
+        (group,) = optimizer.param_groups
+        assert group["weight_decay"] == 1e-4
+        assert group.get("momentum", 0.9) == 0.9
+
+
+def test_a_parameter_may_ask_for_its_own_rate():
+    model = nn.Sequential(nn.Linear(3, 2), nn.Linear(2, 2))
+    model[0].weight._optim = {"lr_scale": 0.1, "weight_decay": 0.0}
+    model[1].bias.requires_grad_(False)
+    groups = parameter_groups(model, 0.5, 1e-4)
+    found = {(g["lr"], g["weight_decay"]): [tuple(p.shape) for p in g["params"]] for g in groups}
+    assert found == {(0.05, 0.0): [(2, 3)], (0.5, 1e-4): [(2,), (2, 2)]}
+    config = TrainingConfig("set", optimizer="adamw", learning_rate=0.5, schedule="one-cycle")
+    optimizer = build_optimizer(model, config)
+    schedule = build_schedule(optimizer, config, 10)
+    peak = np.zeros(2)
+    for _ in range(10):
+        peak = np.maximum(peak, [g["lr"] for g in optimizer.param_groups])
+        optimizer.step()
+        schedule.step()
+    np.testing.assert_allclose(sorted(peak), [0.05, 0.5], rtol=0.2)
+
+
+@pytest.mark.parametrize("published", [False, True])
+def test_lars_is_a_plain_loop(published):
+    rng = np.random.default_rng(0)
+    start = [rng.normal(size=(3, 2)), np.zeros((2, 2)), rng.normal(size=3)]
+    gradients = [[rng.normal(size=w.shape) for w in start] for _ in range(4)]
+    parameters = [nn.Parameter(torch.from_numpy(w.copy())) for w in start]
+    optimizer = LARS(parameters, 0.3, 0.9, 0.1, published)
+    for step in gradients:
+        for p, g in zip(parameters, step, strict=True):
+            p.grad = torch.from_numpy(g)
+        optimizer.step()
+    for k, w in enumerate(start):
+        velocity = np.zeros_like(w)
+        for step in gradients:
+            g, size = step[k], np.sqrt((w**2).sum())
+            if published or w.ndim > 1:
+                trust = 1e-3 * size / (np.sqrt((g**2).sum()) + 0.1 * size)
+                rate = trust if size > 0 or published else 1.0
+                change = rate * 0.3 * (g + 0.1 * w)
+            else:
+                change = 0.3 * g
+            velocity = 0.9 * velocity + change
+            w = w - velocity
+        np.testing.assert_allclose(parameters[k].detach().numpy(), w, atol=1e-12)
+    assert bool(parameters[1].any()) != published  # began at zero
+
+
+# Schedules
+
+
+def rates(updates, **config):
+    settings = TrainingConfig("set", optimizer="sgd", learning_rate=1.0, **config)
+    optimizer = build_optimizer(nn.Linear(1, 1), settings)
+    schedule, found = build_schedule(optimizer, settings, updates), []
+    for _ in range(updates):
+        found.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    return np.array(found)
+
+
+def test_step_is_step_lr_every_30_of_100_epochs():
+    optimizer = torch.optim.SGD(nn.Linear(1, 1).parameters(), 1.0)
+    schedule, expected = torch.optim.lr_scheduler.StepLR(optimizer, 30), []
+    for _ in range(100):
+        expected += [schedule.get_last_lr()[0]] * 7  # updates an epoch
+        optimizer.step()
+        schedule.step()
+    np.testing.assert_allclose(rates(700, schedule="step"), expected)
+
+
+def test_constant_is_constant():
+    assert (rates(50, schedule="constant") == 1).all()
+
+
+def test_cosine_rises_for_ten_epochs_and_falls_to_nothing():
+    found = rates(1000, schedule="cosine", warmup=0.1)
+    assert found[0] < 0.011
+    assert (np.diff(found[:100]) > 0).all()
+    np.testing.assert_allclose(found[100], 1)
+    np.testing.assert_allclose(found[550], 0.5)
+    assert (np.diff(found[100:]) < 0).all()
+    assert found[-1] < 1e-5
+
+
+def test_cosine_annealing_is_damped_in_its_warm_up():
+    found = rates(1000, schedule="cosine-annealing", warmup=0.1)
+    cosine = 0.5 * (1 + np.cos(np.pi * np.arange(1000) / 1000))
+    damping = 1 - (1 - np.minimum(np.arange(1000) / 100, 1)) * (1 - 1e-4)
+    np.testing.assert_allclose(found, cosine * damping, rtol=1e-12)
+    np.testing.assert_allclose(rates(1000, schedule="cosine-annealing", warmup=0.0), cosine)
+
+
+@pytest.mark.parametrize(
+    "schedule", ["step", "constant", "cosine", "cosine-annealing", "one-cycle"]
+)
+@pytest.mark.parametrize("updates", [1, 2, 3])
+def test_a_schedule_may_be_as_short_as_one_wants(schedule, updates):
+    found = rates(updates, schedule=schedule, warmup=0.1)
+    assert np.isfinite(found).all()
+    assert (found > 0).any()
+
+
+# Batches
+
+
+def test_batches_come_in_order_and_what_goes_wrong_comes_too(no_thread_left):
+    def draw():
+        yield from range(5)
+        raise ConfigError("no more")
+
+    found = []
+    with pytest.raises(ConfigError, match="no more"):
+        for item in prefetched(draw):
+            found.append(item)
+    assert found == list(range(5))
+
+
+def test_only_so_many_batches_are_drawn_ahead(no_thread_left):
+    drawn = []
+
+    def draw():
+        for k in range(100):
+            drawn.append(k)
+            yield k
+
+    batches = prefetched(draw, ahead=2)
+    assert next(batches) == 0
+    batches.close()
+    assert len(drawn) <= 5
+
+
+# Runs
+
+
+@pytest.mark.parametrize("objective", ["supervised", "simclr", "simsiam", "autoencoder"])
+@pytest.mark.parametrize("augmentation", ["tactile", "image"])
+def test_a_run_of_every_objective_can_be_repeated(tiny, tmp_path, objective, augmentation):
+    config = TrainingConfig(
+        tiny, **SMALL, objective=objective, augmentation=augmentation, masking=0.25, updates=3
+    )
+    seen = []
+    best = train(config, tmp_path / "a", seen.append)
+    train(config, tmp_path / "b")
+    assert equal(weights(tmp_path / "a" / "last.pt"), weights(tmp_path / "b" / "last.pt"))
+    assert [p.update for p in seen if not p.metrics] == [1, 2, 3]  # of two an epoch
+    assert [p.metrics["epoch"] for p in seen if p.metrics] == [1, 2]
+    assert all(0 <= p.metrics["waiting"] <= 1 for p in seen if p.metrics)
+    model, saved = load_checkpoint(best)
+    assert saved["config"]["objective"] == objective
+    assert predict(SweepSet.read(Path(tiny), "test"), run_on(model)).shape == (3, 22, 3)
+    again = []
+    train(config, tmp_path / "a", again.append)
+    assert not again, "a finished run is finished"
+
+
+def test_training_learns(tiny, tmp_path):
+    config = TrainingConfig(tiny, **SMALL, updates=50, learning_rate=2e-2)
+    lines = []
+    best = train(config, tmp_path / "run", lambda p: lines.append(p.metrics) if p.metrics else None)
+    assert lines[-1]["loss"] < 0.6 * lines[0]["loss"]
+    with (tmp_path / "run" / "history.csv").open() as file:
+        history = list(csv.DictReader(file))
+    assert [int(line["epoch"]) for line in history] == list(range(1, 26))
+    scores = [float(h["validation_top1"]) + float(h["validation_top1_noisy"]) for h in history]
+    _, saved = load_checkpoint(best)
+    kept = saved["metrics"]
+    assert kept["validation_top1"] + kept["validation_top1_noisy"] == max(scores)
+    test = SweepSet.read(Path(tiny), "test")
+    model, _ = load_checkpoint(best)
+    assert hits(predict(test, run_on(model))[:, -1], test.sweeps.labels).mean() > 0.6
+
+
+def test_another_configuration_is_named(tiny, tmp_path):
+    train(TrainingConfig(tiny, **SMALL, updates=1), tmp_path / "run")
+    with pytest.raises(ConfigError, match=r"another configuration \(other updates, seed\)"):
+        train(TrainingConfig(tiny, **SMALL, updates=2, seed=1), tmp_path / "run")
+
+
+def test_a_run_that_diverges_says_so(tiny, tmp_path):
+    config = TrainingConfig(
+        tiny, **SMALL, optimizer="sgd", schedule="constant", learning_rate=1e30, updates=6
+    )
+    with pytest.raises(ModelError, match="training diverged in epoch"):
+        train(config, tmp_path / "run")
+
+
+def test_tensorboard_is_asked_for_by_name(tiny, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    config = TrainingConfig(tiny, **SMALL, updates=1)
+    with pytest.raises(ConfigError, match="pip install tensorboard"):
+        train(config, tmp_path / "run", tensorboard=True)
+
+
+def test_the_initialised_network_is_what_training_begins_with(tiny, tmp_path):
+    config = TrainingConfig(tiny, **SMALL, objective="simclr", updates=1, seed=5)
+    at_rest = TrainingConfig(
+        tiny, **SMALL, objective="simclr", updates=1, seed=5, learning_rate=1e-30, weight_decay=0
+    )
+    begun = weights(initialise(config, tmp_path / "a"))
+    still = weights(train(at_rest, tmp_path / "b"))
+    assert equal(begun, still)
+    assert not equal(begun, weights(train(config, tmp_path / "c")))
+
+
+# The probe
+
+
+def test_the_probe_is_logistic_regression():
+    """Two far clouds of tiny features: they are told apart only if they are standardised."""
+    rng = np.random.default_rng(0)
+    labels = torch.from_numpy(rng.integers(0, 2, 400))
+    features = torch.from_numpy(rng.normal(size=(400, 5)) * 1e-3).float()
+    features[:, 2] += 4e-3 * labels + 7
+    part = features[:300], labels[:300], features[300:], labels[300:], 2
+    layer, history = linear_probe(*part, ProbeConfig(epochs=20))
+    right = (layer(features[300:]).argmax(1) == labels[300:]).float().mean().item()
+    assert right > 0.95
+    assert right == pytest.approx(max(line["validation_top1"] for line in history), abs=0.02)
+    _, plain = linear_probe(*part, ProbeConfig(epochs=20, standardise=False))
+    assert plain[-1]["validation_top1"] < 0.8
+
+
+def test_a_probed_network_is_a_classifier_of_the_frozen_features(tiny, tmp_path):
+    config = TrainingConfig(tiny, **SMALL, objective="simclr", augmentation="tactile", updates=4)
+    trained = train(config, tmp_path / "run")
+    probed = probe(trained, tmp_path / "probe", ProbeConfig(epochs=30))
+    before, after = weights(trained), weights(probed)
+    frozen = [name for name in before if not name.startswith("network.decoder.")]
+    assert all(torch.equal(before[name], after[name]) for name in frozen)
+    model, saved = load_checkpoint(probed)
+    assert (saved["network"]["decoder"], saved["network"]["readout"]) == ("linear", "last")
+    train_set = SweepSet.read(Path(tiny), "train")
+    found = hits(predict(train_set, run_on(model))[:, -1], train_set.sweeps.labels).mean()
+    assert found > 0.6
+    assert saved["metrics"]["validation_top1"] >= 0
+
+
+# Killed and shared: in processes of their own
+
+
+def child(tiny, folder, *arguments, torchrun=0):
+    command = [str(CHILD), tiny, str(folder), *arguments]
+    runner = ["-m", "torch.distributed.run", "--nproc-per-node", str(torchrun), "--standalone"]
+    done = subprocess.run(
+        [sys.executable, *(runner if torchrun else []), *command],
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
+
+
+def digest(state):
+    return hashlib.sha256(b"".join(t.numpy().tobytes() for t in state.values())).hexdigest()
+
+
+def test_a_killed_run_ends_as_one_that_was_not(tiny, tmp_path):
+    """kill -9 in an epoch's middle, with the best network saved but not the run, and at the end."""
+    (found,) = child(tiny, tmp_path / "killed", "killed")
+    assert found["deaths"] == [-9] * 4
+    config = TrainingConfig(tiny, **SMALL, epochs=4, dropout=0.2, attender="gpt")
+    train(config, tmp_path / "whole")
+    for name in ("last.pt", "best.pt"):
+        assert equal(weights(tmp_path / "killed" / name), weights(tmp_path / "whole" / name))
+    histories = []
+    for run in ("killed", "whole"):
+        with (tmp_path / run / "history.csv").open() as file:
+            lines = list(csv.DictReader(file))
+        histories.append([{k: v for k, v in r.items() if k != "seconds"} for r in lines])
+    assert histories[0] == histories[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("objective", ["supervised", "simclr"])
+def test_two_devices_train_as_one(tiny, tmp_path, objective):
+    ranks = child(tiny, tmp_path / "two", objective, torchrun=2)
+    assert [r["devices"] for r in ranks] == [2, 2]
+    assert ranks[0]["digest"] == ranks[1]["digest"]
+    whole = {**SMALL, "objective": objective, "dropout": 0.0, "updates": 3, "precision": "fp32"}
+    train(TrainingConfig(tiny, **whole), tmp_path / "one")
+    one, two = weights(tmp_path / "one" / "last.pt"), weights(tmp_path / "two" / "last.pt")
+    assert digest(two) == ranks[0]["digest"]
+    if objective == "supervised":  # batch norm sees half of the batch in the other
+        for name in one:
+            torch.testing.assert_close(one[name], two[name], atol=2e-5, rtol=1e-3)
