@@ -11,6 +11,8 @@ from typing import Annotated
 import typer
 
 from tactile_rt.cli import app, needs, starting
+from tactile_rt.cli.daemon import Settings, serve
+from tactile_rt.stream import ConfigError
 
 Model = Annotated[
     Path | None, typer.Option(help="An .onnx model; default: the one that comes with the package.")
@@ -42,14 +44,26 @@ def leaving(seconds: float | None) -> Iterator[None]:
 
 @app.command()
 def run(
-    source: Annotated[str, typer.Option(help="URL of a source, e.g. sim:mouse?objects=mug.")],
+    file: Annotated[
+        Path | None, typer.Argument(help="A configuration: run the daemon, e.g. robot.toml.")
+    ] = None,
+    source: Annotated[
+        str | None, typer.Option(help="URL of a source, e.g. sim:mouse?objects=mug.")
+    ] = None,
     model: Model = None,
     every_step: Annotated[
         bool, typer.Option("--every-step/--final-only", help="Decisions to print.")
     ] = True,
     seconds: Seconds = None,
+    sets: Settings = None,
 ) -> None:
-    """Classify what a source's array touches; print one line of JSON per decision.
+    """Run the daemon on a configuration, or classify what one source's array touches.
+
+    With a FILE everything is said there (`tactile-rt config example`);
+    SIGHUP reads it again, SIGTERM closes it. Exit codes: 0 stopped, 2 wrong
+    configuration, 3 already running, 4 stopped but something hung.
+
+    With --source, print one line of JSON per decision.
 
     Fields: type ("classification"); t_ns and onset_ns, times of the last
     sample used and of first contact on the stream's clock; step since onset,
@@ -58,6 +72,16 @@ def run(
 
     A summary goes to stderr. Ctrl-C leaves.
     """
+    if file is not None:
+        if source is not None or model is not None or not every_step:
+            raise ConfigError(
+                f"{file} says what to run: give --set source.NAME.url=... or the like beside it"
+            )
+        serve(file, sets or [], seconds)
+        return
+    if source is None or sets:
+        raise ConfigError("run needs a configuration (robot.toml, --set with it) or --source URL")
+
     import msgspec
 
     from tactile_rt.classifier import Classifier

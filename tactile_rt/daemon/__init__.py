@@ -1,0 +1,10 @@
+"""The onboard daemon: sources, models and consumers, each in a thread of its own that is restarted.
+
+    source --+--> mailbox --> model --> decisions --+
+             |                                      |
+             +--> mailbox <-------------------------+--> mailbox --> consumer (publisher, recorder,
+                                                                     page, metrics, systemd, log)
+
+Every mailbox is bounded, drops its oldest items and counts them, so that nothing that is slow or
+gone ever holds up acquisition. `Daemon` builds all that from a `Config`, one TOML file.
+"""

@@ -1,0 +1,243 @@
+"""Read a configuration: one file, what it extends, and what the command line sets.
+
+Every mistake is one line that names file and line (or the ``--set``), the key, and the nearest
+valid name.
+"""
+
+import hashlib
+import os
+import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NoReturn
+
+import msgspec
+
+from tactile_rt.daemon.config import CONFIG_VERSION, Config
+from tactile_rt.daemon.config_nodes import Node, make_node, merge, named, read_nodes
+from tactile_rt.daemon.config_tables import convert_table, is_list, is_text, nearest, refusal
+from tactile_rt.stream import ConfigError
+
+__all__ = ["Loaded", "load_config"]
+
+DEEPEST = 8  # files that extend files
+FILES_IN = ("replay", "combined")  # schemes of URLs whose target is a file
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A configuration, and where each value of it came from.
+
+    Attributes:
+        config: of which all names are filled in and all paths absolute.
+        nodes: its tree.
+        path: of the file.
+        sets: of the command line.
+    """
+
+    config: Config
+    nodes: Node
+    path: Path
+    sets: tuple[str, ...] = ()
+
+    def refuse(self, path: list[str | int], why: str) -> NoReturn:
+        """Raise the `ConfigError` of a value."""
+        raise refusal(self.nodes, path, why)
+
+    @property
+    def sha256(self) -> str:
+        """Of what it says, however it is written."""
+        return hashlib.sha256(msgspec.json.encode(self.config)).hexdigest()
+
+
+def load_config(path: Path, sets: Sequence[str] = ()) -> Loaded:
+    """Read a file; whatever is wrong with it, or with one that it extends, is a `ConfigError`.
+
+    Args:
+        path: of the TOML file.
+        sets: ``a.b=value``, of which ``source.NAME.url=...`` names an item of a list.
+
+    Raises:
+        ConfigError: one line with file and line.
+    """
+    nodes = _with_bases(path, [])
+    for text in sets:
+        nodes = _set(nodes, text)
+    _check_version(nodes)
+    _absolute(nodes)
+    config = convert_table(nodes, nodes, [], Config)
+    loaded = Loaded(config, nodes, path, tuple(sets))
+    return Loaded(_filled(loaded), nodes, path, tuple(sets))
+
+
+# reading
+
+
+def _with_bases(path: Path, above: list[Path]) -> Node:
+    nodes = read_nodes(path)
+    base = nodes.value.get("extends")
+    if base is None:
+        return nodes
+    if not isinstance(base.value, str) or not base.value:
+        raise ConfigError(f'{base.where}: extends names a file: extends = "base.toml"')
+    here = Path(os.path.realpath(path))
+    file = nodes.folder / base.value
+    if "\0" in base.value:
+        raise ConfigError(f"{base.where}: extends: no file's name has a zero byte")
+    if Path(os.path.realpath(file)) in [*above, here]:
+        raise ConfigError(f"{base.where}: extends: {base.value} extends this file in turn")
+    if len(above) >= DEEPEST:
+        raise ConfigError(f"{base.where}: extends: more than {DEEPEST} files, one in another")
+    if not file.is_file():
+        raise ConfigError(f"{base.where}: extends: no file {file}")
+    shown = file if path.is_absolute() else Path(os.path.relpath(file))
+    under = _with_bases(shown, [*above, here])
+    del nodes.value["extends"]
+    return merge(under, nodes)
+
+
+def _set(nodes: Node, text: str) -> Node:
+    key, equals, written = text.partition("=")
+    origin = f"--set {text}"
+    steps = key.split(".")
+    if not equals or not all(steps):
+        raise ConfigError(f"{origin}: a setting is KEY=VALUE, e.g. page.port=9000")
+    at: Any = nodes
+    path: list[str | int] = []
+    for i, step in enumerate(steps):
+        last = i == len(steps) - 1
+        if isinstance(at.value, list):
+            place = _item(at, step, origin, named(path))
+            path.append(place)
+            if last:
+                raise ConfigError(f"{origin}: {named(path)} is a table: say which key of it")
+            at = at.value[place]
+            continue
+        if not isinstance(at.value, dict):
+            raise ConfigError(f"{origin}: {named(path)} has a value, not keys")
+        path.append(step)
+        if last:
+            value = written if is_text(path) else _value(written)
+            at.value[step] = make_node(value, origin, 0, Path.cwd())
+        else:
+            if step not in at.value:
+                listed = is_list(path)
+                at.value[step] = make_node([] if listed else {}, origin, 0, Path.cwd())
+            at = at.value[step]
+    return nodes
+
+
+def _item(node: Node, step: str, origin: str, where: str) -> int:
+    names = [
+        n.value[key].value
+        for n in node.value
+        for key in ("name", "kind")
+        if isinstance(n.value, dict) and key in n.value and isinstance(n.value[key].value, str)
+    ]
+    for i, n in enumerate(node.value):
+        if isinstance(n.value, dict) and step in (
+            getattr(n.value.get("name"), "value", None),
+            getattr(n.value.get("kind"), "value", None),
+        ):
+            return i
+    if step.isdecimal() and len(step) < 6 and int(step) < len(node.value):
+        return int(step)
+    raise ConfigError(f"{origin}: no {where} {step!r}; {nearest(step, list(dict.fromkeys(names)))}")
+
+
+def _value(written: str) -> Any:
+    """A TOML value, or else text, so that it need not be quoted twice."""
+    try:
+        return tomllib.loads(f"value = {written}")["value"]
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError):
+        return written
+
+
+def _absolute(nodes: Node) -> None:
+    """Relative paths from the folder of the file that they stand in."""
+    for path, node in nodes.walk():
+        if not isinstance(node.value, str) or not node.value or "\0" in node.value:
+            continue
+        last = path[-1] if path else ""
+        top = (path[0], last) if path else ()
+        if top in (("model", "file"), ("recorder", "folder"), ("log", "file")) or (
+            path[0] == "publisher"
+            and "options" in path
+            and (last in ("file", "folder") or str(last).endswith("_file"))
+        ):
+            node.value = str(_from(node, node.value))
+        elif top == ("source", "calibration") and _is_file(_from(node, node.value)):
+            node.value = str(_from(node, node.value))
+        elif top == ("source", "url"):
+            scheme, colon, rest = node.value.partition(":")
+            target, question, options = rest.partition("?")
+            if colon and scheme in FILES_IN and target:
+                node.value = f"{scheme}:{_from(node, target)}{question}{options}"
+
+
+def _from(node: Node, value: str) -> Path:
+    path = Path(value)
+    if value.startswith("~"):
+        try:
+            path = path.expanduser()
+        except RuntimeError:  # no such user
+            raise ConfigError(f"{node.where}: {value} is no folder of a user here") from None
+    return path if path.is_absolute() else node.folder / path
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # too long a name
+        return False
+
+
+def _filled(loaded: Loaded) -> Config:
+    """Names that may be left out."""
+    config = loaded.config
+    sources = [s.name for s in config.source]
+    models, publishers = [], []
+    taken: set[str] = set()
+    for i, model in enumerate(config.model):
+        source = model.source
+        if not source:
+            if len(sources) != 1:
+                loaded.refuse(
+                    ["model", i], f"which source? source = one of {', '.join(sources) or 'none'}"
+                )
+            (source,) = sources
+        name = _free(model.name or source, taken, bool(model.name), loaded, ["model", i])
+        models.append(msgspec.structs.replace(model, source=source, name=name))
+    taken = {"recorder", "page", "metrics", "systemd", "log"}
+    for i, publisher in enumerate(config.publisher):
+        base = publisher.name or re.sub(r"[^A-Za-z0-9_-]", "-", publisher.kind)
+        name = _free(base, taken, bool(publisher.name), loaded, ["publisher", i])
+        publishers.append(msgspec.structs.replace(publisher, name=name))
+    return msgspec.structs.replace(
+        config, model=tuple(models), publisher=tuple(publishers), extends=""
+    )
+
+
+def _free(name: str, taken: set[str], given: bool, loaded: Loaded, path: list[str | int]) -> str:
+    made, n = name, 1
+    while made in taken:
+        if given:
+            loaded.refuse([*path, "name"], f"the name {name!r} is taken")
+        n += 1
+        made = f"{name}-{n}"
+    taken.add(made)
+    return made
+
+
+def _check_version(nodes: Node) -> None:
+    version = nodes.value.get("version")
+    if version is None:
+        raise ConfigError(
+            f"{nodes.file}:1: no version: begin the file with version = {CONFIG_VERSION}"
+        )
+    if version.value != CONFIG_VERSION or isinstance(version.value, bool | float):
+        raise ConfigError(
+            f"{version.where}: version {version.value!r}; this release reads {CONFIG_VERSION}"
+        )

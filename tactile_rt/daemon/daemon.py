@@ -1,0 +1,292 @@
+"""The daemon: parts made from a configuration, watched, exchanged and closed."""
+
+import gc
+import os
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from tactile_rt import __version__
+from tactile_rt.daemon.clock import Clock
+from tactile_rt.daemon.config_file import Loaded
+from tactile_rt.daemon.config_text import config_text
+from tactile_rt.daemon.consumer_part import ConsumerPart
+from tactile_rt.daemon.consumers import Wanted, wanted_consumers
+from tactile_rt.daemon.degraded import degraded
+from tactile_rt.daemon.hub import Hub
+from tactile_rt.daemon.items import Control, Event, Opened
+from tactile_rt.daemon.lock import Locks, lock_keys
+from tactile_rt.daemon.model_part import ModelPart, file_stamp, model_path
+from tactile_rt.daemon.part import Part
+from tactile_rt.daemon.snapshot import Snapshot
+from tactile_rt.daemon.source_part import SourcePart
+
+__all__ = ["Daemon"]
+
+WATCH_S = 0.25
+STARTED_S = 5.0  # what has not started by then is told as degraded instead
+
+
+class Daemon:
+    """Everything that a configuration asks for; a `View` for its consumers.
+
+    Args:
+        loaded: the configuration, checked.
+        clock: of the host.
+        locks: that keep a second daemon away; None: none.
+        on_over: called once, from another thread, when all streams are over.
+        freeze: whether to keep what is there after the start out of the garbage collector, which
+            is right for a process that does nothing else.
+
+    Raises:
+        ConfigError: a consumer cannot be made.
+        AlreadyRunning: another process has a device, or this configuration.
+    """
+
+    def __init__(
+        self,
+        loaded: Loaded,
+        *,
+        clock: Clock | None = None,
+        locks: Locks | None = None,
+        freeze: bool = False,
+        on_over: Callable[[], None] | None = None,
+    ) -> None:
+        self._on_over = on_over
+        self._loaded, self._clock, self._locks = loaded, clock or Clock(), locks
+        self._freeze = freeze
+        self._hub = Hub()
+        self._sources: dict[str, SourcePart] = {}
+        self._models: dict[str, tuple[Any, ModelPart]] = {}
+        self._consumers: dict[str, tuple[Any, ConsumerPart]] = {}
+        self._changing = threading.RLock()  # of the parts
+        self._started_ns = time.monotonic_ns()
+        self._starting, self._stopping = True, False
+        self._degraded: tuple[str, ...] = ()
+        self._reloads = self._clock_steps = 0
+        self._unwatch = threading.Event()
+        self._watcher = threading.Thread(target=self._watch, name="tactile-rt watch", daemon=True)
+        self._ready = [(w, w.make()) for w in wanted_consumers(loaded)]
+
+    # life
+
+    def start(self) -> None:
+        """Start all parts; returns at once."""
+        if self._locks is not None:
+            self._locks.hold(_keys(self._loaded))
+        # Consumers first: they are to hear of everything.
+        ready, self._ready = self._ready, []
+        with self._changing:
+            for wanted, consumer in ready:
+                self._add_consumer(wanted, consumer)
+            self._match()
+        self.report("daemon", "starting", f"{self._loaded.path}")
+        self._watcher.start()
+
+    def reload(self, loaded: Loaded) -> None:
+        """Change to another configuration: what is the same in it goes on undisturbed.
+
+        Raises:
+            ConfigError: a consumer cannot be made; nothing has changed.
+            AlreadyRunning: another process has a device; nothing has changed.
+        """
+        with self._changing:
+            wanted = {w.name: w for w in wanted_consumers(loaded)}
+            new = {
+                name: w.make()
+                for name, w in wanted.items()
+                if name not in self._consumers or self._consumers[name][0] != w.key
+            }
+            if self._locks is not None:
+                self._locks.hold(_keys(loaded))
+            self._loaded = loaded
+            self._reloads += 1
+            gone = [n for n in self._consumers if n not in wanted or n in new]
+            old = [self._consumers.pop(name)[1] for name in gone]
+            self._end(old)
+            for name, consumer in new.items():
+                self._add_consumer(wanted[name], consumer)
+            self._match()
+        parts = ", ".join(sorted(new)) if new else "no consumer"
+        self.report("daemon", "reloaded", f"{loaded.path}: {parts} new or changed")
+
+    def stop(self) -> list[str]:
+        """Close everything within `limits.stop_s`: sources, then models, then consumers, each
+        after it has taken what waited for it.
+
+        Returns:
+            The parts that did not end in time; their threads are left behind.
+        """
+        self._stopping = True
+        until = time.monotonic() + self._loaded.config.limits.stop_s
+        self.report("daemon", "stopping", "")
+        self._unwatch.set()
+        late: list[Part] = []
+        with self._changing:
+            groups: list[list[Part]] = [
+                list(self._sources.values()),
+                [part for _, part in self._models.values()],
+                [part for _, part in self._consumers.values() if part.name != "log"],
+                [part for _, part in self._consumers.values() if part.name == "log"],
+            ]
+            for n, group in enumerate(groups):
+                for part in group:
+                    part.stop()
+                # Whoever hangs must not take the time of those that come after it.
+                left = until - time.monotonic()
+                end = time.monotonic() + left * (0.5 if n < len(groups) - 1 else 0.9)
+                late += [part for part in group if not part.join(end)]
+                for part in late:
+                    if part in group and n < len(groups) - 1:
+                        self.report(part.name, "abandoned", "it did not end in time", "error")
+        if self._watcher.ident is not None and self._watcher is not threading.current_thread():
+            self._watcher.join(max(0.0, until - time.monotonic()))
+        if self._locks is not None:
+            self._locks.close()
+        return [part.name for part in late if not part.join(0.0)]
+
+    # what consumers see
+
+    def snapshot(self) -> Snapshot:
+        """All states now."""
+        # Copies of dictionaries that another thread may be changing are whole: copying is atomic.
+        sources = tuple(p.source_state for p in self._sources.copy().values())
+        models = tuple(p.model_state for _, p in self._models.copy().values())
+        consumers = tuple(p.consumer_state for _, p in self._consumers.copy().values())
+        lines = degraded(sources, models, consumers)
+        state = "degraded" if lines else "running"
+        state = "stopping" if self._stopping else "starting" if self._starting else state
+        return Snapshot(
+            __version__, os.getpid(), str(self._loaded.path), self._clock.monotonic_ns(),
+            self._clock.utc_ns(), self._started_ns, self._reloads, state, lines,
+            self._clock_steps, sources, models, consumers,
+        )  # fmt: skip
+
+    def streams(self) -> Mapping[str, Opened]:
+        """Sources that are open now."""
+        return self._hub.streams()
+
+    def config_text(self) -> str:
+        """The configuration in force as TOML, without secrets."""
+        return config_text(self._loaded.config)
+
+    def report(self, part: str, state: str, reason: str, level: str = "info") -> None:
+        """Put an event into the log and to all consumers."""
+        now = time.monotonic_ns()
+        self._hub.post(Event(part, state, reason, level, now, self._clock.utc_offset_ns()))
+
+    def send(self, consumer: str, control: Control) -> bool:
+        """Ask something of a consumer; whether there is one of that name that listens."""
+        box = self._hub.box(consumer)
+        if box is None or Control not in box.wants:
+            return False
+        box.put(control)
+        return True
+
+    def utc_offset_ns(self) -> int:
+        """UTC less monotonic time, now."""
+        return self._clock.utc_offset_ns()
+
+    # parts
+
+    def _add_consumer(self, wanted: Wanted, consumer: Any) -> None:
+        part = ConsumerPart(
+            wanted.name, wanted.kind, consumer, self, self.report, self._loaded.config.limits
+        )
+        self._consumers[wanted.name] = (wanted.key, part)
+        self._hub.join(wanted.name, part.box)
+        part.start()
+
+    def _match(self) -> None:
+        """Let sources and models be those of the configuration."""
+        config = self._loaded.config
+        limits = config.limits
+        models = {m.name: ((m, limits, file_stamp(model_path(m))), m) for m in config.model}
+        sources = {s.name: s for s in config.source}
+        old: list[Part] = [
+            self._models.pop(name)[1]
+            for name, (key, _) in list(self._models.items())
+            if name not in models or models[name][0] != key
+        ]
+        old += [
+            self._sources.pop(name)
+            for name, part in list(self._sources.items())
+            if sources.get(name) != part.config
+        ]
+        self._end(old)
+        for name, (key, model) in models.items():
+            if name not in self._models:
+                made = ModelPart(model, self._hub, self.report, limits, self._clock)
+                self._models[name] = (key, made)
+                self._hub.join(made.name, made.box)
+                made.start()
+        for name, source in sources.items():
+            if name in self._sources:
+                self._sources[name].limits = limits
+            else:
+                part = SourcePart(source, self._hub, self.report, limits, self._clock)
+                self._sources[name] = part
+                part.start()
+
+    def _end(self, parts: list[Any]) -> None:
+        """Stop parts that are no longer wanted."""
+        for part in parts:
+            box = getattr(part, "box", None)
+            if box is not None:
+                self._hub.leave(part.name, box)
+            part.stop()
+        until = time.monotonic() + self._loaded.config.limits.stop_s
+        for part in parts:
+            if not part.join(until):
+                self.report(part.name, "abandoned", "it did not end in time", "error")
+
+    def _watch(self) -> None:
+        while not self._unwatch.wait(WATCH_S):
+            for part in self._parts():
+                part.watch()
+            step = self._clock.stepped_ns()
+            if step:
+                self._clock_steps += 1
+                self.report("daemon", "clock", f"the wall clock jumped by {step / 1e9:+.3f} s")
+            if self._starting and self._settled():
+                self._starting = False
+                if self._freeze:
+                    # What is there now stays: to look through it again and again costs pauses.
+                    gc.collect()
+                    gc.freeze()
+                if not self.snapshot().degraded:
+                    self.report("daemon", "running", "")
+            elif not self._starting:
+                self._tell_degraded()
+            if self._sources and all(
+                p.state.state == "ended" for p in self._sources.copy().values()
+            ):
+                done, self._on_over = self._on_over, None
+                if done is not None:
+                    done()
+
+    def _parts(self) -> list[Part]:
+        return [
+            *self._sources.copy().values(),
+            *(p for _, p in self._models.copy().values()),
+            *(p for _, p in self._consumers.copy().values()),
+        ]
+
+    def _settled(self) -> bool:
+        if time.monotonic_ns() - self._started_ns > STARTED_S * 1e9:
+            return True
+        return all(p.state.state != "starting" or p.state.failures for p in self._parts())
+
+    def _tell_degraded(self) -> None:
+        lines = self.snapshot().degraded
+        for line in lines:
+            if line not in self._degraded:
+                self.report("daemon", "degraded", line, "warning")
+        if self._degraded and not lines:
+            self.report("daemon", "running", "all parts work again")
+        self._degraded = lines
+
+
+def _keys(loaded: Loaded) -> list[str]:
+    return lock_keys(loaded.path, [s.url for s in loaded.config.source])

@@ -1,0 +1,150 @@
+"""What moves between the parts of the daemon: few, frozen, in the order in which it happened."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from tactile_rt.classifier import Classification
+from tactile_rt.stream import ArraySpec, Chunk, Source
+
+__all__ = [
+    "Closed",
+    "Contact",
+    "Control",
+    "Decision",
+    "Event",
+    "Item",
+    "Opened",
+    "Packet",
+    "Samples",
+]
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A source has been opened, or opened again; samples and packets of it follow.
+
+    Attributes:
+        source: its name in the configuration.
+        spec: its array.
+        url: where it is.
+        stream: the source itself, for `health`, `stats` and what it is; never read or close it.
+        t_ns: when, host CLOCK_MONOTONIC.
+        utc_offset_ns: UTC less monotonic time then.
+        prelude: (packet, arrival) of what came of a device while it was started: it describes
+            itself in them. The same packets also come as `Packet` items.
+    """
+
+    source: str
+    spec: ArraySpec
+    url: str
+    stream: Source
+    t_ns: int
+    utc_offset_ns: int
+    prelude: tuple[tuple[Any, int], ...] = ()
+
+
+@dataclass(frozen=True)
+class Closed:
+    """A source has been closed: it broke, is over, or is no longer configured."""
+
+    source: str
+    reason: str
+    t_ns: int
+
+
+@dataclass(frozen=True)
+class Samples:
+    """A chunk of a source as it came, calibrated.
+
+    Attributes:
+        source: its name.
+        spec: its array.
+        chunk: the samples.
+        arrived_ns: when it was read, host CLOCK_MONOTONIC.
+        utc_offset_ns: UTC less monotonic time then.
+    """
+
+    source: str
+    spec: ArraySpec
+    chunk: Chunk
+    arrived_ns: int
+    utc_offset_ns: int
+
+
+@dataclass(frozen=True)
+class Packet:
+    """What came over a device's line: bytes or CAN frames; None when the line was opened."""
+
+    source: str
+    packet: Any
+    t_ns: int
+
+
+@dataclass(frozen=True)
+class Decision:
+    """A model's decision.
+
+    Attributes:
+        source, model: names in the configuration.
+        frame: mount frame of the array.
+        decision: label, probabilities, step; its times are the stream's.
+        sample_ns: host time of the sample that completed the step.
+        made_ns: host time at which the decision was there.
+        utc_offset_ns: UTC less monotonic time then.
+    """
+
+    source: str
+    model: str
+    frame: str
+    decision: Classification
+    sample_ns: int
+    made_ns: int
+    utc_offset_ns: int
+
+
+@dataclass(frozen=True)
+class Contact:
+    """A model's contact detector found that contact begins (`touching`) or ends."""
+
+    source: str
+    model: str
+    frame: str
+    touching: bool
+    t_ns: int
+    utc_offset_ns: int
+
+
+@dataclass(frozen=True)
+class Event:
+    """A part of the daemon, or a device, changed its state; or something worth a line in the log.
+
+    Attributes:
+        part: ``source.NAME``, ``model.NAME``, ``publisher.NAME``, ``recorder``, ``page``,
+            ``metrics``, ``systemd``, or ``daemon``.
+        state: see `snapshot.PartState`; a device's state is ``device:streaming`` and so on.
+        reason: in words.
+        level: ``info``, ``warning`` or ``error``.
+        t_ns: when, host CLOCK_MONOTONIC.
+        utc_offset_ns: UTC less monotonic time then.
+    """
+
+    part: str
+    state: str
+    reason: str
+    level: str
+    t_ns: int
+    utc_offset_ns: int
+
+
+@dataclass(frozen=True)
+class Control:
+    """Asked of one consumer by another, as by the page of the recorder.
+
+    The recorder knows ``start``, ``stop``, ``trigger`` and ``rotate``.
+    """
+
+    action: str
+    argument: str = ""
+
+
+Item = Opened | Closed | Samples | Packet | Decision | Contact | Event | Control

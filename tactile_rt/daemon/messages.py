@@ -1,0 +1,202 @@
+"""What publishers send: one schema for all of them, JSON, versioned.
+
+Every message is one object with ``type``, ``version``, ``t_ns`` (host CLOCK_MONOTONIC) and
+``utc_ns`` (the same moment in UTC); all but ``health`` and ``state`` also with the ``source`` and
+its mount ``frame``. A field is never renamed and never changes its unit within a version; new ones
+may come.
+"""
+
+from typing import Any, ClassVar, TypeAlias
+from urllib.parse import quote
+
+import msgspec
+
+from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Samples
+from tactile_rt.daemon.snapshot import Snapshot
+
+__all__ = [
+    "MESSAGE_VERSION",
+    "ArrayMessage",
+    "ContactMessage",
+    "DecisionMessage",
+    "HealthMessage",
+    "Message",
+    "SamplesMessage",
+    "StateMessage",
+    "encode",
+    "message_of",
+    "state_message",
+    "topic_of",
+]
+
+MESSAGE_VERSION = 1
+DIGITS = 4  # of probabilities
+
+
+class _Message(msgspec.Struct, frozen=True, tag_field="type", kw_only=True):
+    version: int = MESSAGE_VERSION
+    t_ns: int
+    utc_ns: int
+
+
+class _FromSource(_Message, frozen=True, kw_only=True):
+    source: str
+    frame: str
+
+
+class ArrayMessage(_FromSource, frozen=True, tag="array", kw_only=True):
+    """A source was opened; `array` is its `ArraySpec`: elements, grid, poses in `frame`, units."""
+
+    topic: ClassVar[str] = "array"
+    url: str
+    array: dict[str, Any]
+
+
+class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
+    """A model decided.
+
+    Attributes:
+        t_ns: stream time of the last sample used.
+        onset_ns: stream time at which contact began: with `source` and `model` it names the
+            episode.
+        step: since onset, from 1; `final` the last one.
+        label: the most probable class; probabilities: of all of them.
+        model_ms: time that the network took, ms.
+        latency_ms: from the sample that completed the step until the decision was there, ms.
+    """
+
+    topic: ClassVar[str] = "decision"
+    model: str
+    onset_ns: int
+    step: int
+    final: bool
+    label: str
+    probabilities: dict[str, float]
+    model_ms: float
+    latency_ms: float
+
+
+class ContactMessage(_FromSource, frozen=True, tag="contact", kw_only=True):
+    """Contact began (`touching`) or ended; `t_ns` is the stream's time."""
+
+    topic: ClassVar[str] = "contact"
+    model: str
+    touching: bool
+
+
+class HealthMessage(_Message, frozen=True, tag="health", kw_only=True):
+    """A part of the daemon or a device changed its state; see `items.Event`."""
+
+    topic: ClassVar[str] = "health"
+    part: str
+    state: str
+    reason: str
+    level: str
+
+
+class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
+    """A chunk of n samples; `t_ns` and `utc_ns` are those of its last one.
+
+    Attributes:
+        elements, channels, units: axes of `values`, SI.
+        seq: (n,) sequence numbers.
+        times_ns: (n,) the stream's time of each.
+        values: (n, element, channel); null where the element has no trustworthy value.
+    """
+
+    topic: ClassVar[str] = "samples"
+    elements: tuple[str, ...]
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    seq: list[int]
+    times_ns: list[int]
+    values: list[list[list[float] | None]]
+
+
+class StateMessage(_Message, frozen=True, tag="state", kw_only=True):
+    """Everything; see `snapshot.Snapshot`."""
+
+    topic: ClassVar[str] = "state"
+    snapshot: Snapshot
+
+
+Message: TypeAlias = (
+    ArrayMessage | ContactMessage | DecisionMessage | HealthMessage | SamplesMessage | StateMessage
+)
+
+_encoder = msgspec.json.Encoder()
+
+
+def encode(message: Message) -> bytes:
+    """One line of JSON, without the end of the line."""
+    return _encoder.encode(message)
+
+
+def topic_of(message: Message, prefix: str = "tactile") -> str:
+    """Where a message belongs: ``tactile/SOURCE/decision``, ``tactile/health``, ``tactile/state``.
+
+    Letters, digits and ``-._~`` of a source's name stay, all else is percent-encoded.
+    """
+    parts = [quote(message.source, safe="")] if isinstance(message, _FromSource) else []
+    return "/".join([prefix, *parts, message.topic])
+
+
+def state_message(snapshot: Snapshot) -> StateMessage:
+    """A snapshot as a message."""
+    return StateMessage(t_ns=snapshot.t_ns, utc_ns=snapshot.utc_ns, snapshot=snapshot)
+
+
+def message_of(item: Item) -> Message | None:
+    """What is published of an item; None: it is of no concern outside (`Closed` is told by an
+    `Event`, `Packet` and `Control` are not published)."""
+    if isinstance(item, Decision):
+        return _decision(item)
+    if isinstance(item, Samples):
+        return _samples(item)
+    if isinstance(item, Event):
+        utc_ns = item.t_ns + item.utc_offset_ns
+        return HealthMessage(
+            t_ns=item.t_ns, utc_ns=utc_ns, part=item.part, state=item.state, reason=item.reason,
+            level=item.level,
+        )  # fmt: skip
+    if isinstance(item, Contact):
+        return ContactMessage(
+            t_ns=item.t_ns, utc_ns=item.t_ns + item.utc_offset_ns, source=item.source,
+            frame=item.frame, model=item.model, touching=item.touching,
+        )  # fmt: skip
+    if isinstance(item, Opened):
+        return ArrayMessage(
+            t_ns=item.t_ns, utc_ns=item.t_ns + item.utc_offset_ns, source=item.source,
+            frame=item.spec.frame, url=item.url, array=msgspec.to_builtins(item.spec),
+        )  # fmt: skip
+    return None
+
+
+def _decision(item: Decision) -> DecisionMessage:
+    d = item.decision
+    return DecisionMessage(
+        t_ns=d.t_ns, utc_ns=d.t_ns + item.utc_offset_ns, source=item.source, frame=item.frame,
+        model=item.model, onset_ns=d.onset_ns, step=d.step, final=d.final, label=d.label,
+        probabilities={
+            label: round(p, DIGITS)
+            for label, p in zip(d.labels, d.probabilities.tolist(), strict=True)
+        },
+        model_ms=round(1e3 * d.latency_s, 3),
+        latency_ms=round((item.made_ns - item.sample_ns) / 1e6, 3),
+    )  # fmt: skip
+
+
+def _samples(item: Samples) -> SamplesMessage:
+    chunk, spec = item.chunk, item.spec
+    values: list[list[list[float] | None]] = chunk.values.tolist()
+    if not chunk.valid.all():
+        values = [
+            [cell if ok else None for cell, ok in zip(row, valid, strict=True)]
+            for row, valid in zip(values, chunk.valid.tolist(), strict=True)
+        ]
+    t_ns = int(chunk.t_ns[-1])
+    return SamplesMessage(
+        t_ns=t_ns, utc_ns=t_ns + item.utc_offset_ns, source=item.source, frame=spec.frame,
+        elements=spec.elements, channels=spec.channels, units=spec.units,
+        seq=chunk.seq.tolist(), times_ns=chunk.t_ns.tolist(), values=values,
+    )  # fmt: skip

@@ -1,0 +1,193 @@
+"""A classifier in a thread of its own, fed from a mailbox."""
+
+import hashlib
+import time
+from pathlib import Path
+
+import numpy as np
+
+from tactile_rt.classifier import Classification, Classifier
+from tactile_rt.daemon.clock import Clock
+from tactile_rt.daemon.config import LimitsConfig, ModelConfig
+from tactile_rt.daemon.hub import Hub
+from tactile_rt.daemon.items import Contact, Decision, Item, Opened, Samples
+from tactile_rt.daemon.latency import LatencyMeter
+from tactile_rt.daemon.mailbox import Mailbox
+from tactile_rt.daemon.part import Part, Report
+from tactile_rt.daemon.snapshot import ModelState
+from tactile_rt.daemon.source_part import device_of
+from tactile_rt.model_file import shipped_model
+from tactile_rt.stream import ConfigError, Source, TactileError, concatenate
+from tactile_rt.timebase import NS_PER_S
+
+__all__ = ["ModelPart", "file_stamp", "model_path"]
+
+MODEL_BYTES = 64 << 20
+APART_NS = 60 * NS_PER_S  # a sample's time further from its arrival is of another clock
+
+
+class ModelPart(Part):
+    """Posts `Decision` and `Contact` of one model."""
+
+    def __init__(
+        self, config: ModelConfig, hub: Hub, report: Report, limits: LimitsConfig, clock: Clock
+    ) -> None:
+        super().__init__(f"model.{config.name}", report, limits)
+        self.config = config
+        self.file = model_path(config)
+        self.box = Mailbox(
+            {Opened, Samples}, limits.model_queue_items, MODEL_BYTES, limits.gather_ms / 1e3,
+            source=config.source,
+        )  # fmt: skip
+        self._hub, self._clock = hub, clock
+        self._opened: Opened | None = None
+        self._classifier: Classifier | None = None
+        self._refused: tuple[object, TactileError] | None = None
+        self._half_ns = 0  # half the resampler's kernel
+        self._sha256 = ""
+        self._labels: tuple[str, ...] = ()
+        self._decisions = self._final = 0
+        self._newest: Classification | None = None
+        self._touching = False
+        self._latency, self._step = LatencyMeter(), LatencyMeter()
+
+    @property
+    def model_state(self) -> ModelState:
+        """For the snapshot."""
+        newest = self._newest
+        return ModelState(
+            self.state, self.config.source, str(self.file), self._sha256, self._labels,
+            self.box.state, self._decisions, self._final, self._touching,
+            newest.label if newest else "",
+            float(newest.probabilities.max()) if newest else 0.0,
+            self._latency.state, self._step.state,
+        )  # fmt: skip
+
+    def stop(self) -> None:
+        super().stop()
+        self.box.close()
+
+    def _work(self) -> None:
+        self._load()
+        self.box.taking = True
+        self._up()
+        while True:
+            items = self.box.take()
+            if not items and self.box.closed:
+                return
+            self._busy_ns = time.monotonic_ns()
+            try:
+                self._take(items)
+            finally:
+                self._busy_ns = 0
+
+    def _release(self) -> None:
+        self.box.taking = False
+        self._classifier = None
+        self._touch(False, time.monotonic_ns())
+
+    def _load(self) -> None:
+        """Make the classifier; without a source, at least see whether there is a model."""
+        self._opened = self._hub.streams().get(self.config.source)
+        if self._opened is not None:
+            self._make(self._opened)
+        elif not self.file.is_file():
+            raise ConfigError(f"no model file {self.file}")
+
+    def _make(self, opened: Opened) -> None:
+        # Anew for every stream: what was touched before need not be what is touched now.
+        self._classifier = None
+        tried = (opened.spec, file_stamp(self.file))
+        if self._refused is not None and self._refused[0] == tried:
+            raise self._refused[1]  # as long as nothing has changed, loading it again is in vain
+        self._refused = None
+        try:
+            self._classifier = Classifier(self.file, opened.spec)
+        except TactileError as error:
+            self._refused = (tried, error)
+            raise
+        self._opened = opened
+        self._labels = self._classifier.card.labels
+        self._sha256 = hashlib.sha256(self.file.read_bytes()).hexdigest()
+        card = self._classifier.card
+        self._half_ns = max(card.period_ns, round(NS_PER_S / opened.spec.rate_hz))
+
+    def _take(self, items: list[Item]) -> None:
+        run: list[Samples] = []
+        for item in items:
+            if isinstance(item, Samples):
+                run.append(item)
+            elif isinstance(item, Opened):
+                self._classify(run)
+                run = []
+                if self._opened is None or item.t_ns > self._opened.t_ns:
+                    self._make(item)
+        self._classify(run)
+
+    def _classify(self, run: list[Samples]) -> None:
+        opened, classifier = self._opened, self._classifier
+        # What is left of a stream before this one is of no use to its classifier.
+        run = [s for s in run if opened is not None and s.arrived_ns >= opened.t_ns]
+        if not run or classifier is None or opened is None:
+            return
+        chunk = concatenate([s.chunk for s in run]) if len(run) > 1 else run[0].chunk
+        decisions = classifier.push(chunk)
+        offset = run[-1].utc_offset_ns
+        frame = opened.spec.frame
+        for d in decisions:
+            made = time.monotonic_ns()
+            sample = self._completed(d, run, opened.stream)
+            self._newest = d
+            self._decisions += 1
+            self._final += d.final
+            self._latency.add((made - sample) / 1e9)
+            self._step.add(d.latency_s)
+            if d.final or self.config.decisions == "every_step":
+                self._hub.post(
+                    Decision(self.config.source, self.config.name, frame, d, sample, made, offset)
+                )
+        self._touch(classifier.detector.contact, int(chunk.t_ns[-1]), frame, offset)
+        if not opened.stream.live:
+            for box in self._hub.wanted(Decision):
+                box.wait_for_room(1.0)
+
+    def _completed(self, d: Classification, run: list[Samples], stream: Source) -> int:
+        """Host time of the sample that completed a step."""
+        end = d.t_ns + self._half_ns
+        for samples in run:
+            t_ns = samples.chunk.t_ns
+            if t_ns[-1] < end and samples is not run[-1]:
+                continue
+            arrived = samples.arrived_ns
+            if not stream.live or not _host_time(stream):
+                return arrived
+            taken = int(t_ns[min(int(np.searchsorted(t_ns, end)), len(t_ns) - 1)])
+            return taken if 0 <= arrived - taken < APART_NS else arrived
+        return run[-1].arrived_ns
+
+    def _touch(self, touching: bool, t_ns: int, frame: str = "", offset: int = 0) -> None:
+        if touching == self._touching:
+            return
+        self._touching = touching
+        if not frame and self._opened is not None:
+            frame, offset = self._opened.spec.frame, self._clock.utc_offset_ns()
+        self._hub.post(Contact(self.config.source, self.config.name, frame, touching, t_ns, offset))
+
+
+def _host_time(stream: Source) -> bool:
+    device = device_of(stream)
+    return device is None or device.options.clock == "host"
+
+
+def model_path(config: ModelConfig) -> Path:
+    """The model's file; that of the package if the configuration names none."""
+    return Path(config.file) if config.file else shipped_model()
+
+
+def file_stamp(file: Path) -> tuple[int, ...]:
+    """Changes when a file is replaced, written, or taken away."""
+    try:
+        found = file.stat()
+    except (OSError, ValueError):
+        return ()
+    return (found.st_mtime_ns, found.st_size, found.st_ino)

@@ -1,0 +1,1 @@
+"""Publishers: consumers that send `messages` to others."""

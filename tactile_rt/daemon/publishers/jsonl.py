@@ -1,0 +1,86 @@
+"""Messages as lines of JSON, on standard output or in a file."""
+
+import os
+import sys
+import time
+
+import msgspec
+
+from tactile_rt.daemon.consumer import Consumer, View
+from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Samples
+from tactile_rt.daemon.messages import Message, encode, message_of, state_message
+
+__all__ = ["JsonlOptions", "JsonlPublisher"]
+
+
+class JsonlOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of ``kind = "jsonl"``.
+
+    Attributes:
+        file: appended to; empty: standard output.
+        samples: whether samples are published, too.
+        state_s: a ``state`` message so often, s; 0: none.
+    """
+
+    file: str = ""
+    samples: bool = False
+    state_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.state_s <= 86400:
+            raise ValueError(f"state_s must be from 0 to 86400, not {self.state_s}")
+
+
+class JsonlPublisher(Consumer):
+    """Appends a line per message; a line that could not be written whole is not followed by
+    another in the same line."""
+
+    Options = JsonlOptions
+
+    def __init__(self, name: str, options: JsonlOptions) -> None:
+        self._options = options
+        wants = {Opened, Decision, Contact, Event}
+        self.wants = frozenset(wants | {Samples} if options.samples else wants)
+        self.tick_s = options.state_s
+        self._handle = -1
+        self._view: View | None = None
+        self._state_at = 0.0
+        self._lines = self._bytes = 0
+
+    def open(self, view: View) -> None:
+        self._view = view
+        if not self._options.file:
+            sys.stdout.flush()
+            self._handle = os.dup(sys.stdout.fileno())
+            return
+        flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+        self._handle = os.open(self._options.file, flags, 0o644)
+        size = os.fstat(self._handle).st_size
+        if size and os.pread(self._handle, 1, size - 1) != b"\n":  # a disk that was full
+            os.write(self._handle, b"\n")
+
+    def handle(self, items: list[Item]) -> None:
+        messages: list[Message] = [m for m in map(message_of, items) if m is not None]
+        now = time.monotonic()
+        if self._options.state_s and now >= self._state_at and self._view is not None:
+            self._state_at = now + self._options.state_s
+            messages.append(state_message(self._view.snapshot()))
+        if not messages:
+            return
+        data = memoryview(b"".join(encode(m) + b"\n" for m in messages))
+        self._bytes += len(data)
+        while data:
+            data = data[os.write(self._handle, data) :]
+        self._lines += len(messages)
+
+    def close(self) -> None:
+        handle, self._handle = self._handle, -1
+        if handle >= 0:
+            os.close(handle)
+
+    def details(self) -> dict[str, str | int | float]:
+        return {
+            "file": self._options.file or "standard output",
+            "messages": self._lines,
+            "bytes": self._bytes,
+        }

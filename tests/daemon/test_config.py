@@ -1,0 +1,298 @@
+"""Configurations: what is right is read whole, what is wrong is refused in one golden line."""
+
+import string
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tactile_rt.daemon.config import EXAMPLE, Config
+from tactile_rt.daemon.config_check import check_config, is_loopback
+from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.config_nodes import find_lines
+from tactile_rt.daemon.config_text import config_text
+from tactile_rt.stream import ConfigError
+
+DATA = Path(__file__).parent / "data"
+BROKEN = sorted(p.name for p in DATA.glob("*.toml"))
+SMALL = 'version = 1\n[[source]]\nname = "whiskers"\nurl = "synthetic:5x6"\n'
+
+
+def load(folder, text, *sets, name="robot.toml"):
+    file = folder / name
+    file.write_text(text)
+    return load_config(file, sets)
+
+
+def refused(folder, text, *sets):
+    with pytest.raises(ConfigError) as caught:
+        check_config(load(folder, text, *sets))
+    return str(caught.value).removeprefix(f"{folder}/")
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_a_broken_file_is_refused_by_its_golden_message(name, monkeypatch):
+    monkeypatch.chdir(DATA)
+    golden = (DATA / name).read_bytes().split(b"\n")[0].decode().removeprefix("# ")
+    with pytest.raises(ConfigError) as caught:
+        check_config(load_config(Path(name)))
+    assert str(caught.value).replace(str(DATA), "HERE") == golden
+    assert "\n" not in golden
+
+
+def test_the_corpus_is_all_there():
+    assert len(BROKEN) >= 76
+
+
+def test_a_file_that_is_not_there_or_empty_or_a_folder(tmp_path):
+    with pytest.raises(ConfigError, match="cannot be read: No such file"):
+        load_config(tmp_path / "gone.toml")
+    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
+        load_config(tmp_path)
+    with pytest.raises(ConfigError, match="no version"):
+        load(tmp_path, "")
+    with pytest.raises(ConfigError, match="larger than 1 MB"):
+        load(tmp_path, "#" * (1 << 20) + "\n")
+
+
+def test_the_example_is_right_and_shows_the_defaults(tmp_path):
+    loaded = load(tmp_path, EXAMPLE)
+    check_config(loaded)
+    # What is commented out is as right as what is not.
+    named = ("extends", "calibration", "file")  # of files that are not there
+    lines = [line.removeprefix("# ") for line in EXAMPLE.splitlines()[2:]]
+    whole = "\n".join(line for line in lines if not line.startswith(named))
+    full = load(tmp_path, whole)
+    assert full.config.model[0].source == "whiskers"
+    for table in ("recorder", "page", "metrics", "log", "limits"):
+        shown = getattr(full.config, table)
+        needed = {"folder": shown.folder} if table == "recorder" else {}
+        assert shown == type(shown)(**needed), f"{table}: the example does not show the defaults"
+
+
+def test_names_that_are_left_out_are_filled_in(tmp_path):
+    config = load(
+        tmp_path, SMALL + '[[model]]\n[[model]]\n[[publisher]]\nkind="jsonl"\n' * 1 +
+        '[[publisher]]\nkind="jsonl"\n',
+    ).config  # fmt: skip
+    assert [m.name for m in config.model] == ["whiskers", "whiskers-2"]
+    assert [m.source for m in config.model] == ["whiskers", "whiskers"]
+    assert [p.name for p in config.publisher] == ["jsonl", "jsonl-2"]
+
+
+def test_paths_are_meant_from_the_folder_of_the_file_that_they_stand_in(tmp_path, monkeypatch):
+    (tmp_path / "base").mkdir()
+    (tmp_path / "base" / "cell.toml").write_text("")
+    (tmp_path / "base" / "base.toml").write_text(
+        SMALL
+        + 'calibration = "cell.toml"\n[recorder]\nfolder = "rec"\n[[model]]\nfile = "m.onnx"\n'
+    )
+    monkeypatch.chdir(tmp_path / "base")
+    config = load(
+        tmp_path,
+        'version = 1\nextends = "base/base.toml"\n[log]\nfile = "log.txt"\n'
+        '[[source]]\nname = "old"\nurl = "replay:run.mcap?speed=0"\n[[publisher]]\nkind = "jsonl"\n'
+        'options = { file = "out.jsonl" }\n',
+        "model.0.source=whiskers",
+        "recorder.folder=set",
+    ).config
+    assert config.source[0].calibration == f"{tmp_path}/base/cell.toml"
+    assert config.model[0].file == f"{tmp_path}/base/m.onnx"
+    assert config.log.file == f"{tmp_path}/log.txt"
+    assert config.source[1].url == f"replay:{tmp_path}/run.mcap?speed=0"
+    assert config.publisher[0].options == {"file": f"{tmp_path}/out.jsonl"}
+    assert config.recorder.folder == f"{tmp_path}/base/set"  # of the command line: from here
+
+
+def test_a_calibration_that_is_no_file_is_a_devices_name(tmp_path):
+    assert (
+        load(tmp_path, SMALL + 'calibration = "cell-3"\n').config.source[0].calibration == "cell-3"
+    )
+
+
+def test_extends_adds_and_overrides_by_name(tmp_path):
+    (tmp_path / "base.toml").write_text(
+        SMALL + '[[source]]\nname = "b"\nurl = "synthetic:1x1"\n[page]\nport = 1\ncontrol = true\n'
+    )
+    config = load(
+        tmp_path,
+        'version = 1\nextends = "base.toml"\n[[source]]\nname = "b"\nurl = "synthetic:2x2"\n'
+        '[[source]]\nname = "c"\nurl = "synthetic:3x3"\n[page]\nport = 2\n',
+    ).config
+    assert [(s.name, s.url[-3:]) for s in config.source] == [
+        ("whiskers", "5x6"),
+        ("b", "2x2"),
+        ("c", "3x3"),
+    ]
+    assert (config.page.port, config.page.control) == (2, True)
+
+
+def test_what_is_wrong_is_told_where_it_stands_also_in_the_base(tmp_path):
+    (tmp_path / "base.toml").write_text("\n\n[page]\nport = 0\n")
+    text = SMALL + "[page]\nhost = '::1'\n"
+    assert refused(tmp_path, 'extends = "base.toml"\n' + text).endswith(
+        "base.toml:4: page.port: expected a whole number >= 1, got 0"
+    )
+
+
+def test_settings_reach_every_key(tmp_path):
+    loaded = load(
+        tmp_path,
+        SMALL + '[[publisher]]\nkind = "jsonl"\n',
+        "source.whiskers.url=synthetic:35x6?seed=3",
+        "page.port=9000",
+        "page.token=1234567890123456",  # text, though it looks like a number
+        "publisher.jsonl.options.state_s=2",
+        "log.level=error",
+        "limits.stop_s=1.5",
+    )
+    config = loaded.config
+    assert config.source[0].url == "synthetic:35x6?seed=3"
+    assert (config.page.port, config.page.token) == (9000, "1234567890123456")
+    assert config.publisher[0].options == {"state_s": 2}
+    assert (config.log.level, config.limits.stop_s) == ("error", 1.5)
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        ("page.port", "--set page.port: a setting is KEY=VALUE, e.g. page.port=9000"),
+        ("page..port=1", "--set page..port=1: a setting is KEY=VALUE, e.g. page.port=9000"),
+        (
+            "source.wiskers.url=x",
+            "--set source.wiskers.url=x: no source 'wiskers'; did you mean whiskers?",
+        ),
+        ("page.prot=1", "--set page.prot=1: page has no key 'prot'; did you mean port?"),
+        ("page.port=x", "--set page.port=x: page.port: expected a whole number, got 'x'"),
+        ("version.a=1", "--set version.a=1: version has a value, not keys"),
+        (
+            "source.whiskers=1",
+            "--set source.whiskers=1: source[0] is a table: say which key of it",
+        ),
+        ("version=2", "--set version=2: version 2; this release reads 1"),
+    ],
+)
+def test_a_wrong_setting_is_refused(tmp_path, setting, message):
+    assert refused(tmp_path, SMALL, setting) == message
+
+
+def test_what_is_shown_says_the_same_but_for_secrets(tmp_path):
+    loaded = load(
+        tmp_path,
+        SMALL + '[[publisher]]\nkind = "jsonl"\noptions = { file = "a \\"b\\"\\u007f.jsonl" }\n'
+        '[recorder]\nfolder = "r"\nrotate_s = 1e5\n[page]\ntoken = "0123456789abcdef"\n[[model]]\n',
+    )
+    shown = config_text(loaded.config)
+    assert "0123456789abcdef" not in shown and 'token = "***"' in shown
+    again = load(tmp_path, shown, "page.token=0123456789abcdef", name="again.toml")
+    assert again.config == loaded.config
+    assert again.sha256 == loaded.sha256
+
+
+def test_lines_are_found_in_a_file_that_makes_it_hard():
+    text = (
+        'a = 1\n"b c".d = [ # [x]\n  "]", \'"\',\n]\n[t]\nx = """\n[no]\ny = 1 \\"""\n"""\n'
+        "z = {k = ']'}\n[[l]]\n[[l.m]]\nq=1\n[[l.m]]\nq = 2\n[l.n]\nr = 1\n[[l]]\n"
+    )
+    lines = find_lines(text)
+    assert lines[("a",)] == 1 and lines[("b c", "d")] == 2
+    assert lines[("t",)] == 5 and lines[("t", "x")] == 6 and lines[("t", "z")] == 10
+    assert lines[("l", 0)] == 11 and lines[("l", 0, "m", 0, "q")] == 13
+    assert lines[("l", 0, "m", 1, "q")] == 15 and lines[("l", 0, "n", "r")] == 17
+    assert lines[("l", 1)] == 18
+    assert not any("no" in path or "y" in path for path in lines)
+
+
+@pytest.mark.parametrize(
+    ("host", "is_one"),
+    [("127.0.0.1", True), ("127.1.2.3", True), ("::1", True), ("[::1]", True),
+     ("localhost", True), ("0.0.0.0", False), ("::", False), ("robot", False), ("", False)],
+)  # fmt: skip
+def test_loopback(host, is_one):
+    assert is_loopback(host) == is_one
+
+
+def tables(of=Config):
+    """TOML text of tables with right and wrong keys and values."""
+    tables = ("source", "model", "publisher", "recorder", "page", "metrics", "log", "limits", "x")
+    keys = (
+        "version extends name url calibration file source decisions kind options folder rotate_mb "
+        "rotate_s min_free_mb mode before_s after_s host port token control level format repeat_s "
+        "queue_items queue_mb gather_ms stop_s stall_s retry_first_s samples state_s a.b 'c'"
+    ).split()
+    text = st.text(st.characters(blacklist_categories=("Cs",)), max_size=12).map(quoted)
+    value = st.recursive(
+        st.one_of(
+            st.integers(-(10**25), 10**25).map(str),
+            st.floats().map(repr),
+            st.sampled_from(
+                ["true", "false", '"synthetic:5x6"', '"serial:/dev/null?codec=native"', '"jsonl"',
+                 '"always"', '"robot.toml"', '"~nobody/x"', "1979-05-27", "07:32:00", '"\\u0000"',
+                 '"whiskers"', "0x10", "1_000", '"replay:x?%00=1"', '"can:slcan:?codec=native"']
+            ),
+            text,
+        ),
+        lambda inner: st.one_of(
+            st.lists(inner, max_size=3).map(lambda xs: f"[{', '.join(xs)}]"),
+            st.dictionaries(st.sampled_from(keys[:-2]), inner, max_size=3).map(
+                lambda d: "{" + ", ".join(f"{k} = {v}" for k, v in d.items()) + "}"
+            ),
+        ),
+        max_leaves=4,
+    )  # fmt: skip
+    pairs = st.dictionaries(st.sampled_from(keys), value, max_size=4).map(
+        lambda d: "".join(f"{k} = {v}\n" for k, v in d.items())
+    )
+    header = st.sampled_from([f"[{t}]\n" for t in tables] + [f"[[{t}]]\n" for t in tables])
+    return st.tuples(
+        st.sampled_from(["version = 1\n", SMALL, ""]),
+        st.lists(st.tuples(header, pairs).map("".join), max_size=4).map("".join),
+    ).map("".join)
+
+
+def quoted(text):
+    import json
+
+    return json.dumps(text).replace("\x7f", "\\u007f")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@settings(max_examples=400)
+@given(
+    text=tables(),
+    sets=st.lists(
+        st.tuples(
+            st.sampled_from(
+                ["page.port", "source.whiskers.url", "source.0.name", "a.b.c", "version", "source",
+                 "log.level", "model.x.y", "", ".", "publisher.jsonl.options", "extends"]
+            ),
+            st.text(string.printable, max_size=8),
+        ).map("=".join),
+        max_size=2,
+    ),
+)  # fmt: skip
+def test_no_configuration_raises_anything_but_a_clear_error(folder, text, sets):
+    try:
+        loaded = load(folder, text, *sets)
+        check_config(loaded)
+    except ConfigError as error:
+        assert str(error) and "Traceback" not in str(error)
+    else:
+        assert load(folder, config_text(loaded.config)).config.source == loaded.config.source
+
+
+@settings(max_examples=300)
+@given(data=st.binary(max_size=60), at=st.integers(0, len(EXAMPLE)), cut=st.integers(0, 40))
+def test_no_damage_to_a_file_raises_anything_but_a_clear_error(folder, data, at, cut):
+    file = folder / "damaged.toml"
+    whole = EXAMPLE.replace("# ", "").encode()
+    file.write_bytes(whole[:at] + data + whole[at + cut :])
+    try:
+        check_config(load_config(file))
+    except ConfigError as error:
+        assert str(error)

@@ -1,0 +1,456 @@
+"""The daemon as a whole, on real lines: arrays on ptys, models, consumers, and what goes wrong."""
+
+import json
+import shutil
+import threading
+import time
+
+import numpy as np
+import pytest
+from tiny_model import write_model
+
+from tactile_rt.classifier import Classifier
+from tactile_rt.daemon import consumers
+from tactile_rt.daemon.clock import Clock
+from tactile_rt.daemon.config_check import check_config
+from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.consumer import Consumer
+from tactile_rt.daemon.daemon import Daemon
+from tactile_rt.daemon.items import (
+    Closed,
+    Contact,
+    Control,
+    Decision,
+    Event,
+    Opened,
+    Packet,
+    Samples,
+)
+from tactile_rt.daemon.lock import AlreadyRunning, Locks
+from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
+from tactile_rt.stream import ConfigError, SourceError
+from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
+
+SPEC = small_spec()
+PATIENCE_S = 30.0
+
+pytestmark = pytest.mark.usefixtures("no_thread_left")
+
+
+def touching(n=4000, seed=0):
+    """(n, 3, 2): rest for half a second, then a touch every second."""
+    t = np.arange(n) / 1000.0
+    noise = np.random.default_rng(seed).normal(scale=1e-4, size=(n, 3, 2))
+    on = (t > 0.5) & (t % 1.0 < 0.4)
+    return (noise + 0.5 * on[:, None, None]).astype(np.float32)
+
+
+def until(condition):
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+class Spy(Consumer):
+    """Keeps all that it is given; does as the test says."""
+
+    made: list["Spy"] = []  # noqa: RUF012
+    wants = frozenset({Opened, Closed, Samples, Packet, Decision, Contact, Event, Control})
+
+    def __init__(self, name, options):
+        self.items, self.log = [], []
+        self.opening = self.handling = lambda: None
+        self.view = None
+        type(self).made.append(self)
+
+    def open(self, view):
+        self.log.append("open")
+        self.view = view
+        self.opening()
+
+    def handle(self, items):
+        self.handling()
+        self.items += items
+
+    def close(self):
+        self.log.append("close")
+
+    def of(self, kind, source=None):
+        found = [i for i in list(self.items) if isinstance(i, kind)]
+        return found if source is None else [i for i in found if i.source == source]
+
+    def told(self, part, state):
+        return [e for e in self.of(Event) if (e.part, e.state) == (part, state)]
+
+
+@pytest.fixture
+def spy(monkeypatch):
+    monkeypatch.setitem(consumers.PUBLISHERS, "spy", (f"{__name__}:Spy", ""))
+    Spy.made.clear()
+    return Spy.made
+
+
+@pytest.fixture
+def robot(tmp_path, spy):
+    """A daemon on a configuration; `robot(text)` starts it and gives (daemon, spy)."""
+    running = []
+
+    def start(text, **options):
+        daemon = Daemon(configured(tmp_path, text), **options)
+        running.append(daemon)
+        daemon.start()
+        return daemon, spy[-1]
+
+    yield start
+    for daemon in running:
+        assert daemon.stop() == []
+
+
+def configured(folder, text, checked=True):
+    file = folder / "robot.toml"
+    file.write_text(
+        'version = 1\n[[publisher]]\nkind = "spy"\n[limits]\nretry_first_s = 0.02\n'
+        f'retry_last_s = 0.1\n[log]\nfile = "log"\n{text}'
+    )
+    loaded = load_config(file)
+    if checked:
+        count = len(Spy.made)
+        check_config(loaded)
+        del Spy.made[count:]  # those that were made to see whether they can be
+    return loaded
+
+
+def source(name, url):
+    return f'[[source]]\nname = "{name}"\nurl = "{url}"\n'
+
+
+def state_of(daemon, name):
+    snapshot = daemon.snapshot()
+    parts = [s.part for s in (*snapshot.sources, *snapshot.models, *snapshot.consumers)]
+    return next(p for p in parts if p.name == name)
+
+
+def seqs(spy, name):
+    found = [i.chunk.seq for i in spy.of(Samples, name)]
+    return np.concatenate(found) if found else np.zeros(0, int)
+
+
+def test_two_arrays_and_three_models_on_ptys_lose_nothing(robot, tmp_path):
+    model = write_model(tmp_path / "m.onnx")
+    with (
+        FakeSerial(touching(2000), spec=SPEC) as left,
+        FakeSerial(touching(2000, 1), spec=small_spec()) as right,
+    ):
+        daemon, spy = robot(
+            source("left", left.url)
+            + source("right", right.url)
+            + f'[[model]]\nsource = "left"\nfile = "{model}"\n'
+            f'[[model]]\nsource = "right"\nfile = "{model}"\n'
+            f'[[model]]\nsource = "right"\nname = "last"\nfile = "{model}"\ndecisions = "final"\n'
+        )
+        assert left.wait(PATIENCE_S) and right.wait(PATIENCE_S)
+        until(lambda: all(len(seqs(spy, n)) == 2000 for n in ("left", "right")))
+        until(lambda: daemon.snapshot().state == "running")
+        until(lambda: all(m.queue.taken["samples"] == 2000 for m in daemon.snapshot().models))
+        snapshot = daemon.snapshot()
+    for name in ("left", "right"):
+        assert np.array_equal(seqs(spy, name), np.arange(2000))
+        assert len(spy.of(Opened, name)) == 1
+        # Packets hold the whole stream as it came, beginning where the line was opened.
+        packets = [p.packet for p in spy.of(Packet, name)]
+        assert packets[0] is None and sum(map(len, packets[1:])) > 2000 * 3 * 2 * 4
+    states = {s.part.name: s for s in snapshot.sources}
+    assert states["source.left"].stats.delivered == states["source.left"].samples == 2000
+    assert states["source.right"].frame == "mount" and states["source.right"].device is not None
+    first, second, final = snapshot.models
+    assert (first.part.name, second.part.name, final.part.name) == (
+        "model.left", "model.right", "model.last",
+    )  # fmt: skip
+    made = spy.of(Decision)
+    assert {d.model for d in made} == {"left", "right", "last"}
+    assert all(d.decision.final for d in made if d.model == "last")
+    assert first.decisions == sum(d.model == "left" for d in made) == first.latency.count
+    assert final.final == sum(d.model == "last" for d in made) == second.final
+    assert all(d.sample_ns <= d.made_ns and d.frame == "mount" for d in made)
+    published = next(c for c in snapshot.consumers if c.kind == "spy")
+    assert published.latency.count == len(made) and published.queue.dropped["samples"] == 0
+    contacts = [(c.source, c.touching) for c in spy.of(Contact) if c.model == "left"]
+    assert contacts[:2] == [("left", True), ("left", False)]
+
+
+def test_every_sample_is_accounted_for_through_faults(robot, tmp_path):
+    """From the wire to each consumer: what was sent came, or was counted where it was lost."""
+    model = write_model(tmp_path / "m.onnx")
+    kinds = ("bit_flip", "truncate", "duplicate", "drop", "burst")
+    faults = FaultSchedule([Fault(kind, rate=4.0) for kind in kinds], seed=1)
+    with (
+        FakeSerial(touching(6000), spec=SPEC, faults=faults, pace="fast") as fake,
+        FakeSerial(touching(1000), spec=SPEC) as calm,
+    ):
+        daemon, spy = robot(
+            source("a", fake.url)
+            + source("calm", calm.url)
+            + f'[[model]]\nsource = "a"\nfile = "{model}"\n'
+        )
+        assert fake.wait(PATIENCE_S) and calm.wait(PATIENCE_S)
+        until(lambda: len(seqs(spy, "calm")) == 1000)
+        until(lambda: not any(daemon.snapshot().models[0].queue.waiting.values()))
+        log, snapshot = fake.emulator.log, daemon.snapshot()
+    stats = snapshot.sources[0].stats
+    assert log.sent == 6000 and stats.corrupt > 10 and stats.missing > 5 and stats.duplicates > 5
+    received = stats.delivered + stats.corrupt + stats.missing + stats.dropped
+    assert log.sent + log.duplicated == received + stats.duplicates
+    queue = snapshot.models[0].queue
+    assert queue.put["samples"] == stats.delivered == snapshot.sources[0].samples
+    assert queue.put["samples"] == queue.taken["samples"] + queue.dropped["samples"]
+    box = daemon._consumers["publisher.spy"][1].box.state
+    assert len(seqs(spy, "a")) + len(seqs(spy, "calm")) == box.taken["samples"]
+    assert box.put["samples"] == stats.delivered + 1000
+    calm_stats = snapshot.sources[1].stats
+    assert (calm_stats.delivered, calm_stats.missing, calm_stats.corrupt) == (1000, 0, 0)
+
+
+def test_decisions_are_those_of_the_classifier_alone(robot, tmp_path, monkeypatch):
+    model = write_model(tmp_path / "m.onnx")
+    chunks = cut(touching(3000), SPEC.rate_hz, samples=7)
+    alone = Classifier(model, SPEC)
+    expected = [d for chunk in chunks for d in alone.push(chunk)]
+    monkeypatch.setattr(
+        "tactile_rt.daemon.source_part.open_source", lambda url: ArraySource(SPEC, chunks)
+    )
+    over = threading.Event()
+    daemon, spy = robot(
+        source("a", "synthetic:") + f'[[model]]\nfile = "{model}"\n', on_over=over.set
+    )
+    assert over.wait(PATIENCE_S)
+    daemon.stop()
+    found = [d.decision for d in spy.of(Decision)]
+    assert [(d.t_ns, d.onset_ns, d.step, d.final, d.label) for d in found] == [
+        (d.t_ns, d.onset_ns, d.step, d.final, d.label) for d in expected
+    ]
+    assert all(
+        np.array_equal(a.probabilities, b.probabilities)
+        for a, b in zip(found, expected, strict=True)
+    )
+    assert len(found) > 4 and len(seqs(spy, "a")) == 3000
+    assert spy.log == ["open", "close"] and isinstance(spy.items[-1], Event)
+
+
+def test_a_device_that_goes_and_comes_is_told_and_the_other_goes_on(robot, tmp_path):
+    link = str(tmp_path / "tty")
+    with (
+        FakeSerial(touching(60_000), spec=SPEC, link=link) as goes,
+        FakeSerial(touching(60_000), spec=SPEC) as stays,
+    ):
+        daemon, spy = robot(source("goes", goes.url) + source("stays", stays.url))
+        until(lambda: len(seqs(spy, "goes")) > 50)
+        goes.unplug()
+        until(lambda: spy.told("source.goes", "device:lost"))
+        until(lambda: spy.told("daemon", "degraded"))
+        assert daemon.snapshot().state == "degraded"
+        assert "source.goes: the device is lost" in daemon.snapshot().degraded[0]
+        before = len(seqs(spy, "stays"))
+        until(lambda: len(seqs(spy, "stays")) > before + 100)
+        goes.replug()
+        until(lambda: len(spy.told("source.goes", "device:streaming")) > 1)
+        until(lambda: daemon.snapshot().state == "running")
+    kept = seqs(spy, "stays")
+    assert np.array_equal(kept, kept[0] + np.arange(len(kept)))
+    assert len(spy.of(Opened, "goes")) == 1  # the same stream goes on
+
+
+def test_a_source_that_breaks_is_opened_again_and_its_counts_add_up(robot, monkeypatch):
+    opened = []
+
+    class Breaking(ArraySource):
+        def read(self, timeout=None):
+            if not self._left:
+                raise SourceError("the cable is loose")
+            return super().read(timeout)
+
+    def open_it(url):
+        if len(opened) == 3:
+            raise SourceError("no such port")
+        opened.append(Breaking(SPEC, cut(touching(100), 1000.0)))
+        return opened[-1]
+
+    monkeypatch.setattr("tactile_rt.daemon.source_part.open_source", open_it)
+    daemon, spy = robot(source("a", "synthetic:"))
+    until(lambda: state_of(daemon, "source.a").failures > 4)
+    state = daemon.snapshot().sources[0]
+    assert state.samples == state.stats.delivered == 300 == len(seqs(spy, "a"))
+    assert len(spy.of(Opened)) == len(spy.of(Closed)) == 3
+    reasons = [e.reason for e in spy.told("source.a", "waiting")]
+    assert reasons[:4] == ["the cable is loose"] * 3 + ["no such port"]
+    assert "no samples: source.a fails: no such port" in daemon.snapshot().degraded
+
+
+def test_without_a_model_all_else_goes_on_and_it_comes_back(robot, tmp_path):
+    model = write_model(tmp_path / "m.onnx")
+    good = model.read_bytes()
+    with FakeSerial(touching(60_000), spec=SPEC) as device:
+        loaded = source("a", device.url) + f'[[model]]\nfile = "{model}"\n'
+        daemon, spy = robot(loaded)
+        until(lambda: spy.of(Decision))
+        shutil.copy(model, tmp_path / "keep.onnx")
+        model.write_bytes(b"garbage")
+        # The file is read again only when it is asked to: a running model keeps running.
+        until(lambda: daemon.snapshot().models[0].decisions > 6)
+        with pytest.raises(ConfigError, match=r"model\[0\].file: .* is not a readable ONNX model"):
+            configured(tmp_path, loaded)
+        # Taken all the same, it is the model alone that fails.
+        daemon.reload(configured(tmp_path, loaded, checked=False))
+        until(lambda: state_of(daemon, "model.a").failures > 2)
+        assert any(
+            line.startswith("no decisions: model.a fails:") and "acquisition goes on" in line
+            for line in daemon.snapshot().degraded
+        )
+        before = len(seqs(spy, "a"))
+        until(lambda: len(seqs(spy, "a")) > before + 200)
+        model.write_bytes(good)
+        until(lambda: state_of(daemon, "model.a").state == "running")
+        count = daemon.snapshot().models[0].decisions
+        until(lambda: daemon.snapshot().models[0].decisions > count)
+        kept = seqs(spy, "a")
+        assert np.array_equal(kept, kept[0] + np.arange(len(kept)))
+
+
+def test_a_consumer_that_breaks_or_hangs_harms_itself_alone(robot, tmp_path):
+    with FakeSerial(touching(60_000), spec=SPEC) as device:
+        daemon, spy = robot(
+            source("a", device.url) + '[[publisher]]\nkind = "jsonl"\noptions = {file = "out"}\n'
+        )
+        until(lambda: len(spy.items) > 10)
+
+        def fail():
+            raise ConnectionRefusedError(111, "Connection refused", "tcp://peer")
+
+        spy.handling = fail
+        until(lambda: state_of(daemon, "publisher.spy").failures > 3)
+        assert any("not published: publisher.spy fails" in x for x in daemon.snapshot().degraded)
+        spy.handling = lambda: None
+        until(lambda: state_of(daemon, "publisher.spy").state == "running")
+        assert spy.log.count("open") == spy.log.count("close") + 1
+        hangs = threading.Event()
+        part = daemon._consumers["publisher.spy"][1]
+        part.limits = type(part.limits)(stall_s=0.5)
+        spy.handling = lambda: hangs.wait(PATIENCE_S)
+        until(lambda: state_of(daemon, "publisher.spy").state == "stalled")
+        before = daemon.snapshot().sources[0].samples
+        until(lambda: daemon.snapshot().sources[0].samples > before + 200)
+        spy.handling = lambda: None
+        hangs.set()
+        until(lambda: state_of(daemon, "publisher.spy").state == "running")
+        queue = part.box.state
+    for kind in queue.put:
+        assert queue.put[kind] == queue.taken[kind] + queue.dropped[kind] + queue.waiting[kind]
+    events = [json.loads(line) for line in (tmp_path / "out").read_text().splitlines()]
+    told = [e for e in events if e["type"] == "health" and e["part"] == "publisher.spy"]
+    assert "tcp://peer: Connection refused" in {e["reason"] for e in told}
+    assert {"stalled", "waiting", "running"} <= {e["state"] for e in told}
+
+
+def test_a_reload_disturbs_only_what_has_changed(robot, tmp_path, spy):
+    model = write_model(tmp_path / "m.onnx")
+    with FakeSerial(touching(60_000), spec=SPEC) as device:
+        base = source("a", device.url) + f'[[model]]\nsource = "a"\nfile = "{model}"\n'
+        daemon, first = robot(base)
+        until(lambda: first.of(Decision))
+        models = daemon.snapshot().models[0]
+        daemon.reload(
+            configured(
+                tmp_path,
+                base + source("b", "synthetic:1x1") + '[[publisher]]\nkind = "jsonl"\n'
+                'options = {file = "out"}\n',
+            )
+        )
+        assert len(spy) == 1  # what goes on is not made again
+        until(lambda: first.of(Samples, "b"))
+        until(lambda: '"source":"b"' in (tmp_path / "out").read_text())
+        snapshot = daemon.snapshot()
+        assert snapshot.reloads == 1 and first.told("daemon", "reloaded")
+        assert [s.part.starts for s in snapshot.sources] == [1, 1]
+        assert snapshot.models[0].part.since_ns == models.part.since_ns
+        assert snapshot.models[0].decisions >= models.decisions
+        daemon.reload(configured(tmp_path, base))
+        assert len(daemon.snapshot().sources) == 1 and len(daemon.snapshot().consumers) == 2
+        until(lambda: first.of(Closed, "b"))
+        with pytest.raises(ConfigError):
+            configured(tmp_path, base + source("a", "synthetic:"))
+        before = len(seqs(first, "a"))
+        until(lambda: len(seqs(first, "a")) > before + 100)
+        kept = seqs(first, "a")
+        assert np.array_equal(kept, kept[0] + np.arange(len(kept)))
+        assert first.log == ["open"]
+
+
+def test_a_reload_that_needs_a_device_of_another_process_changes_nothing(robot, tmp_path):
+    folder = tmp_path / "locks"
+    folder.mkdir()
+    base = source("a", "synthetic:")
+    daemon, _ = robot(base, locks=Locks(folder))
+    other = Locks(folder)
+    other.hold(["device /dev/null"])
+    with pytest.raises(AlreadyRunning):
+        daemon.reload(configured(tmp_path, base + source("b", "serial:/dev/null?codec=bota")))
+    assert [s.part.name for s in daemon.snapshot().sources] == ["source.a"]
+    with pytest.raises(AlreadyRunning, match="configuration"):
+        other.hold([f"configuration {tmp_path}/robot.toml"])
+    other.close()
+
+
+def test_closing_drains_what_waits(robot, tmp_path):
+    daemon, spy = robot(source("a", "synthetic:35x6"))
+    until(lambda: len(spy.of(Samples)) > 3)
+    hold = threading.Event()
+    spy.handling = lambda: hold.wait(0.3)
+    until(lambda: daemon._consumers["publisher.spy"][1].box.state.waiting["samples"] > 20)
+    assert daemon.stop() == []
+    queue = daemon.snapshot().consumers[1].queue
+    assert queue.waiting["samples"] == queue.dropped["samples"] == 0
+    assert len(seqs(spy, "a")) == daemon.snapshot().sources[0].samples
+    log = (tmp_path / "log").read_text()
+    assert log.index("daemon stopping") < log.index("source.a stopped")
+
+
+def test_what_hangs_at_the_end_is_named_and_left_behind(tmp_path, spy):
+    hangs = threading.Event()
+    daemon = Daemon(configured(tmp_path, source("a", "synthetic:")))
+    daemon.start()
+    until(lambda: spy[-1].items)
+    spy[-1].handling = lambda: hangs.wait(PATIENCE_S)
+    until(lambda: daemon._consumers["publisher.spy"][1].state.state == "running")
+    time.sleep(0.1)  # until it is in that call
+    assert daemon.stop() == ["publisher.spy"]
+    assert "publisher.spy abandoned: it did not end in time" in (tmp_path / "log").read_text()
+    hangs.set()
+    assert daemon._consumers["publisher.spy"][1].join(time.monotonic() + PATIENCE_S)
+
+
+def test_the_wall_clock_may_jump(robot):
+    class Stepped(Clock):
+        by = 0
+
+        def utc_ns(self):
+            return time.time_ns() + self.by
+
+    clock = Stepped()
+    daemon, spy = robot(source("a", "synthetic:"), clock=clock)
+    until(lambda: len(spy.of(Samples)) > 3)
+    clock.by = 3600 * 10**9
+    until(lambda: spy.told("daemon", "clock"))
+    assert spy.told("daemon", "clock")[0].reason.startswith("the wall clock jumped by +3600.")
+    until(lambda: spy.of(Samples)[-1].utc_offset_ns - spy.of(Samples)[0].utc_offset_ns > 3599e9)
+    assert daemon.snapshot().clock_steps == 1
+    t_ns = np.concatenate([s.chunk.t_ns for s in spy.of(Samples)])
+    assert (np.diff(t_ns) > 0).all()
+
+
+def test_a_consumer_can_ask_something_of_another(robot, spy):
+    daemon, _ = robot(source("a", "synthetic:"))
+    assert daemon.send("publisher.spy", Control("rotate"))
+    assert not daemon.send("recorder", Control("rotate"))
+    assert not daemon.send("log", Control("rotate"))
+    until(lambda: spy[-1].of(Control))
+    assert "synthetic:" in daemon.config_text() and "a" in daemon.streams()

@@ -1,0 +1,425 @@
+"""What the daemon is made of, each piece alone."""
+
+import json
+import math
+import subprocess
+import sys
+import threading
+import time
+import types
+
+import numpy as np
+import pytest
+
+from tactile_rt.classifier import Classification
+from tactile_rt.daemon import mailbox as mailbox_module
+from tactile_rt.daemon.clock import Clock
+from tactile_rt.daemon.config import LimitsConfig, LogConfig
+from tactile_rt.daemon.hub import Hub
+from tactile_rt.daemon.items import (
+    Closed,
+    Contact,
+    Control,
+    Decision,
+    Event,
+    Opened,
+    Packet,
+    Samples,
+)
+from tactile_rt.daemon.latency import EDGES_S, LatencyMeter
+from tactile_rt.daemon.lock import AlreadyRunning, Locks, lock_keys
+from tactile_rt.daemon.log import Log
+from tactile_rt.daemon.mailbox import Mailbox
+from tactile_rt.daemon.messages import encode, message_of, topic_of
+from tactile_rt.daemon.part import Part, reason_of
+from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.testing import ArraySource, cut, small_spec
+
+SPEC = small_spec()
+PATIENCE_S = 20.0
+OFFSET_NS = 1_700_000_000_000_000_000
+
+pytestmark = pytest.mark.usefixtures("no_thread_left")
+
+
+def samples(n=1, source="a", seq=0):
+    chunk = cut(np.arange(n * 6).reshape(n, 3, 2), 1000.0, samples=n)[0]
+    chunk = Chunk(chunk.seq + seq, chunk.t_ns, chunk.values, chunk.valid)
+    return Samples(source, SPEC, chunk, 5, OFFSET_NS)
+
+
+def event(reason="", part="source.a", state="waiting", level="warning"):
+    return Event(part, state, reason, level, 1_500_000_000, OFFSET_NS)
+
+
+def decision():
+    d = Classification(10, 20, 3, True, "y", ("x", "y"), np.array([0.25, 0.75], np.float32), 0.0012)
+    return Decision("a", "m", "mount", d, 1_000_000, 3_500_000, OFFSET_NS)
+
+
+def until(condition):
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+# mailbox
+
+
+def test_a_mailbox_drops_the_oldest_and_counts_them():
+    box = Mailbox({Samples, Event}, items=4, size=1 << 20)
+    for seq in range(10):
+        box.put(samples(3, seq=seq))
+    box.put(event())
+    assert box.state.dropped == {"samples": 21, "packets": 0, "decisions": 0, "events": 0}
+    assert box.state.waiting["samples"] == 9 and box.state.waiting["events"] == 1
+    items = box.take()
+    assert [i.chunk.seq[0] for i in items[:3]] == [7, 8, 9] and isinstance(items[3], Event)
+    state = box.state
+    for kind in state.put:
+        assert state.put[kind] == state.taken[kind] + state.dropped[kind] + state.waiting[kind]
+    assert state.waiting_bytes == 0
+
+
+def test_a_mailbox_is_bounded_in_bytes_but_takes_one_of_any_size():
+    box = Mailbox({Packet}, items=1000, size=10_000)
+    for _ in range(100):
+        box.put(Packet("a", bytes(1000), 0))
+    assert box.state.waiting_bytes <= 10_000 and box.state.waiting["packets"] == 6
+    box.put(Packet("a", bytes(50_000), 0))
+    assert [len(i.packet) for i in box.take()] == [50_000]
+    assert box.state.dropped["packets"] == 100
+
+
+def test_a_mailbox_takes_what_it_wants_of_the_source_that_it_wants():
+    box = Mailbox({Samples}, 10, 1 << 20, source="a")
+    box.put(samples(source="b"))
+    box.put(event())
+    box.put(samples(source="a"))
+    assert [i.source for i in box.take()] == ["a"] and box.state.put["samples"] == 1
+
+
+def test_a_closed_mailbox_gives_out_what_it_has_and_waits_no_more():
+    box = Mailbox({Samples}, 10, 1 << 20)
+    box.put(samples())
+    box.close()
+    box.put(samples())
+    assert len(box.take()) == 1 and box.take() == [] and box.state.dropped["samples"] == 1
+
+
+def test_what_is_urgent_does_not_wait_for_what_is_gathered():
+    box = Mailbox({Samples, Event}, 100, 1 << 20, gather_s=1000.0)
+    box.put(samples())
+    taken = []
+    thread = threading.Thread(target=lambda: taken.extend(box.take()))
+    thread.start()
+    box.put(samples())
+    assert not taken
+    box.put(event())
+    thread.join(PATIENCE_S)
+    assert len(taken) == 3
+
+
+def test_many_writers_and_a_reader_lose_nothing_that_is_not_counted():
+    box, taken = Mailbox({Samples}, 16, 1 << 20, gather_s=0.001), []
+
+    def read():
+        while items := box.take():
+            taken.extend(items)
+
+    reader = threading.Thread(target=read)
+    writers = [
+        threading.Thread(target=lambda: [box.put(samples(2)) for _ in range(500)]) for _ in range(4)
+    ]
+    for thread in [reader, *writers]:
+        thread.start()
+    for thread in writers:
+        thread.join()
+    box.close()
+    reader.join()
+    assert sum(len(i.chunk) for i in taken) == box.state.taken["samples"]
+    assert box.state.taken["samples"] + box.state.dropped["samples"] == 4000
+
+
+def test_whoever_waits_for_room_gets_it_from_the_reader_or_when_there_is_none():
+    box = Mailbox({Samples}, 4, 1 << 20)
+    for _ in range(4):
+        box.put(samples())
+    box.wait_for_room(PATIENCE_S)  # nobody takes: there is nobody to wait for
+    box.taking = True
+    thread = threading.Thread(target=lambda: box.wait_for_room(1000.0))
+    thread.start()
+    assert thread.is_alive()
+    box.take()
+    thread.join(PATIENCE_S)
+    assert not thread.is_alive()
+
+
+def test_every_item_has_a_class():
+    opened = Opened("a", SPEC, "u", ArraySource(SPEC, []), 1, 2)
+    for item in (opened, Closed("a", "", 1), Contact("a", "m", "f", True, 1, 2), Control("x")):
+        assert mailbox_module._measure(item)[:2] == ("events", 1)
+    assert mailbox_module._measure(decision())[0] == "decisions"
+
+
+# hub
+
+
+def test_who_joins_late_hears_of_open_streams_once_and_of_closed_ones_not_at_all():
+    hub = Hub()
+    for name in ("a", "b"):
+        hub.post(Opened(name, SPEC, "u", ArraySource(SPEC, []), 1, 2))
+    hub.post(Closed("a", "", 3))
+    box = Mailbox({Opened, Closed}, 10, 1 << 20)
+    hub.join("x", box)
+    hub.post(Closed("b", "", 4))
+    assert [(type(i).__name__, i.source) for i in box.take()] == [("Opened", "b"), ("Closed", "b")]
+    assert not hub.streams()
+    hub.leave("x", Mailbox({Opened}, 10, 10))  # another one of that name: not this one
+    assert hub.box("x") is box
+    hub.leave("x", box)
+    hub.post(Closed("b", "", 5))
+    box.close()
+    assert box.take() == []
+
+
+# latency
+
+
+def test_percentiles_are_those_of_the_newest_and_buckets_of_all():
+    meter = LatencyMeter()
+    for _ in range(50):
+        meter.add(9.0)
+    values = np.random.default_rng(0).gamma(2.0, 0.004, 1000)
+    for value in values:
+        meter.add(float(value))
+    state = meter.state
+    assert state.count == 1050 and sum(state.buckets) == 1050 and state.buckets[-1] == 50
+    assert math.isclose(state.sum_s, 450 + values.sum())
+    assert state.p50_ms == 1e3 * np.percentile(values, 50, method="inverted_cdf")
+    assert state.p99_ms == 1e3 * np.percentile(values, 99, method="inverted_cdf")
+    assert state.max_ms == 1e3 * values.max()
+    expected = np.histogram(values, [-1, *EDGES_S, np.inf])[0]
+    assert list(state.buckets[:-1]) == list(expected[:-1])
+    assert LatencyMeter().state.p99_ms == 0
+
+
+# messages
+
+
+def test_messages_are_as_documented():
+    utc = OFFSET_NS
+    said = [json.loads(encode(message_of(i))) for i in (
+        decision(), event("gone"), Contact("a", "m", "mount", True, 7, utc), samples(1),
+    )]  # fmt: skip
+    assert said[0] == {
+        "type": "decision", "version": 1, "t_ns": 20, "utc_ns": 20 + utc, "source": "a",
+        "frame": "mount", "model": "m", "onset_ns": 10, "step": 3, "final": True, "label": "y",
+        "probabilities": {"x": 0.25, "y": 0.75}, "model_ms": 1.2, "latency_ms": 2.5,
+    }  # fmt: skip
+    assert said[1] == {
+        "type": "health", "version": 1, "t_ns": 1_500_000_000, "utc_ns": 1_500_000_000 + utc,
+        "part": "source.a", "state": "waiting", "reason": "gone", "level": "warning",
+    }  # fmt: skip
+    assert said[2] == {
+        "type": "contact", "version": 1, "t_ns": 7, "utc_ns": 7 + utc, "source": "a",
+        "frame": "mount", "model": "m", "touching": True,
+    }  # fmt: skip
+    assert said[3] == {
+        "type": "samples", "version": 1, "t_ns": 0, "utc_ns": utc, "source": "a",
+        "frame": "mount", "elements": ["A0", "A1", "A2"], "channels": ["fy", "mz"],
+        "units": ["N", "N m"], "seq": [0], "times_ns": [0],
+        "values": [[[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]]],
+    }  # fmt: skip
+
+
+def test_an_element_without_a_trustworthy_value_is_null():
+    item = samples(2)
+    item.chunk.valid[1, 2] = False
+    assert json.loads(encode(message_of(item)))["values"][1] == [[6.0, 7.0], [8.0, 9.0], None]
+
+
+def test_an_array_is_described_and_the_rest_is_not_published():
+    opened = Opened("a b/ä", SPEC, "synthetic:", ArraySource(SPEC, []), 1, OFFSET_NS)
+    message = message_of(opened)
+    said = json.loads(encode(message))
+    assert said["array"]["positions"] == [[0.0, 0.002 * i, 0.0] for i in range(3)]
+    assert topic_of(message) == "tactile/a%20b%2F%C3%A4/array"
+    assert topic_of(message_of(event()), "robot") == "robot/health"
+    for item in (Closed("a", "", 1), Packet("a", b"", 1), Control("start")):
+        assert message_of(item) is None
+
+
+# log
+
+
+def logged(path, *batches, **options):
+    log = Log("log", LogConfig(file=str(path), **options))
+    log.open(None)
+    for batch in batches:
+        log.handle(list(batch))
+    log.close()
+    return path.read_text().splitlines()
+
+
+def test_a_storm_is_written_once_and_counted(tmp_path):
+    storm = [event("no route") for _ in range(1000)]
+    lines = logged(tmp_path / "log", storm[:600], [event("other")], storm[600:])
+    assert lines == [
+        "2023-11-14T22:13:21.500Z warning source.a waiting: no route",
+        "2023-11-14T22:13:21.500Z warning source.a waiting: other",
+        "2023-11-14T22:13:21.500Z warning source.a waiting: no route (repeated 999 times)",
+    ]
+
+
+def test_no_event_is_lost_among_very_many_different_ones(tmp_path):
+    events = [event(f"reason {i % 700}") for i in range(5000)]
+    lines = logged(tmp_path / "log", events, format="json")
+    said = [json.loads(line) for line in lines]
+    assert sum(s["repeated"] or 1 for s in said) == 5000
+    assert {s["reason"] for s in said} == {f"reason {i}" for i in range(700)}
+    assert said[0]["time"] == "2023-11-14T22:13:21.500Z" and said[0]["t_ns"] == 1_500_000_000
+
+
+def test_what_comes_again_later_is_written_again(tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(
+        "tactile_rt.daemon.log.time", types.SimpleNamespace(monotonic=lambda: now[0])
+    )
+    log = Log("log", LogConfig(file=str(tmp_path / "log"), repeat_s=60.0))
+    log.open(None)
+    for now[0] in (100.0, 130.0, 159.0, 161.0, 170.0):
+        log.handle([event("again")])
+    log.close()
+    ends = [line.rpartition(": ")[2] for line in (tmp_path / "log").read_text().splitlines()]
+    assert ends == ["again", "again (repeated 3 times)", "again"]
+
+
+def test_the_level_is_the_least_that_is_written(tmp_path):
+    events = [event(level=level, reason=level) for level in ("info", "warning", "error")]
+    assert len(logged(tmp_path / "log", events, level="warning")) == 2
+
+
+# locks
+
+
+def test_a_second_process_is_refused_by_the_pid_of_the_first(tmp_path):
+    keys = lock_keys(tmp_path / "robot.toml", ["serial:///dev/null?codec=native", "synthetic:"])
+    assert keys == [f"configuration {tmp_path}/robot.toml", "device /dev/null"]
+    code = (
+        "import sys, pathlib; from tactile_rt.daemon.lock import Locks; "
+        "held = Locks(pathlib.Path(sys.argv[1])); held.hold(['device /dev/null']); "
+        "print('held', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout.readline() == b"held\n"
+        mine = Locks(tmp_path)
+        with pytest.raises(AlreadyRunning, match=f"/dev/null is in use by process {other.pid} "):
+            mine.hold(keys)
+        mine.hold(keys[:1])
+        other.kill()
+    mine.hold(keys)  # a process that is killed holds nothing
+    with pytest.raises(AlreadyRunning):
+        Locks(tmp_path).hold(keys[:1])
+    mine.hold(keys[1:])
+    Locks(tmp_path).hold(keys[:1])
+    mine.close()
+
+
+def test_two_names_of_a_port_are_one_device(tmp_path):
+    link = tmp_path / "whiskers"
+    link.symlink_to("/dev/null")
+    urls = ["serial:///dev/null?codec=bota", f"serial:{link}?codec=native", "can:slcan:/dev/null"]
+    assert lock_keys(tmp_path / "x", urls)[1:] == ["device /dev/null"]
+
+
+# supervision
+
+
+class Fragile(Part):
+    """Breaks as it is told: each entry is an exception, or a number of seconds to work."""
+
+    def __init__(self, plan, **limits):
+        self.told = []
+        self.plan, self.released = list(plan), 0
+        limits = LimitsConfig(retry_first_s=0.01, retry_last_s=0.04, **limits)
+        super().__init__("fragile", lambda *told: self.told.append(told), limits)
+
+    def _work(self):
+        step = self.plan.pop(0) if self.plan else None
+        if isinstance(step, Exception):
+            raise step
+        self._up()
+        if step is None:
+            return
+        self._busy_ns = time.monotonic_ns()
+        step.wait(PATIENCE_S)
+        self._busy_ns = 0
+        self._stop.wait(PATIENCE_S)
+
+    def _release(self):
+        self.released += 1
+
+
+def test_a_part_is_started_again_until_it_works_and_says_why_it_did_not():
+    pauses = []
+    part = Fragile([ConfigError("no such port"), ConfigError("no such port"), ValueError("odd")])
+    part._stop.wait = lambda s: pauses.append(s)  # type: ignore[method-assign]
+    part.start()
+    assert part.join(time.monotonic() + PATIENCE_S)
+    assert [t[1] for t in part.told] == ["waiting", "waiting", "waiting", "running", "ended"]
+    assert part.told[0] == ("fragile", "waiting", "no such port", "warning")
+    assert part.told[2][2].startswith("ValueError: odd (test_parts.py:")
+    assert pauses == [0.01, 0.02, 0.04]
+    state = part.state
+    assert (state.state, state.starts, state.failures, part.released) == ("ended", 4, 3, 4)
+
+
+def test_a_part_that_stalls_is_told_and_so_is_its_return():
+    hangs = threading.Event()
+    part = Fragile([hangs], stall_s=0.5)
+    part.start()
+    until(lambda: part.state.state == "stalled")
+    part.watch()
+    part.watch()
+    hangs.set()
+    until(lambda: part.state.state == "running")
+    part.watch()
+    part.stop()
+    assert part.join(time.monotonic() + PATIENCE_S)
+    assert [t[1] for t in part.told] == ["running", "stalled", "running", "stopped"]
+    assert part.told[1][2] == "in a call that has not returned for 0.5 s"
+
+
+def test_a_part_in_its_pause_stops_at_once():
+    part = Fragile([ConfigError("x")] * 1000)
+    part.limits = LimitsConfig(retry_first_s=60.0, retry_last_s=60.0)
+    part._pause_s = 60.0
+    part.start()
+    until(lambda: part.state.state == "waiting")
+    part.stop()
+    assert part.join(time.monotonic() + PATIENCE_S) and part.state.state == "stopped"
+
+
+def test_reasons_are_one_line():
+    assert reason_of(ConfigError("a\nb")) == "a b"
+    assert reason_of(OSError(28, "No space left on device", "/x")) == "/x: No space left on device"
+    assert reason_of(KeyError("k")) == "KeyError: 'k'"
+    assert reason_of(TimeoutError()) == "TimeoutError"
+
+
+def test_a_step_of_the_wall_clock_is_seen_once():
+    class Stepped(Clock):
+        by = 0
+
+        def utc_ns(self):
+            return time.monotonic_ns() + OFFSET_NS + self.by
+
+    clock = Stepped()
+    assert clock.stepped_ns() == 0
+    clock.by = -3600 * 10**9
+    assert abs(clock.stepped_ns() + 3600 * 10**9) < 10**8
+    assert clock.stepped_ns() == 0

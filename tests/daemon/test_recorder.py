@@ -1,0 +1,265 @@
+"""The daemon's recorder, driven by hand: what it is given is in its files, whatever happens."""
+
+import os
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tactile_rt.classifier import Classification
+from tactile_rt.daemon.config import RecorderConfig
+from tactile_rt.daemon.items import (
+    Closed,
+    Contact,
+    Control,
+    Decision,
+    Event,
+    Opened,
+    Packet,
+    Samples,
+)
+from tactile_rt.daemon.snapshot import Snapshot
+from tactile_rt.sources import open_source
+from tactile_rt.stream_recording import (
+    read_decisions,
+    read_description,
+    read_events,
+    read_packets,
+    read_stream,
+    recover,
+)
+from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
+
+pytest.importorskip("mcap")
+recorder = pytest.importorskip("tactile_rt.daemon.recorder")
+
+SPEC = small_spec()
+UTC = 1_700_000_000_000_000_000
+VALUES = np.random.default_rng(0).normal(size=(90, *SPEC.shape)).astype(np.float32)
+
+
+class Daemon:
+    """What a consumer sees of it."""
+
+    def __init__(self):
+        self.told, self.open = [], {}
+
+    def snapshot(self):
+        return Snapshot("0", 1, "robot.toml", 1, UTC, 0, 0, "running")
+
+    def streams(self):
+        return self.open
+
+    def config_text(self):
+        return "version = 1\n"
+
+    def report(self, part, state, reason, level="info"):
+        self.told.append((state, reason, level))
+
+    def send(self, consumer, control):
+        return False
+
+    def utc_offset_ns(self):
+        return UTC
+
+
+@pytest.fixture
+def daemon():
+    return Daemon()
+
+
+def opened(name="whiskers", stream=None):
+    stream = stream or ArraySource(SPEC, [])
+    return Opened(name, stream.spec, f"synthetic:{name}", stream, time.monotonic_ns(), UTC)
+
+
+def samples(chunk, name="whiskers", at=None):
+    return Samples(name, SPEC, chunk, at or time.monotonic_ns(), UTC)
+
+
+def decision(step=1):
+    now = time.monotonic_ns()
+    made = Classification(
+        5, 9, step, False, "mug", ("mug", "car"), np.array([0.75, 0.25], np.float32), 0.001
+    )
+    return Decision("whiskers", "best", "mount", made, now, now, UTC)
+
+
+def event(level="info", part="source.whiskers"):
+    return Event(part, "waiting", "unplugged", level, time.monotonic_ns(), UTC)
+
+
+def begun(daemon, folder, **config):
+    made = recorder.Recorder("recorder", RecorderConfig(folder=str(folder), **config))
+    made.open(daemon)
+    return made
+
+
+def look(made):
+    """The next look at disk and clock comes now."""
+    made._flush_at = 0.0
+    made.handle([])
+
+
+def files(folder):
+    return sorted(folder.glob("*.mcap"))
+
+
+def same(path, chunks):
+    back = list(read_stream(path))
+    assert len(back) == len(chunks)
+    for a, b in zip(back, chunks, strict=True):
+        assert a.values.tobytes() == b.values.tobytes()
+        assert a.seq.tolist() == b.seq.tolist()
+        assert a.t_ns.tolist() == b.t_ns.tolist()
+
+
+def test_all_that_happens_is_in_the_file(daemon, tmp_path):
+    made, chunks = begun(daemon, tmp_path / "new", min_free_mb=0), cut(VALUES, 1000.0)
+    made.handle([opened()])
+    made.handle([samples(c) for c in chunks[:5]] + [decision(), event()])
+    made.handle([samples(c) for c in chunks[5:]])
+    made.close()
+    (path,) = files(tmp_path / "new")
+    assert path.name.startswith("whiskers-20")
+    same(path, chunks)
+    (told,) = read_decisions(path)
+    assert (told["label"], told["step"], told["probabilities"]["mug"]) == ("mug", 1, 0.75)
+    (state,) = read_events(path)
+    assert (state["part"], state["reason"]) == ("source.whiskers", "unplugged")
+    about = read_description(path)
+    assert about.session["config"] == "version = 1\n"
+    assert about.source == "synthetic:whiskers"
+
+
+def test_each_source_has_its_own_file(daemon, tmp_path):
+    made, chunks = begun(daemon, tmp_path, min_free_mb=0), cut(VALUES, 1000.0)
+    made.handle([opened("left"), opened("right")])
+    made.handle([samples(chunks[0], "left"), samples(chunks[1], "right"), samples(chunks[2], "no")])
+    made.handle([Closed("left", "over", 0)])
+    made.handle([samples(chunks[3], "right")])
+    made.close()
+    left, right = files(tmp_path)
+    same(left, chunks[:1])
+    same(right, [chunks[1], chunks[3]])
+
+
+def test_a_device_s_packets_decode_again_from_every_rotated_file(daemon, tmp_path):
+    values = np.random.default_rng(1).normal(size=(600, 2, 6)).astype(np.float32) * 1e-3
+    heard, got, items = [], [], []
+    with FakeSerial(values) as fake, open_source(fake.url) as source:
+        source.tap(lambda packet, t_ns: heard.append((packet, t_ns)))
+        prelude = tuple(heard)
+        first = replace(opened(stream=source), prelude=prelude, url=fake.url)
+        items += [Packet("whiskers", *p) for p in prelude]
+        made = begun(daemon, tmp_path, min_free_mb=0)
+        made.handle([first, *items])
+        while sum(map(len, got)) < 600:
+            heard.clear()
+            chunk = source.read(1.0)
+            if chunk is None:
+                continue
+            got.append(chunk)
+            came = Samples("whiskers", source.spec, chunk, time.monotonic_ns(), UTC)
+            made.handle([*(Packet("whiskers", *p) for p in heard), came])
+            if len(got) == 3:
+                made.handle([Control("rotate")])
+        made.close()
+    paths = sorted(files(tmp_path), key=os.path.getmtime)
+    assert len(paths) == 2
+    for path, expected in zip(paths, (got[:3], got[3:]), strict=True):
+        same(path, expected)
+        with open_source(f"replay:{path}?from=wire&speed=0") as again:
+            back = np.concatenate([c.values for c in again])
+        expected = np.concatenate([c.values for c in expected])
+        # samples that came with the description stand before, in every file
+        assert back[-len(expected) :].tobytes() == expected.tobytes()
+        assert len(back) < len(expected) + 100
+        assert any(packet for packet, _ in read_packets(path))
+
+
+@pytest.mark.parametrize("config", [{"rotate_mb": 0.001}, {"rotate_s": 0.02}])
+def test_files_are_rotated_by_size_and_time_and_nothing_is_lost_between(config, daemon, tmp_path):
+    made = begun(daemon, tmp_path, min_free_mb=0, **config)
+    chunks = cut(VALUES, 1000.0)
+    made.handle([opened()])
+    for chunk in chunks:
+        made.handle([samples(chunk)])
+        time.sleep(0.005)
+        look(made)
+    made.close()
+    paths = sorted(files(tmp_path), key=lambda p: (p.stat().st_mtime_ns, p.name))
+    assert len(paths) > 1
+    back = sorted((c for path in paths for c in read_stream(path)), key=lambda c: c.seq[0])
+    assert np.concatenate([c.seq for c in back]).tolist() == list(range(90))
+
+
+def test_a_trigger_keeps_what_came_before_it_and_after(daemon, tmp_path):
+    made = begun(daemon, tmp_path, min_free_mb=0, mode="trigger", before_s=0.05, after_s=0.1)
+    chunks = cut(VALUES, 1000.0)
+    made.handle([opened()])
+    now = time.monotonic_ns()
+    early = [samples(c, at=now - 10**9) for c in chunks[:2]]  # too long before
+    made.handle([*early, samples(chunks[2], at=now - 10**7)])
+    look(made)
+    assert files(tmp_path) == []
+    made.handle([Contact("whiskers", "best", "mount", True, time.monotonic_ns(), UTC)])
+    made.handle([samples(chunks[3])])
+    time.sleep(0.15)
+    look(made)
+    made.handle([samples(chunks[4])])
+    (path,) = files(tmp_path)
+    same(path, chunks[2:4])
+    assert [e["type"] for e in read_events(path)] == ["contact"]
+    made.handle([event("warning")])  # a fault is a trigger, too
+    made.close()
+    assert len(files(tmp_path)) == 2
+
+
+def test_stop_and_start_by_hand(daemon, tmp_path):
+    made, chunks = begun(daemon, tmp_path, min_free_mb=0), cut(VALUES, 1000.0)
+    made.handle([opened(), samples(chunks[0]), Control("stop"), samples(chunks[1])])
+    look(made)
+    assert made.details()["state"] == "off"
+    made.handle([Control("start"), samples(chunks[2])])
+    made.close()
+    paths = files(tmp_path)
+    assert [len(list(read_stream(p))) for p in paths] == [1, 1]
+
+
+def test_without_room_it_says_so_counts_and_goes_on_when_there_is(daemon, tmp_path, monkeypatch):
+    made, chunks = begun(daemon, tmp_path, min_free_mb=100), cut(VALUES, 1000.0)
+    free = [10e9]
+    usage = type("usage", (), {"free": property(lambda _: free[0])})
+    monkeypatch.setattr(recorder.shutil, "disk_usage", lambda _: usage())
+    made.handle([opened(), samples(chunks[0])])
+    free[0] = 50e6
+    look(made)
+    made.handle([samples(chunks[1])])
+    look(made)
+    (full,) = (t for t in daemon.told if t[0] == "disk full")
+    assert full[2] == "warning"
+    assert made.details()["lost_samples"] == 9
+    free[0] = 10e9
+    look(made)
+    made.handle([samples(chunks[2])])
+    made.close()
+    paths = sorted(files(tmp_path), key=lambda p: (p.stat().st_mtime_ns, p.name))
+    assert [c.seq[0] for p in paths for c in read_stream(p)] == [0, 18]
+
+
+def test_what_a_killed_recorder_left_is_named_and_can_be_recovered(daemon, tmp_path):
+    made, chunks = begun(daemon, tmp_path, min_free_mb=0), cut(VALUES, 1000.0)
+    made.handle([opened(), *(samples(c) for c in chunks)])
+    look(made)
+    (path,) = files(tmp_path)
+    kept = path.read_bytes()
+    made.close()
+    path.write_bytes(kept)  # as it was before its end
+    begun(daemon, tmp_path, min_free_mb=0).close()
+    ((_, reason, level),) = daemon.told
+    assert path.name in reason
+    assert "tactile-rt recover" in reason
+    assert level == "warning"
+    same(recover(path), chunks)

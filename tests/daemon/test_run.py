@@ -1,0 +1,179 @@
+"""`tactile-rt run robot.toml` as a process: signals and exit codes; `tactile-rt config`."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from tactile_rt.cli import main
+from tactile_rt.daemon.config import EXAMPLE
+
+PATIENCE_S = 30.0
+RUN = [sys.executable, "-c", "from tactile_rt.cli import main; main()"]
+SMALL = """version = 1
+[[source]]
+name = "a"
+url = "synthetic:2x2"
+[[publisher]]
+kind = "jsonl"
+options = { file = "out.jsonl" }
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "robot.toml").write_text(SMALL)
+    return tmp_path
+
+
+@pytest.fixture
+def started(folder):
+    """Start a daemon, and come back when it runs."""
+    processes = []
+
+    def start(*arguments):
+        process = subprocess.Popen(
+            [*RUN, "run", str(folder / "robot.toml"), *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        processes.append(process)
+        await_told(folder, "source.a", "running")
+        return process
+
+    yield start
+    for process in processes:
+        process.kill()
+        with process:
+            pass
+
+
+def told(folder):
+    file = folder / "out.jsonl"
+    lines = file.read_text().splitlines() if file.exists() else []
+    return [m for m in map(json.loads, lines) if m["type"] == "health"]
+
+
+def await_told(folder, part, state):
+    end = time.monotonic() + PATIENCE_S
+    while not any((m["part"], m["state"]) == (part, state) for m in told(folder)):
+        assert time.monotonic() < end
+        time.sleep(0.02)
+
+
+def ended(process):
+    """(exit code, log)"""
+    _, log = process.communicate(timeout=PATIENCE_S)
+    return process.returncode, log
+
+
+def call(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["tactile-rt", *map(str, arguments)])
+    with pytest.raises(SystemExit) as left:
+        main()
+    return left.value.code or 0, *capsys.readouterr()
+
+
+def test_signals_reload_and_stop_and_a_second_one_is_refused(folder, started, monkeypatch, capsys):
+    first = started()
+    code, out, err = call(monkeypatch, capsys, "run", folder / "robot.toml")
+    assert code == 3 and out == ""
+    assert f"robot.toml is in use by process {first.pid} " in err
+    (folder / "robot.toml").write_text(SMALL.replace("2x2", "2by2"))
+    first.send_signal(signal.SIGHUP)
+    await_told(folder, "daemon", "refused")
+    (folder / "robot.toml").write_text(SMALL + '[[source]]\nname = "b"\nurl = "synthetic:1x1"\n')
+    first.send_signal(signal.SIGHUP)
+    await_told(folder, "source.b", "running")
+    first.send_signal(signal.SIGTERM)
+    code, log = ended(first)
+    assert code == 0, log
+    refused = next(m for m in told(folder) if m["state"] == "refused")
+    assert refused["level"] == "error"
+    assert "robot.toml:4: source[0].url: synthetic:2by2 is not a size" in refused["reason"]
+    states = [(m["part"], m["state"]) for m in told(folder)]
+    assert states.count(("source.a", "running")) == 1  # it went on undisturbed
+    assert ("source.b", "stopped") in states
+    assert "Traceback" not in log and "daemon stopping" in log
+
+
+def test_a_stream_that_is_over_and_a_time_that_is_up_end_it(folder, monkeypatch, capfd):
+    (folder / "robot.toml").write_text(SMALL.replace('options = { file = "out.jsonl" }', ""))
+    code, out, err = call(
+        monkeypatch, capfd, "run", folder / "robot.toml",
+        "--set", "source.a.url=synthetic:2x2?seconds=1&pace=fast",
+        "--set", "publisher.jsonl.options.samples=true",
+    )  # fmt: skip
+    assert code == 0, err
+    messages = [json.loads(line) for line in out.splitlines()]
+    assert sum(len(m["seq"]) for m in messages if m["type"] == "samples") == 1000
+    assert messages[-1]["state"] == "stopped" or messages[-1]["type"] == "health"
+    code, out, err = call(monkeypatch, capfd, "run", folder / "robot.toml", "--seconds", "0.5")
+    assert code == 0 and "source.a stopped" in err
+
+
+def test_what_hangs_at_the_end_is_left_behind(folder, started):
+    """Nobody reads its output: the pipe is full, and writing to it never returns."""
+    (folder / "robot.toml").write_text(
+        SMALL + '[[publisher]]\nkind = "jsonl"\nname = "piped"\noptions = { samples = true }\n'
+    )
+    process = started("--set", "source.a.url=synthetic:35x6", "--set", "limits.stall_s=0.5")
+    await_told(folder, "publisher.piped", "stalled")
+    process.send_signal(signal.SIGINT)
+    assert process.wait(PATIENCE_S) == 4
+    log = process.stderr.read()
+    assert "error publisher.piped abandoned: it did not end in time" in log
+    assert "source.a stopped" in log
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run"], "run needs a configuration (robot.toml, --set with it) or --source URL"),
+        (["run", "--source", "synthetic:", "--set", "a=1"], "run needs a configuration"),
+        (["run", "robot.toml", "--source", "synthetic:"], "robot.toml says what to run"),
+        (["run", "gone.toml"], "gone.toml: cannot be read: No such file"),
+        (["run", "robot.toml", "--set", "page.port=0"], "page.port: expected a whole number >= 1"),
+        (["config", "check", "robot.toml", "--set", "sorce=1"], "did you mean source?"),
+        (["config", "example", "robot.toml"], "robot.toml is there already"),
+        (["config", "example", "gone/robot.toml"], "no folder gone to write"),
+    ],
+)
+def test_a_users_mistake_is_one_line(folder, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(folder)
+    code, out, err = call(monkeypatch, capsys, *arguments)
+    assert code == 2 and out == "" and message in err and err.count("\n") == 1
+
+
+def test_config_commands(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert call(monkeypatch, capsys, "config", "check", "robot.toml") == (
+        0, "robot.toml: 1 source, 0 models, 1 publisher: all right\n", "",
+    )  # fmt: skip
+    _, shown, _ = call(
+        monkeypatch, capsys, "config", "show", "robot.toml", "--set", "log.level=error"
+    )
+    assert 'level = "error"' in shown and f"{folder}/out.jsonl" in shown
+    assert call(monkeypatch, capsys, "config", "example")[1] == EXAMPLE
+    assert call(monkeypatch, capsys, "config", "example", "new.toml")[0] == 0
+    assert call(monkeypatch, capsys, "config", "check", "new.toml")[0] == 0
+
+
+def test_the_daemon_reaches_nothing_that_a_robot_does_not_have():
+    code = (
+        "import sys, tactile_rt.daemon.runner, tactile_rt.daemon.log, "
+        "tactile_rt.daemon.publishers.jsonl\n"
+        "print({'torch', 'mujoco', 'trimesh', 'scipy', 'matplotlib'} & set(sys.modules))"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "set()\n"
