@@ -2,28 +2,39 @@
 
     Chunk -> Resampler -> ContactDetector -> model step (explicit state) -> Classification
 
-Contact onset starts an episode: the recurrent state is zeroed, and every completed step gives a
-decision, the last of them final. Without contact there is no decision. A silence too long for the
-resampler to bridge ends an episode early.
+Contact onset starts an episode, and without contact there is no decision. There are two modes:
+
+- ``episode``: the recurrent state is zeroed at the onset, and every completed step gives a
+  decision, the last of them final. With `sure`, the first decision that is sure enough is final.
+- ``sliding``: as before until the first final decision; from there on, as long as the contact
+  lasts, one every few steps, each equal to that of an episode which began so many steps later.
+
+A silence too long for the resampler to bridge ends an episode early.
 """
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.contact import ContactDetector
-from tactile_rt.model_file import load_model
-from tactile_rt.stream import ArraySpec, Chunk, SpecMismatch
-from tactile_rt.timebase import Resampler
+from tactile_rt.inference.bad_samples import without_bad_samples
+from tactile_rt.inference.deadline import Deadline, Policy
+from tactile_rt.inference.lanes import Lanes
+from tactile_rt.inference.providers import onnxruntime_names
+from tactile_rt.inference.stepper import Stepper
+from tactile_rt.model_file import element_order, load_model
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError, SpecMismatch
+from tactile_rt.timebase import NS_PER_S, Resampler
 
-__all__ = ["Classification", "Classifier", "fuse"]
+__all__ = ["Classification", "Classifier", "ClassifierStats", "fuse"]
 
-# What a model does not depend on: the array's name, and its rate, to which we resample.
-ADAPTED = ("name", "rate_hz")
+Mode = Literal["episode", "sliding"]
+EVERY = 4  # steps between the decisions of sliding windows: 180 ms at 45 ms
 
 
 @dataclass(frozen=True)
@@ -33,13 +44,14 @@ class Classification:
     Attributes:
         onset_ns: stream time at which contact began, ns.
         t_ns: stream time of the last resampled sample used, ns.
-        step: steps since onset, counted from 1.
-        final: the episode's last step; an episode that a silence of the stream cuts short has
-            none.
+        step: steps used, counted from 1; those before them, of a longer contact, are not in it.
+        final: nothing more will be said of this window; an episode that a silence of the stream
+            cuts short has no such decision.
         label: the most probable class.
         labels: all class names.
         probabilities: (class,) float32 posterior.
         latency_s: time the model step took, s.
+        late: more work had gathered than the deadline allows.
     """
 
     onset_ns: int
@@ -50,6 +62,7 @@ class Classification:
     labels: tuple[str, ...]
     probabilities: NDArray[np.float32]
     latency_s: float
+    late: bool = False
 
     def top(self, k: int = 5) -> list[tuple[str, float]]:
         """The k most probable classes with their probabilities."""
@@ -57,44 +70,105 @@ class Classification:
         return [(self.labels[i], float(self.probabilities[i])) for i in order]
 
 
+@dataclass
+class ClassifierStats:
+    """Counted since the classifier was made.
+
+    Attributes:
+        steps: that the network took.
+        late: steps that missed the deadline.
+        withheld: decisions that were not returned because they were late.
+        bad_samples: samples of one element that were no number, infinite or absurd, though marked
+            valid; they were taken for invalid.
+        bad_steps: steps at which the network said no numbers; they gave no decision.
+    """
+
+    steps: int = 0
+    late: int = 0
+    withheld: int = 0
+    bad_samples: int = 0
+    bad_steps: int = 0
+
+
 class Classifier:
-    """A model file, run on a stream.
+    """A model file, run on a stream. One thread at a time may use it.
+
+    The stream may have another rate, and its elements another order, than the model's array.
 
     Args:
         model: path of the ``.onnx`` file.
         spec: the array that the stream comes from.
+        mode: ``episode`` or ``sliding``.
+        every: steps between the windows of ``sliding``; the network then runs in
+            ceil(steps / every) lanes, and takes about as many times as long.
+        sure: probability of the best class at which an episode ends early, or None: accuracy
+            given for time, see `tactile_rt.inference.early_exit`. Of ``episode`` only.
+        deadline_s: work that may gather before a step is late, s; None is the step's length.
+        late: what becomes of a late decision, see `tactile_rt.inference.deadline.Deadline`.
+        providers: execution providers, first choice first: cpu, cuda, tensorrt, openvino, coreml.
+        threads: that may share one operator of the network.
 
     Attributes:
         card: the model's metadata.
         detector: contact state and tare of the stream.
         tared: last resampled sample less the tare, (element, channel) SI; zeros before the tare.
+            The next `push` overwrites it.
+        stats: what has been counted.
+        providers: names of the execution providers in use, as onnxruntime has them.
 
     Raises:
         ModelError: the file cannot be used.
         SpecMismatch: the model was made for another array; the message says where they differ.
+        ConfigError: an option that cannot be, or an execution provider that is not there.
     """
 
-    def __init__(self, model: Path, spec: ArraySpec) -> None:
-        self._session, self.card = load_model(model)
-        differences = self.card.array.differences(spec, ignore=ADAPTED)
-        if differences:
+    def __init__(
+        self,
+        model: Path,
+        spec: ArraySpec,
+        *,
+        mode: Mode = "episode",
+        every: int = EVERY,
+        sure: float | None = None,
+        deadline_s: float | None = None,
+        late: Policy = "count",
+        providers: Sequence[str] = ("cpu",),
+        threads: int = 1,
+    ) -> None:
+        _check_mode(mode, sure)
+        session, self.card = load_model(model, onnxruntime_names(providers), threads)
+        try:
+            order = element_order(self.card.array, spec)
+        except SpecMismatch as error:
             raise SpecMismatch(
-                f"{model} was made for another array than {spec.name!r}: " + "; ".join(differences)
-            )
+                f"{model} was made for another array than {spec.name!r}: {error}"
+            ) from None
         self.detector = ContactDetector(spec.shape, np.array(self.card.floor, dtype=np.float32))
         self.tared = np.zeros(spec.shape, dtype=np.float32)
+        self.stats = ClassifierStats()
+        self.providers: tuple[str, ...] = tuple(session.get_providers())
+        self._sliding = mode == "sliding"
+        self._sure = np.inf if sure is None else sure
+        steps = self.card.steps
+        self._lanes = Lanes(steps, min(every, steps) if self._sliding else steps)
+        step_s = self.card.substeps * self.card.period_ns / NS_PER_S
+        self._deadline = Deadline(step_s if deadline_s is None else deadline_s, late)
+        self._stepper = Stepper(session, self.card, self._lanes.count)
         self._resampler = Resampler(self.card.period_ns, spec.rate_hz)
-        self._outputs = [o.name for o in self._session.get_outputs()]
-        self._samples = np.zeros((1, self.card.substeps, *spec.shape), dtype=np.float32)
+        self._order = order  # where the array has the model's elements
+        # Of the episode; the detector does not change them, it makes new ones.
+        self._offset = self.detector.offset
+        self._sigma = self.detector.sigma
         self._filled = 0  # sub-steps of the step under way
-        self._step = 0  # steps done; 0 also when no episode is under way
-        self._onset_ns: int | None = None
+        self._step = 0  # steps done since the onset
+        self._onset_ns: int | None = None  # None when no episode is under way
+        self._decided = False  # the episode has had its final decision
         self._next_seq = 0
-        self._begin()
-        self._run()  # the first run allocates; let it not be a decision
 
     def push(self, chunk: Chunk) -> list[Classification]:
         """Take samples as they come from the array, return the decisions that they complete."""
+        chunk, bad = without_bad_samples(chunk)
+        self.stats.bad_samples += bad
         resampled = self._resampler.push(chunk)
         if resampled is None:
             return []
@@ -113,58 +187,97 @@ class Classifier:
     ) -> Classification | None:
         begins = self.detector.update(sample, valid)
         # An element without a trustworthy value, or without a tare, reads as untouched.
-        trusted = valid & self.detector.tared
-        sample = np.where(trusted[:, None], sample, self.detector.offset)
-        self.tared = sample - self.detector.offset
-        if begins and (self._onset_ns is None or self._step == self.card.steps):
-            self._onset_ns = t_ns
-            self._begin()
+        untouched = ~(valid & self.detector.tared)
+        np.subtract(sample, self.detector.offset, out=self.tared)
+        self.tared[untouched] = 0
+        if begins and (self._onset_ns is None or self._decided):
+            self._begin(t_ns)
         if self._onset_ns is None:
             return None
-        if self._step == self.card.steps:
-            if not self.detector.contact:
-                self._onset_ns = None  # released: the next contact is a new episode
+        if self._decided and not self.detector.contact:
+            self._onset_ns = None  # released: the next contact is a new episode
             return None
-        self._samples[0, self._filled] = sample
+        if self._decided and not self._sliding:
+            return None
+        now = np.where(untouched[:, None], self._offset, sample)
+        self._stepper.samples[:, self._filled] = now[self._order]
         self._filled += 1
         if self._filled < self.card.substeps:
             return None
-        return self._decide(t_ns, self._onset_ns)
+        return self._advance(t_ns, self._onset_ns)
 
-    def _decide(self, t_ns: int, onset_ns: int) -> Classification:
+    def _begin(self, t_ns: int) -> None:
+        self._onset_ns = t_ns
+        self._filled = self._step = 0
+        self._decided = False
+        self._offset = self.detector.offset
+        self._sigma = self.detector.sigma
+        self._stepper.begin(self._offset[self._order], self._sigma[self._order])
+        self._deadline.begin()
+
+    def _advance(self, t_ns: int, onset_ns: int) -> Classification | None:
+        """Take a step with the samples gathered; the decision that it gives, if any."""
         began = time.perf_counter()
-        logits = self._run() / self.card.temperature
+        lane = self._lanes.beginning(self._step)
+        if lane is not None:
+            self._stepper.reset(lane)
+        logits = self._stepper.run()
         latency = time.perf_counter() - began
+        asked = self._lanes.asked(self._step)
         self._filled = 0
         self._step += 1
-        probabilities = np.exp(logits - logits.max())
-        probabilities /= probabilities.sum()
+        self.stats.steps += 1
+        late = self._deadline.missed(t_ns, latency)
+        self.stats.late = self._deadline.late
+        if asked is None:
+            return None
+        lane, step = asked
+        probabilities = self._posterior(logits[lane])
+        if probabilities is None:
+            self._give_up()
+            return None
+        best = int(probabilities.argmax())
+        final = step == self.card.steps or bool(probabilities[best] >= self._sure)
+        self._decided = self._decided or final
+        if late and self._deadline.policy == "skip":
+            self.stats.withheld += 1
+            return None
         return Classification(
             onset_ns=onset_ns,
             t_ns=t_ns,
-            step=self._step,
-            final=self._step == self.card.steps,
-            label=self.card.labels[int(probabilities.argmax())],
+            step=step,
+            final=final,
+            label=self.card.labels[best],
             labels=self.card.labels,
             probabilities=probabilities,
             latency_s=latency,
+            late=late,
         )
 
-    def _begin(self) -> None:
-        self._filled = self._step = 0
-        self._feed = {
-            "samples": self._samples,
-            "offset": self.detector.offset[None],
-            "sigma": self.detector.sigma[None],
-            **{s.name: np.zeros((1, *s.shape), dtype=s.dtype) for s in self.card.state},
-        }
+    def _posterior(self, logits: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        probabilities: NDArray[np.float32] = logits / self.card.temperature
+        probabilities -= probabilities.max()
+        np.exp(probabilities, out=probabilities)
+        probabilities /= probabilities.sum()
+        return probabilities if np.isfinite(probabilities).all() else None
 
-    def _run(self) -> NDArray[np.float32]:
-        outputs = dict(zip(self._outputs, self._session.run(None, self._feed), strict=True))
-        for state in self.card.state:
-            self._feed[state.name] = outputs[f"{state.name}_next"]
-        logits: NDArray[np.float32] = outputs["logits"][0]
-        return logits
+    def _give_up(self) -> None:
+        """The state is no number and would stay none: end the episode, or begin windows anew."""
+        self.stats.bad_steps += 1
+        self._step = 0
+        self._decided = True
+        self._stepper.begin(self._offset[self._order], self._sigma[self._order])
+
+
+def _check_mode(mode: str, sure: float | None) -> None:
+    if mode not in get_args(Mode):
+        raise ConfigError(f"mode: {mode!r}; it can be {', '.join(get_args(Mode))}")
+    if sure is None:
+        return
+    if mode == "sliding":
+        raise ConfigError("sure: windows that slide have no early end; decide by episodes")
+    if not 0 < sure <= 1:
+        raise ConfigError(f"sure: {sure} is no probability above 0")
 
 
 def fuse(posteriors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:

@@ -1,6 +1,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -12,8 +13,15 @@ pytest.importorskip("onnx")
 from tiny_model import CARD, GRAPH, LABELS, write_model
 
 from tactile_rt.classifier import Classifier
-from tactile_rt.model_file import StateTensor, load_model, shipped_model
-from tactile_rt.stream import ModelError
+from tactile_rt.model_file import (
+    StateTensor,
+    element_order,
+    load_model,
+    probe_logits,
+    read_model,
+    shipped_model,
+)
+from tactile_rt.stream import ConfigError, ModelError, SpecMismatch
 from tactile_rt.testing import small_spec
 
 
@@ -79,6 +87,17 @@ def test_onnx_without_our_metadata_is_told_apart_from_damage(tmp_path: Path) -> 
         load_model(path)
 
 
+# The sum of two elements for a state of one.
+SWAPPED = (
+    GRAPH.replace("float[B,1] total_next)", "float[B,2] total_next)")
+    .replace(
+        "total_next = Add(total, sum)",
+        "total_wide = Add(total, sum)\n  total_next = Concat<axis = 1>(total_wide, total_wide)",
+    )
+    .replace("steps_column, total_next, last", "steps_column, total_wide, last")
+)
+
+
 def card_with(**fields: object) -> str:
     return json.dumps({**msgspec.to_builtins(CARD), **fields})
 
@@ -88,9 +107,11 @@ def card_with(**fields: object) -> str:
     [
         ("{", "has damaged metadata"),
         ("[1]", "has damaged metadata"),
-        ("{}", "has metadata of version None; this release reads 1"),
-        (card_with(version=2), "has metadata of version 2; this release reads 1"),
+        ("{}", "has metadata of version None; this release reads 1 and 2"),
+        (card_with(version=3), "has metadata of version 3; this release reads 1 and 2"),
         ('{"version": 1}', "has damaged metadata: .*missing required field"),
+        ('{"version": 1, "name": ' + "[" * 100_000, "has damaged metadata: "),
+        (card_with(clip=[1e-3, float("1e308")]).replace("1e+308", "1e999"), "has damaged metadata"),
         (card_with(steps="many"), r"has damaged metadata: .*\$.steps"),
         (card_with(spec="{}"), "has damaged metadata: array spec of version None"),
         (card_with(spec="mouse"), "has damaged metadata: not an array spec"),
@@ -132,6 +153,7 @@ def test_a_graph_that_disagrees_with_its_card_is_refused(
         (GRAPH, {"labels": LABELS[:4]}, "no output `logits` of 4 classes"),
         (GRAPH.replace("logits", "scores"), {}, "no output `logits` of 5 classes"),
         (GRAPH.replace("total_next", "summed"), {}, "no output `total_next`"),
+        (SWAPPED, {}, "no output `total_next` like `total`"),
     ],
 )
 def test_outputs_that_the_card_promises_must_be_there(
@@ -153,8 +175,22 @@ def test_outputs_that_the_card_promises_must_be_there(
         ({"clip": (1.0, 1.0, 1.0)}, "3 values of clip for 2 channels"),
         ({"scale": ()}, "0 values of scale for 2 channels"),
         ({"floor": (1e-3, 0.0)}, "floor must be positive"),
+        ({"steps": 10**9}, "1000000000 steps"),
+        ({"period_ns": 10**13}, "4 steps of 3 sub-steps of 10000000000000 ns"),
+        ({"substeps": 10**12}, "samples of shape 1000000000000x3x2"),
+        ({"labels": ("a", "a", "b", "c", "d")}, "labels are missing or repeat"),
+        ({"labels": ()}, "labels are missing or repeat"),
+        ({"state": (*CARD.state, StateTensor("samples", (1,), "float32"))}, "names of the state"),
+        ({"state": (CARD.state[0], StateTensor("total", (2**40, 2**40), "float32"))},
+         "total of shape 1099511627776x1099511627776"),
+        ({"state": (CARD.state[0], StateTensor("total", (-1,), "float32"))}, "total of shape -1"),
+        ({"state": tuple(StateTensor(f"s{i}", (2**28,), "int8") for i in range(9))}, "its state"),
+        ({"state": (CARD.state[0], StateTensor("total", (1,), "object"))}, "total of type"),
+        ({"probe": ((0.0,) * 5,) * 3}, "the probe is not 4 steps of 5 logits"),
+        ({"kind": "window"}, "a window has no state"),
+        ({"kind": "film"}, r"Invalid enum value 'film'.*kind"),
     ],
-)
+)  # fmt: skip
 def test_a_card_that_cannot_be_run_is_refused_before_it_is_run(
     tmp_path: Path, changes: dict, complaint: str
 ) -> None:
@@ -185,6 +221,7 @@ def test_loading_a_model_leaves_the_process_s_arithmetic_alone(tmp_path: Path) -
     path = write_model(tmp_path / "m.onnx")
     code = f"""
 import sys
+from dataclasses import replace
 from pathlib import Path
 from tactile_rt.model_file import load_model
 load_model(Path({str(path)!r}))
@@ -199,3 +236,96 @@ def test_the_shipped_model_can_be_run() -> None:
     assert len(card.labels) == len(set(card.labels)) >= 12
     assert card.figures["parity"] <= 1e-5
     Classifier(shipped_model(), card.array)
+
+
+# ---- what may differ between a model and a source
+
+
+def reordered(spec, order):
+    fields = ("elements", "grid", "positions", "orientations")
+    return replace(spec, **{f: tuple(getattr(spec, f)[i] for i in order) for f in fields})
+
+
+def test_a_source_with_the_elements_in_another_order_is_permuted() -> None:
+    spec = small_spec(elements=4)
+    assert element_order(spec, spec).tolist() == [0, 1, 2, 3]
+    source = reordered(spec, (2, 0, 3, 1))
+    order = element_order(spec, replace(source, name="other", rate_hz=17.0))
+    values = np.array([ord(e[-1]) for e in source.elements])
+    assert [source.elements[i] for i in order] == list(spec.elements)
+    assert values[order].tolist() == [ord(e[-1]) for e in spec.elements]
+
+
+def test_anything_else_that_differs_is_said_exactly() -> None:
+    spec = small_spec(elements=4)
+    source = reordered(spec, (2, 0, 3, 1))
+    moved = replace(source, positions=((9.0, 9.0, 9.0), *source.positions[1:]))
+    for other, said in [
+        (small_spec(elements=3), f"elements: lacks {spec.elements[3]}"),
+        (replace(source, elements=("new", *source.elements[1:])),
+         f"elements: lacks {source.elements[0]}; elements: new unknown to the model"),
+        (moved, r"positions\[2\] is \(9.0, 9.0, 9.0\), not"),
+        (replace(source, channels=source.channels[::-1]), r"channels\[0\] is"),
+        (replace(source, frame="elsewhere"), "frame is 'elsewhere', not"),
+    ]:  # fmt: skip
+        with pytest.raises(SpecMismatch, match=said):
+            element_order(spec, other)
+
+
+# ---- versions, kinds, providers
+
+
+def test_metadata_of_version_1_is_read(tmp_path: Path) -> None:
+    added = ("kind", "precision", "opset", "hashes", "thresholds", "decision", "probe")
+    old = {k: v for k, v in json.loads(card_with(version=1)).items() if k not in added}
+    _, card = load_model(write_model(tmp_path / "m.onnx", metadata=json.dumps(old)))
+    assert card == msgspec.structs.replace(CARD, version=1)
+    assert read_model(shipped_model())[0].version in (1, 2)
+
+
+def test_fields_that_a_later_release_adds_are_passed_over(tmp_path: Path) -> None:
+    path = write_model(tmp_path / "m.onnx", metadata=card_with(colour="red"))
+    assert load_model(path)[1] == CARD
+
+
+WINDOW = """
+<ir_version: 9, opset_import: ["" : 18]>
+tiny (float[B,T,3,3,2] samples, float[B,3,2] offset, float[B,3,2] sigma)
+  => (float[B,T,5] logits)
+<int64[2] axes = {3, 4}, int64[1] width = {2}, int64[3] same = {1, 1, 5}>
+{
+  spread = ReduceSum<keepdims = 0>(samples, axes)
+  first = ReduceSum<keepdims = 1>(spread, width)
+  logits = Tile(first, same)
+}
+"""
+
+
+def test_a_window_is_loaded_only_where_one_is_wanted(tmp_path: Path) -> None:
+    path = write_model(tmp_path / "m.onnx", WINDOW, kind="window", state=())
+    with pytest.raises(ModelError, match=f"^{path} is a model of kind 'window'; this needs 'step'"):
+        load_model(path)
+    session, card = load_model(path, kind="window")
+    assert probe_logits(session, card).shape == (4, 5)
+    fixed = WINDOW.replace("B,T", "B,7")
+    write_model(path, fixed, kind="window", state=())
+    with pytest.raises(ModelError, match=r"disagree with its metadata at samples$"):
+        load_model(path, kind=None)
+
+
+def test_a_provider_that_is_not_there_is_refused_not_replaced(tmp_path: Path) -> None:
+    path = write_model(tmp_path / "m.onnx")
+    with pytest.raises(ConfigError, match=r"^no NoSuchProvider in this onnxruntime: it has .*CPU"):
+        load_model(path, providers=("NoSuchProvider", "CPUExecutionProvider"))
+
+
+GOLDEN = [0.0, 4.0, 0.00201300555, -1.13864025e-05, 0.00100000005]
+
+
+def test_the_probe_is_one_episode_of_the_same_input_everywhere(tmp_path: Path) -> None:
+    session, card = load_model(write_model(tmp_path / "m.onnx"))
+    logits = probe_logits(session, card)
+    assert logits[:, 1].tolist() == [1, 2, 3, 4]  # steps since the reset
+    # Golden: the input must never change, or stored probes would all miss.
+    assert np.array_equal(logits, probe_logits(session, card))
+    assert logits[-1].tolist() == pytest.approx(GOLDEN, rel=1e-6)

@@ -62,8 +62,8 @@ def _beside_the_peer(width: float, batch: int, repeats: int) -> list[Record]:
     double = "largest gap to the peer in double precision, 2 windows"
     return [
         # between two networks in single precision there is the rounding of both
-        Record(f"{name}.parity", own, "", "<= 1e-6", PEER, f"of our fp32 logits, {double}; {scale}"),
-        Record(f"{name}.parity_plain", others, "", how=f"of the peer's own fp32 logits, {double}"),
+        Record(f"{name}.parity", own, "", "<= 1e-6", PEER, f"ours in fp32, {double}; {scale}"),
+        Record(f"{name}.parity_plain", others, "", how=f"the peer's in fp32, {double}"),
         Record(f"{name}.parity_both", gap, "", how="largest gap of both in fp32"),
         Record(f"{name}.plain", best[1], "s", anchor="published: 21-25 s", how=how),
         Record(f"{name}.fp32", best[0], "s", how=how),

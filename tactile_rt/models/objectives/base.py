@@ -32,8 +32,16 @@ class Objective(nn.Module):
         return self.augmentation.frames(self.model.inputs(*loads), generator)
 
     def embedding(self, loads: Loads, generator: Generator) -> Tensor:
-        """(batch, feature): what encoder and attender make of a window by its last step."""
-        return self.model.features(self.frames(loads, generator))[:, -1]
+        """(batch, feature): what encoder and attender make of a window.
+
+        By its last step, or, where the network's readout is "mean", on average over all steps
+        that can know anything.
+        """
+        features = self.model.features(self.frames(loads, generator))
+        network = self.model.network
+        if network.config.readout == "mean":
+            return features[:, network.lag :].mean(dim=1)
+        return features[:, -1]
 
     def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
         """The loss of a batch.

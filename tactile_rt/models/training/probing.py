@@ -15,6 +15,7 @@ from torch.nn import functional as F
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
 from tactile_rt.models.data_checks import check_sets, check_split
 from tactile_rt.models.datasets import SweepSet, TrainingBatches, find_onsets, windows
+from tactile_rt.models.ead import READOUTS
 from tactile_rt.models.evaluation import hits, predict
 from tactile_rt.models.training.config import Progress
 from tactile_rt.models.training.logs import log_epoch
@@ -36,6 +37,8 @@ class ProbeConfig:
         drop_epochs: epochs between tenfold drops of the rate (StepLR).
         standardise: fit on features of zero mean and unit variance, folded into the layer
             afterwards; the paper does not, and features that are small then hardly train.
+        readout: "last" fits on the last step (the paper), "mean" on the mean of all steps that can
+            know anything: the only fair one for a network without memory.
         seed: of the layer, the windows and their order.
     """
 
@@ -46,9 +49,12 @@ class ProbeConfig:
     momentum: float = 0.9
     drop_epochs: int = 30
     standardise: bool = True
+    readout: str = "last"
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if self.readout not in READOUTS:
+            raise ConfigError(f"readout is {self.readout!r}, not one of {', '.join(READOUTS)}")
         for name in ("epochs", "batch", "learning_rate", "drop_epochs"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
@@ -61,7 +67,7 @@ def probe(
     report: Callable[[Progress], None] = lambda _: None,
     splits: tuple[SweepSet, SweepSet] | None = None,
 ) -> Path:
-    """Fit a linear layer on a frozen network's last step; returns a classifier's `best.pt`.
+    """Fit a linear layer on a frozen network's features; returns a classifier's `best.pt`.
 
     The layer of the best epoch by the validation split is kept.
 
@@ -91,16 +97,17 @@ def probe(
     data, validation = splits
     torch.manual_seed(config.seed)
     batches = TrainingBatches(data, min(WINDOWS, len(data.sweeps)), config.seed)
-    drawn = [(_features(trained, *loads), labels) for *loads, labels in batches.epoch(0)]
+    begin = trained.network.encoder.lag if config.readout == "mean" else -1
+    drawn = [(_features(trained, begin, *loads), labels) for *loads, labels in batches.epoch(0)]
     features, labels = (torch.cat(part) for part in zip(*drawn, strict=True))
     layer, history = linear_probe(
-        features, labels, *_validation(trained, validation), len(manifest.categories), config
+        features, labels, *_validation(trained, begin, validation), len(manifest.categories), config
     )
     network = replace(
         trained.network.config,
         classes=len(manifest.categories),
         decoder="linear",
-        readout="last",
+        readout=config.readout,
     )
     model = TactileClassifier(manifest.spec, network)
     kept = {k: v for k, v in trained.state_dict().items() if not k.startswith("network.decoder.")}
@@ -177,13 +184,16 @@ def linear_probe(
     return layer, history
 
 
-def _features(model: TactileClassifier, samples: Tensor, offset: Tensor, sigma: Tensor) -> Tensor:
-    """(window, feature) of the last step."""
+def _features(
+    model: TactileClassifier, begin: int, samples: Tensor, offset: Tensor, sigma: Tensor
+) -> Tensor:
+    """(window, feature), the mean of the steps from `begin` on."""
     with torch.inference_mode():
-        return model.features(model.inputs(samples, offset, sigma))[:, -1].float().clone()
+        steps = model.features(model.inputs(samples, offset, sigma))[:, begin:]
+        return steps.float().mean(dim=1)
 
 
-def _validation(model: TactileClassifier, data: SweepSet) -> tuple[Tensor, Tensor]:
+def _validation(model: TactileClassifier, begin: int, data: SweepSet) -> tuple[Tensor, Tensor]:
     """Features and labels of the clean sweeps in which contact is found."""
     found = find_onsets(data.sweeps.values, data.floor)
     usable = torch.from_numpy(found.start >= 0).nonzero().flatten()
@@ -193,5 +203,5 @@ def _validation(model: TactileClassifier, data: SweepSet) -> tuple[Tensor, Tenso
     for at in usable.split(WINDOWS):
         k = at.numpy()
         arrays = windows(data.sweeps.values[k], found.start[k]), found.offset[k], found.sigma[k]
-        parts.append(_features(model, *(torch.from_numpy(a) for a in arrays)))
+        parts.append(_features(model, begin, *(torch.from_numpy(a) for a in arrays)))
     return torch.cat(parts), torch.from_numpy(data.sweeps.labels)[usable]
