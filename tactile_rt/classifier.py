@@ -14,7 +14,6 @@ A silence too long for the resampler to bridge ends an episode early.
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -24,6 +23,8 @@ from numpy.typing import NDArray
 from tactile_rt.contact import ContactDetector
 from tactile_rt.inference.bad_samples import without_bad_samples
 from tactile_rt.inference.deadline import Deadline, Policy
+from tactile_rt.inference.decisions import Classification, ClassifierStats, fuse
+from tactile_rt.inference.early_exit import IN_A_ROW, EarlyExit
 from tactile_rt.inference.lanes import Lanes
 from tactile_rt.inference.providers import onnxruntime_names
 from tactile_rt.inference.stepper import Stepper
@@ -34,60 +35,7 @@ from tactile_rt.timebase import NS_PER_S, Resampler
 __all__ = ["Classification", "Classifier", "ClassifierStats", "fuse"]
 
 Mode = Literal["episode", "sliding"]
-EVERY = 4  # steps between the decisions of sliding windows: 180 ms at 45 ms
-
-
-@dataclass(frozen=True)
-class Classification:
-    """A decision during an episode.
-
-    Attributes:
-        onset_ns: stream time at which contact began, ns.
-        t_ns: stream time of the last resampled sample used, ns.
-        step: steps used, counted from 1; those before them, of a longer contact, are not in it.
-        final: nothing more will be said of this window; an episode that a silence of the stream
-            cuts short has no such decision.
-        label: the most probable class.
-        labels: all class names.
-        probabilities: (class,) float32 posterior.
-        latency_s: time the model step took, s.
-        late: more work had gathered than the deadline allows.
-    """
-
-    onset_ns: int
-    t_ns: int
-    step: int
-    final: bool
-    label: str
-    labels: tuple[str, ...]
-    probabilities: NDArray[np.float32]
-    latency_s: float
-    late: bool = False
-
-    def top(self, k: int = 5) -> list[tuple[str, float]]:
-        """The k most probable classes with their probabilities."""
-        order = np.argsort(-self.probabilities, kind="stable")[:k]
-        return [(self.labels[i], float(self.probabilities[i])) for i in order]
-
-
-@dataclass
-class ClassifierStats:
-    """Counted since the classifier was made.
-
-    Attributes:
-        steps: that the network took.
-        late: steps that missed the deadline.
-        withheld: decisions that were not returned because they were late.
-        bad_samples: samples of one element that were no number, infinite or absurd, though marked
-            valid; they were taken for invalid.
-        bad_steps: steps at which the network said no numbers; they gave no decision.
-    """
-
-    steps: int = 0
-    late: int = 0
-    withheld: int = 0
-    bad_samples: int = 0
-    bad_steps: int = 0
+EVERY = 4
 
 
 class Classifier:
@@ -99,10 +47,11 @@ class Classifier:
         model: path of the ``.onnx`` file.
         spec: the array that the stream comes from.
         mode: ``episode`` or ``sliding``.
-        every: steps between the windows of ``sliding``; the network then runs in
-            ceil(steps / every) lanes, and takes about as many times as long.
+        every: steps between the windows of ``sliding``, None for 4 (180 ms at 45 ms); the network
+            runs in ceil(steps / every) lanes, and takes up to as many times as long.
         sure: probability of the best class at which an episode ends early, or None: accuracy
             given for time, see `tactile_rt.inference.early_exit`. Of ``episode`` only.
+        in_a_row: steps running in which the same class must be so sure.
         deadline_s: work that may gather before a step is late, s; None is the step's length.
         late: what becomes of a late decision, see `tactile_rt.inference.deadline.Deadline`.
         providers: execution providers, first choice first: cpu, cuda, tensorrt, openvino, coreml.
@@ -128,14 +77,19 @@ class Classifier:
         spec: ArraySpec,
         *,
         mode: Mode = "episode",
-        every: int = EVERY,
+        every: int | None = None,
         sure: float | None = None,
+        in_a_row: int = IN_A_ROW,
         deadline_s: float | None = None,
         late: Policy = "count",
         providers: Sequence[str] = ("cpu",),
         threads: int = 1,
     ) -> None:
-        _check_mode(mode, sure)
+        if mode not in get_args(Mode):
+            raise ConfigError(f"mode: {mode!r}; it can be {', '.join(get_args(Mode))}")
+        if mode == "sliding" and sure is not None:
+            raise ConfigError("sure: windows that slide have no early end; decide by episodes")
+        self._exit = EarlyExit(sure, in_a_row)
         session, self.card = load_model(model, onnxruntime_names(providers), threads)
         try:
             order = element_order(self.card.array, spec)
@@ -148,9 +102,9 @@ class Classifier:
         self.stats = ClassifierStats()
         self.providers: tuple[str, ...] = tuple(session.get_providers())
         self._sliding = mode == "sliding"
-        self._sure = np.inf if sure is None else sure
         steps = self.card.steps
-        self._lanes = Lanes(steps, min(every, steps) if self._sliding else steps)
+        every = min(EVERY, steps) if every is None else every
+        self._lanes = Lanes(steps, every if self._sliding else steps)
         step_s = self.card.substeps * self.card.period_ns / NS_PER_S
         self._deadline = Deadline(step_s if deadline_s is None else deadline_s, late)
         self._stepper = Stepper(session, self.card, self._lanes.count)
@@ -210,6 +164,7 @@ class Classifier:
         self._onset_ns = t_ns
         self._filled = self._step = 0
         self._decided = False
+        self._exit.begin()
         self._offset = self.detector.offset
         self._sigma = self.detector.sigma
         self._stepper.begin(self._offset[self._order], self._sigma[self._order])
@@ -237,7 +192,7 @@ class Classifier:
             self._give_up()
             return None
         best = int(probabilities.argmax())
-        final = step == self.card.steps or bool(probabilities[best] >= self._sure)
+        final = step == self.card.steps or self._exit.reached(best, float(probabilities[best]))
         self._decided = self._decided or final
         if late and self._deadline.policy == "skip":
             self.stats.withheld += 1
@@ -267,28 +222,3 @@ class Classifier:
         self._step = 0
         self._decided = True
         self._stepper.begin(self._offset[self._order], self._sigma[self._order])
-
-
-def _check_mode(mode: str, sure: float | None) -> None:
-    if mode not in get_args(Mode):
-        raise ConfigError(f"mode: {mode!r}; it can be {', '.join(get_args(Mode))}")
-    if sure is None:
-        return
-    if mode == "sliding":
-        raise ConfigError("sure: windows that slide have no early end; decide by episodes")
-    if not 0 < sure <= 1:
-        raise ConfigError(f"sure: {sure} is no probability above 0")
-
-
-def fuse(posteriors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
-    """Combine posteriors (class,) of independent sweeps of one object: their normalised product.
-
-    Assumes equal priors, as the training sets have.
-
-    Raises:
-        ValueError: no posteriors.
-    """
-    evidence = np.log(np.clip(np.stack(posteriors), 1e-12, None)).sum(axis=0)
-    fused = np.exp(evidence - evidence.max())
-    normalised: NDArray[np.float32] = (fused / fused.sum()).astype(np.float32)
-    return normalised

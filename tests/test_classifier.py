@@ -11,8 +11,15 @@ pytest.importorskip("onnx")
 
 from tiny_model import CARD, LABELS, PERIOD_NS, STEPS, SUBSTEPS, logits_of, write_model
 from touch_streams import (
-    QUIET, SAME_RATE, SIGMA, SPEC, expected_logits, push_all, signal, stream,
-)  # fmt: skip
+    QUIET,
+    SAME_RATE,
+    SIGMA,
+    SPEC,
+    expected_logits,
+    push_all,
+    signal,
+    stream,
+)
 
 from tactile_rt.classifier import Classification, Classifier, fuse
 from tactile_rt.stream import Chunk, ModelError, SpecMismatch, concatenate
@@ -259,7 +266,10 @@ def test_the_tared_sample_is_the_last_one_less_its_offset(model: Path) -> None:
         ({"channels": ("fx", "mz")}, "channels[0] is 'fx', not 'fy'"),
         ({"units": ("mN", "N m")}, "units[0] is 'mN', not 'N'"),
         ({"grid": ((0, 0), (0, 1), (1, 0))}, "grid[2] is (1, 0), not (0, 2)"),
-        ({"frame": "base", "elements": ("A0", "A1", "B7")}, "elements: lacks A2; elements: B7 unknown to the model; frame"),
+        (
+            {"frame": "base", "elements": ("A0", "A1", "B7")},
+            "elements: lacks A2; elements: B7 unknown to the model; frame",
+        ),
     ],
 )
 def test_another_array_is_refused_by_where_it_differs(model: Path, change: dict, said: str) -> None:

@@ -13,11 +13,11 @@ pytest.importorskip("onnx")
 from tiny_model import CARD, GRAPH, LABELS, write_model
 
 from tactile_rt.classifier import Classifier
+from tactile_rt.model_checks import probe_logits
 from tactile_rt.model_file import (
     StateTensor,
     element_order,
     load_model,
-    probe_logits,
     read_model,
     shipped_model,
 )

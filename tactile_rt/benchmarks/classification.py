@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from tactile_rt.benchmarks.records import Record
 from tactile_rt.benchmarks.robustness import RATED, measure_robustness, robustness_records
-from tactile_rt.classifier import ADAPTED
 from tactile_rt.model_file import load_model
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
@@ -60,7 +59,7 @@ def evaluate_model(
     test = SweepSet.read(data, "test")
     if test.manifest.categories != card.labels:
         raise ConfigError(f"{model} knows other categories than {data}")
-    differences = card.array.differences(test.manifest.spec, ignore=ADAPTED)
+    differences = card.array.differences(test.manifest.spec, ignore=("name", "rate_hz"))
     if differences:
         raise SpecMismatch(f"{model} was made for another array: " + "; ".join(differences))
     if test.manifest.period_ns != card.period_ns:

@@ -50,6 +50,7 @@ def main() -> None:
     # Each module adds its commands; what a command needs is imported when it runs, so that
     # `--help` is instant and a robot never imports torch.
     from tactile_rt.cli import (  # noqa: F401
+        align,
         bench,
         calibrating,
         daemon,
@@ -58,11 +59,14 @@ def main() -> None:
         evaluating,
         grids,
         hil,
+        install,
         live,
         locating,
+        model,
         modelling,
         recording,
         simulation,
+        top,
         view,
         whisking,
     )

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from tactile_rt.benchmarks import roofline
 from tactile_rt.benchmarks.drivers import fuzzing, losses, unplugging
 from tactile_rt.benchmarks.records import Record
 
@@ -25,14 +26,18 @@ def test_a_folder_that_is_not_there_is_named_before_measuring(call, tmp_path):
     assert f"no folder {tmp_path / 'not'}" in err
 
 
-def test_inference_loses_no_sample_uncounted(call, tmp_path):
+def test_inference_loses_no_sample_uncounted(call, tmp_path, monkeypatch):
+    monkeypatch.setattr(roofline, "WEIGHTS", (512, 512))  # in cache, for a test
     code, out, _ = call("bench", "inference", "--quick", "--json", tmp_path / "figures.json")
     figures = {r["name"]: r for r in json.loads((tmp_path / "figures.json").read_text())}
     assert code == 0
-    assert "of 5 bars met" in out
+    assert "of 7 bars met" in out
     assert figures["inference.slow_dropped"]["value"] > 0  # the consumer was too slow
     assert figures["inference.slow_uncounted"]["value"] == 0
     assert figures["inference.size"]["met"]
+    assert figures["inference.shipped.over_roofline"]["value"] > 1
+    assert figures["inference.full_size"]["value"] == 0
+    assert "quick" in figures["inference.full_size"]["how"]
     assert 0 < figures["inference.step_p50"]["value"] <= figures["inference.step_p99"]["value"]
 
 

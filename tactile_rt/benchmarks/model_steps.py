@@ -1,0 +1,143 @@
+"""Steps of model files beside the roofline, and the published networks at full size to measure.
+
+The latter are made here, with random weights, and need the `train` extra.
+"""
+
+import gc
+import importlib
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from tactile_rt.benchmarks.records import Record
+from tactile_rt.benchmarks.roofline import Machine, products, roofline_s
+from tactile_rt.inference.stepper import Stepper
+from tactile_rt.model_file import METADATA_KEY, ModelCard, load_model, read_model, shipped_model
+
+__all__ = ["CLASSES", "FULL_SIZE", "Subject", "full_size", "measure_model", "step_times"]
+
+TAIL = "<= 1.3"  # p99 over p50 of every step
+CLASSES = 117  # of the published networks
+LOAD_INT8_MS = "<= 1000"
+# (name, attender, bar of fp32, bar of int8): p50 over the roofline
+FULL_SIZE = (("intersection_ln", "none", "<= 1.25", "<= 1.6"), ("gpt", "gpt", "<= 1.4", "<= 1.7"))
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A model file to measure, and the bars that it must meet; without one it is only reported."""
+
+    name: str
+    path: Path
+    over_roofline: str = ""
+    step_ms: str = ""
+    load_ms: str = ""
+
+
+def measure_model(subject: Subject, machine: Machine | None, steps: int) -> list[Record]:
+    """Measure one file of kind "step": size, loading, memory, steps, and these over the roofline.
+
+    Raises:
+        ModelError: the file cannot be used.
+    """
+    name, path = f"inference.{subject.name}", subject.path
+    path.read_bytes()  # so that the file is cached
+    gc.collect()
+    before, began = _resident(), time.process_time()
+    session, card = load_model(path)
+    load = time.process_time() - began
+    taken = 1e3 * step_times(session, card, steps)
+    grown = _resident() - before
+    p50, p99 = np.percentile(taken, 50), np.percentile(taken, 99)
+    how = f"network alone, {steps} steps, one thread"
+    records = [
+        Record(f"{name}.size", path.stat().st_size / 1e6, "MB", how=card.precision),
+        Record(f"{name}.load", 1e3 * load, "ms CPU", subject.load_ms, how="file cached"),
+        Record(f"{name}.memory", grown / 1e6, "MB", how="resident, after the steps"),
+        Record(f"{name}.step_p50", float(p50), "ms CPU", subject.step_ms, "45 ms budget", how),
+        Record(f"{name}.step_tail", float(p99 / p50), "x p50", TAIL, f"p99 {p99:.3g} ms CPU", how),
+    ]
+    if machine is not None:
+        work = products(path)
+        least = 1e3 * roofline_s(machine, work)
+        operations = sum(p.operations for p in work) / 1e6
+        weights = sum(p.weights for p in work) / 1e6
+        records.append(
+            Record(
+                f"{name}.over_roofline",
+                float(p50 / least),
+                "x",
+                subject.over_roofline,
+                f"roofline {least:.3g} ms",
+                f"{len(work)} products, {operations:.3g} M operations, {weights:.3g} MB of weights",
+            )
+        )
+    return records
+
+
+def step_times(session: ort.InferenceSession, card: ModelCard, steps: int) -> NDArray[np.float64]:
+    """CPU time of each step of episodes of noise, run as the classifier runs them, s."""
+    rng = np.random.default_rng(0)
+    scale = np.array(card.scale, dtype=np.float32)
+    offset = np.zeros(card.array.shape, dtype=np.float32)
+    sigma = np.broadcast_to(np.array(card.floor, dtype=np.float32), card.array.shape)
+    shape = (card.steps, card.substeps, *card.array.shape)
+    noise = rng.standard_normal(shape, dtype=np.float32) * scale
+    stepper = Stepper(session, card)
+    taken = np.empty(steps)
+    for step in range(-card.steps, steps):  # an episode to warm up
+        if step % card.steps == 0:
+            stepper.begin(offset, sigma)
+        stepper.samples[0] = noise[step % card.steps]
+        began = time.thread_time()
+        stepper.run()
+        if step >= 0:
+            taken[step] = time.thread_time() - began
+    return taken
+
+
+def full_size(folder: Path, lacking: list[str]) -> Iterator[Subject]:
+    """Make the published networks with random weights; what cannot be made is told to `lacking`."""
+    try:
+        torch: Any = importlib.import_module("torch")
+        checkpoints: Any = importlib.import_module("tactile_rt.models.checkpoints")
+        ead: Any = importlib.import_module("tactile_rt.models.ead")
+        exporting: Any = importlib.import_module("tactile_rt.export.onnx_step")
+    except ModuleNotFoundError as error:
+        lacking.append(f"full size: needs {error.name} (pip install 'tactile-rt[train]')")
+        return
+    _, card = load_model(shipped_model())
+    labels = tuple(f"class{i}" for i in range(CLASSES))
+    card = msgspec.structs.replace(card, name="random", labels=labels, provenance={}, figures={})
+    for name, attender, fp32_bar, int8_bar in FULL_SIZE:
+        torch.manual_seed(0)
+        config = ead.EADConfig(CLASSES, encoder="zhuang-intersection-ln", attender=attender)
+        path, small = folder / f"{name}.onnx", folder / f"{name}.int8.onnx"
+        exporting.export_step(checkpoints.TactileClassifier(card.array, config), card, path)
+        _write_int8(path, small)
+        gc.collect()
+        yield Subject(f"{name}.fp32", path, over_roofline=fp32_bar)
+        yield Subject(f"{name}.int8", small, over_roofline=int8_bar, load_ms=LOAD_INT8_MS)
+
+
+def _write_int8(path: Path, small: Path) -> None:
+    onnx: Any = importlib.import_module("onnx")
+    precision: Any = importlib.import_module("tactile_rt.export.precision")
+    proto = precision.in_precision(onnx.load(path), "int8")
+    card = msgspec.structs.replace(read_model(path)[0], precision="int8", probe=(), hashes={})
+    onnx.helper.set_model_props(proto, {METADATA_KEY: msgspec.json.encode(card).decode()})
+    onnx.save(proto, small)
+
+
+def _resident() -> int:
+    """Bytes of memory that this process holds."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")

@@ -1,0 +1,120 @@
+"""`tactile-rt model show`, `verify` and `bench`: what is in a file, is it whole, is it fast."""
+
+import math
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tactile_rt.cli import app
+from tactile_rt.stream import ModelError
+
+model = typer.Typer(help="Look into a model file, check it, time it.", no_args_is_help=True)
+app.add_typer(model, name="model")
+
+File = Annotated[Path, typer.Argument(help="An .onnx model.")]
+MANY = 8  # classes named before "..."
+
+
+@model.command()
+def show(file: File) -> None:
+    """What a model is: read, not run."""
+    from tactile_rt.model_card import one_line
+    from tactile_rt.model_file import read_model
+    from tactile_rt.timebase import NS_PER_S
+
+    card, contents, data = read_model(file)
+    spec = card.array
+    period_ms = card.period_ns / NS_PER_S * 1e3
+    rest = f", ... {card.labels[-1]}" if len(card.labels) > MANY else ""
+    state = sum(math.prod(s.shape) for s in card.state)
+    opset = contents.opset.get("", contents.opset.get("ai.onnx", 0))
+    rows = {
+        "name": card.name,
+        "file": f"{len(data) / 1e6:.2f} MB, {card.precision}, metadata version {card.version}",
+        "graph": f"{sum(contents.operators.values())} operators, opset {opset}, "
+        f"{contents.weights / 1e6:.2f} MB of weights, by {contents.producer or 'unknown'}",
+        "kind": "one step of a stream" if card.kind == "step" else "a whole window",
+        "array": f"{spec.name}: {spec.shape[0]} elements x {', '.join(spec.channels)} "
+        f"at {spec.rate_hz:g} Hz, frame {spec.frame}",
+        "input": f"resampled to {NS_PER_S / card.period_ns:.4g} Hz; a step is {card.substeps} x "
+        f"{period_ms:g} ms, an episode {card.steps} steps "
+        f"({card.steps * card.substeps * period_ms / 1e3:.3g} s)",
+        "classes": f"{len(card.labels)}: {', '.join(card.labels[:MANY])}{rest}",
+        "state": f"{len(card.state)} tensors, {state} values" if card.state else "none",
+        "clip": _channels(spec, card.clip),
+        "scale": _channels(spec, card.scale),
+        "noise floor": _channels(spec, card.floor),
+        "temperature": f"{card.temperature:.4g}",
+        "thresholds": _pairs(card.thresholds),
+        "decisions": _pairs(card.decision),
+        "figures": _pairs(card.figures),
+        "probe": "stored" if card.probe else "none stored",
+        "hashes": _pairs(card.hashes),
+        "made by": _pairs({k: v for k, v in card.provenance.items() if isinstance(v, str)}),
+        "commands": "\n".join(map(str, card.provenance.get("commands", []))),
+    }
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for what, text in rows.items():
+        if text:
+            # Text of a stranger's file: nothing in it is for the terminal to obey.
+            lines = "\n".join(one_line(line) for line in text.splitlines())
+            table.add_row(what, escape(lines))
+    Console().print(table)
+
+
+@model.command()
+def verify(file: File) -> None:
+    """Whether a file is whole, and computes here what it did where it was made.
+
+    Reads it within bounds, checks its metadata against its graph, runs an
+    episode of built-in input, and compares the logits with those in the file.
+    """
+    import hashlib
+
+    from tactile_rt.model_checks import verify_model
+    from tactile_rt.model_file import load_model, read_model
+
+    _, contents, data = read_model(file)
+    typer.echo(f"sha256 {hashlib.sha256(data).hexdigest()}")
+    typer.echo(f"structure: {sum(contents.operators.values())} operators, nothing outside the file")
+    _, card = load_model(file, kind=None)
+    typer.echo(f"metadata: version {card.version}, agrees with the graph")
+    for line in verify_model(file):
+        typer.echo(line)
+
+
+@model.command()
+def bench(
+    file: File,
+    steps: Annotated[int, typer.Option(min=10, max=1_000_000, help="Steps to time.")] = 2000,
+) -> None:
+    """How fast it is here: size, loading, memory, CPU time of a step, and the machine's limit."""
+    from tactile_rt.benchmarks.model_steps import Subject, measure_model
+    from tactile_rt.benchmarks.records import show as show_records
+    from tactile_rt.benchmarks.roofline import measure_machine
+    from tactile_rt.model_file import read_model
+
+    card, _, _ = read_model(file)
+    if card.kind != "step":
+        raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
+    with Console(stderr=True).status("measuring"):
+        records = measure_model(Subject("model", file), measure_machine(10), steps)
+    show_records(records, Console())
+
+
+def _channels(spec: Any, values: tuple[float, ...]) -> str:
+    named = zip(spec.channels, values, spec.units, strict=True)
+    return ", ".join(f"{channel} {value:.3g} {unit}" for channel, value, unit in named)
+
+
+def _pairs(values: dict[str, Any]) -> str:
+    def said(value: Any) -> str:
+        return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+    return "\n".join(f"{key}: {said(value)}" for key, value in values.items())

@@ -1,0 +1,1 @@
+"""The parts of the classifier: network step, execution providers, lanes, deadline, early exit."""

@@ -1,0 +1,311 @@
+"""What an ONNX file holds, read without running it: a bounded walk over its protobuf fields.
+
+onnxruntime follows what a file says: external data to any path, an operator's context to another
+file, a constant's shape to any amount of memory. So a file is walked first, and refused if it is
+anything but weights, ONNX's own operators and metadata within these limits. Only the bytes given
+are read. Field numbers are those of ``onnx.proto`` (IR version 10).
+"""
+
+import hashlib
+import math
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+__all__ = ["MAX_BYTES", "BadModel", "Contents", "graph_sha256", "read_onnx"]
+
+MAX_BYTES = 2**31 - 1  # protobuf's own limit
+MAX_METADATA = 4 * 2**20  # bytes: labels, array, provenance and figures take some 10 kB
+MAX_PARTS = 1_000_000  # protobuf fields: the largest network has some 30,000
+MAX_DEPTH = 8  # graphs within graphs
+MAX_ELEMENTS = 2**28  # of one tensor: 1 GiB of float32
+MAX_SHAPE = 16  # axes of a constant that may be a shape
+
+# Of onnxruntime's own operators those that quantised and fused networks need; EPContext, for one,
+# opens the file that it names.
+MICROSOFT = frozenset(
+    ("DynamicQuantizeMatMul", "FastGelu", "FusedMatMul", "Gelu", "MatMulIntegerToFloat",
+     "MatMulNBits", "QGemm", "QuickGelu", "SkipLayerNormalization")
+)  # fmt: skip
+# Operators whose output is as large as a constant input says: the input's position.
+SIZED_BY = {"ConstantOfShape": 0, "Expand": 1, "OneHot": 1, "Pad": 1, "Range": 1, "Tile": 1}
+VARINT, FIXED64, BYTES, FIXED32 = 0, 1, 2, 5
+TENSOR_BITS = {1: 32, 2: 8, 3: 8, 4: 16, 5: 16, 6: 32, 7: 64, 9: 8, 10: 16, 11: 64, 12: 32,
+               13: 64, 14: 64, 15: 128, 16: 16, 17: 8, 18: 8, 19: 8, 20: 8, 21: 4,
+               22: 4}  # fmt: skip
+INT64 = 7
+
+
+class BadModel(Exception):
+    """The bytes are no model, or one that we do not open: the message says why, in one line."""
+
+
+@dataclass
+class Contents:
+    """What a model file holds.
+
+    Attributes:
+        producer: the program that wrote it.
+        opset: version of each operator set, by domain; ``""`` is ONNX's own.
+        metadata: the file's key-value pairs.
+        operators: how often each is used, subgraphs included.
+        weights: bytes of stored tensors.
+    """
+
+    producer: str = ""
+    opset: dict[str, int] = field(default_factory=dict)
+    metadata: dict[str, str] = field(default_factory=dict)
+    operators: Counter[str] = field(default_factory=Counter)
+    weights: int = 0
+
+
+def read_onnx(data: bytes) -> Contents:
+    """Walk a serialised ``ModelProto``.
+
+    Raises:
+        BadModel: damaged, or with external data, foreign operators, functions, training, loops,
+            or anything past this module's limits.
+    """
+    return _Walk(data).model()
+
+
+def graph_sha256(data: bytes) -> str:
+    """SHA-256 (hex) of a model's bytes less its metadata: what computes, whoever described it.
+
+    Raises:
+        BadModel: damaged.
+    """
+    walk, digest, kept = _Walk(data), hashlib.sha256(), 0
+    at = 0
+    for number, _, _, end in walk.fields(0, len(data)):
+        if number == 14:
+            digest.update(walk.data[kept:at])
+            kept = end
+        at = end
+    digest.update(walk.data[kept:])
+    return digest.hexdigest()
+
+
+class _Walk:
+    def __init__(self, data: bytes) -> None:
+        if len(data) > MAX_BYTES:
+            raise BadModel(f"{len(data)} bytes, more than the {MAX_BYTES} that ONNX allows")
+        self.data = memoryview(data)
+        self.parts = 0
+        self.found = Contents()
+        self.sizes: dict[str, int] = {}  # of constants that may be shapes: elements they ask for
+        self.asked: list[tuple[str, str]] = []  # (operator, constant) to look up at the end
+
+    def fields(self, at: int, end: int) -> Iterator[tuple[int, int, int, int]]:
+        """(field number, wire type, start or varint value, end) of every field in a message."""
+        while at < end:
+            self.parts += 1
+            if self.parts > MAX_PARTS:
+                raise BadModel(f"more than {MAX_PARTS} parts")
+            tag, at = self.varint(at, end)
+            number, wire = tag >> 3, tag & 7
+            if tag >= 2**32 or number == 0:
+                raise BadModel(f"damaged at byte {at}")
+            value = at
+            if wire == VARINT:
+                value, at = self.varint(at, end)
+            elif wire == BYTES:
+                length, value = self.varint(at, end)
+                at = value + length
+            elif wire in (FIXED32, FIXED64):
+                at += 4 if wire == FIXED32 else 8
+            else:
+                raise BadModel(f"damaged at byte {at}")
+            if at > end:
+                raise BadModel(f"cut short or damaged at byte {value}")
+            yield number, wire, value, at
+
+    def varint(self, at: int, end: int) -> tuple[int, int]:
+        value = 0
+        for shift in range(0, 70, 7):
+            if at >= end:
+                raise BadModel(f"cut short or damaged at byte {at}")
+            byte = self.data[at]
+            at += 1
+            value |= (byte & 0x7F) << shift
+            if byte < 0x80:
+                return value & (2**64 - 1), at
+        raise BadModel(f"damaged at byte {at}")
+
+    def messages(self, at: int, end: int, **wanted: int) -> Iterator[tuple[str, int, int]]:
+        """(name, start, end) of the wanted fields; they must hold bytes. The rest is skipped."""
+        names = {number: name for name, number in wanted.items()}
+        for number, wire, start, stop in self.fields(at, end):
+            if number in names:
+                if wire != BYTES:
+                    raise BadModel(f"damaged at byte {start}")
+                yield names[number], start, stop
+
+    def text(self, at: int, end: int) -> str:
+        try:
+            return str(self.data[at:end], "utf-8")
+        except UnicodeDecodeError:
+            raise BadModel(f"damaged text at byte {at}") from None
+
+    def model(self) -> Contents:
+        graphs = described = 0
+        parts = self.messages(
+            0, len(self.data), producer=2, graph=7, opset=8, metadata=14, training=20, function=25
+        )
+        for what, at, end in parts:
+            if what == "producer":
+                self.found.producer = self.text(at, end)
+            elif what == "graph":
+                graphs += 1
+                self.graph(at, end, 0)
+            elif what == "opset":
+                self.opset(at, end)
+            elif what == "metadata":
+                described += end - at
+                if described > MAX_METADATA:
+                    raise BadModel(f"more than {MAX_METADATA} bytes of metadata")
+                self.metadata(at, end)
+            else:
+                raise BadModel(f"has a {what} of its own, which we do not run")
+        if graphs != 1:
+            raise BadModel("no graph in it" if not graphs else "more than one graph")
+        for operator, name in self.asked:
+            if self.sizes.get(name, 0) > MAX_ELEMENTS:
+                raise BadModel(f"{operator} asks for {self.sizes[name]} elements")
+        return self.found
+
+    def opset(self, at: int, end: int) -> None:
+        domain, version = "", 0
+        for number, wire, value, stop in self.fields(at, end):
+            if (number, wire) == (1, BYTES):
+                domain = self.text(value, stop)
+            elif (number, wire) == (2, VARINT):
+                version = value
+        self.found.opset[domain] = version
+
+    def metadata(self, at: int, end: int) -> None:
+        pair = {"key": "", "value": ""}
+        for what, start, stop in self.messages(at, end, key=1, value=2):
+            pair[what] = self.text(start, stop)
+        if pair["key"] in self.found.metadata:
+            raise BadModel(f"metadata {pair['key'][:40]!r} twice")
+        self.found.metadata[pair["key"]] = pair["value"]
+
+    def graph(self, at: int, end: int, depth: int) -> None:
+        if depth > MAX_DEPTH:
+            raise BadModel(f"more than {MAX_DEPTH} graphs within graphs")
+        parts = self.messages(at, end, node=1, tensor=5, input=11, output=12, value=13, sparse=15)
+        for what, start, stop in parts:
+            if what == "node":
+                self.node(start, stop, depth)
+            elif what == "tensor":
+                self.tensor(start, stop)
+            elif what == "sparse":
+                self.sparse(start, stop)
+            else:
+                self.value(start, stop)
+
+    def node(self, at: int, end: int, depth: int) -> None:
+        inputs, outputs, operator, domain = [], [], "", ""
+        attributes = []
+        for what, start, stop in self.messages(
+            at, end, input=1, output=2, operator=4, attribute=5, domain=7
+        ):
+            if what == "attribute":
+                attributes.append((start, stop))
+                continue
+            text = self.text(start, stop)
+            if what == "input":
+                inputs.append(text)
+            elif what == "output":
+                outputs.append(text)
+            elif what == "operator":
+                operator = text
+            else:
+                domain = text
+        if domain not in ("", "ai.onnx") and not (
+            domain == "com.microsoft" and operator in MICROSOFT
+        ):
+            raise BadModel(f"operator {operator[:40]!r} of {domain[:40]!r}, which we do not run")
+        if operator == "Loop":
+            raise BadModel("operator 'Loop', which may never end")
+        self.found.operators[operator] += 1
+        for start, stop in attributes:
+            self.attribute(start, stop, depth, outputs[0] if outputs else "")
+        position = SIZED_BY.get(operator)
+        if position is not None and len(inputs) > position:
+            self.asked.append((operator, inputs[position]))
+
+    def attribute(self, at: int, end: int, depth: int, output: str) -> None:
+        """`output`: what a Constant node would call the tensor."""
+        for what, start, stop in self.messages(
+            at, end, tensor=5, graph=6, tensors=10, graphs=11, sparse=22, sparses=23
+        ):
+            if what.startswith("graph"):
+                self.graph(start, stop, depth + 1)
+            elif what.startswith("sparse"):
+                self.sparse(start, stop)
+            else:
+                self.tensor(start, stop, output)
+
+    def sparse(self, at: int, end: int) -> None:
+        for _, start, stop in self.messages(at, end, values=1, indices=2):
+            self.tensor(start, stop)
+
+    def tensor(self, at: int, end: int, name: str = "") -> None:
+        dims: list[int] = []
+        kind, raw, values = 0, None, []
+        for number, wire, value, stop in self.fields(at, end):
+            if number in (8, 9) and wire != BYTES:
+                raise BadModel(f"damaged at byte {stop}")
+            if number == 1:
+                dims += [value] if wire == VARINT else self.varints(value, stop)
+            elif number == 2:
+                kind = value
+            elif number == 7 and stop - value <= MAX_SHAPE * 10:
+                values += [value] if wire == VARINT else self.varints(value, stop)
+            elif number == 8 and not name:
+                name = self.text(value, stop)
+            elif number == 9:
+                raw = (value, stop)
+            elif number == 13 or (number == 14 and (wire != VARINT or value)):
+                raise BadModel(f"tensor {name[:40]!r} is in another file, which we do not open")
+        elements = math.prod(dims)  # a negative one is huge as read
+        if elements > MAX_ELEMENTS:
+            raise BadModel(f"tensor {name[:40]!r} of {elements} elements")
+        if raw is None:
+            short = elements > 2 * (end - at)  # 4-bit numbers are the smallest
+        else:
+            bits = TENSOR_BITS.get(kind)
+            short = bits is None or (elements * bits + 7) // 8 != raw[1] - raw[0]
+        if short:
+            raise BadModel(f"tensor {name[:40]!r} does not hold its {elements} elements")
+        self.found.weights += end - at
+        if kind == INT64 and elements <= MAX_SHAPE:
+            if raw is not None:
+                values = np.frombuffer(self.data[raw[0] : raw[1]], "<u8").tolist()
+            self.sizes[name] = math.prod(abs(v - 2**64 if v >> 63 else v) or 1 for v in values)
+
+    def varints(self, at: int, end: int) -> list[int]:
+        values = []
+        while at < end:
+            self.parts += 1
+            if self.parts > MAX_PARTS:
+                raise BadModel(f"more than {MAX_PARTS} parts")
+            value, at = self.varint(at, end)
+            values.append(value)
+        return values
+
+    def value(self, at: int, end: int) -> None:
+        """ValueInfoProto -> TypeProto -> TypeProto.Tensor -> TensorShapeProto -> dimensions."""
+        elements = 1
+        for _, a, b in self.messages(at, end, type=2):
+            for _, c, d in self.messages(a, b, tensor=1):
+                for _, e, f in self.messages(c, d, shape=2):
+                    for _, g, h in self.messages(e, f, dimension=1):
+                        sizes = [v for n, w, v, _ in self.fields(g, h) if (n, w) == (1, VARINT)]
+                        elements *= max(sizes, default=1)
+        if elements > MAX_ELEMENTS:
+            raise BadModel(f"a value of {elements} elements")
