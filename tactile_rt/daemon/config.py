@@ -57,13 +57,28 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
         file: ``.onnx``; empty: the model that comes with the package.
         source: name of its source; needed if there are several.
         name: what it is called; empty: as its source.
-        decisions: ``every_step``, or ``final``: the last of each episode alone.
+        decisions: what is published: ``every_step``, or ``final`` ones alone.
+        mode: ``episode``: one decision from the onset on, better with every step; ``sliding``: as
+            long as contact lasts, one about the newest 22 steps, `every` so many of them.
+        every: steps from one to the next when sliding; 0: 4.
+        sure: an episode ends early when a class is as probable as this `in_a_row` steps; 0: never.
+        deadline_ms: how long a step may take, ms; 0: as long as the step itself.
+        late: what becomes of a step that took longer: ``count``, ``report`` in the log, or
+            ``skip``: its decision is not published.
+        providers: of onnxruntime, best first: ``cpu``, ``cuda``, ``tensorrt`` ...
     """
 
     file: str = ""
     source: str = ""
     name: OptionalName = ""
     decisions: Literal["every_step", "final"] = "every_step"
+    mode: Literal["episode", "sliding"] = "episode"
+    every: Annotated[int, msgspec.Meta(ge=0, le=22)] = 0
+    sure: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
+    in_a_row: Annotated[int, msgspec.Meta(ge=1, le=22)] = 2
+    deadline_ms: Annotated[float, msgspec.Meta(ge=0, le=10_000)] = 0.0
+    late: Literal["count", "report", "skip"] = "count"
+    providers: tuple[Text, ...] = ("cpu",)
 
 
 class PublisherConfig(_Table, frozen=True, kw_only=True):

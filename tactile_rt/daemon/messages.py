@@ -63,6 +63,7 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
         label: the most probable class; probabilities: of all of them.
         model_ms: time that the network took, ms.
         latency_ms: from the sample that completed the step until the decision was there, ms.
+        late: whether the step took longer than it may.
     """
 
     topic: ClassVar[str] = "decision"
@@ -74,6 +75,7 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
     probabilities: dict[str, float]
     model_ms: float
     latency_ms: float
+    late: bool = False
 
 
 class ContactMessage(_FromSource, frozen=True, tag="contact", kw_only=True):
@@ -182,7 +184,7 @@ def _decision(item: Decision) -> DecisionMessage:
             for label, p in zip(d.labels, d.probabilities.tolist(), strict=True)
         },
         model_ms=round(1e3 * d.latency_s, 3),
-        latency_ms=round((item.made_ns - item.sample_ns) / 1e6, 3),
+        latency_ms=round((item.made_ns - item.sample_ns) / 1e6, 3), late=d.late,
     )  # fmt: skip
 
 

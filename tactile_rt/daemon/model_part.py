@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +47,7 @@ class ModelPart(Part):
         self._half_ns = 0  # half the resampler's kernel
         self._sha256 = ""
         self._labels: tuple[str, ...] = ()
-        self._decisions = self._final = 0
+        self._decisions = self._final = self._late = self._bad_samples = 0
         self._newest: Classification | None = None
         self._touching = False
         self._latency, self._step = LatencyMeter(), LatencyMeter()
@@ -60,7 +61,7 @@ class ModelPart(Part):
             self.box.state, self._decisions, self._final, self._touching,
             newest.label if newest else "",
             float(newest.probabilities.max()) if newest else 0.0,
-            self._latency.state, self._step.state,
+            self._latency.state, self._step.state, self._late, self._bad_samples,
         )  # fmt: skip
 
     def stop(self) -> None:
@@ -102,7 +103,13 @@ class ModelPart(Part):
             raise self._refused[1]  # as long as nothing has changed, loading it again is in vain
         self._refused = None
         try:
-            self._classifier = Classifier(self.file, opened.spec)
+            config = self.config
+            self._classifier = Classifier(
+                self.file, opened.spec, mode=config.mode, every=config.every or None,
+                sure=config.sure or None, in_a_row=config.in_a_row,
+                deadline_s=config.deadline_ms / 1e3 or None, late=config.late,
+                providers=config.providers,
+            )  # fmt: skip
         except TactileError as error:
             self._refused = (tried, error)
             raise
@@ -131,7 +138,10 @@ class ModelPart(Part):
         if not run or classifier is None or opened is None:
             return
         chunk = concatenate([s.chunk for s in run]) if len(run) > 1 else run[0].chunk
+        before = replace(classifier.stats)
         decisions = classifier.push(chunk)
+        self._late += classifier.stats.late - before.late
+        self._bad_samples += classifier.stats.bad_samples - before.bad_samples
         offset = run[-1].utc_offset_ns
         frame = opened.spec.frame
         for d in decisions:

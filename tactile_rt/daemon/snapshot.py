@@ -121,6 +121,8 @@ class ModelState:
         label, probability: of the newest decision; empty and 0 before.
         latency: from the sample that completed a step to the decision.
         step: time the network took alone.
+        late: steps that took longer than they may.
+        bad_samples: that held what is no number, and were left out.
     """
 
     part: PartState
@@ -136,6 +138,8 @@ class ModelState:
     probability: float = 0.0
     latency: Latency = field(default_factory=Latency)
     step: Latency = field(default_factory=Latency)
+    late: int = 0
+    bad_samples: int = 0
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,99 @@
+"""What publishers over a network share: which messages go out, and how often."""
+
+import abc
+import time
+from typing import Annotated
+
+import msgspec
+
+from tactile_rt.daemon.config_check import is_loopback
+from tactile_rt.daemon.consumer import Consumer, View
+from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Samples
+from tactile_rt.daemon.messages import Message, message_of, state_message
+
+__all__ = ["Repeated", "Sender", "SenderOptions", "tell_exposed"]
+
+Prefix = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64}){0,7}$")]
+StateSeconds = Annotated[float, msgspec.Meta(ge=0, le=86400)]
+
+
+class SenderOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options that all of them have.
+
+    Attributes:
+        prefix: what all topics begin with.
+        samples: whether samples are published, too.
+        state_s: ``state`` and all ``array`` messages are repeated so often, s, for those that come
+            late; 0: never.
+    """
+
+    prefix: Prefix = "tactile"
+    samples: bool = False
+    state_s: StateSeconds = 1.0
+
+
+class Repeated:
+    """Messages that are sent again and again: the state and the arrays that are open.
+
+    Args:
+        every_s: so often, s; 0: never.
+    """
+
+    def __init__(self, every_s: float) -> None:
+        self._every_s, self._due = every_s, 0.0
+
+    def messages(self, view: View) -> list[Message]:
+        """Those that are due."""
+        now = time.monotonic()
+        if not self._every_s or now < self._due:
+            return []
+        self._due = now + self._every_s
+        arrays = [m for m in map(message_of, view.streams().values()) if m is not None]
+        return [*arrays, state_message(view.snapshot())]
+
+
+class Sender(Consumer):
+    """Sends each message as it is; `_send` does it.
+
+    Args:
+        name: of the publisher.
+        options: its own.
+    """
+
+    def __init__(self, name: str, options: SenderOptions) -> None:
+        self.name = name
+        wants = {Opened, Decision, Contact, Event}
+        self.wants = frozenset(wants | {Samples} if options.samples else wants)
+        self.tick_s = options.state_s
+        self._repeated = Repeated(options.state_s)
+        self._view: View | None = None
+        self._messages = self._bytes = 0
+
+    def open(self, view: View) -> None:
+        self._view = view
+        self._connect(view)
+
+    def handle(self, items: list[Item]) -> None:
+        messages: list[Message] = [m for m in map(message_of, items) if m is not None]
+        if self._view is not None:
+            messages += self._repeated.messages(self._view)
+        for message in messages:
+            self._bytes += self._send(message)
+            self._messages += 1
+
+    @abc.abstractmethod
+    def _connect(self, view: View) -> None:
+        """Begin; may raise."""
+
+    @abc.abstractmethod
+    def _send(self, message: Message) -> int:
+        """Hand a message over without waiting for anyone; its size in bytes."""
+
+
+def tell_exposed(view: View, name: str, host: str) -> None:
+    """Warn where others than this computer's own programs can read along."""
+    if not is_loopback(host):
+        view.report(
+            f"publisher.{name}", "exposed",
+            f"whoever can reach {host or 'this computer'} can read what is published", "warning",
+        )  # fmt: skip

@@ -1,0 +1,120 @@
+"""Messages over Zenoh: JSON under key expressions such as ``tactile/whiskers/decision``.
+
+Messages for a peer that cannot keep up are dropped by Zenoh, which does not say how many.
+"""
+
+from typing import Any
+
+import msgspec
+import zenoh
+
+from tactile_rt.daemon.consumer import View
+from tactile_rt.daemon.messages import Message, encode, topic_of
+from tactile_rt.daemon.publishers.sending import Sender, SenderOptions, tell_exposed
+from tactile_rt.stream import ConfigError, SourceError
+
+__all__ = ["ZenohOptions", "ZenohPublisher"]
+
+DROP = zenoh.CongestionControl.DROP
+
+
+class ZenohOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of ``kind = "zenoh"``.
+
+    Attributes:
+        listen: endpoints at which peers may come: ``tcp/ADDRESS:PORT``; none: it does not listen.
+        connect: endpoints of peers or routers to go to; those that are away are tried again.
+        scouting: whether peers find each other by multicast, which the whole network hears.
+        config_file: Zenoh's own configuration (JSON5), for TLS, access control and the like; what
+            is said here comes on top of it.
+    """
+
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    connect: tuple[str, ...] = ()
+    scouting: bool = False
+    config_file: str = ""
+
+    def __post_init__(self) -> None:
+        for endpoint in (*self.listen, *self.connect):
+            protocol, slash, address = endpoint.partition("/")
+            if not (protocol.isalnum() and slash and address):
+                raise ValueError(f"an endpoint is like tcp/127.0.0.1:7447, not {endpoint}")
+        if not (self.listen or self.connect or self.scouting or self.config_file):
+            raise ValueError("nobody could be reached: give listen, connect, scouting or a file")
+
+
+class ZenohPublisher(Sender):
+    """Puts messages as a peer of its own; nothing is listened to but what `listen` says."""
+
+    Options = ZenohOptions
+
+    def __init__(self, name: str, options: ZenohOptions) -> None:
+        super().__init__(name, options)
+        self._options = options
+        self._config()  # refuse what Zenoh does not understand before anything starts
+        self._session: zenoh.Session | None = None
+
+    def _connect(self, view: View) -> None:
+        try:
+            self._session = zenoh.open(self._config())
+        except zenoh.ZError as error:
+            raise SourceError(f"zenoh: {_short(error)}") from None
+        for endpoint in self._options.listen:
+            address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
+            tell_exposed(view, self.name, address.rpartition(":")[0])
+        if self._options.scouting:
+            tell_exposed(view, self.name, "the network by multicast")
+
+    def _send(self, message: Message) -> int:
+        assert self._session is not None
+        data = encode(message)
+        self._session.put(
+            topic_of(message, self._options.prefix), data,
+            encoding=zenoh.Encoding.APPLICATION_JSON, congestion_control=DROP,
+        )  # fmt: skip
+        return len(data)
+
+    def close(self) -> None:
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+
+    def details(self) -> dict[str, str | int | float]:
+        return {
+            "listen": " ".join(self._options.listen),
+            "connect": " ".join(self._options.connect),
+            "messages": self._messages,
+            "bytes": self._bytes,
+        }
+
+    def _config(self) -> Any:
+        options = self._options
+        said: dict[str, Any] = {
+            "listen/endpoints": list(options.listen),
+            "connect/endpoints": list(options.connect),
+            "scouting/multicast/enabled": options.scouting,
+        }
+        try:
+            if options.config_file:
+                config = zenoh.Config.from_file(options.config_file)
+                # What the file says of these stays, unless it is said here as well.
+                default = ZenohOptions()
+                said = {
+                    key: value
+                    for key, value in said.items()
+                    if getattr(options, key.split("/")[0]) != getattr(default, key.split("/")[0])
+                }
+            else:
+                config = zenoh.Config()
+                # A peer that is away is tried again for ever, and meanwhile all else goes on.
+                said |= {"mode": "peer", "connect/timeout_ms": -1, "connect/exit_on_failure": False}
+            for key, value in said.items():
+                config.insert_json5(key, msgspec.json.encode(value).decode())
+        except (zenoh.ZError, OSError) as error:
+            raise ConfigError(f"zenoh: {_short(error)}") from None
+        return config
+
+
+def _short(error: BaseException) -> str:
+    """Its first sentence: Zenoh adds the places in its source."""
+    return " ".join(str(error).split()).partition(" at /")[0]

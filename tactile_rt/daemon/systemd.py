@@ -1,0 +1,141 @@
+"""Tell systemd how the daemon is: READY, STATUS, RELOADING, STOPPING, WATCHDOG; sd_notify(3)."""
+
+import os
+import socket
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from tactile_rt.daemon.consumer import Consumer, View
+from tactile_rt.daemon.items import Event, Item
+from tactile_rt.daemon.snapshot import PartState, Snapshot
+from tactile_rt.stream import ConfigError
+
+__all__ = ["Systemd", "alive", "status_of"]
+
+TICK_S = 1.0
+SEND_S = 0.2  # a manager that does not read must not keep us
+LONGEST = 400  # characters of a status
+
+
+class Systemd(Consumer):
+    """Sends to $NOTIFY_SOCKET; pings the watchdog while the daemon is `alive`.
+
+    Args:
+        name: of the part.
+        options: none.
+        environment: where the variables are.
+
+    Raises:
+        ConfigError: $NOTIFY_SOCKET or $WATCHDOG_USEC is not what systemd sets.
+    """
+
+    wants = frozenset({Event})
+
+    def __init__(
+        self, name: str, options: Any = None, environment: Mapping[str, str] = os.environ
+    ) -> None:
+        path = environment.get("NOTIFY_SOCKET", "")
+        if path[:1] not in ("/", "@"):
+            raise ConfigError(f"systemd: NOTIFY_SOCKET is {path!r}, not a path or @name")
+        self._address = "\0" + path[1:] if path[0] == "@" else path
+        self._watchdog_s = _watchdog_s(environment)
+        # systemd asks for a ping at half of the time; twice as often misses none.
+        self.tick_s = min(TICK_S, self._watchdog_s / 4) if self._watchdog_s else TICK_S
+        self._socket: socket.socket | None = None
+        self._view: View | None = None
+        self._status = ""
+        self._ready = False
+        self._pings = self._withheld = 0
+
+    def open(self, view: View) -> None:
+        self._view = view
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
+        self._socket.settimeout(SEND_S)
+        self._socket.connect(self._address)
+
+    def handle(self, items: list[Item]) -> None:
+        assert self._view is not None
+        for item in items:
+            if isinstance(item, Event) and item.part == "daemon":
+                self._daemon(item.state)
+        snapshot = self._view.snapshot()
+        if not self._ready and snapshot.state in ("running", "degraded"):
+            self._daemon(snapshot.state)
+        status = status_of(snapshot)
+        if status != self._status:
+            self._send(f"STATUS={status}")
+            self._status = status
+        if self._watchdog_s:
+            if alive(snapshot):
+                self._send("WATCHDOG=1")
+                self._pings += 1
+            else:
+                self._withheld += 1
+
+    def close(self) -> None:
+        opened, self._socket = self._socket, None
+        self._status = ""
+        if opened is not None:
+            opened.close()
+
+    def details(self) -> dict[str, str | int | float]:
+        return {
+            "watchdog_s": self._watchdog_s,
+            "pings": self._pings,
+            "withheld": self._withheld,
+        }
+
+    def _daemon(self, state: str) -> None:
+        if state in ("running", "degraded", "reloaded", "refused"):
+            # A device that is not plugged in is no reason not to have started.
+            self._send("READY=1")
+            self._ready = True
+        elif state == "reloading":
+            self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
+        elif state == "stopping":
+            self._send("STOPPING=1")
+
+    def _send(self, text: str) -> None:
+        assert self._socket is not None
+        self._socket.send(text.encode())
+
+
+def alive(snapshot: Snapshot) -> bool:
+    """Whether the daemon still does its work, or is trying to.
+
+    A part that broke is tried again; but a thread in a call that does not return can only be
+    ended with its process. That is worth it once all sources, or all models, are in such a call.
+    Consumers count for nothing here: the samples matter more than who looks at them.
+    """
+    return not (_all_stalled([s.part for s in snapshot.sources])) and not _all_stalled(
+        [m.part for m in snapshot.models]
+    )
+
+
+def status_of(snapshot: Snapshot) -> str:
+    """One line: the state, what does not work, and how much there is."""
+    if snapshot.degraded:
+        return f"{snapshot.state}: {'; '.join(snapshot.degraded)}"[:LONGEST]
+    counts = (
+        (len(snapshot.sources), "source"),
+        (len(snapshot.models), "model"),
+        (sum(c.part.name.startswith("publisher.") for c in snapshot.consumers), "publisher"),
+    )
+    said = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for n, what in counts)
+    recording = any(c.kind == "recorder" for c in snapshot.consumers)
+    return f"{snapshot.state}: {said}{', recorder' if recording else ''}"
+
+
+def _all_stalled(parts: Sequence[PartState]) -> bool:
+    return bool(parts) and all(p.state == "stalled" for p in parts)
+
+
+def _watchdog_s(environment: Mapping[str, str]) -> float:
+    """How soon systemd takes us for dead, s; 0: it does not look."""
+    text = environment.get("WATCHDOG_USEC", "")
+    if not text or environment.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
+        return 0.0
+    if not text.isdigit() or int(text) == 0:
+        raise ConfigError(f"systemd: WATCHDOG_USEC is {text!r}, not a number of microseconds")
+    return int(text) / 1e6

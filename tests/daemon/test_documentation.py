@@ -1,0 +1,189 @@
+"""What docs/messages.md and docs/daemon.md show does what they say."""
+
+import contextlib
+import dataclasses
+import re
+import select
+import socket
+import subprocess
+import sys
+import types
+from pathlib import Path
+from unittest import mock
+
+import pytest
+from published import FORCES, View, busy_snapshot, contact, decision, event, running, samples
+
+from tactile_rt.daemon.config_check import check_config
+from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.messages import encode, message_of
+from tactile_rt.daemon.prometheus import exposition
+from tactile_rt.daemon.publishers.foxglove import FoxgloveOptions, FoxglovePublisher
+from tactile_rt.daemon.publishers.zenoh import ZenohOptions, ZenohPublisher
+from tactile_rt.daemon.publishers.zmq import ZmqOptions, ZmqPublisher
+from tactile_rt.daemon.runner import ExitCode
+
+DOCS = Path(__file__).parents[2] / "docs"
+pytestmark = pytest.mark.skipif(
+    not (DOCS / "messages.md").exists(), reason="a source archive, without docs"
+)
+
+
+def blocks(page, language):
+    return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text("utf-8"), re.S)
+
+
+def example(kind):
+    (text,) = [b for b in blocks("messages.md", "python") if b.startswith(f"# {kind}: ")]
+    return text
+
+
+def free_port():
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
+
+
+@contextlib.contextmanager
+def consumer(kind, *arguments, **options):
+    """The example as a process of its own."""
+    with subprocess.Popen(
+        [sys.executable, "-c", example(kind), *arguments],
+        stdout=subprocess.PIPE, text=True, bufsize=1, **options,
+    ) as process:  # fmt: skip
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def test_the_jsonl_example_reads_all_kinds():
+    items = [contact(), decision(), event(level="error", reason="why"), event(), contact(False)]
+    lines = "".join(f"{encode(message_of(i)).decode()}\n" for i in items)
+    done = subprocess.run(
+        [sys.executable, "-c", example("jsonl")],
+        input=lines, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stdout.splitlines() == [
+        "whiskers: touch", "whiskers: mug 75%", "daemon is running: why", "whiskers: let go",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["zmq", "zenoh", "foxglove"])
+def test_the_example_of_each_publisher_reads_its_decisions(kind):
+    at = f"tcp/127.0.0.1:{free_port()}"
+    publisher = {
+        "zmq": lambda: ZmqPublisher("x", ZmqOptions(bind="tcp://127.0.0.1:*")),
+        "zenoh": lambda: ZenohPublisher("x", ZenohOptions(listen=(at,))),
+        "foxglove": lambda: FoxglovePublisher("x", FoxgloveOptions(port=0)),
+    }[kind]()
+    with running(publisher, View(FORCES, busy_snapshot())):
+        found = publisher.details()
+        address = str(found.get("endpoint") or found.get("url") or found["listen"])
+        with consumer(kind, address) as process:
+            # What was said before it came is not for it: say it until it has heard.
+            line = _heard(process, lambda: publisher.handle([decision(), event()]))
+    assert line == "whiskers: mug 75%"
+
+
+def _heard(process, say):
+    for _ in range(600):
+        say()
+        ready, _, _ = select.select([process.stdout], [], [], 0.05)
+        if ready:
+            return process.stdout.readline().strip()
+        assert process.poll() is None, "the example has ended"
+    raise AssertionError("it heard nothing")
+
+
+def test_examples_are_short():
+    for kind in ("jsonl", "zmq", "zenoh"):
+        code = [x for x in example(kind).splitlines() if x and not x.startswith("#")]
+        assert len(code) <= 15
+
+
+def test_the_example_configuration_is_right(tmp_path):
+    (text,) = blocks("daemon.md", "toml")
+    (tmp_path / "robot.toml").write_text(text)
+    check_config(load_config(tmp_path / "robot.toml"))
+
+
+def test_every_metric_and_exit_code_is_in_the_table():
+    guide = (DOCS / "daemon.md").read_text("utf-8")
+    names = re.findall(r"# TYPE tactile_(\S+) ", exposition(busy_snapshot()).decode())
+    for name in names:
+        shown = re.sub(r"^(model|consumer)_queue_.*", r"\1_queue_*", name)
+        assert f"`{shown}`" in guide, name
+    for code in ExitCode:
+        assert f"\n| {code.value} | " in guide
+
+
+def stubs(monkeypatch, **modules):
+    """Modules that are not installed here, as far as the examples need them."""
+    made = {}
+    for name, members in modules.items():
+        name = name.replace("__", ".")
+        parts = name.split(".")
+        for n in range(1, len(parts) + 1):
+            part = ".".join(parts[:n])
+            if part not in made:
+                made[part] = types.ModuleType(part)
+                monkeypatch.setitem(sys.modules, part, made[part])
+                if n > 1:
+                    setattr(made[".".join(parts[: n - 1])], parts[n - 1], made[part])
+        for key, value in members.items():
+            setattr(made[name], key, value)
+
+
+def loaded(name):
+    namespace: dict = {"__name__": name}
+    exec(compile((DOCS / "publishers" / f"{name}.py").read_text("utf-8"), name, "exec"), namespace)
+    return namespace
+
+
+def test_the_mqtt_example_does_as_it_says_to_a_stub(monkeypatch):
+    client = mock.MagicMock()
+    client.loop_start.return_value = 0
+    client.publish.side_effect = [mock.Mock(rc=0), mock.Mock(rc=15)]
+    stubs(
+        monkeypatch,
+        paho__mqtt__client={
+            "Client": lambda *a, **k: client, "CallbackAPIVersion": mock.Mock(), "MQTTv5": 5,
+            "MQTT_ERR_SUCCESS": 0, "MQTT_ERR_QUEUE_SIZE": 15,
+        },
+    )  # fmt: skip
+    names = loaded("mqtt")
+    options = names["MqttOptions"](host="broker", state_s=0)
+    publisher = names["MqttPublisher"]("m", options)
+    with running(publisher):
+        publisher.handle([decision(), event()])
+    sent = [(c.args[0], c.args[1], c.kwargs["retain"]) for c in client.publish.call_args_list]
+    assert sent == [
+        ("tactile/whiskers/decision", encode(message_of(decision())), False),
+        ("tactile/health", encode(message_of(event())), False),
+    ]
+    assert publisher.details()["dropped"] == 1
+    client.loop_stop.assert_called_once_with()
+
+
+def test_the_ros_2_example_does_as_it_says_to_a_stub(monkeypatch):
+    node, text = mock.MagicMock(), mock.MagicMock()
+    stubs(
+        monkeypatch,
+        rclpy=dict.fromkeys(("Context", "init", "shutdown", "SignalHandlerOptions"), mock.Mock())
+        | {"create_node": lambda *a, **k: node},
+        rclpy__qos=dict.fromkeys(("HistoryPolicy", "QoSProfile", "ReliabilityPolicy"), mock.Mock()),
+        geometry_msgs__msg={"WrenchStamped": mock.MagicMock},
+        std_msgs__msg={"String": text},
+    )
+    names = loaded("ros2")
+    spec = dataclasses.replace(FORCES, channels=names["CHANNELS"], units=("N",) * 3 + ("N m",) * 3)
+    publisher = names["Ros2Publisher"]("r", names["Ros2Options"](wrenches=True, state_s=0))
+    with running(publisher):
+        publisher.handle([samples(spec, [[1, 2, 3, 4, 5, 6]] * 2, valid=[True, False]), decision()])
+    topics = [c.args[1] for c in node.create_publisher.call_args_list]
+    assert topics == ["tactile/whiskers/wrench/B1", "tactile/whiskers/decision"]
+    wrench, _ = [c.args[0] for c in node.create_publisher.return_value.publish.call_args_list]
+    force, torque = wrench.wrench.force, wrench.wrench.torque
+    assert (force.x, force.z, torque.x, torque.z) == (1, 3, 4, 6)
+    assert text.call_args.kwargs == {"data": encode(message_of(decision())).decode()}

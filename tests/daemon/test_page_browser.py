@@ -1,0 +1,240 @@
+"""The page in a real Chromium: live, alone, by itself back after a restart, and deaf to markup."""
+
+import shutil
+import socket
+import threading
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("uvicorn", reason="needs uvicorn: pip install 'tactile-rt[ui]'")
+pytest.importorskip(
+    "playwright.sync_api", reason="needs playwright (165 MB): pip install playwright"
+)
+
+from playwright.sync_api import sync_playwright
+
+from tactile_rt.classifier import Classification
+from tactile_rt.daemon.config import PageConfig
+from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.daemon import Daemon
+from tactile_rt.daemon.items import Decision, Event, Opened, Samples
+from tactile_rt.daemon.page import Page
+from tactile_rt.daemon.snapshot import ModelState, PartState, Snapshot, SourceState
+from tactile_rt.testing import ArraySource, cut, small_spec
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
+PATIENCE_MS = 30_000
+TOKEN = "correct horse battery"
+EVIL = "<img src=x onerror=\"document.title='owned'\">"
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium"),
+]
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    with sync_playwright() as p:
+        browser = p.chromium.launch(executable_path=CHROMIUM, args=ARGS)
+        yield browser
+        browser.close()
+
+
+class Tab:
+    """A page in the browser, and what it asked for and complained of."""
+
+    def __init__(self, browser, **options):
+        self.context = browser.new_context(**options)
+        self.page = self.context.new_page()
+        self.page.set_default_timeout(PATIENCE_MS)
+        self.asked, self.said = [], []
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.on("console", lambda message: self.said.append(message.text))
+        self.page.on("pageerror", lambda error: self.said.append(f"uncaught: {error}"))
+
+    def has(self, expression):
+        # Not wait_for_function: the page's policy forbids what that evaluates inside the page.
+        end = time.monotonic() + PATIENCE_MS / 1000
+        while not self.page.evaluate(expression):
+            assert time.monotonic() < end, (expression, self.said)
+            self.page.wait_for_timeout(50)
+
+    def text(self, selector):
+        return self.page.locator(selector).text_content()
+
+    def faults(self):
+        """Of the page itself; a connection that is refused is the daemon's restart."""
+        return [
+            s for s in self.said if "uncaught" in s or "Content Security" in s or "Trusted" in s
+        ]
+
+
+@pytest.fixture
+def tab(chromium):
+    tabs = []
+
+    def make(**options):
+        tabs.append(Tab(chromium, **options))
+        return tabs[-1]
+
+    yield make
+    for one in tabs:
+        one.context.close()
+
+
+@pytest.fixture
+def port():
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+LIVE = "+document.getElementById('link').dataset.rate > 0"
+
+
+def test_it_shows_live_data_and_comes_back_after_a_restart(tab, port, tmp_path):
+    file = tmp_path / "robot.toml"
+    file.write_text(
+        'version = 1\n[[source]]\nname = "first"\nurl = "synthetic:30x6"\n'
+        '[[source]]\nname = "second"\nurl = "synthetic:5x2?rate_hz=50"\n'
+        f'[page]\nport = {port}\n[log]\nfile = "log"\n'
+    )
+    daemon = Daemon(load_config(file))
+    daemon.start()
+    try:
+        one = tab()
+        one.page.goto(f"http://127.0.0.1:{port}/")
+        one.has(LIVE)
+        assert "30 elements × 6 channels, 1000 Hz" in one.text("#subtitle")
+        one.has("document.getElementById('figures').textContent.includes('Samples per second')")
+        assert one.page.locator("#element option").count() == 30
+        assert one.page.locator("#recording").is_hidden()
+        painted = (
+            "(() => { const c = document.getElementById('trace0'); const d = c.getContext('2d')"
+            ".getImageData(0, 0, c.width, c.height).data; return d.some((v) => v > 0); })()"
+        )
+        one.has(painted)
+
+        one.page.select_option("#source", "second")
+        one.has("document.getElementById('subtitle').textContent.startsWith('5 elements')")
+        one.has(LIVE)
+    finally:
+        assert daemon.stop() == []
+    one.has("document.getElementById('banner').textContent.includes('lost')")
+    assert one.text("#link") == "not connected"
+    again = Daemon(load_config(file))
+    again.start()
+    try:
+        one.has("document.getElementById('banner').textContent.includes('restarted')")
+        one.has(LIVE)
+        assert "5 elements" in one.text("#subtitle")
+    finally:
+        assert again.stop() == []
+    assert all(url.startswith(f"http://127.0.0.1:{port}/") for url in one.asked)
+    assert one.faults() == []
+
+
+class HostileView:
+    """A daemon whose every name is markup."""
+
+    SPEC = replace(
+        small_spec(), name=EVIL, elements=(EVIL, "b", "c"), channels=(EVIL, "y"), frame=EVIL
+    )
+
+    def __init__(self):
+        self.part = PartState("source.a", "waiting", EVIL, 1, 1, 1)
+
+    def snapshot(self):
+        now = time.monotonic_ns()
+        model = replace(self.part, name="model.m")
+        return Snapshot(
+            EVIL, 1, EVIL, now, time.time_ns(), 7, 0, "degraded", (EVIL,),
+            sources=(SourceState(self.part, EVIL, newest_ns=now),),
+            models=(ModelState(model, "a", EVIL, labels=(EVIL, "y"), touching=True),),
+        )  # fmt: skip
+
+    def streams(self):
+        return {"a": Opened("a", self.SPEC, EVIL, ArraySource(self.SPEC, []), 7, 0)}
+
+    def report(self, *event):
+        raise AssertionError(event)
+
+
+class Fed:
+    """A page that is fed; also with what a label must not do."""
+
+    def __init__(self, port, **options):
+        self.page = Page("page", PageConfig(port=port, **options))
+        self.over = threading.Event()
+        self.thread = threading.Thread(target=self.feed)
+
+    def __enter__(self):
+        self.page.open(HostileView())
+        self.thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self.over.set()
+        self.thread.join()
+        self.page.close()
+
+    def feed(self):
+        spec = HostileView.SPEC
+        p = np.array([0.9, 0.1], np.float32)
+        while not self.over.wait(0.03):
+            now = time.monotonic_ns()
+            (chunk,) = cut(np.random.default_rng(0).normal(size=(9, 3, 2)), 300.0, start_ns=now)
+            made = Classification(now - 10**8, now, 2, False, EVIL, (EVIL, "y"), p, 0.001)
+            self.page.handle(
+                [
+                    Samples("a", spec, chunk, now, 0),
+                    Decision("a", "m", EVIL, made, now, now, 0),
+                    Event("source.a", "waiting", EVIL, "error", now, 0),
+                ]
+            )
+
+
+def test_names_that_are_markup_stay_text(tab, port):
+    with Fed(port):
+        one = tab()
+        one.page.goto(f"http://localhost:{port}/")
+        one.has(LIVE)
+        one.has("document.getElementById('label').textContent.startsWith('<img')")
+        one.has("document.getElementById('events').textContent.includes('onerror')")
+        assert one.page.locator("img").count() == 0
+        assert "<img" in one.text("#degraded") and "<img" in one.text("#parts")
+        assert one.page.title() == f"{EVIL} · tactile_rt"
+        assert {url.rpartition("/")[2].partition("?")[0] for url in one.asked} <= {
+            "", "app.js", "draw.js", "stream.js", "style.css", "icon.svg", "live",
+        }  # fmt: skip
+        assert one.faults() == []
+        # The browser itself refuses markup, should a later change try it.
+        blocked = "try { document.body.innerHTML = '<b>x</b>'; } catch (e) { e.name }"
+        assert one.page.evaluate(blocked) == "TypeError"
+
+
+def test_a_wrong_token_opens_nothing_and_the_right_one_lasts(tab, port):
+    with Fed(port, token=TOKEN):
+        one = tab(viewport={"width": 390, "height": 844})
+        one.page.goto(f"http://127.0.0.1:{port}/")
+        one.page.locator("#login").wait_for(state="visible")
+        assert one.page.locator("#main").is_hidden()
+        one.page.fill("#token", TOKEN + "x")
+        one.page.click("#login button")
+        one.has("document.getElementById('login-error').textContent === 'the token is wrong'")
+        assert one.page.locator("#main").is_hidden() and one.context.cookies() == []
+        one.page.fill("#token", TOKEN)
+        one.page.click("#login button")
+        one.has(LIVE)
+        one.page.reload()
+        one.has(LIVE)
+        assert one.page.locator("#login").is_hidden()
+        assert one.page.evaluate("document.cookie") == ""  # scripts cannot see it
+        # Nothing is wider than a phone.
+        assert one.page.evaluate("document.documentElement.scrollWidth") <= 390
+        assert one.faults() == []
