@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test check bench fuzz format clean
+.PHONY: demo test check check-export bench fuzz format clean
 
 demo: $(VENV)/.sim
 	$(BIN)/tactile-rt demo --sweeps 12
@@ -18,6 +18,9 @@ check: $(VENV)/.dev
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -m "slow or not slow"
 	$(BIN)/python bench/check_wheel.py
+
+check-export: $(VENV)/.dev
+	$(BIN)/python bench/check_export.py
 
 bench: $(VENV)/.dev
 	$(BIN)/tactile-rt bench
@@ -39,5 +42,5 @@ $(VENV)/.sim: pyproject.toml
 
 $(VENV)/.dev: pyproject.toml
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[sim,train,view,dbc,record,test,dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[sim,train,view,dbc,record,publish,ui,test,dev]'
 	touch $@ $(VENV)/.sim

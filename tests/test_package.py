@@ -18,9 +18,9 @@ LINKS = ("drivers", "export", "models", "sim_backend")
 # What a robot has none of.
 HEAVY = ("torch", "mujoco", "trimesh", "scipy", "onnx", "onnxscript", "sklearn", "matplotlib")
 ONBOARD = (
-    "calibration", "classifier", "cli", "combined", "contact", "drivers.opening", "model_file",
-    "options", "recording", "session", "sources", "stream", "stream_recording",
-    "testing", "timebase",
+    "calibration", "classifier", "cli", "combined", "contact", "contact_point", "daemon.runner",
+    "drivers.opening", "inference", "model_file", "options", "recording", "session", "sources",
+    "stream", "stream_recording", "testing", "timebase",
 )  # fmt: skip
 
 MODULES = sorted(m.name for m in pkgutil.walk_packages([str(PACKAGE)], "tactile_rt."))
