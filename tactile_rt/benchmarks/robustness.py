@@ -20,10 +20,13 @@ def _amount(table: Mapping[str, float], factor: float = 1.0) -> str:
 
 RATED = _amount(RATED_NOISE)
 
+REST = 80  # samples: 0.7 s, which a tare can be taken from
+
 CONDITIONS = {
     "noise at a quarter of the rated": Disturbance(noise=0.25),
     "noise at half the rated": Disturbance(noise=0.5),
     f"rated noise, {RATED}": Disturbance(noise=1.0),
+    f"rated noise, after {REST} samples of rest": Disturbance(noise=1.0, rest=REST),
     "noise at twice the rated": Disturbance(noise=2.0),
     f"offset of {_amount(OFFSET, 0.25)} after the tare": Disturbance(offset=0.25),
     f"offset of {_amount(OFFSET)} after the tare": Disturbance(offset=1.0),

@@ -23,6 +23,8 @@ class Disturbance:
         dead: how many whiskers, drawn at random, read zero throughout.
         offset: a constant that appears with the contact, after the tare, in units of `OFFSET`;
             its sign is drawn for every whisker and channel.
+        rest: stored samples of silence before each sweep, for the tare; a robot has them, the
+            sweeps have only a short lead.
 
     Raises:
         ConfigError: a negative amount.
@@ -32,9 +34,10 @@ class Disturbance:
     gain: float = 0.0
     dead: int = 0
     offset: float = 0.0
+    rest: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("noise", "gain", "dead", "offset"):
+        for name in ("noise", "gain", "dead", "offset", "rest"):
             if not getattr(self, name) >= 0:  # which NaN is not either
                 raise ConfigError(f"{name} is {getattr(self, name)}, must not be negative")
 
@@ -43,6 +46,9 @@ class Disturbance:
     ) -> NDArray[np.float32]:
         """What the detector sees, of (sweep, sample, element, channel) SI."""
         n, elements = len(values), values.shape[2]
+        if self.rest:
+            silence = np.zeros((n, self.rest, *values.shape[2:]), dtype=np.float32)
+            values = np.concatenate([silence, values], axis=1)
         if self.gain:
             error = rng.normal(size=(n, 1, elements, 1)).astype(np.float32)
             values = values * (1 + np.float32(self.gain) * error)

@@ -1,0 +1,350 @@
+"""`tactile-rt align`: does a model represent touch as barrel cortex does?"""
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+from typer.core import TyperCommand
+
+from tactile_rt.cli import app, check_output, needs
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.stream import ConfigError, TactileError
+
+if TYPE_CHECKING:
+    from tactile_rt.models.alignment.layers import Layers
+    from tactile_rt.models.alignment.stimuli_input import StimuliInput
+
+align = typer.Typer(help="Compare a model with recordings of barrel cortex.", no_args_is_help=True)
+app.add_typer(align, name="align")
+
+USAGE = 2  # click's exit code
+INPUT_ERROR = 3  # of the gate, whose 1 and 2 mean something else
+
+Stimuli = Annotated[
+    Path | None,
+    typer.Option(help="Of `tactile-rt whisk`. Default: the mouse array's, which ships."),
+]
+Benchmark = Annotated[Path, typer.Option(help="What `align build` wrote.")]
+Models = Annotated[list[Path], typer.Argument(help="Checkpoints (best.pt) and .onnx files.")]
+
+
+class GateCommand(TyperCommand):
+    """A command whose misuse is an input error, not an inconclusive test."""
+
+    def make_context(self, *arguments: Any, **more: Any) -> Any:
+        try:
+            return super().make_context(*arguments, **more)
+        except Exception as error:
+            # click's UsageError, which typer brings along under a name of its own.
+            if getattr(error, "exit_code", None) == USAGE:
+                error.exit_code = INPUT_ERROR  # type: ignore[attr-defined]
+            raise
+
+
+@align.command("build")
+def build_benchmark(
+    recordings: Annotated[
+        list[Path], typer.Argument(help="NWB files or folders of them; or one published .npz.")
+    ],
+    out: Annotated[Path, typer.Option(help="The benchmark to write, .json.")],
+    protocol: Annotated[str, typer.Option(help="strict, or paper-code.")] = "strict",
+    bootstraps: Annotated[int, typer.Option(help="Splits of the trials.")] = 1000,
+    seed: Annotated[int, typer.Option(help="Of the splits.")] = 1234,
+) -> None:
+    """Freeze recordings into a small benchmark, so that nobody else needs them."""
+    from tactile_rt.models.alignment import build, save_benchmark
+
+    check_output(out)
+    console = Console(stderr=True)
+    with progress_bar(console, "building", total=1.0) as update:
+        try:
+            made = build(
+                recordings, protocol, bootstraps, seed, lambda share: update(completed=share)
+            )
+        except ModuleNotFoundError as error:
+            raise needs("align", error) from None
+    save_benchmark(made, out)
+    for note in made.notes:
+        console.print(note, highlight=False, markup=False)
+    console.print(
+        f"{out}: {len(made.reliable)} of {len(made.targets)} animals are reliable; animal to "
+        f"animal {made.a2a.mean:.3f} ± {made.a2a.sem:.3f}",
+        highlight=False,
+    )
+
+
+@align.command("score")
+def score_models(
+    models: Models,
+    benchmark: Benchmark,
+    json: Annotated[Path | None, typer.Option(help="Write the scores here.")] = None,
+    page: Annotated[Path | None, typer.Option(help="Write the report here, .html.")] = None,
+    stimuli: Stimuli = None,
+    untrained: Annotated[
+        bool, typer.Option(help="Score each checkpoint's network before training too.")
+    ] = True,
+    seed: Annotated[int, typer.Option(help="Of the untrained networks.")] = 0,
+    performance: Annotated[
+        str | None,
+        typer.Option(help="Accuracy of each model on its task, 0.46,0.52,...; else its own."),
+    ] = None,
+) -> None:
+    """Score every layer of some models against a benchmark."""
+    for file in (json, page):
+        check_output(file)
+    given = _performances(performance, len(models))
+    with _train():
+        from tactile_rt.models.alignment.benchmark_file import load_benchmark
+        from tactile_rt.models.alignment.loading import load_layers, load_untrained
+        from tactile_rt.models.alignment.report import write_page
+        from tactile_rt.models.alignment.results import (
+            ModelResult,
+            model_result,
+            results_of,
+            write_results,
+        )
+        from tactile_rt.models.alignment.stimuli_input import read_stimuli
+
+        felt, frozen = read_stimuli(stimuli), load_benchmark(benchmark)
+        done: list[ModelResult] = []
+        with progress_bar(Console(stderr=True), "scoring", len(models)) as update:
+            for path, told in zip(models, given, strict=True):
+                update(description=path.name)
+                layers, own = load_layers(path, felt)
+                if any(layers.name == one.name for one in done):
+                    layers = replace(layers, name=f"{layers.name} ({path.name})")
+                before = load_untrained(path, felt, seed) if untrained else None
+                done.append(model_result(frozen, layers, before, told or own)[0])
+                update(advance=1)
+    results = results_of(frozen, felt, done)
+    if json:
+        write_results(results, json)
+    if page:
+        write_page(results, page)
+    _show_scores(results)
+
+
+@align.command("report")
+def write_report(
+    scores: Annotated[list[Path], typer.Argument(help="What `align score --json` wrote.")],
+    out: Annotated[Path, typer.Option(help="The page to write, .html.")],
+) -> None:
+    """Write one self-contained page of some scores on the same benchmark."""
+    import msgspec
+
+    from tactile_rt.models.alignment.report import write_page
+    from tactile_rt.models.alignment.results import read_results
+
+    check_output(out)
+    read = [read_results(path) for path in scores]
+    for path, one in zip(scores, read, strict=True):
+        if one.benchmark.sha256 != read[0].benchmark.sha256 or one.input != read[0].input:
+            raise ConfigError(
+                f"{path} was scored on another benchmark or other stimuli than {scores[0]}"
+            )
+    write_page(
+        msgspec.structs.replace(read[0], models=tuple(m for one in read for m in one.models)), out
+    )
+    Console(stderr=True).print(f"{out}", highlight=False)
+
+
+@align.command("gate", cls=GateCommand)
+def gate_model(
+    model: Annotated[Path, typer.Argument(help="What would be released: .onnx or best.pt.")],
+    benchmark: Annotated[
+        Path | None, typer.Option(help="Tests 1 and 2: what `align build` wrote.")
+    ] = None,
+    baseline: Annotated[
+        Path | None, typer.Option(help="Test 3: scores of the model before, on this benchmark.")
+    ] = None,
+    reference: Annotated[
+        Path | None,
+        typer.Option(help="Test 4: the checkpoint (or .onnx) that the model was exported from."),
+    ] = None,
+    stimuli: Stimuli = None,
+    json: Annotated[Path | None, typer.Option(help="Write checks and figures here.")] = None,
+) -> None:
+    """Test a model before its release. Exit code: 0 pass, 1 fail, 2 inconclusive, 3 input error."""
+    try:
+        code = _gate(model, benchmark, baseline, reference, stimuli, json)
+    except (TactileError, OSError) as error:
+        typer.secho(f"tactile-rt: {error}", err=True, fg="red")
+        code = INPUT_ERROR
+    sys.exit(code)
+
+
+@align.command("decode")
+def decode_stimuli(
+    models: Models,
+    benchmark: Annotated[
+        Path | None, typer.Option(help="Decode its animals' mean responses too.")
+    ] = None,
+    stimuli: Stimuli = None,
+    paper: Annotated[
+        bool, typer.Option(help="Also the paper's variant: one stimulus held out at a time.")
+    ] = False,
+    json: Annotated[Path | None, typer.Option(help="Write the table here.")] = None,
+) -> None:
+    """Decode shape and distance of the stimuli from every layer, with permutation chance."""
+    check_output(json)
+    with _train():
+        from tactile_rt.models.alignment.decoding import decode, decode_paper, decode_rdm
+        from tactile_rt.models.alignment.loading import load_layers
+        from tactile_rt.models.alignment.stimuli_input import read_stimuli
+
+        felt = read_stimuli(stimuli)
+        rows: list[tuple[str, str, Any]] = []
+
+        def add(name: str, patterns: Any) -> None:
+            rows.append((name, "", decode(patterns)))
+            if paper:
+                rows.append((name, "paper", decode_paper(patterns)))
+
+        add("raw sensor input", felt.raw())
+        for path in models:
+            layers, _ = load_layers(path, felt)
+            for layer, patterns in layers.patterns.items():
+                add(f"{layers.name}: {layer}" if len(models) > 1 else layer, patterns)
+    if benchmark:
+        from tactile_rt.models.alignment.benchmark_file import load_benchmark
+
+        for target in load_benchmark(benchmark).targets:
+            rows.append((target.name, "", decode_rdm(target.chosen.rdm)))
+    _show_decoded(rows)
+    if json:
+        _write(json, [{"name": n, "variant": v or "balanced", **_plain(d)} for n, v, d in rows])
+
+
+def _gate(
+    model: Path,
+    benchmark: Path | None,
+    baseline: Path | None,
+    reference: Path | None,
+    stimuli: Path | None,
+    json: Path | None,
+) -> int:
+    check_output(json)
+    if benchmark is None and reference is None:
+        raise ConfigError("name a --benchmark to score on, or the --reference it was exported from")
+    if baseline is not None and benchmark is None:
+        raise ConfigError("--baseline needs the --benchmark that it was scored on")
+    with _train():
+        from tactile_rt.models.alignment.benchmark_file import load_benchmark
+        from tactile_rt.models.alignment.fidelity import export_layers, fidelity_check
+        from tactile_rt.models.alignment.gate import Check, exit_code, neural_checks
+        from tactile_rt.models.alignment.loading import load_layers
+        from tactile_rt.models.alignment.results import baseline_of
+        from tactile_rt.models.alignment.scoring import score
+        from tactile_rt.models.alignment.stimuli_input import read_stimuli
+
+        felt = read_stimuli(stimuli)
+        checks: list[Check] = []
+        rows: list[Any] = []
+        ours: Layers | None = None
+        if reference is not None:
+            original, _ = load_layers(reference, felt)
+            ours = _exported(model, felt, original, export_layers)
+            check, found = fidelity_check(original, ours)
+            checks.append(check)
+            rows += found
+        if benchmark is not None:
+            frozen = load_benchmark(benchmark)
+            before = baseline_of(baseline, frozen) if baseline else None
+            ours = ours or load_layers(model, felt)[0]
+            checks = [*neural_checks(score(frozen, ours.patterns), frozen, before), *checks]
+    code = exit_code(checks)
+    colours = {"pass": "green", "fail": "bold red", "inconclusive": "yellow"}
+    console = Console()
+    for check in checks:
+        word = f"[{colours[check.verdict]}]{check.verdict}[/]"
+        console.print(f"{check.name}: {word}: {check.why}", highlight=False)
+    if json:
+        told = [{"name": c.name, "verdict": c.verdict, "why": c.why} for c in checks]
+        taps = [_plain(row) for row in rows]
+        _write(json, {"exit_code": code, "checks": told, "taps": taps})
+    return code
+
+
+def _exported(model: Path, felt: "StimuliInput", original: "Layers", export: Any) -> "Layers":
+    if model.suffix == ".onnx":
+        layers: Layers = export(model, felt, original)
+        return layers
+    from tactile_rt.models.alignment.loading import load_layers
+
+    return load_layers(model, felt)[0]
+
+
+@contextmanager
+def _train() -> Iterator[None]:
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+
+
+def _performances(text: str | None, number: int) -> list[tuple[float, str] | None]:
+    if text is None:
+        return [None] * number
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != number or not all(0 <= v <= 1 for v in values):
+        raise ConfigError(f"--performance is {number} numbers from 0 to 1, not {text!r}")
+    return [(value, "as told") for value in values]
+
+
+def _show_scores(results: Any) -> None:
+    table = Table("model", "score", "p", "95 % of chance", "untrained", "most chosen layer")
+    for model in results.models:
+        chosen = [name for name in model.chosen if name]
+        table.add_row(
+            model.name,
+            f"{_said(model.score)} ± {_said(model.sem)}",
+            _said(model.p, 4),
+            _said(model.null_95),
+            _said(model.untrained.score) if model.untrained else "",
+            max(set(chosen), key=chosen.count) if chosen else "-",
+        )
+    raw, b = results.raw, results.benchmark
+    table.add_row("raw sensor input", f"{_said(raw.score)} ± {_said(raw.sem)}", _said(raw.p, 4))
+    table.add_row("animal to animal", f"{_said(b.a2a_mean)} ± {_said(b.a2a_sem)}")
+    Console().print(table)
+
+
+def _show_decoded(rows: list[tuple[str, str, Any]]) -> None:
+    table = Table("layer", "variant", "shape", "chance", "p", "distance", "chance", "p")
+    for name, variant, d in rows:
+        table.add_row(
+            name, variant, *(_said(v) for v in (d.shape, d.shape_chance)), _said(d.shape_p, 3),
+            *(_said(v) for v in (d.distance, d.distance_chance)), _said(d.distance_p, 3),
+        )  # fmt: skip
+    Console().print(table)
+
+
+def _said(value: float | None, digits: int = 2) -> str:
+    return "-" if value is None or value != value else f"{value:.{digits}f}"
+
+
+def _plain(record: Any) -> dict[str, Any]:
+    """A dataclass without the numbers that JSON does not know."""
+    return {
+        key: None if isinstance(value, float) and not isfinite(value) else value
+        for key, value in asdict(record).items()
+    }
+
+
+def _write(path: Path, what: Any) -> None:
+    import msgspec
+
+    from tactile_rt.recording import write_whole
+
+    text = msgspec.json.format(msgspec.json.encode(what), indent=1)
+    write_whole(path, lambda file: file.write(text + b"\n"))

@@ -1,0 +1,62 @@
+"""A model's layers for the six stimuli, wherever they were computed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["PARTS", "Layers", "first_difference"]
+
+PARTS = ("encoder", "attender", "decoder")  # every layer's name begins with one of them and a dot
+# Lanes of one batch that compute the same may differ by rounding.
+SAME = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Layers:
+    """What a model's layers do while an array whisks the six stimuli.
+
+    Attributes:
+        name: of the model.
+        traces: by layer, (6, step, unit) float32.
+        first: by layer, the first step that input can reach.
+        logits: (6, step, class) float32: the model's output.
+        parameters: numbers that the model is made of.
+        precision: ``fp32``, ``int8``, ...
+        sha256: of the file; empty for a network in memory.
+        network: its configuration, as far as it is known.
+        notes: what could not be had, and why.
+    """
+
+    name: str
+    traces: Mapping[str, NDArray[np.float32]]
+    first: Mapping[str, int]
+    logits: NDArray[np.float32]
+    parameters: int
+    precision: str = "fp32"
+    sha256: str = ""
+    network: Mapping[str, object] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def patterns(self) -> dict[str, NDArray[np.float64]]:
+        """By layer, mean over the steps that input can reach, (6, unit)."""
+        return {
+            name: trace[:, self.first[name] :].mean(axis=1, dtype=np.float64)
+            for name, trace in self.traces.items()
+        }
+
+
+def first_difference(trace: NDArray[np.float32]) -> int:
+    """First step at which the stimuli differ: none has reached a layer before.
+
+    Args:
+        trace: (6, step, unit).
+
+    Returns:
+        0 for a layer in which they never differ.
+    """
+    spread = np.ptp(trace, axis=0).max(axis=1, initial=0.0)
+    differs = spread > SAME * np.abs(trace).max(initial=0.0)
+    return int(differs.argmax())

@@ -1,0 +1,58 @@
+"""Layers of any model file: a checkpoint, a step ONNX or a window ONNX."""
+
+import re
+from pathlib import Path
+
+from tactile_rt.models.alignment.layers import Layers
+from tactile_rt.models.alignment.stimuli_input import StimuliInput
+from tactile_rt.stream import ConfigError
+
+__all__ = ["load_layers", "load_untrained"]
+
+CHECKPOINT = ".pt"
+FIGURES = re.compile(r"(test_|validation_)?top1")
+
+
+def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float, str] | None]:
+    """Layers, and the model's accuracy on its task with what it was measured on, where known.
+
+    Raises:
+        ModelError: not such a file.
+        ConfigError: the stimuli are of another array.
+    """
+    if path.suffix == CHECKPOINT:
+        from tactile_rt.models.alignment.activations import checkpoint_layers
+
+        layers, saved = checkpoint_layers(path, stimuli)
+        return layers, _accuracy(saved.get("metrics", {}))
+    from tactile_rt.models.alignment.onnx_activations import onnx_layers
+
+    layers, card = onnx_layers(path, stimuli)
+    return layers, _accuracy(card.figures) if card else None
+
+
+def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | None:
+    """Layers of a checkpoint's network before training; None for an ONNX file.
+
+    Raises:
+        ModelError: not such a file.
+        ConfigError: a seed below 0.
+    """
+    if path.suffix != CHECKPOINT:
+        return None
+    if seed < 0:
+        raise ConfigError(f"a seed is at least 0, not {seed}")
+    from tactile_rt.models.alignment.activations import untrained_layers
+    from tactile_rt.models.checkpoints import load_checkpoint
+
+    return untrained_layers(load_checkpoint(path)[1], stimuli, seed)
+
+
+def _accuracy(figures: object) -> tuple[float, str] | None:
+    if not isinstance(figures, dict):
+        return None
+    for key in sorted(k for k in figures if isinstance(k, str) and FIGURES.fullmatch(k)):
+        value = figures[key]
+        if isinstance(value, int | float) and 0 <= value <= 1:
+            return float(value), key.replace("_", " ").replace("top1", "top-1")
+    return None

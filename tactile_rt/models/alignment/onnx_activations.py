@@ -1,0 +1,218 @@
+"""Activations of every layer of an ONNX file, for the six stimuli.
+
+Layers become further outputs of a copy of the graph in memory; the file stays as it is, and so,
+bitwise, does what it decides: `onnx_layers` runs both and says if not. A step is run for the 22
+steps of a stimulus, a window, which is a `Scan` over the same step, once.
+"""
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from tactile_rt.inference.denormals import FlushDenormals
+from tactile_rt.model_file import ModelCard, load_model
+from tactile_rt.models.alignment.layers import Layers, first_difference
+from tactile_rt.models.alignment.onnx_taps import (
+    GRU_LAYERS,
+    float_tensors,
+    named_taps,
+    precision_of,
+    step_graph,
+)
+from tactile_rt.models.alignment.stimuli_input import STEPS, StimuliInput
+from tactile_rt.stream import ModelError
+
+__all__ = ["nearest_taps", "onnx_layers", "with_outputs"]
+
+Floats = NDArray[np.float32]
+TOKENS = 2  # of a GPT attender's step, the action token last
+TAP = "tap:"  # prefix of the outputs that are added
+
+
+def onnx_layers(
+    path: Path, stimuli: StimuliInput, taps: Mapping[str, str] | None = None
+) -> tuple[Layers, ModelCard]:
+    """Layers of a step or window file, and its card.
+
+    Args:
+        path: of the file.
+        stimuli: the input.
+        taps: tensors by layer; found by the names of parameters unless given.
+
+    Raises:
+        ModelError: not there, damaged, or not a model of this package.
+        ConfigError: the stimuli are of another array.
+    """
+    plain, card, model = _opened(path, stimuli)
+    taps = named_taps(model) if taps is None else taps
+    tensors = list(dict.fromkeys(taps.values()))
+    logits, _ = _run(plain, stimuli, card, ())
+    tapped, found = _run(_session(with_outputs(model, tensors)), stimuli, card, tensors)
+    traces: dict[str, Floats] = {}
+    for layer, tensor in taps.items():
+        values = found[tensor]
+        if layer == GRU_LAYERS:
+            traces |= {f"encoder.layer{i}": values[:, :, 0, i] for i in range(values.shape[3])}
+        else:
+            traces[layer] = _trace(layer, values)
+    notes = []
+    if not np.array_equal(logits, tapped):
+        worst = float(np.abs(logits - tapped).max())
+        notes.append(f"taps changed the logits by up to {worst:.1e}: the runtime fuses otherwise")
+    if not traces:
+        traces["decoder.logits"] = logits
+        notes.append("no layer but the logits: the graph's parameters have lost their names")
+    return Layers(
+        name=card.name,
+        traces=traces,
+        first={layer: first_difference(trace) for layer, trace in traces.items()},
+        logits=logits,
+        parameters=sum(int(np.prod(i.dims)) for i in model.graph.initializer if len(i.dims) > 1),
+        precision=precision_of(model),
+        sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+        network=card.provenance.get("network", {}),
+        notes=tuple(notes),
+    ), card
+
+
+def nearest_taps(path: Path, stimuli: StimuliInput, wanted: Mapping[str, Floats]) -> dict[str, str]:
+    """For layers whose names are lost, the tensor of the same size that is nearest in value.
+
+    Args:
+        path: of a file.
+        stimuli: the input.
+        wanted: by layer, (6, step, unit) as computed elsewhere.
+
+    Returns:
+        Tensors by layer; a layer for which no tensor has the size is missing.
+
+    Raises:
+        ModelError, ConfigError: as `onnx_layers`.
+    """
+    _, card, model = _opened(path, stimuli)
+    names = float_tensors(model)
+    # One stimulus and the last step tell them apart, and of all tensors that is much already.
+    session = _session(with_outputs(model, names))
+    _, found = _run(session, stimuli, card, names, (0,), (STEPS - 1,))
+    taps: dict[str, str] = {}
+    for layer, trace in wanted.items():
+        goal = trace[0, -1]
+        candidates = {
+            name: _trace(layer, values)[0, -1]
+            for name, values in found.items()
+            if values.dtype == np.float32
+        }
+        far = {
+            name: float(np.abs(values - goal).max())
+            for name, values in candidates.items()
+            if values.shape == goal.shape
+        }
+        if far:
+            taps[layer] = min(far, key=far.__getitem__)
+    return taps
+
+
+def with_outputs(model: onnx.ModelProto, tensors: Iterable[str]) -> onnx.ModelProto:
+    """A copy whose tensors are outputs too, ``tap:`` and their name; of a window for every step.
+
+    Args:
+        model: a step or a window.
+        tensors: names in the graph of the step.
+    """
+    copy = onnx.ModelProto()
+    copy.CopyFrom(model)
+    graph, scan = step_graph(copy)
+    known = {v.name: v.type for v in (*graph.value_info, *graph.output)}
+    for name in tensors:
+        # By a node of its own: a tensor that is an output already may not be one again.
+        graph.node.append(onnx.helper.make_node("Identity", [name], [f"{TAP}{name}"]))
+        # Without a type the runtime infers it, as it must for tensors of a quantised graph.
+        graph.output.append(onnx.ValueInfoProto(name=f"{TAP}{name}", type=known.get(name)))
+        if scan is not None:
+            scan.output.append(f"{TAP}{name}_steps")
+            copy.graph.output.append(onnx.ValueInfoProto(name=f"{TAP}{name}_steps"))
+            next(a for a in scan.attribute if a.name == "scan_output_axes").ints.append(0)
+    return copy
+
+
+def _opened(
+    path: Path, stimuli: StimuliInput
+) -> tuple[ort.InferenceSession, ModelCard, onnx.ModelProto]:
+    session, card = load_model(path, kind=None)
+    stimuli.check(card.array, str(path))
+    try:
+        model = onnx.load(path, load_external_data=False)
+    except Exception as error:  # protobuf raises unrelated types; the file may have changed
+        raise ModelError(f"{path} is not a readable ONNX model: {error}") from None
+    if card.kind == "window" and step_graph(model)[1] is None:
+        raise ModelError(f"{path} is a window that is no Scan over a step: its layers are unknown")
+    return session, card, model
+
+
+def _session(model: onnx.ModelProto) -> ort.InferenceSession:
+    """With the options of `load_model`, so that it computes the same."""
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.set_denormal_as_zero", "1")
+    options.log_severity_level = 4
+    with FlushDenormals():
+        return ort.InferenceSession(
+            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
+
+
+def _run(
+    session: ort.InferenceSession,
+    loads: StimuliInput,
+    card: ModelCard,
+    tensors: Sequence[str],
+    stimuli: Sequence[int] = range(6),
+    keep: Sequence[int] = range(STEPS),
+) -> tuple[Floats, dict[str, Floats]]:
+    """Logits (stimulus, step, class) and tensors (stimulus, step, ...).
+
+    One stimulus at a time, so that no axis is taken for the batch's.
+    """
+    window = card.kind == "window"
+    end = "_steps" if window else ""
+    wanted = [f"{TAP}{name}{end}" for name in tensors]
+    states = [f"{s.name}_next" for s in card.state]
+    logits: list[Floats] = []
+    found: dict[str, list[Floats]] = {name: [] for name in tensors}
+    for i in stimuli:
+        feed: dict[str, NDArray[Any]] = {
+            "offset": loads.offset[i : i + 1],
+            "sigma": loads.sigma[i : i + 1],
+            **{s.name: np.zeros((1, *s.shape), dtype=s.dtype) for s in card.state},
+        }
+        if window:
+            feed["samples"] = loads.samples[i : i + 1]
+            first, *rest = session.run(["logits", *wanted], feed)
+            logits.append(first[0])
+            for name, values in zip(tensors, rest, strict=True):
+                found[name].append(values[list(keep)])
+            continue
+        steps: list[list[Floats]] = []
+        for t in range(STEPS):
+            feed["samples"] = loads.samples[i : i + 1, t]
+            out = session.run(["logits", *wanted, *states], feed)
+            steps.append(out[: 1 + len(wanted)] if t in keep else out[:1])
+            following = out[1 + len(wanted) :]
+            feed |= {s.name: v for s, v in zip(card.state, following, strict=True)}
+        logits.append(np.concatenate([step[0] for step in steps]))
+        for k, name in enumerate(tensors):
+            found[name].append(np.stack([steps[t][1 + k] for t in keep]))
+    return np.stack(logits), {name: np.stack(values) for name, values in found.items()}
+
+
+def _trace(layer: str, values: Floats) -> Floats:
+    """(stimulus, step, 1, ...) -> (stimulus, step, unit); of a GPT's tokens the action token."""
+    if layer.startswith("attender.") and values.ndim == 5 and values.shape[3] == TOKENS:
+        values = values[:, :, :, -1]
+    return values.reshape(*values.shape[:2], -1)

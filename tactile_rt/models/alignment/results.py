@@ -1,0 +1,264 @@
+"""Scores at rest: one JSON file that a report is drawn from and a gate compares with."""
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tactile_rt.models.alignment.benchmark import Benchmark
+from tactile_rt.models.alignment.benchmark_file import benchmark_sha256
+from tactile_rt.models.alignment.layers import Layers
+from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, rdm
+from tactile_rt.models.alignment.scoring import Score, score
+from tactile_rt.models.alignment.stimuli_input import StimuliInput
+from tactile_rt.recording import write_whole
+from tactile_rt.stream import ConfigError
+
+__all__ = [
+    "BenchmarkResult",
+    "Control",
+    "ModelResult",
+    "Results",
+    "baseline_of",
+    "model_result",
+    "read_results",
+    "results_of",
+    "write_results",
+]
+
+VERSION = 1
+Number = float | None  # None in the file where there is no value
+
+
+class Control(msgspec.Struct, frozen=True):
+    """What a score is compared with: raw sensor input, or an untrained network.
+
+    Attributes:
+        name: of it.
+        layers: names.
+        corrected: (layer, target) noise-corrected correlations.
+        score, sem, p: as a model's.
+    """
+
+    name: str
+    layers: tuple[str, ...]
+    corrected: tuple[tuple[Number, ...], ...]
+    score: Number
+    sem: Number
+    p: Number
+
+
+class ModelResult(msgspec.Struct, frozen=True):
+    """Everything that is shown of a model; fields as in `scoring.Score` and `layers.Layers`.
+
+    Attributes:
+        rdms: (layer, 15).
+        units: by layer.
+        performance: accuracy on the task, 0 to 1, and where from; None if it is not known.
+        untrained: its network before training, where there is one.
+    """
+
+    name: str
+    sha256: str
+    precision: str
+    parameters: int
+    layers: tuple[str, ...]
+    first: tuple[int, ...]
+    units: tuple[int, ...]
+    rdms: tuple[tuple[Number, ...], ...]
+    corrected: tuple[tuple[Number, ...], ...]
+    unfiltered: tuple[tuple[Number, ...], ...]
+    chosen: tuple[str, ...]
+    per_target: tuple[Number, ...]
+    score: Number
+    sem: Number
+    p: Number
+    null_95: Number
+    performance: Number = None
+    performance_of: str = ""
+    untrained: Control | None = None
+    notes: tuple[str, ...] = ()
+
+
+class BenchmarkResult(msgspec.Struct, frozen=True):
+    """What is shown of the benchmark; (target, 15) RDMs and a factor and a reliability each."""
+
+    protocol: str
+    sha256: str
+    targets: tuple[str, ...]
+    reliable: tuple[bool, ...]
+    factors: tuple[Number, ...]
+    reliabilities: tuple[Number, ...]
+    rdms: tuple[tuple[Number, ...], ...]
+    a2a_mean: Number
+    a2a_sem: Number
+    a2a_highest: Number
+    a2a: dict[str, Number]
+    notes: tuple[str, ...] = ()
+
+
+class Results(msgspec.Struct, frozen=True):
+    """One file of scores.
+
+    Attributes:
+        stimuli, pairs: names along the RDMs' axes.
+        input: file name and sha256 of the stimuli's loads.
+        raw: the control: the sensors themselves.
+    """
+
+    benchmark: BenchmarkResult
+    models: tuple[ModelResult, ...]
+    raw: Control
+    raw_rdm: tuple[Number, ...]
+    input: dict[str, str]
+    stimuli: tuple[str, ...] = STIMULI
+    kind: str = "tactile_rt alignment scores"
+    version: int = VERSION
+
+
+def results_of(
+    benchmark: Benchmark, stimuli: StimuliInput, models: Sequence[ModelResult]
+) -> Results:
+    """Scores of models on one benchmark, the sensors themselves beside them."""
+    targets = benchmark.all_targets
+    raw = stimuli.raw()
+    a2a = benchmark.a2a
+    return Results(
+        benchmark=BenchmarkResult(
+            protocol=benchmark.protocol,
+            sha256=benchmark_sha256(benchmark),
+            targets=tuple(t.name for t in targets),
+            reliable=tuple(bool(t.reliable) for t in targets),
+            factors=_numbers([t.chosen.factor for t in targets]),
+            reliabilities=_numbers([t.chosen.reliability for t in targets]),
+            rdms=_table([t.chosen.rdm for t in targets]),
+            a2a_mean=_number(a2a.mean),
+            a2a_sem=_number(a2a.sem),
+            a2a_highest=_number(a2a.highest),
+            a2a=dict(zip(a2a.animals, _numbers(a2a.pooled), strict=True)),
+            notes=benchmark.notes,
+        ),
+        models=tuple(models),
+        raw=_control("raw sensor input", score(benchmark, {"raw": raw})),
+        raw_rdm=_numbers(rdm(raw)),
+        input={"file": stimuli.name, "sha256": stimuli.sha256},
+    )
+
+
+def model_result(
+    benchmark: Benchmark,
+    layers: Layers,
+    untrained: Layers | None = None,
+    performance: tuple[float, str] | None = None,
+) -> tuple[ModelResult, Score]:
+    """Score a model."""
+    patterns = layers.patterns
+    made = score(benchmark, patterns)
+    return ModelResult(
+        name=layers.name,
+        sha256=layers.sha256,
+        precision=layers.precision,
+        parameters=layers.parameters,
+        layers=made.layers,
+        first=tuple(int(layers.first[n]) for n in patterns),
+        units=tuple(p.shape[1] for p in patterns.values()),
+        rdms=_table([rdm(p) for p in patterns.values()]),
+        corrected=_table(made.corrected),
+        unfiltered=_table(made.unfiltered),
+        chosen=made.chosen,
+        per_target=_numbers(made.per_target),
+        score=_number(made.score),
+        sem=_number(made.sem),
+        p=_number(made.p),
+        null_95=_number(made.null_95),
+        performance=performance[0] if performance else None,
+        performance_of=performance[1] if performance else "",
+        untrained=(
+            _control(untrained.name, score(benchmark, untrained.patterns)) if untrained else None
+        ),
+        notes=layers.notes,
+    ), made
+
+
+def write_results(results: Results, path: Path) -> None:
+    """Write them whole or not at all, as JSON."""
+    text = msgspec.json.format(msgspec.json.encode(results), indent=1)
+    write_whole(path, lambda file: file.write(text + b"\n"))
+
+
+def read_results(path: Path) -> Results:
+    """Read what `write_results` wrote.
+
+    Raises:
+        ConfigError: not there, damaged, or of another version.
+    """
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    try:
+        head = msgspec.json.decode(raw)
+        if not isinstance(head, dict) or head.get("kind") != "tactile_rt alignment scores":
+            raise ConfigError(f"{path} has no scores: write some with `tactile-rt align score`")
+        if head.get("version") != VERSION:
+            raise ConfigError(
+                f"{path} has scores of version {head.get('version')!r}, not {VERSION}"
+            )
+        results = msgspec.json.decode(raw, type=Results)
+    except msgspec.MsgspecError as error:
+        raise ConfigError(f"{path} is damaged: {error}") from None
+    targets = len(results.benchmark.targets)
+    for model in results.models:
+        shapes = {len(model.rdms), len(model.corrected), len(model.units), len(model.first)}
+        wide = {len(row) for row in model.corrected} | {len(model.per_target)}
+        if (
+            shapes != {len(model.layers)}
+            or wide != {targets}
+            or {len(row) for row in model.rdms} != {len(PAIRS)}
+        ):
+            raise ConfigError(f"{path} is damaged: the tables of {model.name} do not fit")
+    return results
+
+
+def baseline_of(path: Path, benchmark: Benchmark) -> Mapping[str, float]:
+    """By animal, the score of the one model in a file, on this same benchmark.
+
+    Raises:
+        ConfigError: unreadable, of several models, or of another benchmark.
+    """
+    results = read_results(path)
+    if len(results.models) != 1:
+        raise ConfigError(f"{path} has {len(results.models)} models; a baseline is one")
+    if results.benchmark.sha256 != benchmark_sha256(benchmark):
+        raise ConfigError(f"{path} was scored on another benchmark: score the baseline on this one")
+    return {
+        name: value if value is not None else math.nan
+        for name, value in zip(results.benchmark.targets, results.models[0].per_target, strict=True)
+    }
+
+
+def _control(name: str, made: Score) -> Control:
+    return Control(
+        name=name,
+        layers=made.layers,
+        corrected=_table(made.corrected),
+        score=_number(made.score),
+        sem=_number(made.sem),
+        p=_number(made.p),
+    )
+
+
+def _number(value: float) -> Number:
+    return float(value) if math.isfinite(value) else None
+
+
+def _numbers(values: ArrayLike) -> tuple[Number, ...]:
+    array: NDArray[np.float64] = np.asarray(values, dtype=np.float64)
+    return tuple(_number(v) for v in array.tolist())
+
+
+def _table(rows: ArrayLike) -> tuple[tuple[Number, ...], ...]:
+    return tuple(_numbers(row) for row in np.asarray(rows, dtype=np.float64))

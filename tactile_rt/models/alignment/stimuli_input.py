@@ -1,0 +1,117 @@
+"""What an array feels while it whisks the six stimuli: the input that models are scored on.
+
+One such input ships, of the right mouse array, so that scoring needs no simulator; of any other
+array `tactile-rt whisk --array ...` makes one. A stimulus has 22 steps of 5 sub-steps from the
+first contact on.
+"""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.contact import CHANNEL_FLOOR
+from tactile_rt.models.alignment.rdm import STIMULI
+from tactile_rt.stream import ArraySpec, ConfigError
+
+__all__ = ["SHIPPED", "STEPS", "SUBSTEPS", "StimuliInput", "read_stimuli"]
+
+SHIPPED = Path(__file__).parents[2] / "assets" / "six_stimuli.npz"
+STEPS, SUBSTEPS = 22, 5
+
+
+@dataclass(frozen=True, eq=False)
+class StimuliInput:
+    """Loads of the six stimuli, in the order of `STIMULI`.
+
+    Attributes:
+        samples: (6, step, sub-step, element, channel) float32, N and N m.
+        sigma: (6, element, channel) float32: noise at rest, the smallest that is assumed of a
+            sensor; the tare is zero, for the whiskers rest before they whisk.
+        elements, channels, units: names along the last axes.
+        name: of the file.
+        sha256: of the samples.
+    """
+
+    samples: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    elements: tuple[str, ...]
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    name: str
+    sha256: str
+
+    @property
+    def offset(self) -> NDArray[np.float32]:
+        """(6, element, channel) float32: the tare."""
+        return np.zeros_like(self.sigma)
+
+    def check(self, spec: ArraySpec, model: str) -> None:
+        """Hold the input against the array that a model was trained on.
+
+        Raises:
+            ConfigError: they differ in elements, channels or units.
+        """
+        for what in ("elements", "channels", "units"):
+            ours, theirs = getattr(self, what), getattr(spec, what)
+            if ours != theirs:
+                raise ConfigError(
+                    f"{self.name} has the {what} {_few(ours)}, but {model} was trained on "
+                    f"{_few(theirs)}: make its input with `tactile-rt whisk OUT.npz --array ...` "
+                    "and name it with --stimuli"
+                )
+
+    def raw(self) -> NDArray[np.float64]:
+        """The control: the loads themselves, mean over time, (6, element * channel), SI."""
+        mean: NDArray[np.float64] = self.samples.astype(np.float64).mean(axis=(1, 2))
+        return mean.reshape(len(STIMULI), -1)
+
+
+def read_stimuli(path: Path | None = None) -> StimuliInput:
+    """Read what `tactile-rt whisk` wrote; without a path, the input that ships.
+
+    Raises:
+        ConfigError: not there, not such a file, or not all six stimuli.
+    """
+    path = SHIPPED if path is None else path
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {k: file[k] for k in ("stimuli", "values", "elements", "channels", "units")}
+    except FileNotFoundError:
+        raise ConfigError(f"no file {path}: make one with `tactile-rt whisk`") from None
+    except Exception as error:  # numpy and zipfile raise many unrelated types for a damaged file
+        raise ConfigError(f"{path} is no model input of `tactile-rt whisk`: {error}") from None
+    names = [str(n) for n in arrays["stimuli"]]
+    missing = [n for n in STIMULI if n not in names]
+    if missing:
+        raise ConfigError(f"{path} lacks the stimuli {', '.join(missing)}")
+    elements, channels, units = (
+        tuple(str(n) for n in arrays[k]) for k in ("elements", "channels", "units")
+    )
+    values = arrays["values"]
+    shape = (len(names), STEPS * SUBSTEPS, len(elements), len(channels))
+    if values.shape != shape or len(units) != len(channels):
+        raise ConfigError(
+            f"{path}: values are {values.shape}, not (stimulus, sample, element, channel) {shape}"
+        )
+    if not np.isfinite(values).all():
+        raise ConfigError(f"{path} has samples that are not finite")
+    if unknown := sorted(set(units) - set(CHANNEL_FLOOR)):
+        raise ConfigError(f"{path}: channels in {', '.join(unknown)} cannot be scored")
+    samples = values[[names.index(n) for n in STIMULI]].astype(np.float32)
+    floor = np.array([CHANNEL_FLOOR[u] for u in units], dtype=np.float32)
+    return StimuliInput(
+        samples=samples.reshape(len(STIMULI), STEPS, SUBSTEPS, *shape[2:]),
+        sigma=np.broadcast_to(floor, (len(STIMULI), *shape[2:])).copy(),
+        elements=elements,
+        channels=channels,
+        units=units,
+        name=path.name,
+        sha256=hashlib.sha256(samples.tobytes()).hexdigest(),
+    )
+
+
+def _few(names: tuple[str, ...]) -> str:
+    return f"{', '.join(names[:4])}{', ...' if len(names) > 4 else ''} ({len(names)})"

@@ -1,0 +1,136 @@
+"""`tactile-rt align`, on the shipped model and synthetic animals."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "models" / "alignment"))  # for `brains`
+
+import brains
+
+from tactile_rt.model_file import shipped_model
+from tactile_rt.models.alignment import save_benchmark
+from tactile_rt.models.alignment.published import write_published
+from tactile_rt.models.alignment.strict import freeze_strict
+
+pytest.importorskip("onnx")
+
+MODEL = shipped_model()
+
+
+@pytest.fixture(scope="module")
+def frozen(tmp_path_factory):
+    """Benchmarks of six animals and of one."""
+    folder = tmp_path_factory.mktemp("frozen")
+    rng = np.random.default_rng(1)
+    shared = brains.geometry(rng)
+    for number in (6, 1):
+        made = freeze_strict(brains.animals(rng, number, shared=shared), 20)
+        save_benchmark(made, folder / f"{number}.json")
+    return folder
+
+
+def test_score_report_and_a_baseline(call, frozen, tmp_path):
+    scores, page = tmp_path / "scores.json", tmp_path / "page.html"
+    code, out, _ = call(
+        "align", "score", MODEL, "--benchmark", frozen / "6.json", "--json", scores,
+        "--page", page, "--performance", "0.91",
+    )  # fmt: skip
+    assert code == 0 and "mouse24" in out and "raw sensor" in out
+    model = json.loads(scores.read_text())["models"][0]
+    assert model["performance"] == 0.91 and model["layers"][0] == "encoder.conv1"
+    assert page.read_text().startswith("<!doctype html>")
+    again = tmp_path / "again.html"
+    assert call("align", "report", scores, "--out", again)[0] == 0
+    assert again.read_text() == page.read_text()
+    # The model is no worse than itself; random geometries are no match for it, though.
+    told = tmp_path / "gate.json"
+    code, out, _ = call(
+        "align", "gate", MODEL, "--benchmark", frozen / "6.json", "--baseline", scores,
+        "--reference", MODEL, "--json", told,
+    )  # fmt: skip
+    found = json.loads(told.read_text())
+    verdicts = {check["name"]: check["verdict"] for check in found["checks"]}
+    assert verdicts == {
+        "validity": "pass", "turing": "fail", "regression": "pass", "fidelity": "pass"
+    }  # fmt: skip
+    assert code == found["exit_code"] == 1
+    assert {tap["layer"] for tap in found["taps"]} >= {"encoder.conv1", "output"}
+
+
+def test_the_gate_without_neural_data(call):
+    code, out, err = call("align", "gate", MODEL, "--reference", MODEL)
+    assert (code, err) == (0, "")
+    assert out.startswith("fidelity: pass")
+
+
+def test_the_gate_on_one_animal_is_inconclusive(call, frozen):
+    code, out, _ = call("align", "gate", MODEL, "--benchmark", frozen / "1.json")
+    assert code == 2
+    assert "validity: inconclusive" in out
+
+
+def test_what_the_gate_cannot_read_is_an_input_error(call, frozen, tmp_path):
+    broken = tmp_path / "broken.onnx"
+    broken.write_bytes(b"no model")
+    text = tmp_path / "broken.json"
+    text.write_text("{")
+    for arguments in (
+        (broken, "--reference", MODEL),
+        (MODEL, "--reference", broken),
+        (tmp_path / "none.onnx", "--reference", MODEL),
+        (tmp_path, "--reference", MODEL),
+        (MODEL, "--benchmark", text),
+        (MODEL, "--benchmark", frozen / "6.json", "--baseline", text),
+        (MODEL, "--baseline", text),
+        (MODEL, "--reference", MODEL, "--stimuli", text),
+        (MODEL, "--reference", MODEL, "--json", tmp_path / "none" / "x.json"),
+        (MODEL,),
+    ):
+        code, out, err = call("align", "gate", *arguments)
+        assert (code, out) == (3, ""), arguments
+        assert err.startswith("tactile-rt: ") and err.count("\n") == 1, arguments
+    for arguments in (("--no-such-option",), ()):
+        assert call("align", "gate", *arguments)[0] == 3
+
+
+def test_decode(call, frozen, tmp_path):
+    table = tmp_path / "table.json"
+    code, out, _ = call("align", "decode", MODEL, "--benchmark", frozen / "1.json", "--json", table)
+    assert code == 0 and "encoder.fc8" in out
+    rows = json.loads(table.read_text())
+    assert rows[0]["name"] == "raw sensor input" and rows[-1]["name"] == "mouse-0"
+    assert rows[0]["shape_chance"] == pytest.approx(0.5)
+
+
+def test_build_from_the_published_layout(call, tmp_path):
+    rng = np.random.default_rng(0)
+    patterns = brains.geometry(rng)
+    rates = {f"animal-{i}": brains.padded(rng, patterns=patterns) for i in range(3)}
+    source, out = tmp_path / "rates.npz", tmp_path / "benchmark.json"
+    write_published(rates, source)
+    arguments = ("--protocol", "paper-code", "--bootstraps", 20, "--out", out)
+    code, _, err = call("align", "build", source, *arguments)
+    assert code == 0 and "animals are reliable" in err
+    assert json.loads(out.read_text())["protocol"] == "paper-code"
+
+
+def test_mistakes_are_one_line(call, frozen, tmp_path):
+    benchmark = ("--benchmark", frozen / "6.json")
+    for arguments, said in (
+        (("score", tmp_path / "none.onnx", *benchmark), "no model file"),
+        (("score", tmp_path / "none.pt", *benchmark), "no checkpoint"),
+        (("score", MODEL, *benchmark, "--performance", "0.4,0.5"), "--performance is 1 numbers"),
+        (("score", MODEL, *benchmark, "--performance", "90"), "from 0 to 1"),
+        (("score", MODEL, *benchmark, "--page", tmp_path / "x" / "p.html"), "no folder"),
+        (("report", frozen / "6.json", "--out", tmp_path / "p.html"), "has no scores"),
+        (("build", tmp_path / "none", "--out", tmp_path / "b.json"), "none"),
+        (("decode", MODEL, "--stimuli", tmp_path / "none.npz"), "no file"),
+    ):
+        code, _, err = call("align", *arguments)
+        assert code == 2, arguments
+        assert said in err and err.startswith("tactile-rt: "), err
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,207 @@
+"""Layers of networks and of files, for the six stimuli."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+
+from tactile_rt.model_file import load_model, shipped_model  # noqa: E402
+from tactile_rt.models.alignment.activations import (  # noqa: E402
+    network_layers,
+    reach,
+    untrained_layers,
+)
+from tactile_rt.models.alignment.layers import first_difference  # noqa: E402
+from tactile_rt.models.alignment.onnx_activations import onnx_layers, with_outputs  # noqa: E402
+from tactile_rt.models.alignment.onnx_taps import named_taps, precision_of  # noqa: E402
+from tactile_rt.models.alignment.rdm import STIMULI, rdm  # noqa: E402
+from tactile_rt.models.alignment.stimuli_input import SHIPPED, read_stimuli  # noqa: E402
+from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
+from tactile_rt.models.ead import EADConfig  # noqa: E402
+from tactile_rt.models.encoders.zhuang import zhuang_graph  # noqa: E402
+from tactile_rt.stream import ConfigError, ModelError  # noqa: E402
+
+FELT = read_stimuli()
+SPEC = load_model(shipped_model())[1].array
+# Steps from the frame to each map, counted by hand from the paper's graph.
+STEPS_TO = {"conv1": 0, "conv2": 1, "conv3": 2, "conv4": 3, "conv5": 4, "conv6": 5, "fc7": 2,
+            "fc8": 3}  # fmt: skip
+MAMBA = [f"block{i}" for i in range(4)]
+GPT = [f"block{i}" for i in range(8)]
+LAYERS = {
+    "zhuang-ugrnn": list(STEPS_TO),
+    "resnet18": ["stem", *(f"block{i}" for i in range(8)), "fc"],
+    "s4": ["embed", "block0", "block1", "block2", "block3", "out"],
+    "mamba": ["embed", *MAMBA, "norm"],
+    "gru": ["layer0", "layer1"],
+    "gpt": [*GPT, "norm", "project_out"],
+    "none": [],
+    "linear": ["logits"],
+    "mlp": ["fc1", "fc2", "logits"],
+    "mlp-all": ["fc1", "fc2", "logits"],
+}
+
+
+def build(encoder, attender="none", decoder="linear", seed=0):
+    torch.manual_seed(seed)
+    config = EADConfig(7, encoder, attender, decoder, width=1 / 32)
+    return TactileClassifier(SPEC, config)
+
+
+def test_shipped_input():
+    assert SHIPPED.stat().st_size < 300_000
+    assert FELT.samples.shape == (6, 22, 5, 30, 6)
+    felt = (np.abs(FELT.samples) > 1e-7).any(axis=(1, 2, 4)).sum(axis=1)
+    assert (felt > 0).all()  # every stimulus is touched
+    assert np.isfinite(rdm(FELT.raw())).all()
+
+
+@pytest.mark.parametrize(
+    "encoder, attender, decoder",
+    [
+        ("zhuang-ugrnn", "gpt", "mlp"),
+        ("resnet18", "none", "mlp-all"),
+        ("s4", "mamba", "linear"),
+        ("mamba", "gpt", "linear"),
+        ("gru", "mamba", "mlp"),
+    ],
+)
+def test_every_layer_of_every_kind(encoder, attender, decoder):
+    model = build(encoder, attender, decoder)
+    found = network_layers(model, FELT)
+    # "mamba" is the name of an encoder and of an attender, which alone has no embedding.
+    expected = [f"encoder.{n}" for n in LAYERS[encoder]]
+    names = [*MAMBA, "norm"] if attender == "mamba" else LAYERS[attender]
+    expected += [f"attender.{n}" for n in names] + [f"decoder.{n}" for n in LAYERS[decoder]]
+    assert list(found.traces) == expected
+    for name, trace in found.traces.items():
+        assert trace.shape[:2] == (6, 22), name
+        # Independent of the graph: the first step at which the stimuli differ.
+        assert found.first[name] == first_difference(trace), name
+    model.eval()
+    with torch.no_grad():
+        frames = model.inputs(*(map(torch.from_numpy, (FELT.samples, FELT.offset, FELT.sigma))))
+        features = model.network.encoder(frames)
+        attended = model.network.attender(features)
+        logits = model.network(frames)
+    last = [n for n in expected if n.startswith("encoder.")][-1]
+    np.testing.assert_allclose(found.traces[last], features.numpy(), atol=2e-6)
+    if attender != "none":
+        last = [n for n in expected if n.startswith("attender.")][-1]
+        np.testing.assert_allclose(found.traces[last], attended.numpy(), atol=2e-6)
+    np.testing.assert_allclose(found.traces["decoder.logits"], logits.numpy(), atol=2e-6)
+    np.testing.assert_array_equal(found.logits, logits.numpy())
+
+
+def test_only_steps_that_input_can_reach_count():
+    assert reach(zhuang_graph()) == STEPS_TO
+    found = network_layers(build("zhuang-ugrnn"), FELT)
+    trace = found.traces["encoder.conv6"]
+    assert not np.ptp(trace[:, :5], axis=0).any()
+    np.testing.assert_allclose(found.patterns["encoder.conv6"], trace[:, 5:].mean(axis=1), 1e-5)
+
+
+@pytest.mark.parametrize("encoder, attender", [("resnet18", "none"), ("gru", "gpt")])
+def test_batch_norm_and_dropout_are_off_and_the_mode_is_kept(encoder, attender):
+    model = build(encoder, attender)
+    quiet = network_layers(model.eval(), FELT)
+    assert not model.training
+    loud = network_layers(model.train(), FELT)
+    assert model.training
+    assert all(np.array_equal(quiet.traces[n], loud.traces[n]) for n in quiet.traces)
+
+
+def test_untrained_networks_are_of_a_seed_and_leave_the_generator_alone():
+    saved = {"spec": SPEC.to_json(), "network": {"classes": 7, "encoder": "gru", "width": 1 / 32}}
+    torch.manual_seed(5)
+    before = torch.random.get_rng_state()
+    one, again, other = (untrained_layers(saved, FELT, seed) for seed in (1, 1, 2))
+    assert torch.equal(before, torch.random.get_rng_state())
+    name = "encoder.layer1"
+    np.testing.assert_array_equal(one.traces[name], again.traces[name])
+    assert not np.allclose(one.traces[name], other.traces[name])
+
+
+def test_taps_of_the_shipped_step_leave_its_output_bitwise_unchanged():
+    found, card = onnx_layers(shipped_model(), FELT)
+    assert found.notes == ()  # which would say that the logits changed
+    assert list(found.traces) == [
+        *(f"encoder.{n}" for n in STEPS_TO),
+        *(f"decoder.{n}" for n in LAYERS["mlp"]),
+    ]
+    assert {n: found.first[f"encoder.{n}"] for n in STEPS_TO} == STEPS_TO
+    session, _ = load_model(shipped_model())
+    state = {s.name: np.zeros((1, *s.shape), dtype=s.dtype) for s in card.state}
+    names = [o.name for o in session.get_outputs()]
+    quiet = {"offset": FELT.offset[3:4], "sigma": FELT.sigma[3:4]}
+    for t in range(22):
+        out = dict(
+            zip(
+                names,
+                session.run(None, {**state, **quiet, "samples": FELT.samples[3:4, t]}),
+                strict=True,
+            )
+        )
+        state = {s.name: out[f"{s.name}_next"] for s in card.state}
+        np.testing.assert_array_equal(found.logits[3, t], out["logits"][0])
+        np.testing.assert_array_equal(found.traces["encoder.conv3"][3, t], state["conv3_h"].ravel())
+
+
+def test_a_tap_changes_nothing_of_the_model_that_it_is_put_into():
+    model = onnx.load(shipped_model())
+    before = model.SerializeToString()
+    tapped = with_outputs(model, named_taps(model).values())
+    assert model.SerializeToString() == before
+    assert len(tapped.graph.output) == len(model.graph.output) + len(named_taps(model))
+    assert precision_of(model) == "fp32"
+
+
+def test_another_array_is_refused(tmp_path):
+    arrays = dict(np.load(SHIPPED))
+    arrays["elements"] = np.array([f"x{i}" for i in range(30)])
+    path = tmp_path / "other.npz"
+    np.savez(path, **arrays)
+    with pytest.raises(ConfigError, match=r"other.npz has the elements x0, .*was trained on A0"):
+        onnx_layers(shipped_model(), read_stimuli(path))
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda a: a | {"stimuli": np.array([*STIMULI[:5], "mug"])}, "lacks the stimuli concave-f"),
+        (lambda a: a | {"values": a["values"][:, :50]}, "values are"),
+        (lambda a: a | {"values": a["values"] * np.nan}, "not finite"),
+        (lambda a: a | {"units": np.array(["N"] * 5 + ["K"])}, "channels in K cannot be scored"),
+        (lambda a: {"values": a["values"]}, "no model input"),
+    ],
+)
+def test_damaged_input_is_refused(tmp_path, change, said):
+    path = tmp_path / "input.npz"
+    np.savez(path, **change(dict(np.load(SHIPPED))))
+    with pytest.raises(ConfigError, match=said):
+        read_stimuli(path)
+
+
+def test_stimuli_are_taken_by_name_not_by_place(tmp_path):
+    arrays = dict(np.load(SHIPPED))
+    order = [3, 1, 5, 0, 2, 4]
+    path = tmp_path / "shuffled.npz"
+    np.savez(
+        path, **arrays | {"stimuli": arrays["stimuli"][order], "values": arrays["values"][order]}
+    )
+    again = read_stimuli(path)
+    np.testing.assert_array_equal(again.samples, FELT.samples)
+    assert again.sha256 == FELT.sha256
+
+
+def test_broken_files(tmp_path):
+    broken = tmp_path / "broken.onnx"
+    broken.write_bytes(b"no model")
+    with pytest.raises(ModelError, match=r"broken\.onnx is not a readable ONNX model"):
+        onnx_layers(broken, FELT)
+    with pytest.raises(ConfigError, match="no file"):
+        read_stimuli(tmp_path / "none.npz")
+    broken.with_suffix(".npz").write_bytes(b"no array")
+    with pytest.raises(ConfigError, match="no model input"):
+        read_stimuli(broken.with_suffix(".npz"))

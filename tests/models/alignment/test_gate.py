@@ -1,0 +1,262 @@
+"""The gate: what may be released, and the exported model beside the one it was made from."""
+
+import hashlib
+import itertools
+
+import brains
+import msgspec
+import numpy as np
+import pytest
+from scipy import stats
+
+from tactile_rt.models.alignment.gate import (
+    FAIL,
+    INCONCLUSIVE,
+    PASS,
+    STUDENT,
+    Check,
+    exit_code,
+    neural_checks,
+    regression,
+)
+from tactile_rt.models.alignment.scoring import score
+from tactile_rt.models.alignment.strict import freeze_strict
+
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+
+from small_networks import stir  # noqa: E402
+
+from tactile_rt.export.onnx_step import export_step  # noqa: E402
+from tactile_rt.export.windows import window_graph  # noqa: E402
+from tactile_rt.model_file import METADATA_KEY, load_model, shipped_model  # noqa: E402
+from tactile_rt.models.alignment.activations import network_layers  # noqa: E402
+from tactile_rt.models.alignment.fidelity import (  # noqa: E402
+    compare,
+    export_layers,
+    fidelity_check,
+)
+from tactile_rt.models.alignment.onnx_activations import onnx_layers  # noqa: E402
+from tactile_rt.models.alignment.stimuli_input import read_stimuli  # noqa: E402
+from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
+from tactile_rt.models.ead import EADConfig  # noqa: E402
+
+FELT = read_stimuli()
+
+
+@pytest.fixture(scope="module")
+def world():
+    """A geometry, a benchmark of six animals that share it, an aligned and a random model."""
+    rng = np.random.default_rng(4)
+    shared = brains.geometry(rng)
+    benchmark = freeze_strict(brains.animals(rng, 6, shared=shared), 50)
+    aligned = {f"encoder.{i}": brains.responses(rng, shared, 400) for i in range(2)}
+    random = {f"encoder.{i}": rng.normal(size=(6, 60)) for i in range(2)}
+    return benchmark, score(benchmark, aligned), score(benchmark, random)
+
+
+def codes(checks):
+    return {check.name: check.code for check in checks}
+
+
+def test_an_aligned_model_passes(world):
+    benchmark, aligned, _ = world
+    checks = neural_checks(aligned, benchmark)
+    assert codes(checks) == {"validity": PASS, "turing": PASS}
+    assert exit_code(checks) == PASS
+
+
+def test_a_random_model_fails(world):
+    benchmark, _, random = world
+    checks = neural_checks(random, benchmark)
+    assert codes(checks) == {"validity": PASS, "turing": FAIL}
+    assert exit_code(checks) == FAIL
+
+
+def test_a_score_as_high_as_the_animals_is_not_enough(world):
+    benchmark, aligned, _ = world
+    lucky = changed_to(aligned, p=0.06)
+    assert codes(neural_checks(lucky, benchmark))["turing"] == FAIL
+
+
+def test_one_animal_is_inconclusive():
+    rng = np.random.default_rng(4)
+    shared = brains.geometry(rng)
+    benchmark = freeze_strict(brains.animals(rng, 1, shared=shared), 50)
+    made = score(benchmark, {"encoder.0": brains.responses(rng, shared, 60)})
+    checks = neural_checks(made, benchmark, {"mouse-0": 1.0})
+    assert codes(checks) == dict.fromkeys(("validity", "turing", "regression"), INCONCLUSIVE)
+    assert exit_code(checks) == INCONCLUSIVE
+
+
+@pytest.mark.parametrize(
+    "drop, spread, code",
+    [
+        (0.2, 0.02, FAIL),
+        (0.04, 0.001, PASS),  # certain, but small
+        (0.2, 0.4, PASS),  # large, but not to be told from none
+        (-0.2, 0.02, PASS),
+    ],
+)
+def test_regression(world, drop, spread, code):
+    _, aligned, _ = world
+    wiggle = spread * np.array([1, -1, 1, -1, 1, -1])
+    before = dict(zip(aligned.targets, aligned.per_target + drop + wiggle, strict=True))
+    assert regression(aligned, before).code == code
+    drops = drop + wiggle  # Student's interval, from another source
+    low, high = stats.t.interval(0.95, 5, drops.mean(), stats.sem(drops))
+    assert f"[{low:+.3f}, {high:+.3f}]" in regression(aligned, before).why
+
+
+def test_regression_over_fewer_than_two_animals_is_inconclusive(world):
+    _, aligned, _ = world
+    before = {aligned.targets[0]: 1.0, aligned.targets[1]: float("nan"), "another": 1.0}
+    assert regression(aligned, before).code == INCONCLUSIVE
+
+
+def test_students_points():
+    np.testing.assert_allclose(STUDENT, stats.t.ppf(0.975, np.arange(1, 31)), atol=5e-4)
+
+
+def test_exit_code_of_every_combination():
+    for these in itertools.product((PASS, FAIL, INCONCLUSIVE), repeat=3):
+        expected = FAIL if FAIL in these else max(these)
+        assert exit_code([Check("x", code, "") for code in these]) == expected
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    """A small network and its export."""
+    torch.manual_seed(2)
+    card = load_model(shipped_model())[1]
+    model = TactileClassifier(card.array, EADConfig(24, "gru", "none", "mlp", width=1 / 16)).eval()
+    stir(model)
+    path = tmp_path_factory.mktemp("gate") / "step.onnx"
+    export_step(model, msgspec.structs.replace(card, provenance={}, figures={}), path)
+    return network_layers(model, FELT), path
+
+
+@pytest.fixture(scope="module")
+def quantised(exported):
+    """The same, quantised to int8."""
+    quantization = pytest.importorskip("onnxruntime.quantization")
+    path = exported[1].with_name("int8.onnx")
+    model = onnx.load(exported[1])
+    del model.graph.value_info[:]  # the exporter's and the quantiser's differ
+    quantization.quantize_dynamic(model, path)
+    return path
+
+
+def damaged(source, path, matching):
+    """A copy in which the units of some weights are shuffled."""
+    model = onnx.load(source)
+    rng = np.random.default_rng(0)
+    changed = 0
+    for tensor in model.graph.initializer:
+        values = onnx.numpy_helper.to_array(tensor)
+        if values.ndim == 2 and matching(tensor.name, values):
+            mixed = rng.permuted(values, axis=0)
+            tensor.CopyFrom(onnx.numpy_helper.from_array(mixed, tensor.name))
+            changed += 1
+    assert changed
+    onnx.save(model, path)
+    return path
+
+
+def test_a_faithful_export_passes(exported):
+    reference, path = exported
+    check, rows = fidelity_check(reference, export_layers(path, FELT, reference))
+    assert check.code == PASS
+    assert [row.layer for row in rows] == [*reference.traces, "output"]
+    assert min(row.pearson for row in rows) >= 0.9999
+    assert max(row.difference for row in rows) <= 1e-5
+
+
+def test_a_window_gives_the_layers_of_its_step(exported):
+    reference, path = exported
+    card = load_model(path)[1]
+    window = window_graph(onnx.load(path), card.state)
+    text = msgspec.json.encode(msgspec.structs.replace(card, kind="window", state=(), probe=()))
+    onnx.helper.set_model_props(window, {METADATA_KEY: text.decode()})
+    other = path.with_name("window.onnx")
+    onnx.save(window, other)
+    step, _ = onnx_layers(path, FELT)
+    whole, _ = onnx_layers(other, FELT)
+    assert whole.notes == step.notes == ()
+    assert list(whole.traces) == list(step.traces) == list(reference.traces)
+    for name, trace in step.traces.items():
+        np.testing.assert_allclose(whole.traces[name], trace, atol=1e-6)
+
+
+def test_layers_whose_names_are_lost_are_found_by_value(exported):
+    reference, path = exported
+    model = onnx.load(path)
+    names = {t.name: f"w{i}" for i, t in enumerate(model.graph.initializer)}
+    for tensor in model.graph.initializer:
+        tensor.name = names[tensor.name]
+    for node in model.graph.node:
+        node.input[:] = [names.get(name, name) for name in node.input]
+    other = path.with_name("nameless.onnx")
+    onnx.save(model, other)
+    assert "decoder.fc1" not in onnx_layers(other, FELT)[0].traces
+    check, rows = fidelity_check(reference, export_layers(other, FELT, reference))
+    assert check.code == PASS
+    assert "decoder.fc1" in {row.layer for row in rows}
+
+
+def test_an_int8_export_passes_and_a_damaged_one_fails(exported, quantised, tmp_path):
+    reference, _ = exported
+    layers = export_layers(quantised, FELT, reference)
+    assert layers.precision == "int8"
+    check, rows = fidelity_check(reference, layers)
+    assert check.code == PASS
+    assert len(rows) == len(reference.traces) + 1
+    assert min(row.pearson for row in rows) >= 0.98
+
+    bad = damaged(quantised, tmp_path / "bad.onnx", lambda name, v: v.dtype in (np.int8, np.uint8))
+    check, _ = fidelity_check(reference, export_layers(bad, FELT, reference))
+    assert check.code == FAIL
+
+
+def test_one_damaged_layer_is_named(exported, tmp_path):
+    reference, path = exported
+    last = reference.logits.shape[-1]
+    bad = damaged(path, tmp_path / "bad.onnx", lambda name, v: last in v.shape)
+    check, rows = fidelity_check(reference, export_layers(bad, FELT, reference))
+    assert check.code == FAIL
+    assert {row.layer for row in rows if not row.kept} == {"decoder.logits", "output"}
+    assert "decoder.logits" in check.why or "output" in check.why
+
+
+def test_another_network_fails(exported):
+    reference, _ = exported
+    check, _ = fidelity_check(reference, onnx_layers(shipped_model(), FELT)[0])
+    assert check.code == FAIL
+
+
+def test_a_small_difference_misses_single_precision_but_not_int8(exported):
+    reference, path = exported
+    same, _ = onnx_layers(path, FELT)
+    rng = np.random.default_rng(0)
+    moved = {
+        n: (t + 1e-4 * np.abs(t).max() * rng.normal(size=t.shape[2:])).astype(np.float32)
+        for n, t in same.traces.items()
+    }
+    other = changed_to(same, traces=moved)
+    assert fidelity_check(reference, other)[0].code == FAIL
+    assert fidelity_check(reference, changed_to(other, precision="int8"))[0].code == PASS
+
+
+def test_the_shipped_model_is_as_it_says(exported):
+    """Of the checkpoint it was exported from only the hash is here; the file against itself."""
+    layers, card = onnx_layers(shipped_model(), FELT)
+    assert len(card.provenance["checkpoint_sha256"]) == len(hashlib.sha256().hexdigest())
+    rows = compare(layers, layers)
+    assert all(row.kept and row.difference == 0 for row in rows)
+    assert all(row.pearson == pytest.approx(1) for row in rows)  # every layer tells them apart
+
+
+def changed_to(record, **changes):
+    from dataclasses import replace
+
+    return replace(record, **changes)

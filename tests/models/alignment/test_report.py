@@ -1,0 +1,212 @@
+"""Scores at rest and the page that is drawn from them."""
+
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import brains
+import msgspec
+import numpy as np
+import pytest
+
+from tactile_rt.models.alignment.layers import Layers
+from tactile_rt.models.alignment.pictures import Bar, Level, Point, bars, heat_map, scatter, ticks
+from tactile_rt.models.alignment.rdm import STIMULI
+from tactile_rt.models.alignment.report import page
+from tactile_rt.models.alignment.results import (
+    baseline_of,
+    model_result,
+    read_results,
+    results_of,
+    write_results,
+)
+from tactile_rt.models.alignment.stimuli_input import read_stimuli
+from tactile_rt.models.alignment.strict import freeze_strict
+from tactile_rt.stream import ConfigError
+
+ALONE = {"meta", "line", "rect", "circle", "br"}
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    rng = np.random.default_rng(4)
+    return freeze_strict(brains.animals(rng, 5, shared=brains.geometry(rng)), 20)
+
+
+def network(rng, name, units=30):
+    def trace():
+        return rng.normal(size=(6, 22, units)).astype(np.float32)
+
+    traces = {"encoder.conv1": trace(), "attender.block0": trace(), "decoder.logits": trace()}
+    traces["encoder.dead"] = np.ones((6, 22, units), dtype=np.float32)
+    return Layers(name, traces, dict.fromkeys(traces, 0), traces["decoder.logits"], 12_345)
+
+
+@pytest.fixture(scope="module")
+def results(benchmark):
+    rng = np.random.default_rng(0)
+    models = [
+        model_result(benchmark, network(rng, f"model <{i}>"), network(rng, "before"), (p, "told"))
+        for i, p in enumerate((0.4, 0.5, 0.7))
+    ]
+    return results_of(benchmark, read_stimuli(), [m for m, _ in models])
+
+
+class Balanced(HTMLParser):
+    """Every element that is opened is closed, in order."""
+
+    def __init__(self):
+        super().__init__()
+        self.open, self.seen = [], []
+
+    def handle_starttag(self, tag, attributes):
+        self.seen.append((tag, dict(attributes)))
+        if tag not in ALONE:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        if tag not in ALONE:
+            assert self.open.pop() == tag
+
+
+def parsed(text):
+    parser = Balanced()
+    parser.feed(text)
+    assert parser.open == []
+    return parser.seen
+
+
+def test_the_page_stands_alone_and_is_well_formed(results):
+    text = page(results)
+    elements = parsed(text)
+    assert not {"script", "link", "img", "iframe"} & {tag for tag, _ in elements}
+    for _, attributes in elements:
+        assert not {"src", "href"} & set(attributes)
+    assert "http" not in text and "@import" not in text
+    assert re.findall(r"url\(([^)]*)\)", text) == ["#hatch"]
+    assert "prefers-color-scheme:dark" in text
+    assert "model &lt;0&gt;" in text and "model <0>" not in text
+    assert not re.search(r"\bnan\b", text)
+
+
+def test_everything_is_on_the_page(results):
+    text = page(results)
+    for part in ("encoder", "attender", "decoder", "raw", "missing"):
+        assert f'<rect class="{part}' in text, part
+    assert text.count("<title>dead: no value (NaN)</title>") == 3
+    for said in ("animal to animal", "all that noise permits", "chance, 95th percentile",
+                 "Neural fit against task performance", "Neural fit against size", "3 models",
+                 "mouse-4", "raw sensor input", *STIMULI):  # fmt: skip
+        assert said in text, said
+    # One dot per reliable animal and layer that has a value, in each of three models' figures.
+    dots = re.findall(r"<title>conv1, mouse-\d: ", text)
+    assert len(dots) == 3 * sum(results.benchmark.reliable)
+
+
+def test_one_model_is_not_compared(results):
+    text = page(msgspec.structs.replace(results, models=results.models[:1]))
+    assert "side by side" not in text and "task performance" not in text
+
+
+def test_a_benchmark_without_reliable_animals_says_so(results):
+    b = results.benchmark
+    bad = msgspec.structs.replace(b, reliable=(False,) * 5, a2a_mean=None, a2a_sem=None)
+    text = page(msgspec.structs.replace(results, benchmark=bad))
+    assert "cannot tell" in text
+    parsed(text)
+
+
+def test_bars_are_where_their_values_are():
+    drawn = bars(
+        [Bar("a", 0.5, "encoder", (("x", 0.7),), 0.2), Bar("b", float("nan"), "decoder")],
+        [Level("one", 1.0, "one"), Level("none", float("nan"), "null"), Level("z", 0.0, "a2a")],
+        "r", "figure",
+    )  # fmt: skip
+    lines = {
+        k: float(y)
+        for k, y in re.findall(r'<line class="(one|a2a|control)"[^>]*y1="([^"]*)"', drawn)
+    }
+    top, height = re.search(r'class="encoder"[^>]*y="([\d.]+)" height="([\d.]+)"', drawn).groups()
+    dot = float(re.search(r'class="dot"[^>]*cy="([\d.]+)"', drawn)[1])
+    unit = lines["a2a"] - lines["one"]  # pixels of 1
+    assert float(height) == pytest.approx(0.5 * unit, abs=0.2)
+    assert float(top) == pytest.approx(lines["a2a"] - 0.5 * unit, abs=0.2)
+    assert dot == pytest.approx(lines["a2a"] - 0.7 * unit, abs=0.2)
+    assert lines["control"] == pytest.approx(lines["a2a"] - 0.2 * unit, abs=0.2)
+    assert 'class="missing"' in drawn and ">none<" not in drawn
+
+
+def test_the_fitted_line_and_its_correlation():
+    points = [Point("a", 1e4, 0.1), Point("b", 1e5, 0.3), Point("c", 1e6, 0.2)]
+    r = np.corrcoef([4, 5, 6], [0.1, 0.3, 0.2])[0, 1]
+    assert f"r = {r:.2f}" in scatter(points, "x", "y", "figure", log=True)
+    assert "fit" not in scatter(points[:2], "x", "y", "a picture")
+    assert "fit" not in scatter([Point(n, 0.5, 0.1) for n in "abc"], "x", "y", "a picture")
+
+
+def test_names_of_models_that_lie_on_each_other_are_all_written():
+    drawn = scatter([Point(f"m{i}", 0.5, 0.3) for i in range(30)], "x", "y", "a picture")
+    heights = re.findall(r'class="name" x="[^"]*" y="([^"]*)"', drawn)
+    assert len(heights) == 30 and len(set(heights)) >= 17
+
+
+def test_the_largest_dissimilarity_is_the_darkest():
+    drawn = heat_map(np.arange(1, 16) / 15, STIMULI, "map")
+    shades = [float(s) for s in re.findall(r'fill-opacity="([\d.]+)"', drawn)]
+    assert len(shades) == 36 and max(shades) == 1 and shades.count(0) == 6
+    assert heat_map([float("nan")] * 15, STIMULI, "map").count('class="missing"') == 30
+
+
+def test_ticks():
+    assert ticks(0, 1) == [0, 0.2, 0.4, 0.6, 0.8, 1.0]
+    assert ticks(-0.13, 0.31) == [-0.1, 0, 0.1, 0.2, 0.3]
+
+
+def test_scores_come_back_as_they_went(results, tmp_path):
+    path = tmp_path / "scores.json"
+    write_results(results, path)
+    assert read_results(path) == results
+
+
+def test_scores_are_those_of_the_layers(results, benchmark):
+    model = results.models[0]
+    assert model.rdms[model.layers.index("encoder.dead")] == (None,) * 15
+    assert len(model.per_target) == len(benchmark.targets)
+    assert model.performance == 0.4 and model.untrained.layers == model.layers
+
+
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        (b"{}", "has no scores"),
+        (b"\xff", "is damaged"),
+        (b'{"kind": "tactile_rt alignment scores", "version": 9}', "version 9"),
+        (b'{"kind": "tactile_rt alignment scores", "version": 1}', "is damaged"),
+    ],
+)
+def test_damaged_scores(tmp_path, text, said):
+    path = tmp_path / "scores.json"
+    path.write_bytes(text)
+    with pytest.raises(ConfigError, match=said):
+        read_results(path)
+
+
+def test_tables_that_do_not_fit(results, tmp_path):
+    path = tmp_path / "scores.json"
+    short = msgspec.structs.replace(results.models[0], corrected=())
+    write_results(msgspec.structs.replace(results, models=(short,)), path)
+    with pytest.raises(ConfigError, match="do not fit"):
+        read_results(path)
+
+
+def test_a_baseline_is_one_model_on_the_same_benchmark(results, benchmark, tmp_path):
+    path = tmp_path / "scores.json"
+    write_results(results, path)
+    with pytest.raises(ConfigError, match="has 3 models"):
+        baseline_of(path, benchmark)
+    one = msgspec.structs.replace(results, models=results.models[:1])
+    write_results(one, path)
+    before = baseline_of(path, benchmark)
+    assert before == dict(zip(one.benchmark.targets, one.models[0].per_target, strict=True))
+    with pytest.raises(ConfigError, match="another benchmark"):
+        baseline_of(path, replace(benchmark, seed=1))
