@@ -17,7 +17,7 @@ AREAS: dict[str, tuple[str, str] | None] = {
     "models": ("tactile_rt.benchmarks.models", "train"),
     "inference": ("tactile_rt.benchmarks.inference", ""),
     "daemon": None,
-    "align": ("tactile_rt.benchmarks.alignment", "train"),
+    "align": ("tactile_rt.benchmarks.alignment", ""),
 }
 
 

@@ -189,18 +189,40 @@ def export(
     checkpoint: Annotated[Path, typer.Argument(help="best.pt of a training run.")],
     model: Annotated[Path, typer.Argument(help="The .onnx file to write.")],
     name: Annotated[str, typer.Option(help="Of the model; default: the file's name.")] = "",
+    precision: Annotated[
+        str, typer.Option(help="fp32, fp16 or bf16 (smaller files), int8 (also faster).")
+    ] = "fp32",
+    kind: Annotated[
+        str, typer.Option(help="step: one step of a stream; window: a whole episode at once.")
+    ] = "step",
 ) -> None:
     """Export a trained network as a streaming ONNX step, with everything needed to run it."""
     try:
+        from tactile_rt.export.precision import PRECISIONS
         from tactile_rt.export.release import release
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     if model.is_dir():
         raise ConfigError(f"{model} is a folder: name a file to write")
+    if precision not in PRECISIONS:
+        raise ConfigError(f"--precision is {precision!r}, not one of {', '.join(PRECISIONS)}")
+    if kind not in ("step", "window"):
+        raise ConfigError(f"--kind is {kind!r}, not one of step, window")
     console = Console(stderr=True)
     with console.status("calibrating, exporting and checking parity"):
-        card = release(checkpoint, model, name or model.stem)
+        card = release(
+            checkpoint,
+            model,
+            name or model.stem,
+            precision,
+            "window" if kind == "window" else "step",
+        )
     console.print(
         f"{model}: {model.stat().st_size / 1e6:.1f} MB, parity {card.figures['parity']:.1e}, "
         f"temperature {card.temperature:.2f}"
     )
+    if precision != "fp32":
+        console.print(
+            "{quantisation_agreement:.1f} % of {quantisation_sweeps} validation decisions as in "
+            "fp32, top-1 {quantisation_top1_drop:.1f} points lower".format(**card.figures)
+        )

@@ -24,34 +24,54 @@ from torch import Tensor, nn
 
 from tactile_rt import __version__
 from tactile_rt.contact import CHANNEL_FLOOR
+from tactile_rt.export.precision import Precision, in_precision
+from tactile_rt.export.streaming import streaming
+from tactile_rt.export.windows import window_graph
+from tactile_rt.model_card import Kind
+from tactile_rt.model_checks import probe_logits
 from tactile_rt.model_file import METADATA_KEY, ModelCard, StateTensor, load_model
 from tactile_rt.models.datasets import STEPS, SUBSTEPS, channel_values
 from tactile_rt.models.training import TactileClassifier, load_checkpoint
+from tactile_rt.onnx_reading import graph_sha256
 from tactile_rt.recording import SweepManifest
 from tactile_rt.stream import ModelError
 
-__all__ = ["OPSET", "PARITY_BAR", "StreamingStep", "export_checkpoint", "export_step", "parity"]
+__all__ = [
+    "OPSET",
+    "PARITY_BAR",
+    "StreamingStep",
+    "export_checkpoint",
+    "export_step",
+    "file_logits",
+    "parity",
+    "step_graph",
+    "write_model",
+]
 
 OPSET = 20
 PARITY_BAR = 1e-5  # largest difference of logits between the file and the torch window
 
 
 class StreamingStep(nn.Module):
-    """One 45 ms step of a classifier with its state as arguments and results."""
+    """One 45 ms step of a classifier with its state as arguments and results.
 
-    def __init__(self, model: TactileClassifier) -> None:
+    Args:
+        model: as trained.
+        integer: its products will be quantised, see `streaming`.
+    """
+
+    def __init__(self, model: TactileClassifier, integer: bool = False) -> None:
         super().__init__()
-        self.model = model
-        self.names = list(model.network.initial_state(1))
+        self.inputs = model.inputs
+        self.network = streaming(model.network, integer)
+        self.names = list(self.network.initial_state(1))
 
     def forward(
         self, samples: Tensor, offset: Tensor, sigma: Tensor, *state: Tensor
     ) -> tuple[Tensor, ...]:
         """(batch, sub-step, element, channel) SI and state -> logits (batch, class) and state."""
-        frame = self.model.inputs(samples, offset, sigma)
-        logits, following = self.model.network.step(
-            frame, dict(zip(self.names, state, strict=True))
-        )
+        frame = self.inputs(samples, offset, sigma)
+        logits, following = self.network.step(frame, dict(zip(self.names, state, strict=True)))
         return (logits, *(following[name] for name in self.names))
 
 
@@ -62,6 +82,8 @@ def export_checkpoint(
     temperature: float = 1.0,
     figures: dict[str, Any] | None = None,
     commands: Sequence[str] = (),
+    precision: Precision = "fp32",
+    kind: Kind = "step",
 ) -> ModelCard:
     """Export what `training.train` saved.
 
@@ -72,6 +94,8 @@ def export_checkpoint(
         temperature: divides the logits at run time.
         figures: measured accuracies to store in the file.
         commands: that remake the file.
+        precision: of the weights, and of products with them.
+        kind: "step" or "window".
 
     Raises:
         ModelError: the checkpoint cannot be read, or the exported graph misses the parity bar.
@@ -105,25 +129,42 @@ def export_checkpoint(
         },
         figures=dict(figures or {}),
     )
-    return export_step(model, card, path)
+    return export_step(model, card, path, precision, kind)
 
 
-def export_step(model: TactileClassifier, card: ModelCard, path: Path) -> ModelCard:
-    """Write a classifier's streaming step; `card.state` is filled in.
+def export_step(
+    model: TactileClassifier,
+    card: ModelCard,
+    path: Path,
+    precision: Precision = "fp32",
+    kind: Kind = "step",
+) -> ModelCard:
+    """Write a classifier's streaming step, or a whole window of it.
+
+    What the card says of the graph (state, kind, precision, hashes, parity, probe) is filled in.
+    Parity is of the graph in single precision; what less precise weights change is
+    ``quantisation_logits``, on the same input.
 
     Raises:
         ModelError: the exported graph misses the parity bar.
+        ConfigError: no such precision.
     """
-    model = model.eval()
-    step = StreamingStep(model).eval()
-    state = model.network.initial_state(2)
-    card = msgspec.structs.replace(
-        card,
-        state=tuple(
-            StateTensor(n, tuple(t.shape[1:]), str(t.dtype).removeprefix("torch."))
-            for n, t in state.items()
-        ),
-    )
+    proto, state = step_graph(model, card, integer=precision == "int8")
+    return write_model(proto, state, model, card, path, precision, kind)
+
+
+def step_graph(
+    model: TactileClassifier, card: ModelCard, integer: bool = False
+) -> tuple[onnx.ModelProto, tuple[StateTensor, ...]]:
+    """The step in single precision, without metadata, and its state.
+
+    Args:
+        model: as trained.
+        card: says how large the array and a step are.
+        integer: its products will be quantised, see `streaming`.
+    """
+    step = StreamingStep(model.eval(), integer).eval()
+    state = step.network.initial_state(2)
     elements, channels = card.array.shape
     arguments = (
         torch.zeros(2, card.substeps, elements, channels),
@@ -149,34 +190,66 @@ def export_step(model: TactileClassifier, card: ModelCard, path: Path) -> ModelC
         )
     assert program is not None
     proto = program.model_proto
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, partial = tempfile.mkstemp(dir=path.parent, suffix=".partial")
-    os.close(handle)
-    try:
-        _write(proto, card, Path(partial))
-        worst = parity(model, Path(partial))
-        if not worst <= PARITY_BAR:  # NaN misses it too
-            raise ModelError(
-                f"{path}: logits of the exported graph differ by {worst:.1e} from torch's "
-                f"(at most {PARITY_BAR:.0e} is allowed); nothing was written"
-            )
-        card = msgspec.structs.replace(card, figures={**card.figures, "parity": worst})
-        _write(proto, card, Path(partial))
-        os.chmod(partial, 0o644)
-        os.replace(partial, path)
-    finally:
-        Path(partial).unlink(missing_ok=True)
-    return card
-
-
-def _write(proto: onnx.ModelProto, card: ModelCard, path: Path) -> None:
-    onnx.helper.set_model_props(proto, {METADATA_KEY: msgspec.json.encode(card).decode()})
     # The exporter records where in the source each node came from: weight without use here.
     for node in proto.graph.node:
         del node.metadata_props[:]
         node.doc_string = ""
     for value in (*proto.graph.value_info, *proto.graph.input, *proto.graph.output):
         del value.metadata_props[:]
+    return proto, tuple(
+        StateTensor(n, tuple(t.shape[1:]), str(t.dtype).removeprefix("torch."))
+        for n, t in state.items()
+    )
+
+
+def write_model(
+    proto: onnx.ModelProto,
+    state: tuple[StateTensor, ...],
+    model: TactileClassifier,
+    card: ModelCard,
+    path: Path,
+    precision: Precision = "fp32",
+    kind: Kind = "step",
+) -> ModelCard:
+    """Write what `step_graph` made, in a precision, as `export_step` says."""
+    card = msgspec.structs.replace(card, state=state, kind="step", precision="fp32", opset=OPSET)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, partial_name = tempfile.mkstemp(dir=path.parent, suffix=".partial")
+    os.close(handle)
+    partial = Path(partial_name)
+    try:
+        if kind == "window":
+            card = msgspec.structs.replace(card, state=(), kind="window")
+        form = window_graph(proto, state) if kind == "window" else proto
+        _write(form, card, partial)
+        worst = parity(model, partial)
+        if not worst <= PARITY_BAR:  # NaN misses it too
+            raise ModelError(
+                f"{path}: logits of the exported graph differ by {worst:.1e} from torch's "
+                f"(at most {PARITY_BAR:.0e} is allowed); nothing was written"
+            )
+        figures = {**card.figures, "parity": worst}
+        if precision != "fp32":
+            form = in_precision(proto, precision)
+            form = window_graph(form, state) if kind == "window" else form
+            card = msgspec.structs.replace(card, precision=precision)
+            _write(form, card, partial)
+            figures["quantisation_logits"] = parity(model, partial)
+        session, _ = load_model(partial, kind=None)
+        probe = tuple(tuple(row) for row in probe_logits(session, card).tolist())
+        del session
+        hashes = {**card.hashes, "graph": graph_sha256(partial.read_bytes())}
+        card = msgspec.structs.replace(card, figures=figures, probe=probe, hashes=hashes)
+        _write(form, card, partial)
+        os.chmod(partial, 0o644)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
+    return card
+
+
+def _write(proto: onnx.ModelProto, card: ModelCard, path: Path) -> None:
+    onnx.helper.set_model_props(proto, {METADATA_KEY: msgspec.json.encode(card).decode()})
     onnx.save(proto, path)
 
 
@@ -185,7 +258,7 @@ def parity(model: TactileClassifier, path: Path, episodes: int = 3, seed: int = 
 
     NaN if either computes one.
     """
-    session, card = load_model(path)
+    session, card = load_model(path, kind=None)
     elements, channels = card.array.shape
     rng = np.random.default_rng(seed)
     scale = np.array(card.scale, dtype=np.float32)
@@ -195,14 +268,30 @@ def parity(model: TactileClassifier, path: Path, episodes: int = 3, seed: int = 
     sigma = np.abs(offset)
     with torch.inference_mode():
         expected = model.eval()(*(torch.from_numpy(a) for a in (samples, offset, sigma))).numpy()
+    found = file_logits(session, card, samples, offset, sigma)
+    return float(np.abs(found - expected).max())
+
+
+def file_logits(
+    session: onnxruntime.InferenceSession,
+    card: ModelCard,
+    samples: NDArray[np.float32],
+    offset: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+) -> NDArray[np.float32]:
+    """Logits (batch, step, class) of windows (batch, step, sub-step, element, channel)."""
+    if card.kind == "window":
+        feed = {"samples": samples, "offset": offset, "sigma": sigma}
+        window: NDArray[np.float32] = session.run(["logits"], feed)[0]
+        return window
     names = [o.name for o in session.get_outputs()]
-    feed: dict[str, NDArray[Any]] = {
-        s.name: np.zeros((episodes, *s.shape), dtype=s.dtype) for s in card.state
+    state: dict[str, NDArray[Any]] = {
+        s.name: np.zeros((len(samples), *s.shape), dtype=s.dtype) for s in card.state
     }
-    differences = []
-    for t in range(card.steps):
-        feed |= {"samples": samples[:, t], "offset": offset, "sigma": sigma}
-        out = dict(zip(names, session.run(None, feed), strict=True))
-        feed |= {s.name: out[f"{s.name}_next"] for s in card.state}
-        differences.append(np.abs(out["logits"] - expected[:, t]).max())
-    return float(np.max(differences))  # which keeps a NaN, as Python's own max may not
+    logits = []
+    for t in range(samples.shape[1]):
+        feed = {"samples": samples[:, t], "offset": offset, "sigma": sigma, **state}
+        out = dict(zip(names, session.run(names, feed), strict=True))
+        state = {s.name: out[f"{s.name}_next"] for s in card.state}
+        logits.append(out["logits"])
+    return np.stack(logits, axis=1)

@@ -1,6 +1,21 @@
-"""Encoder-Attender-Decoder networks in torch. Needs the `train` extra."""
+"""Encoder-Attender-Decoder networks in torch, and what is done with them. Needs the `train` extra.
 
-from tactile_rt.models.ead import EAD, EADConfig, count_parameters
-from tactile_rt.models.inputs import InputStage
+`alignment` and the RSA benchmark do without torch, so nothing is imported before it is asked for.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tactile_rt.models.ead import EAD, EADConfig, count_parameters
+    from tactile_rt.models.inputs import InputStage
 
 __all__ = ["EAD", "EADConfig", "InputStage", "count_parameters"]
+
+_HOMES = {"EAD": "ead", "EADConfig": "ead", "InputStage": "inputs", "count_parameters": "ead"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -24,6 +24,7 @@ from tactile_rt.model_file import ModelCard, load_model
 from tactile_rt.models.datasets import STEPS, SUBSTEPS, find_onsets, windows
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.training import TactileClassifier
+from tactile_rt.onnx_reading import graph_sha256
 from tactile_rt.recording import SweepManifest
 from tactile_rt.stream import ArraySpec, ModelError
 from tactile_rt.testing import cut
@@ -173,7 +174,9 @@ def test_the_metadata_says_everything_needed(exported: SimpleNamespace) -> None:
     assert set(card) == set(ModelCard.__struct_fields__)
     assert ArraySpec.from_json(card["spec"]) == SPEC
     assert card["name"] == "tiny"
-    assert card["version"] == 1
+    assert card["version"] == 2
+    assert (card["kind"], card["precision"], card["opset"]) == ("step", "fp32", onnx_step.OPSET)
+    assert card["hashes"]["graph"] == graph_sha256(exported.path.read_bytes())
     assert card["period_ns"] == PERIOD_NS
     assert (card["substeps"], card["steps"]) == (5, 22)
     assert card["labels"] == list(CATEGORIES)

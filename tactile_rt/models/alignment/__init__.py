@@ -6,6 +6,8 @@ neural, nwb, nwb_parts, published   recordings: from NWB files, and in the publi
 strict, pooling, paper_code, building   the two protocols: recordings -> a frozen benchmark
 benchmark, benchmark_file   the frozen benchmark and its file
 scoring, statistics      a model's layers -> score, exact p-value
+stimuli_input, layers, activations, onnx_taps, onnx_activations, loading   a model -> its layers
+fidelity, gate, decoding, results, pictures, report   what is done with them
 """
 
 from tactile_rt.models.alignment.benchmark import (

@@ -1,0 +1,226 @@
+"""Smaller files and integer products: an exported graph's weights in fewer bits.
+
+fp16, bf16: the weights of products are stored in 16 bits and cast back when the file is loaded:
+half the size, the same speed.
+
+int8: products are integer ones, weights quantised ahead, activations as they come. Products of
+one or a few rows (dense layers, attention) read their weights in blocks of their inputs, each
+with a scale of its own (`MatMulNBits`); convolutions, of a row per site, have one scale per output
+channel (`MatMulInteger`), and their activations are quantised before the taps are gathered, once
+per map. States, norms, biases and sums stay in single precision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Literal
+
+import numpy as np
+import onnx
+from numpy.typing import NDArray
+from onnx import helper, numpy_helper
+
+from tactile_rt.stream import ConfigError
+
+__all__ = ["PRECISIONS", "Precision", "in_precision"]
+
+Precision = Literal["fp32", "fp16", "bf16", "int8"]
+PRECISIONS: tuple[Precision, ...] = ("fp32", "fp16", "bf16", "int8")
+BLOCK, LEAST_BLOCK = 128, 16  # inputs that share a scale; onnxruntime wants a power of two
+SMALL = 1024  # weights of fewer numbers stay as they are
+CONTRIB = "com.microsoft"  # onnxruntime's own operators, which every build of it has
+
+
+def in_precision(proto: onnx.ModelProto, precision: Precision) -> onnx.ModelProto:
+    """A copy of a graph in another precision.
+
+    Raises:
+        ConfigError: no such precision.
+    """
+    if precision not in PRECISIONS:
+        raise ConfigError(f"precision is {precision!r}, not one of {', '.join(PRECISIONS)}")
+    out = onnx.ModelProto()
+    out.CopyFrom(proto)
+    if precision in ("fp16", "bf16"):
+        _store(out, precision)
+    elif precision == "int8":
+        _quantise(out)
+    return out
+
+
+def _store(proto: onnx.ModelProto, precision: Precision) -> None:
+    """Weights in 16 bits, each with a Cast that is folded when the file is loaded."""
+    casts = []
+    for weight in proto.graph.initializer:
+        if weight.data_type != onnx.TensorProto.FLOAT or np.prod(weight.dims) < SMALL:
+            continue
+        values = numpy_helper.to_array(weight)
+        name = weight.name
+        if precision == "fp16":
+            limit = np.finfo(np.float16).max
+            weight.CopyFrom(
+                numpy_helper.from_array(
+                    np.clip(values, -limit, limit).astype(np.float16), f"{name}_16"
+                )
+            )
+        else:
+            weight.CopyFrom(_bfloat16(values, f"{name}_16"))
+        casts.append(
+            helper.make_node(
+                "Cast", [weight.name], [name], f"{name}_cast", to=onnx.TensorProto.FLOAT
+            )
+        )
+    nodes = [*casts, *proto.graph.node]
+    del proto.graph.node[:]
+    proto.graph.node.extend(nodes)
+
+
+def _bfloat16(values: NDArray[np.float32], name: str) -> onnx.TensorProto:
+    """Rounded to nearest, ties to even."""
+    bits = np.ascontiguousarray(values).view(np.uint32)
+    rounded = (bits + 0x7FFF + ((bits >> 16) & 1)) >> 16
+    tensor = onnx.TensorProto(name=name, data_type=onnx.TensorProto.BFLOAT16, dims=values.shape)
+    tensor.raw_data = rounded.astype("<u2").tobytes()
+    return tensor
+
+
+def _quantise(proto: onnx.ModelProto) -> None:
+    graph = proto.graph
+    weights = {w.name: w for w in graph.initializer}
+    makers = {output: node for node in graph.node for output in node.output}
+    nodes: list[onnx.NodeProto] = []
+    added: dict[str, onnx.TensorProto] = {}
+    gathered: dict[str, tuple[str, str, str]] = {}
+    for node in graph.node:
+        weight = weights.get(node.input[1]) if node.op_type in ("MatMul", "Gemm") else None
+        if weight is None or len(weight.dims) != 2 or np.prod(weight.dims) < SMALL:
+            nodes.append(node)
+            continue
+        values = numpy_helper.to_array(weight)
+        if node.op_type == "Gemm":
+            if _attribute(node, "transB"):
+                values = values.T
+        taps = _taps_of(node.input[0], makers)
+        replaced = (
+            _blocks(node, values, added)
+            if taps is None
+            else _integer(node, values, taps, added, gathered)
+        )
+        nodes.extend(replaced)
+    del graph.node[:]
+    graph.node.extend(_used(nodes, {o.name for o in graph.output}))
+    needed = {name for node in graph.node for name in node.input}
+    kept = [w for w in (*graph.initializer, *added.values()) if w.name in needed]
+    del graph.initializer[:]
+    graph.initializer.extend(kept)
+    del graph.value_info[:]  # some say what is no longer there
+    if all(o.domain != CONTRIB for o in proto.opset_import):
+        proto.opset_import.append(helper.make_opsetid(CONTRIB, 1))
+
+
+def _blocks(
+    node: onnx.NodeProto, values: NDArray[np.float32], added: dict[str, onnx.TensorProto]
+) -> Iterator[onnx.NodeProto]:
+    """x (..., inputs) times weights (inputs, outputs), the weights in blocks of inputs."""
+    inputs, outputs = values.shape
+    block = min(BLOCK, max(LEAST_BLOCK, 1 << (inputs - 1).bit_length()))
+    count = -(-inputs // block)
+    blocks = np.zeros((outputs, count * block), dtype=np.float32)
+    blocks[:, :inputs] = values.T
+    blocks = blocks.reshape(outputs, count, block)
+    scale = np.abs(blocks).max(-1) / 127
+    scale[scale == 0] = 1.0
+    codes = (np.rint(blocks / scale[..., None]) + 128).astype(np.uint8)  # 128 stands for zero
+    name = node.input[1]
+    for part, array in ((f"{name}_int8", codes), (f"{name}_scale", scale.astype(np.float32))):
+        added[part] = numpy_helper.from_array(array, part)
+    product = node.output[0] if len(node.input) < 3 else f"{node.output[0]}_product"
+    yield helper.make_node(
+        "MatMulNBits",
+        [node.input[0], f"{name}_int8", f"{name}_scale"],
+        [product],
+        f"{node.name}_int8",
+        domain=CONTRIB,
+        K=inputs,
+        N=outputs,
+        bits=8,
+        block_size=block,
+        accuracy_level=4,  # integer products
+    )
+    if len(node.input) == 3:  # of Gemm
+        yield helper.make_node(
+            "Add", [product, node.input[2]], [node.output[0]], f"{node.name}_add"
+        )
+
+
+def _integer(
+    node: onnx.NodeProto,
+    values: NDArray[np.float32],
+    taps: tuple[onnx.NodeProto, ...],
+    added: dict[str, onnx.TensorProto],
+    gathered: dict[str, tuple[str, str, str]],
+) -> Iterator[onnx.NodeProto]:
+    """Gathered taps times weights, from a map that is quantised before it is gathered."""
+    final = taps[0].output[0]
+    if final not in gathered:
+        source = taps[-1].input[0]
+        value, scale, zero = (f"{source}_{part}" for part in ("int8", "scale", "zero"))
+        if not any(done[1] == scale for done in gathered.values()):
+            yield helper.make_node(
+                "DynamicQuantizeLinear", [source], [value, scale, zero], f"{source}_quantise"
+            )
+        for step in reversed(taps):
+            inputs = [value, *step.input[1:]]
+            if step.op_type == "Pad":  # a silent site is the code of zero
+                inputs = [value, step.input[1], zero]
+            output = f"{step.output[0]}_int8"
+            copy = helper.make_node(step.op_type, inputs, [output], f"{step.name}_int8")
+            copy.attribute.extend(step.attribute)
+            yield copy
+            value = output
+        gathered[final] = (value, scale, zero)
+    value, scale, zero = gathered[final]
+    name = node.input[1]
+    channel = np.abs(values).max(0) / 127
+    channel[channel == 0] = 1.0
+    codes = np.rint(values / channel).astype(np.int8)
+    for part, array in ((f"{name}_int8", codes), (f"{name}_scale", channel.astype(np.float32))):
+        added[part] = numpy_helper.from_array(array, part)
+    yield helper.make_node(
+        "MatMulIntegerToFloat",
+        [value, f"{name}_int8", scale, f"{name}_scale", zero],
+        [node.output[0]],
+        f"{node.name}_int8",
+        domain=CONTRIB,
+    )
+
+
+def _taps_of(name: str, makers: dict[str, onnx.NodeProto]) -> tuple[onnx.NodeProto, ...] | None:
+    """The nodes that gather a convolution's taps, last first; None if nothing is gathered."""
+    chain = []
+    while (node := makers.get(name)) is not None:
+        if node.op_type not in ("Reshape", "Gather", "Pad"):
+            break
+        chain.append(node)
+        name = node.input[0]
+        if node.op_type == "Pad":
+            break
+    if not any(node.op_type == "Gather" for node in chain):
+        return None
+    while chain[-1].op_type == "Reshape":
+        chain.pop()
+    return tuple(chain)
+
+
+def _used(nodes: list[onnx.NodeProto], outputs: set[str]) -> list[onnx.NodeProto]:
+    """Those nodes that an output needs, in order."""
+    needed, kept = set(outputs), []
+    for node in reversed(nodes):
+        if needed.intersection(node.output):
+            kept.append(node)
+            needed.update(node.input)
+    return kept[::-1]
+
+
+def _attribute(node: onnx.NodeProto, name: str) -> int:
+    return next((a.i for a in node.attribute if a.name == name), 0)

@@ -1,0 +1,334 @@
+"""A trained network rewritten for streaming: the same logits, laid out for the runtime's kernels.
+
+Maps are `(lane, site, channel)`, sites row by row, in the state and inside, so nothing is
+transposed between steps; a convolution is one gather of every site's taps and one product, or two
+where that is less arithmetic. What cannot be rewritten is left as it was trained.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from tactile_rt.models.attenders import GPT, HEADS, TOKENS
+from tactile_rt.models.attenders.gpt import Block
+from tactile_rt.models.ead import EAD
+from tactile_rt.models.encoders.cells import Cell
+from tactile_rt.models.encoders.graph_encoder import GraphEncoder
+from tactile_rt.models.encoders.resnet import FoldedResNet18, ResNet18Encoder
+
+__all__ = ["StreamingGPT", "StreamingGraph", "StreamingResNet18", "streaming"]
+
+
+def streaming(network: EAD, integer: bool = False) -> EAD:
+    """The same network for the runtime: `step` and `initial_state`, not `forward`.
+
+    Its state has other names and layouts than the trained network's.
+
+    Args:
+        network: as trained, in evaluation mode.
+        integer: its products will be quantised: gather all taps of a convolution at once.
+    """
+    out = copy.copy(network)
+    out._modules = dict(network._modules)  # a shallow copy would share it
+    encoder = network.encoder
+    if isinstance(encoder, GraphEncoder):
+        if all(
+            len(encoder.inputs) == 1 and _plain(encoder, node.name) for node in encoder.graph.nodes
+        ):
+            out.encoder = StreamingGraph(encoder, integer)
+    elif isinstance(encoder, ResNet18Encoder):
+        out.encoder = StreamingResNet18(encoder)
+    elif hasattr(encoder, "deployed"):
+        out.encoder = encoder.deployed()
+    if isinstance(network.attender, GPT):
+        out._modules["attender"] = StreamingGPT(network.attender)
+    return out.eval()
+
+
+def _plain(encoder: GraphEncoder, name: str) -> bool:
+    """Whether a node only concatenates, and reads maps if it is one."""
+    (node,) = [n for n in encoder.graph.nodes if n.name == name]
+    fused = any(e.fusion != "concatenate" for e in node.reads)
+    vectors = any(encoder.sizes[e.source] == (1, 1) for e in node.reads)
+    return not fused and (node.kind == "dense" or not vectors)
+
+
+class Product(nn.Module):
+    """x W + b of (..., input); W is stored as the kernels read it."""
+
+    weight: Tensor
+    bias: Tensor | None
+
+    def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
+        super().__init__()
+        self.register_buffer("weight", weight.detach().t().contiguous())
+        self.register_buffer("bias", None if bias is None else bias.detach().clone())
+
+    def forward(self, x: Tensor) -> Tensor:
+        out = torch.matmul(x, self.weight)
+        return out if self.bias is None else out + self.bias
+
+
+class Columns(nn.Module):
+    """W x + b of maps (lane, site, channel), the lanes as columns.
+
+    For one lane this reads the weights at memory speed, as a row times W does not. The bias is
+    added after the transposition: onnxruntime would merge it with the product into a slow `Gemm`.
+    """
+
+    weight: Tensor
+    bias: Tensor
+
+    def __init__(self, weight: Tensor, bias: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("weight", weight.detach().clone())
+        self.register_buffer("bias", bias.detach().clone())
+
+    def forward(self, maps: Tensor) -> Tensor:
+        columns = maps.permute(1, 2, 0).flatten(0, 1)
+        return torch.matmul(self.weight, columns).t() + self.bias
+
+
+class Taps(nn.Module):
+    """2 x 2 convolution of maps (lane, site, channel) that are concatenated on channels.
+
+    Args:
+        weight: (output, 2, 2, input).
+        size: rows and columns of the maps that come in.
+        valid: without the padding that makes the output as large as the input.
+        whole: gather all four taps; else add the lower two as a product of their own, of fewer
+            sites: what lies below the map needs no product.
+    """
+
+    taps: Tensor
+
+    def __init__(
+        self, weight: Tensor, bias: Tensor | None, size: tuple[int, int], valid: bool, whole: bool
+    ) -> None:
+        super().__init__()
+        rows, columns = size
+        self.columns, self.sites = columns, rows * columns
+        self.padded = not valid
+        site = torch.full((rows + 1, columns + 1), self.sites)  # the last one is silent
+        site[:-1, :-1] = torch.arange(self.sites).view(size)
+        if valid:
+            site = site[:-1, :-1]
+        taps = torch.stack([site[:-1, :-1], site[:-1, 1:], site[1:, :-1], site[1:, 1:]], -1)
+        taps = taps.flatten(0, 1)
+        self.lower: Product | None = None
+        if whole or valid:
+            self.product = Product(weight.flatten(1), bias)
+        else:
+            taps = taps[:, :2]
+            upper, lower = weight.flatten(2).unbind(1)
+            self.product, self.lower = Product(upper, bias), Product(lower, None)
+        self.outputs = len(taps)
+        self.register_buffer("taps", taps.flatten())
+
+    def forward(self, *maps: Tensor) -> Tensor:
+        x = torch.cat(maps, dim=-1) if len(maps) > 1 else maps[0]
+        if self.padded:
+            x = F.pad(x, (0, 0, 0, 1))
+        x = x.index_select(1, self.taps).unflatten(1, (self.outputs, -1)).flatten(2)
+        out: Tensor = self.product(x)
+        if self.lower is not None:
+            out = out + F.pad(self.lower(x[:, self.columns :]), (0, 0, 0, self.columns))
+        return out
+
+
+class StreamingGraph(nn.Module):
+    """A `GraphEncoder` that only concatenates; see `streaming`."""
+
+    def __init__(self, encoder: GraphEncoder, integer: bool) -> None:
+        super().__init__()
+        self.graph, self.sizes, self.lag = encoder.graph, encoder.sizes, encoder.lag
+        self.features, self.heard = encoder.features, encoder.heard
+        self.drives, self.cells = nn.ModuleDict(), nn.ModuleDict()
+        self.integer = integer
+        for node in self.graph.nodes:
+            if node.kind == "dense":
+                linear = encoder.dense[node.name]
+                assert isinstance(linear, nn.Linear)
+                maps = all(self.sizes[e.source] != (1, 1) for e in node.reads)
+                kind = Columns if maps and not integer else Product
+                self.drives[node.name] = kind(linear.weight, linear.bias)
+            else:
+                conv: Any = encoder.convs[node.name]
+                size = self.sizes[node.reads[0].source]
+                valid = node.kind == "valid"
+                self.drives[node.name] = Taps(conv.weight, conv.bias, size, valid, integer)
+            if node.cell != "none":
+                self.cells[node.name] = self._cell(encoder.cells[node.name], node.name)
+
+    def _cell(self, cell: nn.Module, name: str) -> Cell:
+        assert isinstance(cell, Cell)
+        out = copy.copy(cell)
+        out._modules = dict(cell._modules)
+        for part, conv in cell._modules.items():
+            assert conv is not None
+            weight, bias = conv.weight, conv.bias
+            out._modules[part] = Taps(weight, bias, self.sizes[name], False, self.integer)  # type: ignore[arg-type]
+        return out
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        """Zeros: each node's cell state and, where a node hears it, its output `_h`."""
+        zeros = next(self.buffers()).new_zeros
+        state = {}
+        for node in self.graph.nodes:
+            rows, columns = self.sizes[node.name]
+            sites = () if node.kind == "dense" else (rows * columns,)
+            for key in self._keys(node.name):
+                state[key] = zeros((batch, *sites, node.channels), dtype=torch.float32)
+        return state
+
+    def step(
+        self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """One step. frame (batch, channel, row, column) -> features (batch, feature), new state."""
+        now = frame.flatten(2).transpose(1, 2)
+        new: dict[str, Tensor] = {}
+        for node in self.graph.nodes:
+            sources = [e.source for e in node.reads]
+            read = [now if s == self.graph.inputs[0].name else state[f"{s}_h"] for s in sources]
+            drive = self.drives[node.name]
+            x = self._dense(drive, read) if node.kind == "dense" else drive(*read)
+            if node.name in self.cells:
+                cell = self.cells[node.name]
+                assert isinstance(cell, Cell)
+                names = [f"{node.name}_{kind}" for kind in cell.states]
+                x, memory = cell(x, tuple(state[name] for name in names))
+                new |= dict(zip(names, memory, strict=True))
+            new[f"{node.name}_h"] = F.relu(x)
+        return new[f"{self.graph.readout}_h"], {key: new[key] for key in self.initial_keys()}
+
+    def initial_keys(self) -> list[str]:
+        return [key for node in self.graph.nodes for key in self._keys(node.name)]
+
+    def _dense(self, drive: nn.Module, read: Sequence[Tensor]) -> Tensor:
+        """Of every site's channels, then those of vectors."""
+        maps, vectors = [m for m in read if m.dim() == 3], [m for m in read if m.dim() == 2]
+        if not vectors:
+            joined = torch.cat(maps, -1)
+            out: Tensor = drive(joined if isinstance(drive, Columns) else joined.flatten(1))
+            return out
+        x = torch.cat([torch.cat(maps, -1).flatten(1), *vectors] if maps else vectors, -1)
+        out = drive(x)
+        return out
+
+    def _keys(self, name: str) -> list[str]:
+        memory = []
+        if name in self.cells:
+            cell = self.cells[name]
+            assert isinstance(cell, Cell)
+            memory = [f"{name}_{kind}" for kind in cell.states]
+        return memory + [f"{name}_h"] * (name in self.heard)
+
+
+class StreamingResNet18(FoldedResNet18):
+    """A `FoldedResNet18` that is traced for any number of lanes."""
+
+    def _encode(self, frames: Tensor) -> Tensor:
+        layers = self.layers
+        x = F.relu(layers["stem"](frames.flatten(2).transpose(1, 2).flatten(1)))
+        x = x.unflatten(1, (*self.shape, -1))
+        for axis in (1, 2):  # the largest of 3 x 3 sites, stride 2, padded by 1
+            size = x.shape[axis]
+            ranges = [(max(c - 1, 0), min(c + 2, size)) for c in range(0, size, 2)]
+            x = torch.stack([x.narrow(axis, a, b - a).amax(axis) for a, b in ranges], axis)
+        x = x.flatten(1)
+        for i in range(self.count):
+            short = layers[f"{i}_shortcut"](x) if f"{i}_shortcut" in layers else x
+            x = F.relu(short + layers[f"{i}_second"](F.relu(layers[f"{i}_first"](x))))
+        features: Tensor = layers["fc"](x)
+        return features
+
+
+class StreamingGPT(nn.Module):
+    """A `GPT` whose cache is one tensor per layer: each is read once and written once a step."""
+
+    def __init__(self, gpt: GPT) -> None:
+        super().__init__()
+        self.features, self.max_steps = gpt.features, gpt.max_steps
+        self.head = gpt.features // HEADS
+        with torch.no_grad():
+            tokens = TOKENS * gpt.max_steps
+            positions = gpt.positions[:tokens].unflatten(0, (-1, TOKENS)).clone()
+            positions[:, 1] += gpt.project_in(gpt.action)
+        self.register_buffer("positions", positions)
+        self.project_in = _product(gpt.project_in)
+        self.project_out = _product(gpt.project_out)
+        self.norm = gpt.norm
+        self.blocks = nn.ModuleList(StreamingBlock(block) for block in gpt.blocks)
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        """Zeros: keys and values of each layer, (batch, head, step, token, width / head)."""
+        zeros = self.norm.weight.new_zeros
+        shape = (batch, HEADS, self.max_steps, TOKENS, self.head)
+        names = [f"gpt_{kind}{layer}" for layer in range(len(self.blocks)) for kind in "kv"]
+        return {name: zeros(shape) for name in names}
+
+    def step(
+        self, features: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """One step, as `GPT.step`."""
+        index = index.clamp(max=self.max_steps - 1)
+        token = torch.arange(TOKENS * self.max_steps)
+        first = TOKENS * index[:, None, None, None]
+        here = torch.arange(self.max_steps)[:, None, None] == index[:, None, None, None, None]
+        # The observation sees the pairs before and itself, the action token its own pair too.
+        query = first + torch.arange(TOKENS)[:, None]
+        unseen = torch.where(token <= query, 0.0, -torch.inf)
+        inputs = self.project_in(features)
+        pair = torch.stack([inputs, torch.zeros_like(inputs)], 1)
+        x = pair + self.positions[index]  # type: ignore[index]
+        new: dict[str, Tensor] = {}
+        for layer, block in enumerate(self.blocks):
+            names = (f"gpt_k{layer}", f"gpt_v{layer}")
+            x, *cache = block(x, state[names[0]], state[names[1]], here, unseen)
+            new |= dict(zip(names, cache, strict=True))
+        return self.project_out(self.norm(x[:, TOKENS - 1])), new
+
+
+class StreamingBlock(nn.Module):
+    """One layer of `StreamingGPT`."""
+
+    def __init__(self, block: nn.Module) -> None:
+        super().__init__()
+        assert isinstance(block, Block)
+        self.norm1, self.norm2 = block.norm1, block.norm2
+        width = block.proj.in_features
+        self.head = width // HEADS
+        # The attention's scale is in the queries' weights.
+        scale = torch.ones(3 * width)
+        scale[:width] = 1 / math.sqrt(self.head)
+        qkv = block.qkv
+        self.qkv = Product(qkv.weight * scale[:, None], qkv.bias * scale)
+        self.proj, self.mlp_in = _product(block.proj), _product(block.mlp_in)
+        self.mlp_out = _product(block.mlp_out)
+
+    def forward(
+        self, x: Tensor, k_cache: Tensor, v_cache: Tensor, here: Tensor, unseen: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        q, k, v = (
+            part.unflatten(-1, (HEADS, self.head)).transpose(1, 2)
+            for part in self.qkv(self.norm1(x)).chunk(3, dim=-1)
+        )
+        k_cache = torch.where(here, k[:, :, None], k_cache)
+        v_cache = torch.where(here, v[:, :, None], v_cache)
+        scores = torch.matmul(q, k_cache.flatten(2, 3).transpose(-1, -2))
+        weights = torch.softmax(scores + unseen, dim=-1)
+        attended = torch.matmul(weights, v_cache.flatten(2, 3)).transpose(1, 2).flatten(2)
+        x = x + self.proj(attended)
+        hidden = F.gelu(self.mlp_in(self.norm2(x)), approximate="tanh")
+        return x + self.mlp_out(hidden), k_cache, v_cache
+
+
+def _product(linear: nn.Linear) -> Product:
+    return Product(linear.weight, linear.bias)

@@ -1,0 +1,108 @@
+"""The network as it is exported, step by step, against the window that was trained."""
+
+from collections.abc import Iterator
+
+import pytest
+
+pytest.importorskip("torch")
+
+import torch
+from small_networks import TOLERANCE, build, frames, stream
+
+from tactile_rt.export.streaming import StreamingGPT, StreamingGraph, StreamingResNet18, streaming
+
+STEPS = 22
+# Every cell, encoder, attender and decoder at least once; `make check-export` takes all of them.
+SAMPLE = [
+    ("zhuang-timedecay", "none", "mlp"),
+    ("zhuang-timedecay-ln", "mamba", "linear"),
+    ("zhuang-vanilla", "gpt", "linear"),
+    ("zhuang-vanilla-ln", "none", "linear"),
+    ("zhuang-ugrnn", "none", "linear"),
+    ("zhuang-ugrnn-ln", "gpt", "mlp-all"),
+    ("zhuang-intersection", "mamba", "mlp"),
+    ("zhuang-intersection-ln", "gpt", "linear"),
+    ("zhuang-gru", "none", "mlp-all"),
+    ("zhuang-gru-ln", "none", "linear"),
+    ("zhuang-lstm", "none", "linear"),
+    ("zhuang-lstm-ln", "mamba", "mlp-all"),
+    ("resnet18", "gpt", "mlp"),
+    ("s4", "gpt", "mlp-all"),
+    ("mamba", "none", "mlp"),
+    ("gru", "mamba", "linear"),
+]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with torch.inference_mode():
+        yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(("encoder", "attender", "decoder"), SAMPLE)
+def test_steps_give_the_window_s_logits(encoder: str, attender: str, decoder: str) -> None:
+    ead = build(encoder, attender, "mean" if decoder == "mlp" else "last", decoder=decoder)
+    x = frames()
+    expected = ead(x)
+    assert expected.std() > 1e-3, "logits that say nothing would agree in any network"
+    for integer in (False, True):
+        assert abs(stream(streaming(ead, integer), x) - expected).max() <= TOLERANCE
+
+
+@pytest.mark.parametrize("encoder", ["zhuang-lstm-ln", "s4"])
+def test_lanes_are_reset_one_by_one_at_any_step(encoder: str) -> None:
+    """Lane i begins anew at step 3 i + 1: from then on it is a new episode."""
+    ead = build(encoder, "gpt", "mean", decoder="mlp-all")
+    deployed, x, lanes = streaming(ead), frames(batch=3), 3
+    at = [3 * lane + 1 for lane in range(lanes)]
+    state, zero = deployed.initial_state(lanes), deployed.initial_state(lanes)
+    logits = []
+    for t in range(STEPS):
+        for lane in range(lanes):
+            if t == at[lane]:
+                for name in state:
+                    state[name] = state[name].clone()
+                    state[name][lane] = zero[name][lane]
+        out, state = deployed.step(x[:, t], state)
+        logits.append(out)
+    for lane in range(lanes):
+        found = torch.stack(logits[at[lane] :])[:, lane]
+        assert abs(found - ead(x[lane : lane + 1, at[lane] :])[0]).max() <= TOLERANCE
+
+
+def test_what_is_rewritten_and_what_is_not() -> None:
+    ead = build("zhuang-intersection-ln", "gpt")
+    deployed = streaming(ead)
+    assert isinstance(deployed.encoder, StreamingGraph)
+    assert isinstance(deployed.attender, StreamingGPT)
+    assert isinstance(streaming(build("resnet18", "none")).encoder, StreamingResNet18)
+    assert type(ead.encoder).__name__ == "ZhuangEncoder", "the trained network is left alone"
+
+
+def test_a_graph_with_sums_and_gates_streams_as_it_was_trained() -> None:
+    graph = """
+    readout = "out"
+    [inputs.frame]
+    channels = 30
+    rows = 5
+    columns = 7
+    [nodes.a]
+    channels = 64
+    kind = "valid"
+    cell = "ugrnn"
+    reads = ["frame"]
+    [nodes.b]
+    channels = 32
+    kind = "same"
+    reads = ["a"]
+    [nodes.out]
+    channels = 32
+    kind = "dense"
+    reads = ["b", {source = "a", fusion = "gate"}]
+    """
+    ead = build("graph", "none", graph=graph, width=1.0)
+    x = frames()
+    assert abs(stream(streaming(ead), x) - ead(x)).max() <= TOLERANCE
