@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_rt.benchmarks.model_steps import CLASSES, FULL_SIZE, Subject, full_size, measure_model
+from tactile_rt.benchmarks.model_steps import FULL_SIZE, Subject, full_size, measure_model
 from tactile_rt.benchmarks.records import Record
 from tactile_rt.benchmarks.roofline import measure_machine
 from tactile_rt.classifier import Classifier
@@ -100,7 +100,7 @@ def run(quick: bool) -> list[Record]:
             records += measure_model(subject, machine, 300)
             subject.path.unlink()
             measured += 1
-    how = "; ".join(lacking) or f"random weights, {CLASSES} classes"
+    how = "; ".join(lacking) or "random weights"
     records.append(Record("inference.full_size", measured, f"of {2 * len(FULL_SIZE)}", how=how))
     return records
 

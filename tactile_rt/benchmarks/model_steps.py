@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
@@ -20,15 +19,14 @@ from numpy.typing import NDArray
 from tactile_rt.benchmarks.records import Record
 from tactile_rt.benchmarks.roofline import Machine, products, roofline_s
 from tactile_rt.inference.stepper import Stepper
-from tactile_rt.model_file import METADATA_KEY, ModelCard, load_model, read_model, shipped_model
+from tactile_rt.model_file import ModelCard, load_model
 
-__all__ = ["CLASSES", "FULL_SIZE", "Subject", "full_size", "measure_model", "step_times"]
+__all__ = ["FULL_SIZE", "Subject", "full_size", "measure_model", "step_times"]
 
 TAIL = "<= 1.3"  # p99 over p50 of every step
-CLASSES = 117  # of the published networks
 LOAD_INT8_MS = "<= 1000"
-# (name, attender, bar of fp32, bar of int8): p50 over the roofline
-FULL_SIZE = (("intersection_ln", "none", "<= 1.25", "<= 1.6"), ("gpt", "gpt", "<= 1.4", "<= 1.7"))
+# p50 over the roofline, of fp32 and of int8: without the GPT, with it
+FULL_SIZE = {False: ("<= 1.25", "<= 1.6"), True: ("<= 1.4", "<= 1.7")}
 
 
 @dataclass(frozen=True)
@@ -107,34 +105,18 @@ def step_times(session: ort.InferenceSession, card: ModelCard, steps: int) -> ND
 def full_size(folder: Path, lacking: list[str]) -> Iterator[Subject]:
     """Make the published networks with random weights; what cannot be made is told to `lacking`."""
     try:
-        torch: Any = importlib.import_module("torch")
-        checkpoints: Any = importlib.import_module("tactile_rt.models.checkpoints")
-        ead: Any = importlib.import_module("tactile_rt.models.ead")
-        exporting: Any = importlib.import_module("tactile_rt.export.onnx_step")
+        making: Any = importlib.import_module("tactile_rt.export.full_size")
     except ModuleNotFoundError as error:
         lacking.append(f"full size: needs {error.name} (pip install 'tactile-rt[train]')")
         return
-    _, card = load_model(shipped_model())
-    labels = tuple(f"class{i}" for i in range(CLASSES))
-    card = msgspec.structs.replace(card, name="random", labels=labels, provenance={}, figures={})
-    for name, attender, fp32_bar, int8_bar in FULL_SIZE:
-        torch.manual_seed(0)
-        config = ead.EADConfig(CLASSES, encoder="zhuang-intersection-ln", attender=attender)
-        path, small = folder / f"{name}.onnx", folder / f"{name}.int8.onnx"
-        exporting.export_step(checkpoints.TactileClassifier(card.array, config), card, path)
-        _write_int8(path, small)
+    for name, path in making.full_size_models(folder):
         gc.collect()
-        yield Subject(f"{name}.fp32", path, over_roofline=fp32_bar)
-        yield Subject(f"{name}.int8", small, over_roofline=int8_bar, load_ms=LOAD_INT8_MS)
-
-
-def _write_int8(path: Path, small: Path) -> None:
-    onnx: Any = importlib.import_module("onnx")
-    precision: Any = importlib.import_module("tactile_rt.export.precision")
-    proto = precision.in_precision(onnx.load(path), "int8")
-    card = msgspec.structs.replace(read_model(path)[0], precision="int8", probe=(), hashes={})
-    onnx.helper.set_model_props(proto, {METADATA_KEY: msgspec.json.encode(card).decode()})
-    onnx.save(proto, small)
+        fp32_bar, int8_bar = FULL_SIZE["gpt" in name]
+        integer = name.endswith("int8")
+        yield Subject(
+            name.replace("-", "_"), path, over_roofline=int8_bar if integer else fp32_bar,
+            load_ms=LOAD_INT8_MS if integer else "",
+        )  # fmt: skip
 
 
 def _resident() -> int:

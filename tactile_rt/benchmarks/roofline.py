@@ -129,8 +129,8 @@ def _from_profile(operator: str, arguments: dict[str, Any]) -> Product:
     else:
         columns, inner = output[-1], inputs[0][-1]
     integer = operator in INTEGER
-    # Weights that were packed are not listed: one matrix, at least.
-    weights = inner * columns * (1 if integer else 4)
+    # Weights that were packed are not listed: one matrix, at least. They may also stand first.
+    weights = max(inner * columns, math.prod(inputs[0])) * (1 if integer else 4)
     return Product(math.prod(output) // columns, inner, columns, weights, integer)
 
 
