@@ -337,6 +337,7 @@ def test_a_consumer_that_breaks_or_hangs_harms_itself_alone(robot, tmp_path):
         part.limits = type(part.limits)(stall_s=0.5)
         spy.handling = lambda: hangs.wait(PATIENCE_S)
         until(lambda: state_of(daemon, "publisher.spy").state == "stalled")
+        until(lambda: part._stalled)  # and told
         before = daemon.snapshot().sources[0].samples
         until(lambda: daemon.snapshot().sources[0].samples > before + 200)
         spy.handling = lambda: None
