@@ -134,10 +134,16 @@ class TrainingBatches:
     def __len__(self) -> int:
         return len(self._usable) // self._batch
 
-    def epoch(self, number: int) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Batches of samples, offset, sigma (as `InputStage` takes them) and labels (batch,)."""
+    def epoch(self, number: int, view: int = 0) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Batches of samples, offset, sigma (as `InputStage` takes them) and labels (batch,).
+
+        Every view of an epoch has the same sweeps in the same order, with an onset, noise, gains
+        and dead whiskers of its own: by those alone two views are not to be known as one sweep.
+        """
         rng = np.random.default_rng([self._seed, number])
         order = rng.permutation(self._usable)
+        if view:
+            rng = np.random.default_rng([self._seed, number, view])
         for i in range(len(self)):
             yield self._draw(order[i * self._batch : (i + 1) * self._batch], rng)
 

@@ -111,6 +111,20 @@ def test_an_epoch_has_every_sweep_once_and_depends_on_seed_and_number_alone() ->
     assert not np.array_equal(seeded[0], first[0][:4])
 
 
+def test_two_views_of_an_epoch_share_the_sweeps_and_nothing_that_is_drawn() -> None:
+    batches = TrainingBatches(sweeps(touches(24)), 8, seed=1)
+    for one, other in zip(batches.epoch(3), batches.epoch(3, view=1), strict=True):
+        (samples, offset, sigma, labels), (samples2, offset2, sigma2, labels2) = one, other
+        assert labels.tolist() == labels2.tolist()
+        # no window is the same twice, clean ones included: gains differ
+        same = (
+            np.isclose(samples.numpy(), samples2.numpy(), rtol=1e-6, atol=0)
+            & (samples != 0).numpy()
+        )
+        assert same.mean() < 0.01
+        assert not np.array_equal(offset, offset2) or not np.array_equal(sigma, sigma2)
+
+
 def test_a_third_is_clean_a_third_rated_and_a_third_between() -> None:
     samples = drawn(TrainingBatches(sweeps(touches(60)), 20, seed=0), epochs=20)[0]
     level = noise_level(samples)

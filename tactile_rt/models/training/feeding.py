@@ -43,7 +43,7 @@ class Batch:
     """What an update needs.
 
     Attributes:
-        views: one or two batches of loads, as `InputStage` takes them.
+        views: one or two batches of loads, as `InputStage` takes them, each drawn by itself.
         labels: (batch,).
         index: which of the epoch's batches it is.
     """
@@ -95,11 +95,15 @@ class Feed:
 
     def _draw(self, number: int) -> Iterator[Batch]:
         share, device = self._share, self._device
-        for index, (*loads, labels) in enumerate(self._batches.epoch(number)):
+        drawn = [self._batches.epoch(number, view) for view in range(self._views)]
+        for index, batches in enumerate(zip(*drawn, strict=True)):
             generator = generator_of(CPU, self._seed, number, index, share.rank)
-            mine = share.of(loads[0]), share.of(loads[1]), share.of(loads[2])
-            views = [self._augmentation.loads(mine, generator) for _ in range(self._views)]
-            yield Batch([_to(v, device) for v in views], share.of(labels).to(device), index)
+            views = [
+                self._augmentation.loads((share.of(a), share.of(b), share.of(c)), generator)
+                for a, b, c, _ in batches
+            ]
+            labels = share.of(batches[0][3]).to(device)
+            yield Batch([_to(v, device) for v in views], labels, index)
 
 
 def generator_of(device: torch.device, *seed: int) -> Generator:
