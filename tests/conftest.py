@@ -1,6 +1,7 @@
 import os
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,12 +21,17 @@ pytest.register_assert_rewrite("contract", "codec_contract", "tiny_model")
 settings.register_profile("tactile_rt", deadline=None, derandomize=True)
 settings.load_profile("tactile_rt")
 
+PATIENCE_S = 5.0
+
 
 @pytest.fixture
 def no_thread_left() -> Iterator[None]:
     """Fail a test that leaves a thread behind."""
     before = _threads()
     yield
+    end = time.monotonic() + PATIENCE_S
+    while not _threads() <= before and time.monotonic() < end:
+        time.sleep(0.02)  # a progress bar tells its thread to end, and does not wait for it
     assert _threads() <= before
 
 

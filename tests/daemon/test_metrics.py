@@ -1,5 +1,6 @@
 """Metrics, health and state over real HTTP; read by Prometheus' own parser."""
 
+import contextlib
 import dataclasses
 import http.client
 import json
@@ -51,9 +52,10 @@ def get(port, path, method="GET", **headers):
 def raw(port, data, finish=True):
     """What comes back for these bytes."""
     with socket.create_connection(("127.0.0.1", port), timeout=20) as line:
-        line.sendall(data)
-        if finish:
-            line.shutdown(socket.SHUT_WR)
+        with contextlib.suppress(OSError):  # it may have hung up in the middle
+            line.sendall(data)
+            if finish:
+                line.shutdown(socket.SHUT_WR)
         found = b""
         try:
             while more := line.recv(65536):
