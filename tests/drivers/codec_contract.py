@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tactile_rt.drivers.codec import Codec, Event, Frame, Samples
+from tactile_rt.benchmarks.drivers.fuzzing import mutate
+from tactile_rt.drivers.codec import Codec, Event, Samples
 from tactile_rt.stream import Chunk
 
 T0 = 5_000_000_000
@@ -152,7 +153,7 @@ class CodecContract:
         wire, _ = sent
         codec = self.case.make()
         draw = random.Random(3)
-        for packet in mutations(codec, wire, draw, 100_000):
+        for packet in mutations(wire, draw, 100_000):
             samples = codec.feed(packet, T0)
             if samples is not None:
                 assert samples.values.shape[1:] == codec.spec.shape
@@ -163,7 +164,7 @@ class CodecContract:
     def test_respond_takes_anything(self, sent: tuple[Any, np.ndarray]) -> None:
         codec = self.case.make()
         draw = random.Random(4)
-        for packet in mutations(codec, sent[0], draw, 10_000):
+        for packet in mutations(sent[0], draw, 10_000):
             assert isinstance(codec.respond(packet), bytes if codec.wire == "serial" else Sequence)
 
     def test_commands_are_packets(self) -> None:
@@ -182,39 +183,14 @@ class CodecContract:
         assert np.array_equal(stacked(again, "values"), stacked(fresh, "values"))
 
 
-def mutations(codec: Codec[Any], wire: Any, draw: random.Random, size: int) -> list[Any]:
+def mutations(wire: Any, draw: random.Random, size: int) -> list[Any]:
     """At least `size` bytes of damaged, shuffled, repeated and foreign input, in packets."""
     packets: list[Any] = []
     done = 0
     while done < size:
-        start = draw.randrange(len(wire))
-        part = wire[start : start + draw.randrange(1, 400)]
-        if codec.wire == "serial":
-            hurt = bytearray(part)
-            for _ in range(draw.choice((0, 0, 1, 1, 3, 40))):
-                hurt[draw.randrange(len(hurt))] = draw.randrange(256)
-            if draw.random() < 0.3:
-                hurt += draw.randbytes(draw.randrange(60))
-            if draw.random() < 0.2:
-                del hurt[draw.randrange(len(hurt)) :]
-            packets.append(bytes(hurt))
-            done += len(hurt) + 1
-        else:
-            frames = list(part)
-            for k, f in enumerate(frames):
-                luck = draw.random()
-                if luck < 0.2:
-                    frames[k] = f._replace(data=draw.randbytes(draw.randrange(9)))
-                elif luck < 0.25:
-                    frames[k] = Frame(draw.randrange(2048), f.data, draw.random() < 0.5)
-                elif luck < 0.3:
-                    frames[k] = f._replace(remote=True, data=b"")
-                elif luck < 0.35:
-                    frames[k] = f._replace(data=f.data[: draw.randrange(9)])
-            if draw.random() < 0.2:
-                draw.shuffle(frames)
-            packets.append(frames)
-            done += sum(len(f.data) + 2 for f in frames) + 1
+        packet, length = mutate(wire, draw)
+        packets.append(packet)
+        done += length + 1
     return packets
 
 

@@ -199,7 +199,7 @@ def test_it_finds_back_after_any_damage() -> None:
     draw = random.Random(6)
     for _ in range(40):
         codec = anyskin()
-        for packet in mutations(codec, whole, draw, 500):
+        for packet in mutations(whole, draw, 500):
             codec.feed(packet, T0)
         again = decode(codec, whole)
         values = stacked(again, "values")

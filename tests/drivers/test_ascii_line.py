@@ -210,7 +210,7 @@ def test_it_finds_back_after_any_damage() -> None:
     draw = random.Random(6)
     for _ in range(40):
         codec = ascii_line()
-        for packet in mutations(codec, wire, draw, 500):
+        for packet in mutations(wire, draw, 500):
             codec.feed(packet, T0)
         values = stacked(decode(codec, wire), "values")
         assert np.array_equal(values[-20:], clean.astype(np.float32))

@@ -407,7 +407,7 @@ def test_no_input_leads_astray(sanitized: Path) -> None:
     commands = [s.send for s in (*host.commands(Event.START), *host.commands(Event.STOP))]
     commands += [host.whisk(8.0, 0.5, -0.25).send, frame(12, bytes(32)), frame(7, b"TR\x10")]
     wire, json = b"".join(commands * 3), Description.of(SPEC).to_json()
-    packets = mutations(host, wire, random.Random(3), 100_000)
+    packets = mutations(wire, random.Random(3), 100_000)
     given = [json, *packets]
     data = b"".join(len(b).to_bytes(2, "little") + b for b in given)
     answer, _ = run(sanitized, "h", data)

@@ -9,7 +9,8 @@ import numpy as np
 
 from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
 from tactile_rt.drivers.codecs.rounds import Rounds
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+from tactile_rt.drivers.codecs.six_axis import six_axis
+from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = ["Aft200", "Aft200Options"]
 
@@ -62,18 +63,8 @@ class Aft200(CanCodec):
         self._options, self._first = options, options.force_id
         self._period_us = round(1e6 / options.rate_hz)
         super().__init__(
-            ArraySpec(
-                name="AFT200-D80",
-                elements=("sensor",),
-                grid=((0, 0),),
-                positions=((0.0, 0.0, 0.0),),
-                orientations=((1.0, 0.0, 0.0, 0.0),),
-                channels=("fx", "fy", "fz", "mx", "my", "mz"),
-                units=("N",) * 3 + ("N m",) * 3,
-                rate_hz=1e6 / self._period_us,  # it takes whole microseconds
-                frame="sensor",
-            )
-        )
+            six_axis("AFT200-D80", 1e6 / self._period_us)
+        )  # it takes whole microseconds
         self._rounds: Rounds[bytes] = Rounds(2)
         self.streaming = False
 

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+from tactile_rt.drivers.codecs.six_axis import six_axis
+from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = ["AtiCan", "AtiCanOptions"]
 
@@ -94,19 +95,7 @@ class AtiCan(CanCodec):
 
     def __init__(self, options: AtiCanOptions) -> None:
         self._options, self._base = options, options.base << 4
-        super().__init__(
-            ArraySpec(
-                name="ati",
-                elements=("sensor",),
-                grid=((0, 0),),
-                positions=((0.0, 0.0, 0.0),),
-                orientations=((1.0, 0.0, 0.0, 0.0),),
-                channels=("fx", "fy", "fz", "mx", "my", "mz"),
-                units=("N",) * 3 + ("N m",) * 3,
-                rate_hz=options.rate_hz,
-                frame="sensor",
-            )
-        )
+        super().__init__(six_axis("ati", options.rate_hz))
         self._matrix: NDArray[np.float64] | None = None  # counts to SI, gauges in order 0 to 5
         self.streaming = False
         self.forget()

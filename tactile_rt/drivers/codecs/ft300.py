@@ -17,7 +17,8 @@ import numpy as np
 from tactile_rt.drivers.codec import Event, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.frame_finder import FrameFinder
 from tactile_rt.drivers.codecs.framing import crc16_modbus
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+from tactile_rt.drivers.codecs.six_axis import six_axis
+from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = ["Ft300", "Ft300Options"]
 
@@ -61,19 +62,7 @@ class Ft300(SerialCodec):
     )
 
     def __init__(self, options: Ft300Options) -> None:
-        super().__init__(
-            ArraySpec(
-                name="ft300",
-                elements=("sensor",),
-                grid=((0, 0),),
-                positions=((0.0, 0.0, 0.0),),  # loads are told at the frame's origin
-                orientations=((1.0, 0.0, 0.0, 0.0),),
-                channels=("fx", "fy", "fz", "mx", "my", "mz"),
-                units=("N",) * 3 + ("N m",) * 3,
-                rate_hz=100.0,
-                frame="sensor",
-            )
-        )
+        super().__init__(six_axis("ft300", 100.0))
         select = bytes((options.slave, WRITE)) + OUTPUT.to_bytes(2, "big") + b"\0\1"
         self._request = _checked(select + b"\2" + STREAM.to_bytes(2, "big"))
         self._echo = _checked(select)

@@ -15,7 +15,8 @@ import numpy as np
 
 from tactile_rt.drivers.codec import Event, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.frame_finder import FrameFinder
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+from tactile_rt.drivers.codecs.six_axis import six_axis
+from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = ["Kwr75", "Kwr75Options"]
 
@@ -60,19 +61,7 @@ class Kwr75(SerialCodec):
     )
 
     def __init__(self, options: Kwr75Options) -> None:
-        super().__init__(
-            ArraySpec(
-                name="kwr75",
-                elements=("sensor",),
-                grid=((0, 0),),
-                positions=((0.0, 0.0, 0.0),),  # loads are told at the frame's origin
-                orientations=((1.0, 0.0, 0.0, 0.0),),
-                channels=("fx", "fy", "fz", "mx", "my", "mz"),
-                units=("N",) * 3 + ("N m",) * 3,
-                rate_hz=options.rate_hz,
-                frame="sensor",
-            )
-        )
+        super().__init__(six_axis("kwr75", options.rate_hz))
         self._newton = options.newton
         self._sync = (ONCE if options.poll else STREAM)[:2]
         self._finder = FrameFinder(self._sync, FRAME.itemsize, _whole, NOTHING, self.stats)
