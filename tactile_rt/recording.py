@@ -114,10 +114,14 @@ class SweepManifest:
         """Write into a folder, or check that the set already there is this very one.
 
         Raises:
-            ConfigError: the folder holds another set.
+            ConfigError: the folder holds another set, or things that are none.
         """
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / MANIFEST
+        if not path.exists() and (other := next(folder.iterdir(), None)) is not None:
+            raise ConfigError(
+                f"{folder} holds {other.name!r} and no sweep set: choose a new or an empty folder"
+            )
         text = msgspec.json.encode(self)
         if path.exists():
             # Compared as JSON, which knows no tuples: a recipe may have been written with some.

@@ -176,6 +176,13 @@ def test_another_set_in_the_folder_is_refused_by_what_differs(
     assert (folder / "manifest.json").read_bytes() == before
 
 
+def test_a_folder_of_other_things_takes_no_set(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("of somebody")
+    with pytest.raises(ConfigError, match=r"holds 'thesis.txt' and no sweep set"):
+        MANIFEST.write(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["thesis.txt"]
+
+
 # What is missing or damaged
 
 

@@ -45,6 +45,7 @@ ATTENDERS = ("gpt", "mamba", "none")
 DECODERS = decoders.DECODERS
 READOUTS = ("last", "mean")
 WIDTH_UNIT = 32  # every channel count is a multiple of this at width 1
+WIDEST = 4  # sixteen times the paper's parameters, a billion
 GPT_OF_RESNET = 256  # the paper's GPT is narrower than its features there, and only there
 
 
@@ -79,9 +80,10 @@ class EADConfig:
                 raise ConfigError(f"{field} is {value!r}, not one of {', '.join(known)}")
         if self.classes < 1:
             raise ConfigError(f"classes is {self.classes}, must be at least 1")
-        if not 0 < self.width < float("inf") or self.width * WIDTH_UNIT % 1:
+        if not 0 < self.width <= WIDEST or self.width * WIDTH_UNIT % 1:
             raise ConfigError(
-                f"width is {self.width}, must be a positive multiple of 1/{WIDTH_UNIT}"
+                f"width is {self.width}, must be a positive multiple of 1/{WIDTH_UNIT}, "
+                f"at most {WIDEST}"
             )
         if not 0 <= self.dropout < 1:
             raise ConfigError(f"dropout is {self.dropout}, must be in [0, 1)")

@@ -156,6 +156,7 @@ def torch():
     ("options", "said"),
     [
         (("--width", 0.1), "width is 0.1, must be a positive multiple of 1/32"),
+        (("--width", 1e6), "width is 1000000.0, must be a positive multiple of 1/32, at most 4"),
         (("--attender", "lstm"), "attender is 'lstm', not one of gpt, mamba, none"),
         (("--seed", -1), "seed must be 0 to 4294967295"),
         (("--learning-rate", "nan"), "learning_rate must be positive, not nan"),
