@@ -32,7 +32,6 @@ from tactile_rt.stream_recording import (
     recover,
     writer,
 )
-from tactile_rt.stream_recording.conversion import convert
 from tactile_rt.stream_recording.layout import (
     decode_packet,
     decode_samples,
@@ -805,42 +804,6 @@ def test_without_the_extra_it_says_what_to_install(path, monkeypatch):
     ):
         with pytest.raises(ConfigError, match=r"need mcap, .* pip install 'tactile-rt\[record\]'"):
             use()
-
-
-# other forms
-
-
-def test_a_recording_becomes_arrays(path, tmp_path):
-    chunks = odd_chunks()
-    write(path, chunks)
-    assert convert(path, tmp_path / "out.npz") == 50
-    whole = concatenate(chunks)
-    with np.load(tmp_path / "out.npz") as arrays:
-        for name in ("seq", "t_ns", "values", "valid"):
-            assert arrays[name].tobytes() == getattr(whole, name).tobytes()
-        assert int(arrays["utc_offset_ns"]) == read_description(path).utc_offset_ns
-        assert SPEC.from_json(str(arrays["spec"])) == SPEC
-
-
-def test_a_recording_becomes_text(path, tmp_path):
-    chunks = odd_chunks()
-    write(path, chunks)
-    assert convert(path, tmp_path / "out.csv") == 50
-    lines = (tmp_path / "out.csv").read_text().splitlines()
-    assert lines[0].split(",")[:4] == ["seq", "t_ns", "A0.fy [N]", "A0.mz [N m]"]
-    whole = concatenate(chunks)
-    for i, line in enumerate(lines[1:]):
-        seq, t_ns, *cells = line.split(",")
-        assert (int(seq), int(t_ns)) == (whole.seq[i], whole.t_ns[i])
-        for j, cell in enumerate(cells):
-            element, channel = divmod(j, 2)
-            if whole.valid[i, element]:
-                assert np.float32(cell) == whole.values[i, element, channel]
-            else:
-                assert cell == ""
-    with pytest.raises(ConfigError, match=r"neither .npz nor .csv"):
-        convert(path, tmp_path / "out.txt")
-    assert len(lines) == 51
 
 
 def test_readers_may_stop_early(path):

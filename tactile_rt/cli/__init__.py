@@ -65,6 +65,7 @@ def main() -> None:
         model,
         modelling,
         recording,
+        replaying,
         simulation,
         top,
         view,

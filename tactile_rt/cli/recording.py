@@ -123,14 +123,21 @@ def recover(
 
 @app.command()
 def convert(
-    recording: Annotated[Path, typer.Argument(help="A .mcap of tactile-rt.")],
-    output: Annotated[Path, typer.Argument(help="A .npz or .csv.")],
+    recording: Annotated[Path, typer.Argument(help="A .mcap of tactile-rt, .npz, .csv or .h5.")],
+    output: Annotated[Path, typer.Argument(help="Another of these.")],
     force: Force = False,
 ) -> None:
-    """Write a recording's samples as arrays (.npz) or text (.csv)."""
-    from tactile_rt.stream_recording.conversion import convert as converted
+    """Write a recording as arrays (.npz, .h5) or text (.csv), or make it one again (.mcap).
 
-    check_output(output)
-    if output.exists() and not force:
-        raise ConfigError(f"{output} is there already: name another file, or give --force")
+    Samples, description, decisions, events and health come back bit for
+    bit; raw packets are in the .mcap alone. A .csv has a .csv.json beside
+    it, with all that is no sample.
+    """
+    from tactile_rt.stream_recording.conversion import convert as converted
+    from tactile_rt.stream_recording.conversion import outputs_of
+
+    for file in outputs_of(output):
+        check_output(file)
+        if file.exists() and not force:
+            raise ConfigError(f"{file} is there already: name another file, or give --force")
     typer.echo(f"{output}: {converted(recording, output)} samples")

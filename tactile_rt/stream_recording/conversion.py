@@ -1,78 +1,91 @@
-"""A recording's samples as plain arrays or text."""
+"""A recording as plain arrays or text, and these as a recording again: bit for bit."""
 
-import csv
-import io
+from collections.abc import Generator, Iterable
+from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO
 
-import numpy as np
-
 from tactile_rt.recording import write_whole
-from tactile_rt.stream import ConfigError, RecordingError, concatenate
-from tactile_rt.stream_recording.description import Description
-from tactile_rt.stream_recording.reader import read_description, read_stream
+from tactile_rt.stream import ConfigError
+from tactile_rt.stream_recording.as_csv import beside, read_csv, write_csv
+from tactile_rt.stream_recording.as_hdf5 import need_h5py, read_hdf5, write_hdf5
+from tactile_rt.stream_recording.as_npz import read_npz, write_npz
+from tactile_rt.stream_recording.description import RECOVERED, Description
+from tactile_rt.stream_recording.flat import TEXTS
+from tactile_rt.stream_recording.layout import SAMPLES, decode_samples, need_mcap
+from tactile_rt.stream_recording.mcap_file import McapFile
+from tactile_rt.stream_recording.reader import Raw, read_description, read_raw
 
-__all__ = ["convert"]
+__all__ = ["convert", "outputs_of"]
+
+MCAP, HDF5 = ".mcap", (".h5", ".hdf5")
+READERS = {".npz": read_npz, ".csv": read_csv, **dict.fromkeys(HDF5, read_hdf5)}
+
+
+def outputs_of(output: str | Path) -> list[Path]:
+    """The files that `convert` makes for this name."""
+    path = Path(output)
+    return [path, beside(path)] if path.suffix == ".csv" else [path]
 
 
 def convert(path: str | Path, output: str | Path) -> int:
-    """Write a recording's samples as ``.npz`` or ``.csv``, whole or not at all.
+    """Write a recording as ``.npz``, ``.csv`` or ``.h5``, or any of these as a recording again.
 
-    npz: ``seq``, ``t_ns``, ``values``, ``valid`` as in `Chunk`; ``utc_offset_ns``; ``spec`` as
-    `ArraySpec.from_json` reads it. csv: a line per sample, ``seq``, ``t_ns``, then a column
-    ``ELEMENT.CHANNEL [UNIT]`` each, empty where it is not valid.
+    All forms hold samples, description, decisions, events and health, and the chunks in which the
+    samples came; raw packets stay behind. They are laid out in docs/recording.md. What is written
+    appears whole or not at all.
 
     Returns:
         Number of samples.
 
     Raises:
-        ConfigError: an output of another kind.
-        RecordingError: the recording is damaged.
+        ConfigError: a file of another kind, or an extra is not installed.
+        RecordingError: what is read is damaged, or has no samples.
     """
-    output = Path(output)
-    if output.suffix not in (".npz", ".csv"):
-        raise ConfigError(f"{output} is neither .npz nor .csv")
-    about = read_description(path)
-    write = _write_csv if output.suffix == ".csv" else _write_npz
+    path, output = Path(path), Path(output)
+    for file in (path, output):
+        if file.suffix not in (MCAP, *READERS):
+            raise ConfigError(f"{file} is neither .mcap nor {', '.join(READERS)}")
+    if path.suffix == output.suffix == MCAP:
+        raise ConfigError(f"{path} is a recording already: {output} would be no other")
+    if {path.suffix, output.suffix} & set(HDF5):
+        need_h5py()
+    if MCAP in (path.suffix, output.suffix):
+        need_mcap()
+    about, raws = _read(path)
     n = 0
 
     def fill(file: BinaryIO) -> None:
         nonlocal n
-        n = write(Path(path), about, file)
+        n = _write(str(path), about, raws, file, output)
 
-    write_whole(output, fill)
+    with closing(raws):
+        write_whole(output, fill)
     return n
 
 
-def _write_npz(path: Path, about: Description, file: BinaryIO) -> int:
-    chunks = list(read_stream(path))
-    if not chunks:
-        raise RecordingError(f"{path} has no samples")
-    whole = concatenate(chunks)
-    np.savez(
-        file, seq=whole.seq, t_ns=whole.t_ns, values=whole.values, valid=whole.valid,
-        utc_offset_ns=np.int64(about.utc_offset_ns), spec=np.str_(about.spec.to_json()),
-    )  # fmt: skip
-    return len(whole)
+def _read(path: Path) -> tuple[Description, Generator[Raw, None, None]]:
+    if path.suffix == MCAP:
+        raws = (raw for _, raw in read_raw(path, SAMPLES, *TEXTS))
+        return read_description(path), raws
+    if not path.is_file():
+        raise ConfigError(f"no file {path}")
+    return READERS[path.suffix](path)
 
 
-def _write_csv(path: Path, about: Description, file: BinaryIO) -> int:
-    spec, n = about.spec, 0
-    text = io.TextIOWrapper(file, encoding="utf-8", newline="", write_through=True)
-    lines = csv.writer(text, lineterminator="\n")
-    columns = [
-        f"{e}.{c} [{unit}]"
-        for e in spec.elements
-        for c, unit in zip(spec.channels, spec.units, strict=True)
-    ]
-    lines.writerow(["seq", "t_ns", *columns])
-    for chunk in read_stream(path):
-        good = np.repeat(chunk.valid, len(spec.channels), axis=1)
-        flat = chunk.values.reshape(len(chunk), -1)
-        for seq, t_ns, row, valid in zip(chunk.seq, chunk.t_ns, flat, good, strict=True):
-            # str() of a float32 is the shortest text that reads back as the same number
-            cells = [str(x) if ok else "" for x, ok in zip(row, valid, strict=True)]
-            lines.writerow([seq, t_ns, *cells])
-        n += len(chunk)
-    text.detach()
+def _write(what: str, about: Description, raws: Iterable[Raw], file: BinaryIO, output: Path) -> int:
+    if output.suffix == ".csv":
+        return write_csv(what, about, raws, file, output)
+    if output.suffix == ".npz":
+        return write_npz(what, about, raws, file)
+    if output.suffix in HDF5:
+        return write_hdf5(what, about, raws, file)
+    made, n = McapFile(file, about), 0
+    if about.recovered:
+        made.note(RECOVERED, {"by": "tactile_rt"})
+    for raw in raws:
+        made.add(raw.topic, raw.data, raw.t_ns)
+        if raw.topic == SAMPLES:
+            n += len(decode_samples(raw.data, about.spec.shape))
+    made.finish()
     return n

@@ -87,8 +87,10 @@ def test_what_is_left_of_a_killed_one_is_recovered(call, path):
     assert call("recover", made)[1] == f"{made} is whole: nothing to do\n"
 
 
-@pytest.mark.parametrize("name", ["out.npz", "out.csv"])
-def test_a_recording_is_converted(name, call, path):
+@pytest.mark.parametrize("name", ["out.npz", "out.csv", "out.h5"])
+def test_a_recording_is_converted_and_made_one_again(name, call, path):
+    if name == "out.h5":
+        pytest.importorskip("h5py")
     call("record", SOURCE, path)
     output = path.with_name(name)
     code, out, err = call("convert", path, output)
@@ -97,6 +99,9 @@ def test_a_recording_is_converted(name, call, path):
     assert call("convert", path, output)[0] == 2
     assert call("convert", path, output, "--force")[0] == 0
     assert len(output.read_bytes()) == len(before)
+    again = path.with_name("again.mcap")
+    assert call("convert", output, again) == (0, f"{again}: 300 samples\n", "")
+    assert samples(again) == 300
 
 
 def test_a_file_that_is_there_is_not_written_over(call, path):
@@ -118,8 +123,10 @@ def test_a_file_that_is_there_is_not_written_over(call, path):
         (("record", SOURCE, "x.mcap", "--note", "who"), "--note is NAME=VALUE, not 'who'"),
         (("recover", "none.mcap"), "no recording none.mcap"),
         (("convert", "none.mcap", "x.npz"), "no recording none.mcap"),
-        (("convert", "none.mcap", "x.txt"), "neither .npz nor .csv"),
+        (("convert", "none.mcap", "x.txt"), "neither .mcap nor .npz, .csv, .h5"),
         (("convert", "text.mcap", "x.csv"), "text.mcap is not an MCAP file"),
+        (("convert", "text.mcap", "x.mcap"), "text.mcap is a recording already"),
+        (("convert", "none.npz", "x.mcap"), "no file none.npz"),
         (("run", "--source", "replay:text.mcap"), "text.mcap is not an MCAP file"),
         (("run", "--source", "replay:"), "replay: needs a file"),
     ],

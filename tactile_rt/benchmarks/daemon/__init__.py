@@ -1,0 +1,1 @@
+"""Benchmark area `daemon`: the real process between emulated arrays and live readers."""
