@@ -15,10 +15,10 @@ from tactile_rt.benchmarks.records import Record
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.encoders.cells import CELLS
 
-__all__ = ["training_speed"]
+__all__ = ["CLASSES", "STEPS", "training_speed", "training_step"]
 
 STEPS, CLASSES = 22, 117
-PEER = "the same network, plain eager conv2d, written here from the paper (not the published code)"
+PEER = "the same network, plain eager conv2d (beside the published code: bench/peer.py)"
 
 
 def training_speed(quick: bool) -> list[Record]:
