@@ -22,16 +22,23 @@ CARD_VERSIONS = (1, 2)  # 1: without what `ModelCard` says is since 2
 STATE_TYPES = ("bool", "float16", "float32", "float64", "int32", "int64", "int8", "uint8")
 MAX_STEPS = 1_000_000
 MAX_PERIOD_NS = 10**12
+MAX_EPISODE = 2**24  # values: checks run one at once, and a robot's has some 20,000
+MAX_NAME = 200  # characters
+LISTS = ("commands", "unseen_objects")  # of the provenance, where they are there
 
 Kind = Literal["step", "window"]
 
 
 class StateTensor(msgspec.Struct, frozen=True):
-    """One recurrent state: its name, shape without the batch axis, and element type."""
+    """One recurrent state: its name, shape without the batch axis, and element type.
+
+    `in_place`: a step only writes some rows of it, so `<name>_next` may be the same memory.
+    """
 
     name: str
     shape: tuple[int, ...]
     dtype: str
+    in_place: bool = False
 
 
 class ModelCard(msgspec.Struct, frozen=True):
@@ -160,6 +167,14 @@ def parse_card(path: Path, text: str) -> ModelCard:
         raise damaged(f"{card.steps} steps of {card.substeps} sub-steps of {card.period_ns} ns")
     if not card.labels or len(set(card.labels)) != len(card.labels):
         raise damaged("labels are missing or repeat")
+    # Decisions carry them to terminals, pages and logs.
+    if not all(0 < len(label) <= MAX_NAME and label.isprintable() for label in card.labels):
+        raise damaged(f"labels must be 1 to {MAX_NAME} printable characters")
+    if len(card.name) > MAX_NAME:
+        raise damaged(f"a name of {len(card.name)} characters")
+    for what in LISTS:
+        if not isinstance(card.provenance.get(what, []), list):
+            raise damaged(f"{what} of the provenance must be a list")
     names = ["samples", "offset", "sigma", *(s.name for s in card.state)]
     if len(set(names)) != len(names):
         raise damaged("names of the state repeat")
@@ -172,6 +187,9 @@ def parse_card(path: Path, text: str) -> ModelCard:
         # Python's integers: a product of int64 may come round to something small.
         if min(shape, default=1) < 1 or math.prod(shape) > MAX_ELEMENTS:
             raise damaged(f"{name[:40]} of shape {'x'.join(map(str, shape))[:80]}")
+    episode = card.steps * card.substeps * elements * channels
+    if episode > MAX_EPISODE:
+        raise damaged(f"an episode of {episode} values")
     if sum(math.prod(shape) for shape in shapes.values()) > MAX_ELEMENTS:
         raise damaged("its state is larger than any robot's memory should hold")
     for state in card.state:

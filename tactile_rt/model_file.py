@@ -14,6 +14,7 @@ A file of kind "window" takes a whole episode instead: ``samples (batch, step, s
 channel)``, no state, and gives ``logits (batch, step, class)``.
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ __all__ = [
 ]
 
 METADATA_KEY = "tactile_rt"
+MESSAGE = 300  # characters of what a file, or onnxruntime, has us say
 SHIPPED = Path(__file__).parent / "assets" / "mouse24.onnx"
 
 
@@ -54,19 +56,20 @@ def read_model(path: Path) -> tuple[ModelCard, Contents, bytes]:
 
     Raises:
         ModelError: not there, too large, not ONNX, reaching outside the file or past the limits
-            of `onnx_reading`, without our metadata, or with metadata that is damaged or of
-            another version.
+            of `onnx_reading`, without our metadata, or with metadata that is damaged, of
+            another version, or names other inputs and outputs than the graph.
     """
     if not path.is_file():
         raise ModelError(f"no model file {path}")
     size = path.stat().st_size
     if size > MAX_BYTES:
         raise ModelError(f"{path} is not a readable ONNX model: {size} bytes is too large")
+    data = b""
     try:
         data = path.read_bytes()
         contents = read_onnx(data)
     except (BadModel, OSError) as error:
-        reason = error.strerror if isinstance(error, OSError) else error
+        reason = error.strerror if isinstance(error, OSError) else _mistaken(data) or error
         raise ModelError(f"{path} is not a readable ONNX model: {reason}") from None
     text = contents.metadata.get(METADATA_KEY)
     if text is None:
@@ -74,7 +77,14 @@ def read_model(path: Path) -> tuple[ModelCard, Contents, bytes]:
             f"{path} is ONNX but not a tactile_rt model: no {METADATA_KEY!r} metadata "
             "(export it with `tactile-rt export`)"
         )
-    return parse_card(path, text), contents, data
+    card = parse_card(path, text)
+    named = {"samples", "offset", "sigma", *(s.name for s in card.state)}
+    if wrong := sorted(named ^ set(contents.inputs)):
+        raise _disagree(path, wrong)
+    for name in ("logits", *(f"{s.name}_next" for s in card.state)):
+        if name not in contents.outputs:
+            raise ModelError(f"{path}: no output `{one_line(name)}`, which its metadata promises")
+    return card, contents, data
 
 
 def load_model(
@@ -117,7 +127,7 @@ def load_model(
         with FlushDenormals():  # which in the end puts the thread's mode back
             session = ort.InferenceSession(data, options, providers=list(providers))
     except Exception as error:  # onnxruntime raises a dozen unrelated types for a bad file
-        raise ModelError(f"{path} is not a readable ONNX model: {one_line(error)}") from None
+        raise ModelError(f"{path} is not a readable ONNX model: {_reason(error)}") from None
     unused = [p for p in providers if p not in session.get_providers()]
     if unused:
         raise ConfigError(f"onnxruntime cannot use {', '.join(unused)} on this machine")
@@ -141,9 +151,7 @@ def _checked(card: ModelCard, session: ort.InferenceSession, path: Path) -> Mode
         expected["samples"] = ((inputs["samples"][0][0], *sample), _onnx_type("float32"))
     if inputs != expected:
         wrong = sorted(k for k in inputs | expected if inputs.get(k) != expected.get(k))
-        raise ModelError(
-            f"{path}: the graph's inputs disagree with its metadata at {one_line(', '.join(wrong))}"
-        )
+        raise _disagree(path, wrong)
     batches = {i.shape[0] for i in session.get_inputs()}
     if any(isinstance(batch, int) and batch != 1 for batch in batches):
         raise ModelError(f"{path}: the graph's batch size is fixed to another than 1")
@@ -159,6 +167,43 @@ def _checked(card: ModelCard, session: ort.InferenceSession, path: Path) -> Mode
         if not same or len(shape) != len(state.shape) or kind != _onnx_type(state.dtype):
             raise ModelError(f"{path}: no output `{state.name}_next` like `{state.name}`")
     return card
+
+
+def _disagree(path: Path, wrong: Sequence[str]) -> ModelError:
+    names = one_line(", ".join(wrong))[:MESSAGE]
+    return ModelError(f"{path}: the graph's inputs disagree with its metadata at {names}")
+
+
+def _mistaken(data: bytes) -> str:
+    """What a file is that somebody took for a model, as far as its first bytes tell."""
+    if not data:
+        return "it is empty"
+    if data.startswith(b"version https://git-lfs"):
+        return "it is a Git LFS pointer; `git lfs pull` fetches the file"
+    if data.startswith(b"PK\x03\x04"):
+        return "it is a zip archive, as checkpoints are; `tactile-rt export` makes a model of one"
+    head = data[:100].decode("latin-1")
+    if head.isascii() and all(c.isprintable() or c in "\t\r\n" for c in head):
+        return "it is text"
+    return ""
+
+
+def _reason(error: Exception) -> str:
+    """What onnxruntime says, less where in its source that is."""
+    text = re.sub(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ", "", one_line(error))
+    if newest := re.search(r"Opset (\d+) is .* is till opset (\d+)", text):
+        return (
+            f"it uses opset {newest[1]}, and onnxruntime {ort.__version__} reads {newest[2]} at "
+            "most: update onnxruntime"
+        )
+    if where := re.match(r"\S+\.(?:cc|h):\d+ [^(]*", text):  # then the function's arguments
+        depth = 0
+        for at in range(where.end(), len(text)):
+            depth += (text[at] == "(") - (text[at] == ")")
+            if depth == 0:
+                text = text[at + 1 :].strip() or text
+                break
+    return text[:MESSAGE]
 
 
 def _onnx_type(dtype: str) -> str:

@@ -20,6 +20,7 @@ MAX_BYTES = 2**31 - 1  # protobuf's own limit
 MAX_METADATA = 4 * 2**20  # bytes: labels, array, provenance and figures take some 10 kB
 MAX_PARTS = 1_000_000  # protobuf fields: the largest network has some 30,000
 MAX_DEPTH = 8  # graphs within graphs
+MAX_OPSET = 1000  # ONNX is at 26 after nine years
 MAX_ELEMENTS = 2**28  # of one tensor: 1 GiB of float32
 MAX_SHAPE = 16  # axes of a constant that may be a shape
 
@@ -51,6 +52,7 @@ class Contents:
         opset: version of each operator set, by domain; ``""`` is ONNX's own.
         metadata: the file's key-value pairs.
         operators: how often each is used, subgraphs included.
+        inputs, outputs: names of the graph's, without inputs that have a stored value.
         weights: bytes of stored tensors.
     """
 
@@ -58,6 +60,8 @@ class Contents:
     opset: dict[str, int] = field(default_factory=dict)
     metadata: dict[str, str] = field(default_factory=dict)
     operators: Counter[str] = field(default_factory=Counter)
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
     weights: int = 0
 
 
@@ -171,6 +175,8 @@ class _Walk:
                 raise BadModel(f"has a {what} of its own, which we do not run")
         if graphs != 1:
             raise BadModel("no graph in it" if not graphs else "more than one graph")
+        if len(self.found.opset.keys() & {"", "ai.onnx"}) != 1:
+            raise BadModel("it does not say, once, which version of ONNX's operators it uses")
         for operator, name in self.asked:
             if self.sizes.get(name, 0) > MAX_ELEMENTS:
                 raise BadModel(f"{operator} asks for {self.sizes[name]} elements")
@@ -183,6 +189,8 @@ class _Walk:
                 domain = self.text(value, stop)
             elif (number, wire) == (2, VARINT):
                 version = value
+        if domain in self.found.opset or not 0 < version <= MAX_OPSET:
+            raise BadModel(f"opset {version} of {domain[:40] or 'ai.onnx'!r}")
         self.found.opset[domain] = version
 
     def metadata(self, at: int, end: int) -> None:
@@ -196,16 +204,20 @@ class _Walk:
     def graph(self, at: int, end: int, depth: int) -> None:
         if depth > MAX_DEPTH:
             raise BadModel(f"more than {MAX_DEPTH} graphs within graphs")
+        names: dict[str, list[str]] = {"tensor": [], "input": [], "output": [], "value": []}
         parts = self.messages(at, end, node=1, tensor=5, input=11, output=12, value=13, sparse=15)
         for what, start, stop in parts:
             if what == "node":
                 self.node(start, stop, depth)
-            elif what == "tensor":
-                self.tensor(start, stop)
             elif what == "sparse":
                 self.sparse(start, stop)
             else:
-                self.value(start, stop)
+                read = self.tensor if what == "tensor" else self.value
+                names[what].append(read(start, stop))
+        if depth == 0:
+            stored = set(names["tensor"])
+            self.found.inputs = tuple(name for name in names["input"] if name not in stored)
+            self.found.outputs = tuple(names["output"])
 
     def node(self, at: int, end: int, depth: int) -> None:
         inputs, outputs, operator, domain = [], [], "", ""
@@ -254,7 +266,8 @@ class _Walk:
         for _, start, stop in self.messages(at, end, values=1, indices=2):
             self.tensor(start, stop)
 
-    def tensor(self, at: int, end: int, name: str = "") -> None:
+    def tensor(self, at: int, end: int, name: str = "") -> str:
+        """`name`: if another than it says. Returns the name."""
         dims: list[int] = []
         kind, raw, values = 0, None, []
         for number, wire, value, stop in self.fields(at, end):
@@ -287,6 +300,7 @@ class _Walk:
             if raw is not None:
                 values = np.frombuffer(self.data[raw[0] : raw[1]], "<u8").tolist()
             self.sizes[name] = math.prod(abs(v - 2**64 if v >> 63 else v) or 1 for v in values)
+        return name
 
     def varints(self, at: int, end: int) -> list[int]:
         values = []
@@ -298,10 +312,16 @@ class _Walk:
             values.append(value)
         return values
 
-    def value(self, at: int, end: int) -> None:
-        """ValueInfoProto -> TypeProto -> TypeProto.Tensor -> TensorShapeProto -> dimensions."""
-        elements = 1
-        for _, a, b in self.messages(at, end, type=2):
+    def value(self, at: int, end: int) -> str:
+        """ValueInfoProto -> TypeProto -> TypeProto.Tensor -> TensorShapeProto -> dimensions.
+
+        Returns the value's name.
+        """
+        elements, name = 1, ""
+        for what, a, b in self.messages(at, end, name=1, type=2):
+            if what == "name":
+                name = self.text(a, b)
+                continue
             for _, c, d in self.messages(a, b, tensor=1):
                 for _, e, f in self.messages(c, d, shape=2):
                     for _, g, h in self.messages(e, f, dimension=1):
@@ -309,3 +329,4 @@ class _Walk:
                         elements *= max(sizes, default=1)
         if elements > MAX_ELEMENTS:
             raise BadModel(f"a value of {elements} elements")
+        return name

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("onnx")
 
-from tiny_model import CARD, GRAPH, LABELS, write_model
+from tiny_model import CARD, GRAPH, LABELS, WINDOW, write_model
 
 from tactile_rt.classifier import Classifier
 from tactile_rt.model_checks import probe_logits
@@ -64,6 +64,61 @@ def test_a_file_that_is_not_onnx_is_named_in_one_line(tmp_path: Path, content: b
     with pytest.raises(ModelError, match=f"^{path} is not a readable ONNX model: .+") as caught:
         load_model(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "it is empty"),
+        (b"garbage" * 100, "it is text"),
+        (b'{\n\t"version": 2}', "it is text"),
+        (
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n",
+            "`git lfs pull` fetches",
+        ),
+        (b"PK\x03\x04\x00\x00", "it is a zip archive, as checkpoints are; `tactile-rt export`"),
+    ],
+)
+def test_what_is_often_taken_for_a_model_is_named(
+    tmp_path: Path, content: bytes, said: str
+) -> None:
+    path = tmp_path / "m.onnx"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match=f"^{path} is not a readable ONNX model: .*{said}"):
+        read_model(path)
+
+
+@pytest.mark.parametrize(
+    ("graph", "said"),
+    [
+        (GRAPH.replace("18]", "99]"), "it uses opset 99, and onnxruntime .* reads .* at most"),
+        (GRAPH.replace("ir_version: 9", "ir_version: 99"), "Unsupported model IR version: 99"),
+        (GRAPH.replace("Sub(last, last)", "Sub(last, gone)"), "Invalid model. Node input 'gone'"),
+        (GRAPH.replace("Sub(last, last)", "Explode(last, last)"), "This is an invalid model."),
+    ],
+)
+def test_onnxruntime_s_reasons_are_said_without_its_source(
+    tmp_path: Path, graph: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("onnx.checker.check_model", lambda *a, **k: None)
+    path = write_model(tmp_path / "m.onnx", graph)
+    with pytest.raises(ModelError, match=f"^{path} is not a readable ONNX model: {said}") as caught:
+        load_model(path)
+    assert "\n" not in str(caught.value)
+    assert "onnxruntime_src" not in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 350
+
+
+def test_other_names_are_found_without_running_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("onnxruntime.InferenceSession", None)  # would be a TypeError
+    for old, said in (("sigma", "disagree with its metadata at S, sigma"), ("logits", "`logits`")):
+        path = write_model(tmp_path / "m.onnx", GRAPH.replace(old, "S"))
+        with pytest.raises(ModelError, match=f"^{path}: .*{said}"):
+            read_model(path)
+    stored = GRAPH.replace("float[B,3,2] sigma,", "float[B,3,2] sigma, int64[1] one,")
+    assert read_model(write_model(tmp_path / "m.onnx", stored))[0] == CARD
 
 
 def test_a_model_cut_short_is_named(tmp_path: Path) -> None:
@@ -151,7 +206,7 @@ def test_a_graph_that_disagrees_with_its_card_is_refused(
     ("graph", "changes", "complaint"),
     [
         (GRAPH, {"labels": LABELS[:4]}, "no output `logits` of 4 classes"),
-        (GRAPH.replace("logits", "scores"), {}, "no output `logits` of 5 classes"),
+        (GRAPH.replace("logits", "scores"), {}, "no output `logits`, which its metadata promises"),
         (GRAPH.replace("total_next", "summed"), {}, "no output `total_next`"),
         (SWAPPED, {}, "no output `total_next` like `total`"),
     ],
@@ -180,6 +235,13 @@ def test_outputs_that_the_card_promises_must_be_there(
         ({"substeps": 10**12}, "samples of shape 1000000000000x3x2"),
         ({"labels": ("a", "a", "b", "c", "d")}, "labels are missing or repeat"),
         ({"labels": ()}, "labels are missing or repeat"),
+        ({"labels": ("a", "b", "c", "d", "\x1b[2J")}, "labels must be 1 to 200 printable"),
+        ({"labels": ("a", "b", "c", "d", "")}, "labels must be 1 to 200 printable characters"),
+        ({"labels": ("a", "b", "c", "d", "e" * 201)}, "labels must be 1 to 200 printable"),
+        ({"name": "x" * 3_000_000}, "a name of 3000000 characters"),
+        ({"steps": 1_000_000}, "an episode of 18000000 values"),
+        ({"provenance": {"commands": 5}}, "commands of the provenance must be a list"),
+        ({"provenance": {"unseen_objects": "mug"}}, "unseen_objects of the provenance"),
         ({"state": (*CARD.state, StateTensor("samples", (1,), "float32"))}, "names of the state"),
         ({"state": (CARD.state[0], StateTensor("total", (2**40, 2**40), "float32"))},
          "total of shape 1099511627776x1099511627776"),
@@ -286,19 +348,6 @@ def test_metadata_of_version_1_is_read(tmp_path: Path) -> None:
 def test_fields_that_a_later_release_adds_are_passed_over(tmp_path: Path) -> None:
     path = write_model(tmp_path / "m.onnx", metadata=card_with(colour="red"))
     assert load_model(path)[1] == CARD
-
-
-WINDOW = """
-<ir_version: 9, opset_import: ["" : 18]>
-tiny (float[B,T,3,3,2] samples, float[B,3,2] offset, float[B,3,2] sigma)
-  => (float[B,T,5] logits)
-<int64[2] axes = {3, 4}, int64[1] width = {2}, int64[3] same = {1, 1, 5}>
-{
-  spread = ReduceSum<keepdims = 0>(samples, axes)
-  first = ReduceSum<keepdims = 1>(spread, width)
-  logits = Tile(first, same)
-}
-"""
 
 
 def test_a_window_is_loaded_only_where_one_is_wanted(tmp_path: Path) -> None:

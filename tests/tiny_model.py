@@ -44,6 +44,19 @@ tiny (float[B,3,3,2] samples, float[B,3,2] offset, float[B,3,2] sigma,
 }
 """
 
+# An episode at once, of any number of steps; its logits say nothing.
+WINDOW = """
+<ir_version: 9, opset_import: ["" : 18]>
+tiny (float[B,T,3,3,2] samples, float[B,3,2] offset, float[B,3,2] sigma)
+  => (float[B,T,5] logits)
+<int64[2] axes = {3, 4}, int64[1] width = {2}, int64[3] same = {1, 1, 5}>
+{
+  spread = ReduceSum<keepdims = 0>(samples, axes)
+  first = ReduceSum<keepdims = 1>(spread, width)
+  logits = Tile(first, same)
+}
+"""
+
 CARD = ModelCard(
     name="tiny",
     spec=small_spec().to_json(),

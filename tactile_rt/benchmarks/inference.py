@@ -11,6 +11,7 @@ import numpy as np
 from tactile_rt.benchmarks.model_steps import FULL_SIZE, Subject, full_size, measure_model
 from tactile_rt.benchmarks.records import Record
 from tactile_rt.benchmarks.roofline import measure_machine
+from tactile_rt.benchmarks.window_speed import window_speed
 from tactile_rt.classifier import Classifier
 from tactile_rt.model_file import load_model, shipped_model
 from tactile_rt.session import Session
@@ -79,7 +80,8 @@ class Pulses(Source):
 
 def run(quick: bool) -> list[Record]:
     """Measure the shipped model: size, loading, one step, and a consumer that is too slow; then
-    steps of models beside what the machine could do (those of full size not when `quick`).
+    steps of models beside what the machine could do (those of full size not when `quick`), and
+    windows beside the same network written plainly.
     """
     records = _load(3 if quick else 20) + _steps(200 if quick else 5000) + _slow(2 if quick else 10)
     machine = measure_machine(5 if quick else 30)
@@ -102,7 +104,7 @@ def run(quick: bool) -> list[Record]:
             measured += 1
     how = "; ".join(lacking) or "random weights"
     records.append(Record("inference.full_size", measured, f"of {2 * len(FULL_SIZE)}", how=how))
-    return records
+    return records + window_speed(quick)
 
 
 def _load(times: int) -> list[Record]:

@@ -12,6 +12,7 @@ per map. States, norms, biases and sums stay in single precision.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Literal
 
@@ -89,6 +90,7 @@ def _quantise(proto: onnx.ModelProto) -> None:
     weights = {w.name: w for w in graph.initializer}
     makers = {output: node for node in graph.node for output in node.output}
     nodes: list[onnx.NodeProto] = []
+    biases = _biases(graph, weights)
     added: dict[str, onnx.TensorProto] = {}
     gathered: dict[str, tuple[str, str, str]] = {}
     for node in graph.node:
@@ -104,9 +106,12 @@ def _quantise(proto: onnx.ModelProto) -> None:
         replaced = (
             _blocks(node, values, added)
             if taps is None
-            else _integer(node, values, taps, added, gathered)
+            else _integer(node, values, taps, added, gathered, biases.get(node.output[0]))
         )
         nodes.extend(replaced)
+    # What a product has added to itself already, the node that did so adds no more.
+    made = {output for node in nodes if node.domain == CONTRIB for output in node.output}
+    nodes = [n for n in nodes if n.domain == CONTRIB or not made.intersection(n.output)]
     del graph.node[:]
     graph.node.extend(_used(nodes, {o.name for o in graph.output}))
     needed = {name for node in graph.node for name in node.input}
@@ -159,8 +164,12 @@ def _integer(
     taps: tuple[onnx.NodeProto, ...],
     added: dict[str, onnx.TensorProto],
     gathered: dict[str, tuple[str, str, str]],
+    bias: tuple[str, str] | None,
 ) -> Iterator[onnx.NodeProto]:
-    """Gathered taps times weights, from a map that is quantised before it is gathered."""
+    """Gathered taps times weights, from a map that is quantised before it is gathered.
+
+    `bias` is what is added, and the name of the sum.
+    """
     final = taps[0].output[0]
     if final not in gathered:
         source = taps[-1].input[0]
@@ -188,11 +197,27 @@ def _integer(
         added[part] = numpy_helper.from_array(array, part)
     yield helper.make_node(
         "MatMulIntegerToFloat",
-        [value, f"{name}_int8", scale, f"{name}_scale", zero],
-        [node.output[0]],
+        [value, f"{name}_int8", scale, f"{name}_scale", zero, *(("", bias[0]) if bias else ())],
+        [bias[1] if bias else node.output[0]],
         f"{node.name}_int8",
         domain=CONTRIB,
     )
+
+
+def _biases(
+    graph: onnx.GraphProto, weights: dict[str, onnx.TensorProto]
+) -> dict[str, tuple[str, str]]:
+    """By product: the vector that is added to it, where it has no other use, and their sum."""
+    uses = Counter(name for node in graph.node for name in node.input)
+    uses.update(output.name for output in graph.output)
+    found = {}
+    for node in graph.node:
+        if node.op_type == "Add":
+            for value, other in (node.input, reversed(node.input)):
+                vector = other in weights and len(weights[other].dims) == 1
+                if vector and uses[value] == 1:
+                    found[value] = (other, node.output[0])
+    return found
 
 
 def _taps_of(name: str, makers: dict[str, onnx.NodeProto]) -> tuple[onnx.NodeProto, ...] | None:

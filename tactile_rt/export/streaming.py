@@ -8,7 +8,6 @@ where that is less arithmetic. What cannot be rewritten is left as it was traine
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,14 +15,21 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.models.attenders import GPT, HEADS, TOKENS
-from tactile_rt.models.attenders.gpt import Block
+from tactile_rt.export.products import Columns, Product
+from tactile_rt.export.streaming_gpt import StreamingGPT
+from tactile_rt.models.attenders import GPT
 from tactile_rt.models.ead import EAD
-from tactile_rt.models.encoders.cells import Cell
+from tactile_rt.models.encoders.cells import FORGET_BIAS, Cell, IntersectionCell, State
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 from tactile_rt.models.encoders.resnet import FoldedResNet18, ResNet18Encoder
 
-__all__ = ["StreamingGPT", "StreamingGraph", "StreamingResNet18", "streaming"]
+__all__ = [
+    "StreamingGPT",
+    "StreamingGraph",
+    "StreamingIntersection",
+    "StreamingResNet18",
+    "streaming",
+]
 
 
 def streaming(network: EAD, integer: bool = False) -> EAD:
@@ -58,42 +64,6 @@ def _plain(encoder: GraphEncoder, name: str) -> bool:
     fused = any(e.fusion != "concatenate" for e in node.reads)
     vectors = any(encoder.sizes[e.source] == (1, 1) for e in node.reads)
     return not fused and (node.kind == "dense" or not vectors)
-
-
-class Product(nn.Module):
-    """x W + b of (..., input); W is stored as the kernels read it."""
-
-    weight: Tensor
-    bias: Tensor | None
-
-    def __init__(self, weight: Tensor, bias: Tensor | None) -> None:
-        super().__init__()
-        self.register_buffer("weight", weight.detach().t().contiguous())
-        self.register_buffer("bias", None if bias is None else bias.detach().clone())
-
-    def forward(self, x: Tensor) -> Tensor:
-        out = torch.matmul(x, self.weight)
-        return out if self.bias is None else out + self.bias
-
-
-class Columns(nn.Module):
-    """W x + b of maps (lane, site, channel), the lanes as columns.
-
-    For one lane this reads the weights at memory speed, as a row times W does not. The bias is
-    added after the transposition: onnxruntime would merge it with the product into a slow `Gemm`.
-    """
-
-    weight: Tensor
-    bias: Tensor
-
-    def __init__(self, weight: Tensor, bias: Tensor) -> None:
-        super().__init__()
-        self.register_buffer("weight", weight.detach().clone())
-        self.register_buffer("bias", bias.detach().clone())
-
-    def forward(self, maps: Tensor) -> Tensor:
-        columns = maps.permute(1, 2, 0).flatten(0, 1)
-        return torch.matmul(self.weight, columns).t() + self.bias
 
 
 class Taps(nn.Module):
@@ -143,6 +113,38 @@ class Taps(nn.Module):
         return out
 
 
+class StreamingIntersection(Cell):
+    """An `IntersectionCell` with layer norm: scale, offset and forget bias are each gate's norm's.
+
+    Args:
+        cell: as trained.
+        conv: its convolution.
+    """
+
+    gates, norms = 0, 0
+
+    def __init__(self, cell: IntersectionCell, conv: Taps) -> None:
+        super().__init__(cell.channels, layer_norm=False)
+        assert cell.gamma is not None and cell.beta is not None
+        self.conv = conv  # type: ignore[assignment]
+        self.normed = nn.ModuleList()
+        for gate in range(cell.norms):
+            norm = nn.LayerNorm(cell.channels, cell.epsilon)
+            forget = FORGET_BIAS if gate >= 2 else 0.0  # of p and y
+            norm.weight, norm.bias = (
+                nn.Parameter(part[gate].detach().clone())
+                for part in (cell.gamma, cell.beta + forget)
+            )
+            self.normed.append(norm)
+
+    def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
+        (s,) = state
+        gates = self.conv(x, s).chunk(4, dim=-1)
+        m, n, p, y = (norm(gate) for norm, gate in zip(self.normed, gates, strict=True))
+        m, n, p, y = torch.tanh(m), torch.relu(n), torch.sigmoid(p), torch.sigmoid(y)
+        return n + y * (x - n), (m + p * (s - m),)
+
+
 class StreamingGraph(nn.Module):
     """A `GraphEncoder` that only concatenates; see `streaming`."""
 
@@ -169,6 +171,10 @@ class StreamingGraph(nn.Module):
 
     def _cell(self, cell: nn.Module, name: str) -> Cell:
         assert isinstance(cell, Cell)
+        if isinstance(cell, IntersectionCell) and cell.gamma is not None:
+            weights = cell.conv.weight, cell.conv.bias
+            taps = Taps(*weights, self.sizes[name], valid=False, whole=self.integer)
+            return StreamingIntersection(cell, taps)
         out = copy.copy(cell)
         out._modules = dict(cell._modules)
         for part, conv in cell._modules.items():
@@ -248,87 +254,3 @@ class StreamingResNet18(FoldedResNet18):
             x = F.relu(short + layers[f"{i}_second"](F.relu(layers[f"{i}_first"](x))))
         features: Tensor = layers["fc"](x)
         return features
-
-
-class StreamingGPT(nn.Module):
-    """A `GPT` whose cache is one tensor per layer: each is read once and written once a step."""
-
-    def __init__(self, gpt: GPT) -> None:
-        super().__init__()
-        self.features, self.max_steps = gpt.features, gpt.max_steps
-        self.head = gpt.features // HEADS
-        with torch.no_grad():
-            tokens = TOKENS * gpt.max_steps
-            positions = gpt.positions[:tokens].unflatten(0, (-1, TOKENS)).clone()
-            positions[:, 1] += gpt.project_in(gpt.action)
-        self.register_buffer("positions", positions)
-        self.project_in = _product(gpt.project_in)
-        self.project_out = _product(gpt.project_out)
-        self.norm = gpt.norm
-        self.blocks = nn.ModuleList(StreamingBlock(block) for block in gpt.blocks)
-
-    def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zeros: keys and values of each layer, (batch, head, step, token, width / head)."""
-        zeros = self.norm.weight.new_zeros
-        shape = (batch, HEADS, self.max_steps, TOKENS, self.head)
-        names = [f"gpt_{kind}{layer}" for layer in range(len(self.blocks)) for kind in "kv"]
-        return {name: zeros(shape) for name in names}
-
-    def step(
-        self, features: Tensor, index: Tensor, state: dict[str, Tensor]
-    ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step, as `GPT.step`."""
-        index = index.clamp(max=self.max_steps - 1)
-        token = torch.arange(TOKENS * self.max_steps)
-        first = TOKENS * index[:, None, None, None]
-        here = torch.arange(self.max_steps)[:, None, None] == index[:, None, None, None, None]
-        # The observation sees the pairs before and itself, the action token its own pair too.
-        query = first + torch.arange(TOKENS)[:, None]
-        unseen = torch.where(token <= query, 0.0, -torch.inf)
-        inputs = self.project_in(features)
-        pair = torch.stack([inputs, torch.zeros_like(inputs)], 1)
-        x = pair + self.positions[index]  # type: ignore[index]
-        new: dict[str, Tensor] = {}
-        for layer, block in enumerate(self.blocks):
-            names = (f"gpt_k{layer}", f"gpt_v{layer}")
-            x, *cache = block(x, state[names[0]], state[names[1]], here, unseen)
-            new |= dict(zip(names, cache, strict=True))
-        return self.project_out(self.norm(x[:, TOKENS - 1])), new
-
-
-class StreamingBlock(nn.Module):
-    """One layer of `StreamingGPT`."""
-
-    def __init__(self, block: nn.Module) -> None:
-        super().__init__()
-        assert isinstance(block, Block)
-        self.norm1, self.norm2 = block.norm1, block.norm2
-        width = block.proj.in_features
-        self.head = width // HEADS
-        # The attention's scale is in the queries' weights.
-        scale = torch.ones(3 * width)
-        scale[:width] = 1 / math.sqrt(self.head)
-        qkv = block.qkv
-        self.qkv = Product(qkv.weight * scale[:, None], qkv.bias * scale)
-        self.proj, self.mlp_in = _product(block.proj), _product(block.mlp_in)
-        self.mlp_out = _product(block.mlp_out)
-
-    def forward(
-        self, x: Tensor, k_cache: Tensor, v_cache: Tensor, here: Tensor, unseen: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        q, k, v = (
-            part.unflatten(-1, (HEADS, self.head)).transpose(1, 2)
-            for part in self.qkv(self.norm1(x)).chunk(3, dim=-1)
-        )
-        k_cache = torch.where(here, k[:, :, None], k_cache)
-        v_cache = torch.where(here, v[:, :, None], v_cache)
-        scores = torch.matmul(q, k_cache.flatten(2, 3).transpose(-1, -2))
-        weights = torch.softmax(scores + unseen, dim=-1)
-        attended = torch.matmul(weights, v_cache.flatten(2, 3)).transpose(1, 2).flatten(2)
-        x = x + self.proj(attended)
-        hidden = F.gelu(self.mlp_in(self.norm2(x)), approximate="tanh")
-        return x + self.mlp_out(hidden), k_cache, v_cache
-
-
-def _product(linear: nn.Linear) -> Product:
-    return Product(linear.weight, linear.bias)

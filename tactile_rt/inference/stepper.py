@@ -1,7 +1,8 @@
 """The network's step, bound once to buffers that are made once.
 
 The state lives in two sets of buffers; a step reads the one and writes the other, by turns. So a
-step allocates nothing, and with a GPU the state never leaves it.
+step allocates nothing, and with a GPU the state never leaves it. A cache of which a step writes a
+few rows is in both sets the same buffer: onnxruntime then copies nothing.
 """
 
 from typing import Any
@@ -50,10 +51,16 @@ class Stepper:
         self._offset = _Tensor(shape, np.float32, device)
         self._sigma = _Tensor(shape, np.float32, device)
         self._logits = _Tensor((lanes, len(card.labels)), np.float32, "cpu")
-        self._states = tuple(
-            {s.name: _Tensor((lanes, *s.shape), s.dtype, device) for s in card.state}
-            for _ in range(2)
-        )
+        first = {s.name: _Tensor((lanes, *s.shape), s.dtype, device) for s in card.state}
+        # How other providers than onnxruntime's own write rows is not known.
+        own = session.get_providers() == ["CPUExecutionProvider"]
+        second = {
+            s.name: first[s.name]
+            if s.in_place and own
+            else _Tensor((lanes, *s.shape), s.dtype, device)
+            for s in card.state
+        }
+        self._states = (first, second)
         self.samples = self._samples.array
         self._bindings = tuple(
             self._bound(self._states[now], self._states[1 - now]) for now in range(2)

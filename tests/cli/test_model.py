@@ -2,18 +2,20 @@
 
 import hashlib
 import json
+from pathlib import Path
 
-import msgspec
 import pytest
 
 from tactile_rt.benchmarks import roofline
 from tactile_rt.model_checks import probe_logits
-from tactile_rt.model_file import load_model, read_model, shipped_model
+from tactile_rt.model_file import METADATA_KEY, load_model, read_model, shipped_model
 from tactile_rt.onnx_reading import graph_sha256
 
 pytest.importorskip("onnx")
 
-from tiny_model import CARD, write_model
+import onnx
+from onnx import helper
+from tiny_model import WINDOW, write_model
 
 
 @pytest.fixture
@@ -50,7 +52,8 @@ def test_a_stranger_s_text_cannot_command_the_terminal(call, tmp_path):
     path = write_model(
         tmp_path / "m.onnx",
         name="\x1b[2Jgone",
-        labels=("[red]a", "b\x07", "c\x1b]0;x\x07", "d", "e"),
+        labels=("[red]a", "b", "c", "d", "e"),
+        provenance={"network": "x\x1b]0;x\x07", "commands": ["\x1b[2J", 5]},
     )
     code, out, _ = call("model", "show", path)
     assert code == 0
@@ -106,10 +109,89 @@ def test_a_bad_file_is_one_line(call, tmp_path, what):
     for content, said in ((None, "no model file"), (b"garbage", "is not a readable ONNX model")):
         if content is not None:
             path.write_bytes(content)
-        code, out, err = call("model", what, path)
-        assert (code, out) == (2, "")
-        assert said in err
-        assert err.count("\n") == 1
+        refused(call, what, path, said)
+
+
+def refused(call, what, path, said):
+    code, out, err = call("model", what, path)
+    assert (code, out) == (2, "")
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def far(proto):
+    """A tensor in a file that is there, and readable."""
+    weight = max(proto.graph.initializer, key=lambda tensor: len(tensor.raw_data))
+    weight.ClearField("raw_data")
+    weight.data_location = 1
+    weight.external_data.add(key="location", value="../../../../../../etc/passwd")
+
+
+def renamed(proto):
+    proto.graph.input[0].name = "sample"
+
+
+def huge(proto):
+    proto.graph.initializer[0].dims[:] = [2**40, 2**20]
+
+
+def described(**changes):
+    def change(proto):
+        card = json.loads(proto.metadata_props[0].value)
+        helper.set_model_props(proto, {METADATA_KEY: json.dumps(card | changes)})
+
+    return change
+
+
+BROKEN = {
+    "cut short": (lambda data: data[: len(data) // 2], "cut short or damaged at byte"),
+    "text": (lambda data: b"<!DOCTYPE html>\n<html>404", "it is text"),
+    "empty": (lambda data: b"", "it is empty"),
+    "checkpoint": (lambda data: b"PK\x03\x04" + data, "tactile-rt export"),
+    "far": (far, "is in another file, which we do not open"),
+    "huge": (huge, "of 1152921504606846976 elements"),
+    "renamed": (renamed, "the graph's inputs disagree with its metadata at sample, samples"),
+    "opset": (lambda proto: proto.opset_import[0].CopyFrom(helper.make_opsetid("", 2**40)),
+              "opset 1099511627776 of 'ai.onnx'"),
+    "no opset": (lambda proto: proto.ClearField("opset_import"), "which version of ONNX's"),
+    "two opsets": (lambda proto: proto.opset_import.add(domain="ai.onnx", version=7), "say, once"),
+    "no metadata": (lambda proto: proto.ClearField("metadata_props"), "no 'tactile_rt' metadata"),
+    "types": (described(steps="many"), "has damaged metadata: Expected `int`, got `str` - at `$.s"),
+    "future": (described(version=99), "has metadata of version 99; this release reads 1 and 2"),
+    "episode": (described(steps=900_000), "an episode of 810000000 values"),
+    "state": (described(state=[]), "the graph's inputs disagree with its metadata at "),
+    "spec": (described(spec="{}"), "array spec of version None"),
+    "commands": (described(provenance={"commands": 5}), "commands of the provenance must be a"),
+    "escape": (described(labels=["\x1b[2J"]), "labels must be 1 to 200 printable characters"),
+}  # fmt: skip
+SHIPPED = shipped_model().read_bytes()
+
+
+@pytest.mark.parametrize("what", ["show", "verify", "bench"])
+@pytest.mark.parametrize("how", BROKEN)
+def test_a_broken_file_is_one_line_whatever_is_asked_of_it(call, tmp_path, monkeypatch, how, what):
+    change, said = BROKEN[how]
+    changed = change(SHIPPED) if how in ("cut short", "text", "empty", "checkpoint") else None
+    if changed is None:
+        proto = onnx.load_model_from_string(SHIPPED)
+        change(proto)
+        changed = proto.SerializeToString()
+    path = tmp_path / "m.onnx"
+    path.write_bytes(changed)
+    monkeypatch.setattr("onnxruntime.InferenceSession", None)  # none of it is run
+    monkeypatch.setattr(roofline, "measure_machine", None)
+    opened = []
+    monkeypatch.setattr(Path, "read_bytes", watched(Path.read_bytes, opened))
+    refused(call, what, path, said)
+    assert set(opened) <= {path}
+
+
+def watched(read, opened):
+    def read_bytes(self):
+        opened.append(self)
+        return read(self)
+
+    return read_bytes
 
 
 def test_bench_times_steps_beside_the_machine_s_limit(call, sealed, monkeypatch):
@@ -122,8 +204,7 @@ def test_bench_times_steps_beside_the_machine_s_limit(call, sealed, monkeypatch)
 
 
 def test_bench_refuses_a_window(call, tmp_path):
-    fields = {**msgspec.to_builtins(CARD), "kind": "window", "state": []}
-    path = write_model(tmp_path / "m.onnx", metadata=json.dumps(fields))
+    path = write_model(tmp_path / "m.onnx", WINDOW, kind="window", state=())
     code, _, err = call("model", "bench", path)
     assert code == 2
     assert "only steps are timed" in err

@@ -13,13 +13,21 @@ pytest.importorskip("torch")
 pytest.importorskip("onnxscript")
 
 import onnx
+import onnx.parser
 import torch
 
 import tactile_rt
 from tactile_rt.classifier import Classifier
 from tactile_rt.contact import CHANNEL_FLOOR
 from tactile_rt.export import onnx_step
-from tactile_rt.export.onnx_step import PARITY_BAR, export_checkpoint, export_step, parity
+from tactile_rt.export.onnx_step import (
+    PARITY_BAR,
+    export_checkpoint,
+    export_step,
+    file_logits,
+    parity,
+)
+from tactile_rt.inference.stepper import Stepper
 from tactile_rt.model_file import ModelCard, load_model
 from tactile_rt.models.datasets import STEPS, SUBSTEPS, find_onsets, windows
 from tactile_rt.models.ead import EADConfig
@@ -248,6 +256,52 @@ def test_the_robot_decides_as_training_saw_it(exported: SimpleNamespace) -> None
     for d, posterior in zip(decisions, expected, strict=True):
         assert d.probabilities == pytest.approx(posterior, abs=2e-6)
         assert d.labels == CATEGORIES
+
+
+def test_the_cache_is_written_in_place_with_the_same_result(exported: SimpleNamespace) -> None:
+    """Through the stepper, begun anew after any number of steps, against plain onnxruntime."""
+    session, card = load_model(exported.path)
+    marked = {s["name"] for s in metadata(exported.path)["state"] if s["in_place"]}
+    assert marked == {s.name for s in card.state if s.name.startswith("gpt_")} != set()
+    samples, offset, sigma = episodes(1, seed=4)
+    stepper = Stepper(session, card)
+    for name in (s.name for s in card.state):
+        assert (stepper._states[0][name] is stepper._states[1][name]) == (name in marked)
+    expected = file_logits(session, card, samples, offset, sigma)[0]
+    for steps in (*range(1, STEPS + 1), STEPS):
+        stepper.begin(offset[0], sigma[0])
+        for step in range(steps):
+            stepper.samples[:] = samples[:, step]
+            assert np.array_equal(stepper.run()[0], expected[step]), (steps, step)
+
+
+def test_a_lane_begun_anew_leaves_the_others_cache_alone(exported: SimpleNamespace) -> None:
+    session, card = load_model(exported.path)
+    samples, offset, sigma = episodes(1, seed=5)
+    alone = file_logits(session, card, samples, offset, sigma)[0]
+    stepper = Stepper(session, card, lanes=2)
+    stepper.begin(offset[0], sigma[0])
+    late = 7  # lane 1 begins so many steps after lane 0
+    for step in range(STEPS):
+        if step == late:
+            stepper.reset(1)
+        stepper.samples[0], stepper.samples[1] = samples[0, step], samples[0, max(step - late, 0)]
+        logits = stepper.run()
+        assert abs(logits[0] - alone[step]).max() <= 1e-6
+        if step >= late:
+            assert abs(logits[1] - alone[step - late]).max() <= 1e-6
+
+
+@pytest.mark.parametrize(
+    ("other", "marked"),
+    [("", True), ("size = Shape(cache)", True), ("twice = Add(cache, cache)", False)],
+)
+def test_a_state_that_something_else_reads_is_not_written_in_place(other, marked) -> None:
+    graph = onnx.parser.parse_graph(
+        "g (float[B,4,2] cache, int64[B,1,2] rows, float[B,1,2] new) => (float[B,4,2] cache_next)"
+        f"{{ {other}\n cache_next = ScatterND(cache, rows, new) }}"
+    )
+    assert onnx_step._written_by_rows(graph, "cache") == marked
 
 
 # What goes wrong

@@ -45,6 +45,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     config = EADConfig(CLASSES, attender="gpt", width=1 / 16, readout="mean")
     model, card = random_model(spec, config, "small")
     with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            if name.endswith("bias"):  # at zero it would not be missed
+                parameter += 0.1 * torch.randn_like(parameter)
         model.network.decoder.weight *= 8  # logits of a spread of about 1
     proto, state = step_graph(model, card, integer=True)
     cards, paths = {}, {}
@@ -99,6 +102,11 @@ def test_int8_leaves_no_large_product_in_floats_and_norms_and_states_alone(
             assert np.prod(weights[node.input[1]].dims) < 1024
     assert count["MatMulIntegerToFloat"] == 5 + 6  # drives and cells; conv1 is small here
     assert count["DynamicQuantizeLinear"] <= count["MatMulIntegerToFloat"]
+    # Every convolution has a bias, which its product adds by itself.
+    assert count["Add"] == before["Add"] - count["MatMulIntegerToFloat"]
+    for node in proto.graph.node:
+        if node.op_type == "MatMulIntegerToFloat":
+            assert len(node.input) == 7 and np.any(numpy_helper.to_array(weights[node.input[6]]))
     assert count["LayerNormalization"] == before["LayerNormalization"]
     for value in (*proto.graph.input, *proto.graph.output):
         kind = value.type.tensor_type.elem_type

@@ -9,7 +9,13 @@ pytest.importorskip("torch")
 import torch
 from small_networks import TOLERANCE, build, frames, stream
 
-from tactile_rt.export.streaming import StreamingGPT, StreamingGraph, StreamingResNet18, streaming
+from tactile_rt.export.streaming import (
+    StreamingGPT,
+    StreamingGraph,
+    StreamingIntersection,
+    StreamingResNet18,
+    streaming,
+)
 
 STEPS = 22
 # Every cell, encoder, attender and decoder at least once; `make check-export` takes all of them.
@@ -73,10 +79,30 @@ def test_lanes_are_reset_one_by_one_at_any_step(encoder: str) -> None:
         assert abs(found - ead(x[lane : lane + 1, at[lane] :])[0]).max() <= TOLERANCE
 
 
+def test_a_step_writes_its_own_rows_of_the_cache_and_no_others() -> None:
+    """Each lane is at a step of its own; the last is past the end, where the last row is used."""
+    deployed = streaming(build(attender="gpt"))
+    at = torch.tensor([0, 4, STEPS - 1, STEPS + 3])
+    state = deployed.initial_state(len(at))
+    caches = [name for name in state if name.startswith("gpt_")]
+    for name in caches:
+        state[name] = torch.randn_like(state[name])
+    (counter,) = [name for name in state if state[name].dtype == torch.int64]
+    state[counter] = at
+    _, new = deployed.step(frames(batch=len(at))[:, 0], state)
+    for name in caches:
+        changed = (new[name] != state[name]).all(-1).all(1)  # (lane, row), in every head
+        assert torch.equal(changed, (new[name] != state[name]).any(-1).any(1))
+        rows = [row.nonzero().flatten().tolist() for row in changed]
+        last = 2 * (STEPS - 1)
+        assert rows == [[0, 1], [8, 9], [last, last + 1], [last, last + 1]]
+
+
 def test_what_is_rewritten_and_what_is_not() -> None:
     ead = build("zhuang-intersection-ln", "gpt")
     deployed = streaming(ead)
     assert isinstance(deployed.encoder, StreamingGraph)
+    assert all(isinstance(c, StreamingIntersection) for c in deployed.encoder.cells.values())
     assert isinstance(deployed.attender, StreamingGPT)
     assert isinstance(streaming(build("resnet18", "none")).encoder, StreamingResNet18)
     assert type(ead.encoder).__name__ == "ZhuangEncoder", "the trained network is left alone"
