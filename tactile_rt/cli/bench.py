@@ -16,7 +16,7 @@ AREAS: dict[str, tuple[str, str] | None] = {
     "drivers": ("tactile_rt.benchmarks.drivers.area", "record"),
     "models": ("tactile_rt.benchmarks.models", "train"),
     "inference": ("tactile_rt.benchmarks.inference", ""),
-    "daemon": None,
+    "daemon": ("tactile_rt.benchmarks.daemon.area", "train"),
     "align": ("tactile_rt.benchmarks.alignment", ""),
 }
 

@@ -204,12 +204,18 @@ class Recorder(Consumer):
         try:
             track.file.write((message,))
         except OSError as error:
+            self._lose(track, message)
             self._no_room(track, error)
 
-    def _lose(self, track: _Track, message: Message) -> None:
-        track.lost.dropped_samples += message.samples
-        track.lost.dropped_packets += message.topic == WIRE
-        self._lost_samples += message.samples
+    def _lose(self, track: _Track, *messages: Message) -> None:
+        self._count_lost(
+            track, sum(m.samples for m in messages), sum(m.topic == WIRE for m in messages)
+        )
+
+    def _count_lost(self, track: _Track, samples: int, packets: int) -> None:
+        track.lost.dropped_samples += samples
+        track.lost.dropped_packets += packets
+        self._lost_samples += samples
 
     def _trigger(self, track: _Track) -> None:
         if self._config.mode != "trigger" or not self._on:
@@ -259,25 +265,35 @@ class Recorder(Consumer):
         }
         try:
             track.file = RecordingFile(self._folder, track.opened, session, track.lost)
-            track.lost = WriterStats()
-            track.file.write(track.empty())
         except OSError as error:
             self._no_room(track, error)
             return
+        track.lost = WriterStats()
+        kept = track.empty()
+        for n, message in enumerate(kept):
+            try:
+                track.file.write((message,))
+            except OSError as error:
+                self._lose(track, *kept[n:])
+                self._no_room(track, error)
+                return
         self._files += 1
         self._newest = track.file.path.name
 
-    def _finish_file(self, track: _Track) -> None:
+    def _finish_file(self, track: _Track, told: bool = False) -> None:
         file, track.file, track.until_ns = track.file, None, 0
         if file is None:
             return
         try:
             file.finish()
         except OSError as error:
-            self._view.report(
-                self._name, "running", f"{file.path}: not finished ({error.strerror or error}); "
-                "`tactile-rt recover` keeps what is in it", "error",
-            )  # fmt: skip
+            if not told:
+                self._view.report(
+                    self._name, "running", f"{file.path}: not finished "
+                    f"({error.strerror or error}); `tactile-rt recover` keeps what is in it",
+                    "error",
+                )  # fmt: skip
+            self._count_lost(track, *file.unsafe())
         self._bytes += file.stats.bytes
 
     def _rotate(self, track: _Track) -> None:
@@ -335,4 +351,5 @@ class Recorder(Consumer):
             "what is in it", "error",
         )  # fmt: skip
         if track.file is not None:
-            self._finish_file(track)
+            self._count_lost(track, *track.file.unsafe())
+            self._finish_file(track, told=True)

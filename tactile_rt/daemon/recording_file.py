@@ -52,6 +52,7 @@ class RecordingFile:
         self.stats = WriterStats(
             dropped_samples=lost.dropped_samples, dropped_packets=lost.dropped_packets
         )
+        self._safe = (0, 0)  # samples and packets that the system has
         self._health = HealthTeller(opened.stream)
         try:
             self._file = McapFile(self._raw, about)
@@ -77,7 +78,16 @@ class RecordingFile:
         """Let the system have all of it; the file's size."""
         self._health.tell(self._file, self.stats)
         self.stats.bytes = self._file.flush()
+        self._safe = (self.stats.samples, self.stats.packets)
         return self.stats.bytes
+
+    def unsafe(self) -> tuple[int, int]:
+        """Samples and packets that were added and may not be in the file, because writing failed;
+        they no longer count as written."""
+        stats = self.stats
+        samples, packets = stats.samples - self._safe[0], stats.packets - self._safe[1]
+        stats.samples, stats.packets = self._safe
+        return samples, packets
 
     def finish(self) -> None:
         """Write the index and close. Also when that fails the file is closed: it can be recovered.

@@ -7,6 +7,7 @@ import pytest
 from tactile_rt.benchmarks import roofline
 from tactile_rt.benchmarks.drivers import fuzzing, losses, unplugging
 from tactile_rt.benchmarks.records import Record
+from tactile_rt.cli import bench
 
 
 def test_an_unknown_area_lists_the_areas(call):
@@ -16,7 +17,8 @@ def test_an_unknown_area_lists_the_areas(call):
     assert err.count("\n") == 1
 
 
-def test_an_area_without_figures_says_so(call):
+def test_an_area_without_figures_says_so(call, monkeypatch):
+    monkeypatch.setitem(bench.AREAS, "daemon", None)
     assert call("bench", "daemon") == (0, "no figures yet for: daemon\n", "")
 
 

@@ -12,6 +12,8 @@ from tactile_rt.daemon.messages import Message, encode, message_of, state_messag
 
 __all__ = ["JsonlOptions", "JsonlPublisher"]
 
+TOGETHER = 64  # messages in one write
+
 
 class JsonlOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of ``kind = "jsonl"``.
@@ -60,13 +62,16 @@ class JsonlPublisher(Consumer):
             os.write(self._handle, b"\n")
 
     def handle(self, items: list[Item]) -> None:
-        messages: list[Message] = [m for m in map(message_of, items) if m is not None]
+        # After a reader that stalled much waits: not all of it at once, in this thread and memory.
+        for start in range(0, len(items), TOGETHER):
+            found = map(message_of, items[start : start + TOGETHER])
+            self._write([message for message in found if message is not None])
         now = time.monotonic()
         if self._options.state_s and now >= self._state_at and self._view is not None:
             self._state_at = now + self._options.state_s
-            messages.append(state_message(self._view.snapshot()))
-        if not messages:
-            return
+            self._write([state_message(self._view.snapshot())])
+
+    def _write(self, messages: list[Message]) -> None:
         data = memoryview(b"".join(encode(m) + b"\n" for m in messages))
         self._bytes += len(data)
         while data:
