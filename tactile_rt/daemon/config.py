@@ -24,8 +24,8 @@ __all__ = [
 
 CONFIG_VERSION = 1
 
-Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
-OptionalName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{0,64}$")]
+Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,64}\Z")]
+OptionalName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{0,64}\Z")]
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
 Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
@@ -78,7 +78,7 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
     in_a_row: Annotated[int, msgspec.Meta(ge=1, le=22)] = 2
     deadline_ms: Annotated[float, msgspec.Meta(ge=0, le=10_000)] = 0.0
     late: Literal["count", "report", "skip"] = "count"
-    providers: tuple[Text, ...] = ("cpu",)
+    providers: Annotated[tuple[Text, ...], msgspec.Meta(min_length=1)] = ("cpu",)
 
 
 class PublisherConfig(_Table, frozen=True, kw_only=True):

@@ -3,8 +3,10 @@
 Nothing is opened, and no device is asked; files that are named must be there.
 """
 
-import ipaddress
+import dataclasses
+import math
 import os
+import re
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
@@ -14,21 +16,31 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 from tactile_rt.calibration import load_calibration
 from tactile_rt.daemon.config import Config
 from tactile_rt.daemon.config_file import Loaded
-from tactile_rt.daemon.config_tables import nearest
+from tactile_rt.daemon.config_shared import (
+    check_folder,
+    check_host,
+    check_listeners,
+    check_outputs,
+    is_loopback,
+)
+from tactile_rt.daemon.config_tables import WORDS, nearest
 from tactile_rt.daemon.consumers import wanted_consumers
 from tactile_rt.daemon.lock import lock_keys
 from tactile_rt.drivers.codec import codec_class
 from tactile_rt.drivers.opening import CanOptions, SerialOptions
 from tactile_rt.drivers.synthetic import SyntheticOptions, SyntheticSource
+from tactile_rt.inference.providers import onnxruntime_names
 from tactile_rt.model_file import load_model
 from tactile_rt.options import parse_options, take_options
-from tactile_rt.sources import ENTRY_POINTS, SCHEMES
+from tactile_rt.sources import ENTRY_POINTS, SCHEMES, _lookup
 from tactile_rt.stream import TactileError
 
 __all__ = ["check_config"]
 
 SHORTEST_TOKEN = 16  # of a page that others can reach
 SCHEME_FILES = ("replay", "combined")
+SIMULATED = ("sim", "whisking")
+MCAP, NPZ = b"\x89MCAP0\r\n", b"PK"  # how they begin
 
 
 def check_config(loaded: Loaded) -> None:
@@ -41,10 +53,18 @@ def check_config(loaded: Loaded) -> None:
             _try(loaded, ["source", i, "calibration"], load_calibration, source.calibration)
     _check_devices(loaded, config)
     for i, model in enumerate(config.model):
+        if model.file and os.path.isdir(model.file):
+            loaded.refuse(["model", i, "file"], f"{model.file} is a folder")
         if model.file:
             _try(loaded, ["model", i, "file"], load_model, Path(model.file))
+        _try(loaded, ["model", i, "providers"], onnxruntime_names, model.providers)
+        if model.every and model.mode != "sliding":
+            loaded.refuse(["model", i, "every"], 'it is for mode = "sliding"')
     _check_tables(loaded, config)
-    for wanted in wanted_consumers(loaded):
+    found = wanted_consumers(loaded)
+    check_listeners(loaded, found)
+    check_outputs(loaded, found)
+    for wanted in found:
         try:
             wanted.make()
         except TactileError as error:
@@ -73,6 +93,8 @@ def _check_names(loaded: Loaded, config: Config) -> None:
 
 def _check_url(loaded: Loaded, i: int, url: str) -> None:
     path: list[str | int] = ["source", i, "url"]
+    if not url.isprintable():
+        loaded.refuse(path, f"{url!r:.80} holds what cannot be printed")
     try:
         parts = urlsplit(url, allow_fragments=False)
     except ValueError as error:
@@ -89,14 +111,35 @@ def _check_url(loaded: Loaded, i: int, url: str) -> None:
     try:
         _check_options(parts.scheme, target, fields)
     except TactileError as error:
-        loaded.refuse(path, str(error))
+        loaded.refuse(path, _in_words(str(error), fields))
     if parts.scheme in SCHEME_FILES and not os.path.isfile(target):
         loaded.refuse(path, f"no file {target}")
+    if parts.scheme == "replay":
+        try:
+            with open(target, "rb") as file:
+                begins = file.read(len(MCAP))
+        except OSError as error:
+            loaded.refuse(path, f"{target}: {error.strerror}")
+        if begins != MCAP and not begins.startswith(NPZ):
+            loaded.refuse(path, f"{target} is no recording: it is neither MCAP nor npz")
+
+
+def _in_words(message: str, fields: dict[str, str]) -> str:
+    """A mistake in the options of a URL, in a user's words."""
+    found = re.search(r"Expected `(\w+)`.* - at `\$\.(\w+)`$", message)
+    if not found:
+        return message
+    what, key = WORDS.get(found[1], found[1]), found[2]
+    return f"{message[: found.start()]}{key}: expected {what}, got {fields.get(key, '')!r:.60}"
 
 
 def _check_options(scheme: str, target: str, fields: dict[str, str]) -> None:
     if scheme == "synthetic":
         SyntheticSource(target, parse_options("source synthetic:", fields, SyntheticOptions))
+    elif scheme not in SCHEMES or scheme in SIMULATED:
+        options = getattr(_lookup(f"{scheme}:", scheme), "Options", None)
+        if options is not None:
+            parse_options(f"source {scheme}:", fields, options)
     if scheme not in ("serial", "can"):
         return
     if not target:
@@ -105,9 +148,28 @@ def _check_options(scheme: str, target: str, fields: dict[str, str]) -> None:
         raise TactileError(
             f"{scheme}:{target} needs codec=...: what the device speaks, see `tactile-rt codecs`"
         )
+    if scheme == "can":
+        _check_bus(target)
     kind = codec_class(scheme, fields["codec"])
     line = SerialOptions if scheme == "serial" else CanOptions
-    take_options(f"{scheme}:{target}", fields, line, kind.Options)
+    for made in take_options(f"{scheme}:{target}", fields, line, kind.Options):
+        for field in dataclasses.fields(made):
+            value = getattr(made, field.name)
+            if isinstance(value, float) and not math.isfinite(value):
+                raise TactileError(f"{scheme}:{target}: {field.name}: {value} is no quantity")
+
+
+def _check_bus(target: str) -> None:
+    from can import VALID_INTERFACES
+
+    interface, _, channel = target.partition(":")
+    if not channel:
+        raise TactileError(
+            f"can:{target} needs an interface and a channel, e.g. can:socketcan:can0?codec=xela"
+        )
+    if interface not in VALID_INTERFACES:
+        near = nearest(interface, sorted(VALID_INTERFACES))
+        raise TactileError(f"can:{target}: no interface {interface!r}; {near}")
 
 
 def _check_devices(loaded: Loaded, config: Config) -> None:
@@ -121,7 +183,9 @@ def _check_devices(loaded: Loaded, config: Config) -> None:
 
 
 def _check_tables(loaded: Loaded, config: Config) -> None:
-    page, metrics, recorder, limits = config.page, config.metrics, config.recorder, config.limits
+    page, recorder, limits = config.page, config.recorder, config.limits
+    if page is not None:
+        check_host(loaded, ["page", "host"], page.host)
     if page is not None and not is_loopback(page.host):
         if not page.token:
             loaded.refuse(
@@ -132,12 +196,8 @@ def _check_tables(loaded: Loaded, config: Config) -> None:
                 ["page", "token"],
                 f"{len(page.token)} characters are too few beyond loopback: {SHORTEST_TOKEN} do",
             )
-    if page is not None and metrics is not None and page.port == metrics.port:
-        loaded.refuse(["metrics", "port"], f"{metrics.port} is the page's port")
     if recorder is not None:
-        folder = Path(recorder.folder)
-        if "\0" in recorder.folder or (folder.exists() and not folder.is_dir()):
-            loaded.refuse(["recorder", "folder"], f"{recorder.folder!r} is not a folder")
+        check_folder(loaded, recorder.folder)
         if 0 < recorder.rotate_mb < 1:
             loaded.refuse(["recorder", "rotate_mb"], "must be 0 (never) or at least 1")
         if 0 < recorder.rotate_s < 1:
@@ -146,20 +206,8 @@ def _check_tables(loaded: Loaded, config: Config) -> None:
             loaded.refuse(
                 ["recorder", "mode"], "a trigger with before_s = 0 and after_s = 0 keeps nothing"
             )
-    if config.log.file and not Path(config.log.file).parent.is_dir():
-        loaded.refuse(["log", "file"], f"no folder {Path(config.log.file).parent}")
     if limits.retry_last_s < limits.retry_first_s:
         loaded.refuse(["limits", "retry_last_s"], "must not be below retry_first_s")
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this computer can reach what listens there."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
 
 
 def _try(loaded: Loaded, path: list[str | int], check: Callable[[Any], Any], value: Any) -> None:

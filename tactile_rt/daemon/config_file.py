@@ -77,6 +77,8 @@ def load_config(path: Path, sets: Sequence[str] = ()) -> Loaded:
 
 def _with_bases(path: Path, above: list[Path]) -> Node:
     nodes = read_nodes(path)
+    if "version" in nodes.value:
+        _check_version(nodes)  # of a base, too: its keys may mean something else
     base = nodes.value.get("extends")
     if base is None:
         return nodes
@@ -91,7 +93,8 @@ def _with_bases(path: Path, above: list[Path]) -> Node:
     if len(above) >= DEEPEST:
         raise ConfigError(f"{base.where}: extends: more than {DEEPEST} files, one in another")
     if not file.is_file():
-        raise ConfigError(f"{base.where}: extends: no file {file}")
+        found = f"{file} is a folder" if file.is_dir() else f"no file {file}"
+        raise ConfigError(f"{base.where}: extends: {found}")
     shown = file if path.is_absolute() else Path(os.path.relpath(file))
     under = _with_bases(shown, [*above, here])
     del nodes.value["extends"]

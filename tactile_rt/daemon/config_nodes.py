@@ -93,7 +93,7 @@ def read_nodes(path: Path) -> Node:
     if len(data) > LARGEST:
         raise ConfigError(f"{path}: larger than {LARGEST >> 20} MB: not a configuration")
     try:
-        text = data.decode()
+        text = data.decode().removeprefix("\ufeff")  # which some editors write before the text
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise ConfigError(f"{path}:{line}: not UTF-8 text") from None

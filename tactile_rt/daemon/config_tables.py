@@ -7,6 +7,7 @@ import difflib
 import re
 import typing
 from collections.abc import Sequence
+from datetime import date, time
 from typing import Any
 
 import msgspec
@@ -68,9 +69,8 @@ def _check_keys(root: Node, node: Node, path: list[str | int], kind: Any) -> Non
         here = [*path, key]
         if key not in fields:
             owner = named(path) or "the file"
-            raise ConfigError(
-                f"{below.where}: {owner} has no key {key!r}; {_hint(key, list(fields))}"
-            )
+            hint = (path and _table_hint(key)) or _hint(key, list(fields))
+            raise ConfigError(f"{below.where}: {owner} has no key {key!r}; {hint}")
         inner, several = _inner(fields[key])
         if inner is None:
             continue
@@ -100,6 +100,15 @@ def _hint(key: str, known: list[str]) -> str:
             if name in known and f"_{suffix}" in UNITS:
                 return f"did you mean {name}, in {UNITS[f'_{suffix}']}?"
     return nearest(key, known)
+
+
+def _table_hint(key: str) -> str:
+    """Where a table of the file belongs that stands in another one; empty: it is no such table."""
+    kinds = {f.encode_name: f.type for f in msgspec.structs.fields(Config)}
+    inner, several = _inner(kinds.get(key))
+    if inner is None:
+        return ""
+    return f"it is a table of the file: write {f'[[{key}]]' if several else f'[{key}]'}"
 
 
 def _inner(kind: Any) -> tuple[Any, bool]:
@@ -162,19 +171,25 @@ def _said(message: str, node: Node, steps: list[str | int], kind: Any) -> str:
         choices = [str(c) for c in typing.get_args(leaf)]
         near = difflib.get_close_matches(str(value).lower(), choices, 1, 0.5)
         hint = f"; did you mean {near[0]}?" if near else ""
-        return f"{value!r:.60} is not one of {', '.join(choices)}{hint}"
+        return f"{_shown(value)} is not one of {', '.join(choices)}{hint}"
     if "matching regex" in message:
-        return f"{value!r:.60} is no name: letters, digits, - and _, 64 at most"
+        return f"{_shown(value)} is no name: letters, digits, - and _, 64 at most"
     if "of length" in message:
         return "must not be empty" if value in ("", [], {}) else "is too long"
     if not message.startswith("Expected "):
         return message.replace("`", "'")
     message = message.partition(", got ")[0].replace("`", "").replace("Expected", "expected")
     message = re.sub("|".join(WORDS), lambda word: WORDS[word[0]], message)
-    message += f", got {value!r:.60}"
+    message += f", got {_shown(value)}"
     key = str(steps[-1]) if steps else ""
     unit = next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
     return message + (f" (in {unit})" if unit else "")
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, date | time):
+        return value.isoformat()
+    return f"{value!r:.60}"
 
 
 def _leaf(kind: Any, steps: list[str | int]) -> Any:

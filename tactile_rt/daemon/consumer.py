@@ -31,6 +31,10 @@ class View(Protocol):
     def utc_offset_ns(self) -> int:
         """UTC less host monotonic time, now."""
 
+    def silent(self) -> Mapping[str, float]:
+        """How long the current turn of each thread that must go on has taken, s: ``main``,
+        ``watch``, ``source.NAME``, ``model.NAME``; one that waits for work: 0."""
+
 
 class Consumer(abc.ABC):
     """Takes what happens. All methods are called in one thread, the consumer's own.

@@ -43,12 +43,14 @@ class Wanted:
         kind: of consumer.
         key: equal for two that are configured alike, which need not be restarted.
         make: makes it; may raise `ConfigError`.
+        options: its table, or of a publisher that of its options.
     """
 
     name: str
     kind: str
     key: Any
     make: Callable[[], Consumer]
+    options: Any = None
 
 
 def wanted_consumers(loaded: Loaded) -> list[Wanted]:
@@ -68,7 +70,9 @@ def wanted_consumers(loaded: Loaded) -> list[Wanted]:
                 cls = _class(where, table, extra)
             except ConfigError as error:
                 loaded.refuse([table], str(error))
-            wanted.append(Wanted(table, table, (options, limits), _maker(cls, table, options)))
+            wanted.append(
+                Wanted(table, table, (options, limits), _maker(cls, table, options), options)
+            )
     if os.environ.get("NOTIFY_SOCKET"):
         cls = _class(f"{_HERE}.systemd:Systemd", "systemd", "")
         wanted.append(Wanted("systemd", "systemd", limits, _maker(cls, "systemd", None)))
@@ -79,7 +83,8 @@ def _log(loaded: Loaded) -> Wanted:
     from tactile_rt.daemon.log import Log
 
     config = loaded.config
-    return Wanted("log", "log", (config.log, config.limits), _maker(Log, "log", config.log))
+    log = config.log
+    return Wanted("log", "log", (log, config.limits), _maker(Log, "log", log), log)
 
 
 def _publisher(loaded: Loaded, i: int, config: PublisherConfig) -> Wanted:
@@ -103,7 +108,7 @@ def _publisher(loaded: Loaded, i: int, config: PublisherConfig) -> Wanted:
                 loaded.refuse(["publisher", i], f"options: {error}".replace("`", "'"))
     key = (config.kind, config.name, options, loaded.config.limits)
     name = f"publisher.{config.name}"
-    return Wanted(name, config.kind, key, _maker(cls, name, options))
+    return Wanted(name, config.kind, key, _maker(cls, name, options), options)
 
 
 def _publisher_class(kind: str) -> Any:

@@ -65,6 +65,7 @@ class Daemon:
         self._starting, self._stopping = True, False
         self._degraded: tuple[str, ...] = ()
         self._reloads = self._clock_steps = 0
+        self._turns: dict[str, int] = {}  # threads that are no parts: when they last turned
         self._unwatch = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="tactile-rt watch", daemon=True)
         self._ready = [(w, w.make()) for w in wanted_consumers(loaded)]
@@ -188,6 +189,20 @@ class Daemon:
         """UTC less monotonic time, now."""
         return self._clock.utc_offset_ns()
 
+    def turned(self, name: str) -> None:
+        """A thread that must go on, and is no part, tells that it does."""
+        self._turns[name] = time.monotonic_ns()
+
+    def silent(self) -> Mapping[str, float]:
+        """How long the current turn of each thread that must go on has taken, s."""
+        now = time.monotonic_ns()
+        turns = {} if self._stopping else self._turns.copy()
+        return {
+            **{name: (now - turned) / 1e9 for name, turned in turns.items()},
+            **{p.name: p.silent_s for p in self._sources.copy().values()},
+            **{p.name: p.silent_s for _, p in self._models.copy().values()},
+        }
+
     # parts
 
     def _add_consumer(self, wanted: Wanted, consumer: Any) -> None:
@@ -238,11 +253,17 @@ class Daemon:
             part.stop()
         until = time.monotonic() + self._loaded.config.limits.stop_s
         for part in parts:
-            if not part.join(until):
+            while not part.join(min(until, time.monotonic() + WATCH_S)):
+                if "main" in self._turns:
+                    self.turned("main")  # it waits, but not for ever
+                if time.monotonic() >= until:
+                    break
+            if not part.join(0.0):
                 self.report(part.name, "abandoned", "it did not end in time", "error")
 
     def _watch(self) -> None:
         while not self._unwatch.wait(WATCH_S):
+            self.turned("watch")
             for part in self._parts():
                 part.watch()
             step = self._clock.stepped_ns()

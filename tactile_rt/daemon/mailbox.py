@@ -12,6 +12,7 @@ __all__ = ["Mailbox"]
 CLASSES = ("samples", "packets", "decisions", "events")
 AROUND_BYTES = 500  # what Python needs around an item
 FRAME_BYTES = 200  # and around a CAN frame
+LOOK_S = 0.2  # how long to wait for the counts
 
 
 class Mailbox:
@@ -38,6 +39,7 @@ class Mailbox:
         self._bytes = self._urgent = 0
         self._changed = threading.Condition()
         self._closed = False
+        self._seen = QueueState()
         self.taking = False  # whether anyone is there to wait for
         self._put = dict.fromkeys(CLASSES, 0)
         self._taken = dict.fromkeys(CLASSES, 0)
@@ -112,14 +114,19 @@ class Mailbox:
 
     @property
     def state(self) -> QueueState:
-        """Counts now."""
-        with self._changed:
+        """Counts now; those of the last look if it hangs, so that this can still be told."""
+        if not self._changed.acquire(timeout=LOOK_S):
+            return self._seen
+        try:
             waiting = dict.fromkeys(CLASSES, 0)
             for _, kind, n, _ in self._queue:
                 waiting[kind] += n
-            return QueueState(
+            self._seen = QueueState(
                 waiting, dict(self._put), dict(self._taken), dict(self._dropped), self._bytes
             )
+            return self._seen
+        finally:
+            self._changed.release()
 
 
 def _measure(item: Item) -> tuple[str, int, int]:

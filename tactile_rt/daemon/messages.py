@@ -11,6 +11,7 @@ from urllib.parse import quote
 
 import msgspec
 
+from tactile_rt.daemon.digits import shortest
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Samples
 from tactile_rt.daemon.snapshot import Snapshot
 
@@ -103,7 +104,8 @@ class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
         elements, channels, units: axes of `values`, SI.
         seq: (n,) sequence numbers.
         times_ns: (n,) the stream's time of each.
-        values: (n, element, channel); null where the element has no trustworthy value.
+        values: (n, element, channel), with the fewest digits that read back as the same float32;
+            null where the element has no trustworthy value.
     """
 
     topic: ClassVar[str] = "samples"
@@ -190,7 +192,7 @@ def _decision(item: Decision) -> DecisionMessage:
 
 def _samples(item: Samples) -> SamplesMessage:
     chunk, spec = item.chunk, item.spec
-    values: list[list[list[float] | None]] = chunk.values.tolist()
+    values: list[list[list[float] | None]] = shortest(chunk.values).tolist()
     if not chunk.valid.all():
         values = [
             [cell if ok else None for cell, ok in zip(row, valid, strict=True)]

@@ -37,7 +37,7 @@ class Part(abc.ABC):
         self._stop = threading.Event()
         self._state, self._reason, self._since_ns = "starting", "", time.monotonic_ns()
         self._starts = self._failures = 0
-        self._busy_ns = 0  # since when it is in a call that may not return; 0: it is not
+        self._busy_ns = 0  # since when it is in a turn that may not end; 0: it waits for work
         self._stalled = False
         self._pause_s = limits.retry_first_s
         self._thread = threading.Thread(target=self._run, name=f"tactile-rt {name}", daemon=True)
@@ -60,13 +60,17 @@ class Part(abc.ABC):
     def state(self) -> PartState:
         """Now; from any thread."""
         state, reason, since = self._state, self._reason, self._since_ns
-        busy = self._busy_ns
-        if state == "running" and busy:
-            silent = (time.monotonic_ns() - busy) / 1e9
-            if silent > self.limits.stall_s:
-                state, since = "stalled", busy
-                reason = f"in a call that has not returned for {silent:.0f} s"
+        silent = self.silent_s
+        if state == "running" and silent > self.limits.stall_s:
+            state, since = "stalled", time.monotonic_ns() - round(1e9 * silent)
+            reason = f"in a call that has not returned for {silent:.0f} s"
         return PartState(self.name, state, reason, since, self._starts, self._failures)
+
+    @property
+    def silent_s(self) -> float:
+        """How long one turn of its work has taken by now, s; 0: it has nothing to do."""
+        busy = self._busy_ns
+        return (time.monotonic_ns() - busy) / 1e9 if busy else 0.0
 
     def watch(self) -> None:
         """Tell when it stalls, and when it goes on; called now and then by the daemon."""
@@ -105,11 +109,12 @@ class Part(abc.ABC):
             except Exception as error:
                 why = reason_of(error)
                 error.__traceback__ = None  # it holds everything that was at hand
-            self._busy_ns = 0
+            self._busy_ns = time.monotonic_ns()
             try:
                 self._release()
             except Exception as error:
                 why = why or reason_of(error)
+            self._busy_ns = 0
             if not why:
                 break
             self._failures += 1

@@ -19,6 +19,7 @@ from tactile_rt.stream import TactileError
 __all__ = ["ExitCode", "leave", "run_daemon"]
 
 OVER = 0  # no signal has this number
+TURN_S = 0.25  # how often the main loop tells that it goes on
 SWITCH_S = 0.001  # how long a thread that computes may keep those waiting that acquire
 
 
@@ -78,10 +79,14 @@ def _serve(
 ) -> None:
     end = None if seconds is None else time.monotonic() + seconds
     while True:
-        try:
-            number = calls.get(timeout=None if end is None else max(0.0, end - time.monotonic()))
-        except Empty:
+        daemon.turned("main")
+        left = TURN_S if end is None else min(TURN_S, end - time.monotonic())
+        if left < 0:
             return
+        try:
+            number = calls.get(timeout=left)
+        except Empty:
+            continue
         if number != signal.SIGHUP:
             return
         daemon.report("daemon", "reloading", "")

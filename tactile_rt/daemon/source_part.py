@@ -1,6 +1,7 @@
 """A source in a thread of its own: opened, read, closed, and opened again when it broke."""
 
 import dataclasses
+import threading
 import time
 from typing import Any
 
@@ -20,6 +21,7 @@ __all__ = ["SourcePart", "device_of"]
 
 POLL_S = 0.1  # how soon it notices that it should stop
 LOOK_NS = 50_000_000  # between two looks at a device's health
+AWAY_S = 0.3  # how long a source whose device is away may take to end
 
 
 class SourcePart(Part):
@@ -39,6 +41,9 @@ class SourcePart(Part):
         self._offset_ns = 0
         self._look_ns = 0
         self._told: tuple[Any, ...] = ()
+        self._opening = self._announced = self._left = False
+        self._telling = threading.Lock()  # of the stream's end
+        self._stopped_s = 0.0  # CLOCK_MONOTONIC
 
     @property
     def source_state(self) -> SourceState:
@@ -56,17 +61,43 @@ class SourcePart(Part):
             elements=spec.elements, channels=spec.channels, units=spec.units,
         )  # fmt: skip
 
+    @property
+    def silent_s(self) -> float:
+        """As of every part; but to wait for a device that is away is no silence."""
+        return 0.0 if self._away else super().silent_s
+
+    def stop(self) -> None:
+        self._stopped_s = self._stopped_s or time.monotonic()
+        super().stop()
+
+    def join(self, until: float) -> bool:
+        """As of every part; but one that waits for its device owes nothing to anyone: it is left
+        to end by itself, which may take as long as that device is given to answer."""
+        if super().join(min(until, self._stopped_s + AWAY_S) if self._stopped_s else until):
+            return True
+        if self._away:
+            if not self._left:
+                self._turn("stopped", "while it waited for its device")
+                self._left = True  # what its thread still does is no longer told
+                self._tell_closed()
+            return True
+        return super().join(until)
+
+    @property
+    def _away(self) -> bool:
+        """Whether it waits for a device that does not answer, or has not begun to send."""
+        device = self._device
+        return self._opening or (
+            device is not None and device.health.state in (State.CONNECTING, State.LOST)
+        )
+
     def _work(self) -> None:
-        stream = open_source(self.config.url)
-        if self.config.calibration:
-            try:
-                stream = CalibratedSource(stream, load_calibration(self.config.calibration))
-            except BaseException:
-                stream.close()
-                raise
+        stream = self._open()
         self._stream, self._spec, self._device = stream, stream.spec, device_of(stream)
         if self._stop.is_set():
             return
+        self._announced = True
+        self._busy_ns = time.monotonic_ns()
         self._announce(stream)
         self._up()
         while not self._stop.is_set():
@@ -75,8 +106,8 @@ class SourcePart(Part):
                 chunk = stream.read(POLL_S)
             except EndOfStream:
                 break
-            finally:
-                self._busy_ns = 0
+            if self._left:
+                return
             now = time.monotonic_ns()
             if now >= self._look_ns:
                 self._look(now)
@@ -97,7 +128,32 @@ class SourcePart(Part):
         finally:
             self._before = _sum(self._before, stream.stats)
             self._told = ()
-            self._hub.post(Closed(self.config.name, "", time.monotonic_ns()))
+            self._tell_closed()
+
+    def _tell_closed(self) -> None:
+        """Once: by the time its thread ends, another part may have opened a stream of that name."""
+        with self._telling:
+            if self._announced:
+                self._announced = False
+                self._hub.post(Closed(self.config.name, "", time.monotonic_ns()))
+
+    def _turn(self, state: str, reason: str) -> None:
+        if not self._left:  # else its end has been told
+            super()._turn(state, reason)
+
+    def _open(self) -> Source:
+        self._opening = True
+        try:
+            stream = open_source(self.config.url)
+            if self.config.calibration:
+                try:
+                    stream = CalibratedSource(stream, load_calibration(self.config.calibration))
+                except BaseException:
+                    stream.close()
+                    raise
+            return stream
+        finally:
+            self._opening = False
 
     def _announce(self, stream: Source) -> None:
         prelude: list[tuple[Any, int]] = []
@@ -117,7 +173,7 @@ class SourcePart(Part):
             self._device.tap(self._packet)
 
     def _packet(self, packet: Any, t_ns: int) -> None:
-        if self._hub.wanted(Packet):
+        if self._hub.wanted(Packet) and not self._left:
             self._hub.post(Packet(self.config.name, packet, t_ns))
 
     def _look(self, now: int) -> None:
@@ -138,7 +194,8 @@ class SourcePart(Part):
     def _await_room(self) -> None:
         """A source that waits for its reader is read no faster than all can take."""
         for box in self._hub.wanted(Samples):
-            box.wait_for_room(1.0)
+            self._busy_ns = time.monotonic_ns()
+            box.wait_for_room(min(1.0, self.limits.stall_s / 2))
 
 
 def device_of(source: Source) -> DeviceSource | None:

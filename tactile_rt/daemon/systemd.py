@@ -3,23 +3,24 @@
 import os
 import socket
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import Event, Item
-from tactile_rt.daemon.snapshot import PartState, Snapshot
+from tactile_rt.daemon.snapshot import Snapshot
 from tactile_rt.stream import ConfigError
 
-__all__ = ["Systemd", "alive", "status_of"]
+__all__ = ["Systemd", "hanging", "status_of"]
 
 TICK_S = 1.0
 SEND_S = 0.2  # a manager that does not read must not keep us
+LEAST_S = 1.0  # a busy host may keep a thread from its turn for less
 LONGEST = 400  # characters of a status
 
 
 class Systemd(Consumer):
-    """Sends to $NOTIFY_SOCKET; pings the watchdog while the daemon is `alive`.
+    """Sends to $NOTIFY_SOCKET; pings the watchdog while nothing is `hanging`.
 
     Args:
         name: of the part.
@@ -47,6 +48,7 @@ class Systemd(Consumer):
         self._status = ""
         self._ready = False
         self._pings = self._withheld = 0
+        self._hanging: tuple[str, ...] = ()
 
     def open(self, view: View) -> None:
         self._view = view
@@ -59,6 +61,9 @@ class Systemd(Consumer):
         for item in items:
             if isinstance(item, Event) and item.part == "daemon":
                 self._daemon(item.state)
+        if self._watchdog_s:
+            # First: what asks more of the daemon may wait for the very thread that hangs.
+            self._feed(self._view)
         snapshot = self._view.snapshot()
         if not self._ready and snapshot.state in ("running", "degraded"):
             self._daemon(snapshot.state)
@@ -66,12 +71,6 @@ class Systemd(Consumer):
         if status != self._status:
             self._send(f"STATUS={status}")
             self._status = status
-        if self._watchdog_s:
-            if alive(snapshot):
-                self._send("WATCHDOG=1")
-                self._pings += 1
-            else:
-                self._withheld += 1
 
     def close(self) -> None:
         opened, self._socket = self._socket, None
@@ -96,21 +95,39 @@ class Systemd(Consumer):
         elif state == "stopping":
             self._send("STOPPING=1")
 
+    def _feed(self, view: View) -> None:
+        limit = max(LEAST_S, self._watchdog_s / 2)
+        found = hanging(view.silent(), limit)
+        if found:
+            self._withheld += 1
+            if not self._hanging:
+                why = f"{', '.join(found)}: not a turn for {limit:g} s: systemd will start it anew"
+                view.report("systemd", "withheld", why, "error")
+        else:
+            self._send("WATCHDOG=1")
+            self._pings += 1
+            if self._hanging:
+                view.report("systemd", "fed", "all threads turn again")
+        self._hanging = found
+
     def _send(self, text: str) -> None:
         assert self._socket is not None
         self._socket.send(text.encode())
 
 
-def alive(snapshot: Snapshot) -> bool:
-    """Whether the daemon still does its work, or is trying to.
+def hanging(silent: Mapping[str, float], limit: float) -> tuple[str, ...]:
+    """Threads that the daemon cannot do without, and that have not turned for so long, s.
 
     A part that broke is tried again; but a thread in a call that does not return can only be
-    ended with its process. That is worth it once all sources, or all models, are in such a call.
-    Consumers count for nothing here: the samples matter more than who looks at them.
+    ended with its process. That is worth it for the main loop, the watch and every source; and for
+    models once none works. Consumers count for nothing here: the samples matter more than who
+    looks at them.
     """
-    return not (_all_stalled([s.part for s in snapshot.sources])) and not _all_stalled(
-        [m.part for m in snapshot.models]
-    )
+    late = [name for name, seconds in silent.items() if seconds > limit]
+    models = [name for name in silent if name.startswith("model.")]
+    if not all(name in late for name in models):
+        late = [name for name in late if name not in models]
+    return tuple(late)
 
 
 def status_of(snapshot: Snapshot) -> str:
@@ -125,10 +142,6 @@ def status_of(snapshot: Snapshot) -> str:
     said = ", ".join(f"{n} {what}{'' if n == 1 else 's'}" for n, what in counts)
     recording = any(c.kind == "recorder" for c in snapshot.consumers)
     return f"{snapshot.state}: {said}{', recorder' if recording else ''}"
-
-
-def _all_stalled(parts: Sequence[PartState]) -> bool:
-    return bool(parts) and all(p.state == "stalled" for p in parts)
 
 
 def _watchdog_s(environment: Mapping[str, str]) -> float:

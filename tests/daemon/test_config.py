@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_rt.daemon.config import EXAMPLE, Config
-from tactile_rt.daemon.config_check import check_config, is_loopback
+from tactile_rt.daemon.config_check import check_config
 from tactile_rt.daemon.config_file import load_config
 from tactile_rt.daemon.config_nodes import find_lines
+from tactile_rt.daemon.config_shared import is_loopback
 from tactile_rt.daemon.config_text import config_text
 from tactile_rt.stream import ConfigError
 
@@ -42,7 +43,7 @@ def test_a_broken_file_is_refused_by_its_golden_message(name, monkeypatch):
 
 
 def test_the_corpus_is_all_there():
-    assert len(BROKEN) >= 76
+    assert len(BROKEN) >= 131
 
 
 def test_a_file_that_is_not_there_or_empty_or_a_folder(tmp_path):
@@ -202,6 +203,30 @@ def test_lines_are_found_in_a_file_that_makes_it_hard():
     assert lines[("l", 0, "m", 1, "q")] == 15 and lines[("l", 0, "n", "r")] == 17
     assert lines[("l", 1)] == 18
     assert not any("no" in path or "y" in path for path in lines)
+
+
+@pytest.mark.parametrize(
+    "tables",
+    [
+        '[page]\nhost = "::1"\n[metrics]\nport = 8765\n',  # another address
+        '[page]\nport = 9464\n[metrics]\nhost = "::1"\n',
+        '[[publisher]]\nkind = "zmq"\noptions = {bind = "tcp://127.0.0.1:*"}\n' * 2,
+        '[[publisher]]\nkind = "foxglove"\noptions = {port = 0}\n' * 2,
+        '[[publisher]]\nkind = "jsonl"\n[[publisher]]\nkind = "jsonl"\noptions = {file = "a"}\n',
+        '[metrics]\nhost = "robot-1.local"\n',
+        '[page]\nhost = "fe80::1%eth0"\ntoken = "0123456789abcdef"\n',
+        "",
+    ],
+)
+def test_what_looks_alike_and_disturbs_nobody_is_right(tmp_path, tables):
+    check_config(load(tmp_path, SMALL + tables))
+    check_config(load(tmp_path, "\ufeff" + SMALL + tables))  # as Windows' editor writes it
+
+
+@pytest.mark.parametrize("host", ["localhost", "0.0.0.0", "127.0.0.1"])
+def test_one_port_of_one_address_however_it_is_written(tmp_path, host):
+    text = f'[page]\nport = 9464\n[metrics]\nhost = "{host}"\n'
+    assert "is where page listens" in refused(tmp_path, SMALL + text)
 
 
 @pytest.mark.parametrize(

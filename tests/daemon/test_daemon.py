@@ -4,6 +4,7 @@ import json
 import shutil
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from tactile_rt.daemon.items import (
 )
 from tactile_rt.daemon.lock import AlreadyRunning, Locks
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
+from tactile_rt.sources import open_source
 from tactile_rt.stream import ConfigError, SourceError
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
 
@@ -179,6 +181,12 @@ def test_two_arrays_and_three_models_on_ptys_lose_nothing(robot, tmp_path):
     assert contacts[:2] == [("left", True), ("left", False)]
 
 
+def received(daemon):
+    """Of the first source: what came, and what is known not to have come."""
+    s = daemon.snapshot().sources[0].stats
+    return s.delivered + s.corrupt + s.missing + s.dropped + s.duplicates
+
+
 def test_every_sample_is_accounted_for_through_faults(robot, tmp_path):
     """From the wire to each consumer: what was sent came, or was counted where it was lost."""
     model = write_model(tmp_path / "m.onnx")
@@ -195,12 +203,13 @@ def test_every_sample_is_accounted_for_through_faults(robot, tmp_path):
         )
         assert fake.wait(PATIENCE_S) and calm.wait(PATIENCE_S)
         until(lambda: len(seqs(spy, "calm")) == 1000)
+        told = fake.emulator.log
+        until(lambda: received(daemon) == told.sent + told.duplicated)
         until(lambda: not any(daemon.snapshot().models[0].queue.waiting.values()))
         log, snapshot = fake.emulator.log, daemon.snapshot()
     stats = snapshot.sources[0].stats
     assert log.sent == 6000 and stats.corrupt > 10 and stats.missing > 5 and stats.duplicates > 5
-    received = stats.delivered + stats.corrupt + stats.missing + stats.dropped
-    assert log.sent + log.duplicated == received + stats.duplicates
+    assert log.sent + log.duplicated == received(daemon)
     queue = snapshot.models[0].queue
     assert queue.put["samples"] == stats.delivered == snapshot.sources[0].samples
     assert queue.put["samples"] == queue.taken["samples"] + queue.dropped["samples"]
@@ -384,6 +393,35 @@ def test_a_reload_disturbs_only_what_has_changed(robot, tmp_path, spy):
         kept = seqs(first, "a")
         assert np.array_equal(kept, kept[0] + np.arange(len(kept)))
         assert first.log == ["open"]
+
+
+def test_a_source_that_is_still_being_opened_disturbs_no_other_after_a_reload(robot, monkeypatch):
+    answers, closed = threading.Event(), []
+
+    class Late(ArraySource):
+        def close(self):
+            closed.append(self)
+
+    def open_it(url):
+        if url.endswith("1x1"):
+            answers.wait(PATIENCE_S)
+            return Late(SPEC, [], live=True)
+        return open_source(url)
+
+    monkeypatch.setattr("tactile_rt.daemon.source_part.open_source", open_it)
+    daemon, spy = robot(source("a", "synthetic:1x1"))
+    until(lambda: daemon._sources["a"]._opening)
+    old = daemon._sources["a"]
+    daemon.reload(configured(Path(daemon.snapshot().config).parent, source("a", "synthetic:2x2")))
+    until(lambda: spy.of(Samples, "a"))
+    assert not closed and [e.reason for e in spy.told("source.a", "stopped")] == [
+        "while it waited for its device"
+    ]
+    answers.set()
+    until(lambda: closed)
+    until(lambda: not old._thread.is_alive())
+    assert set(daemon.streams()) == {"a"} and not spy.of(Closed)
+    assert len(spy.of(Opened)) == len(spy.told("source.a", "stopped")) == 1
 
 
 def test_a_reload_that_needs_a_device_of_another_process_changes_nothing(robot, tmp_path):

@@ -139,6 +139,30 @@ def test_it_shows_live_data_and_comes_back_after_a_restart(tab, port, tmp_path):
     assert one.faults() == []
 
 
+def test_without_an_array_it_says_why(tab, port, tmp_path):
+    file = tmp_path / "robot.toml"
+    file.write_text(
+        'version = 1\n[[source]]\nname = "finger"\nurl = "serial:/dev/gone?codec=native"\n'
+        f'[page]\nport = {port}\n[log]\nfile = "log"\n'
+    )
+    daemon = Daemon(load_config(file))
+    daemon.start()
+    try:
+        one = tab()
+        one.page.goto(f"http://127.0.0.1:{port}/")
+        one.has("document.getElementById('empty').textContent.includes('/dev/gone: no such port')")
+        one.has("document.getElementById('link').textContent === 'connected, no samples'")
+        assert one.page.locator("#map-card").is_hidden()
+        file.write_text(file.read_text().replace("serial:/dev/gone?codec=native", "synthetic:3x6"))
+        daemon.reload(load_config(file))
+        one.has(LIVE)
+        assert one.page.locator("#map-card").is_visible()
+        assert one.page.locator("#empty-card").is_hidden()
+        assert one.faults() == []
+    finally:
+        assert daemon.stop() == []
+
+
 class HostileView:
     """A daemon whose every name is markup."""
 

@@ -1,10 +1,13 @@
 """`tactile-rt run robot.toml` as a process: signals and exit codes; `tactile-rt config`."""
 
+import contextlib
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
+import termios
 import time
 
 import pytest
@@ -36,7 +39,7 @@ def started(folder):
     """Start a daemon, and come back when it runs."""
     processes = []
 
-    def start(*arguments):
+    def start(*arguments, until=("source.a", "running")):
         process = subprocess.Popen(
             [*RUN, "run", str(folder / "robot.toml"), *arguments],
             stdout=subprocess.PIPE,
@@ -45,7 +48,7 @@ def started(folder):
             env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         )
         processes.append(process)
-        await_told(folder, "source.a", "running")
+        await_told(folder, *until)
         return process
 
     yield start
@@ -117,6 +120,50 @@ def test_a_stream_that_is_over_and_a_time_that_is_up_end_it(folder, monkeypatch,
     assert messages[-1]["state"] == "stopped" or messages[-1]["type"] == "health"
     code, out, err = call(monkeypatch, capfd, "run", folder / "robot.toml", "--seconds", "0.5")
     assert code == 0 and "source.a stopped" in err
+
+
+@contextlib.contextmanager
+def silent_line(kind):
+    """A URL of a device that is asked to begin, and never sends; whether it has been asked."""
+    with contextlib.ExitStack() as open_now:
+        if kind in ("serial", "can:slcan"):
+            master, slave = os.openpty()
+            for handle in (master, slave):
+                open_now.callback(os.close, handle)
+            # Somebody has it open, or the port has settings of its own.
+            yield (
+                f"{kind}:{os.ttyname(slave)}",
+                lambda: termios.tcgetattr(slave)[4] != termios.B38400,
+            )
+            return
+        if kind == "can:virtual":
+            yield "can:virtual:tactile-silent", lambda: True
+            return
+        peer = open_now.enter_context(socket.create_server(("127.0.0.1", 0), backlog=0))
+        url = f"serial:socket://127.0.0.1:{peer.getsockname()[1]}"
+        if kind == "socket":
+            peer.settimeout(PATIENCE_S)
+            yield url, lambda: bool(open_now.enter_context(peer.accept()[0]))
+            return
+        # Nobody takes what knocks: its queue is full, and whoever comes now waits to be let in.
+        for _ in range(2):
+            knocks = open_now.enter_context(socket.socket())
+            knocks.setblocking(False)
+            knocks.connect_ex(peer.getsockname())
+        yield url, lambda: True
+
+
+@pytest.mark.parametrize("kind", ["serial", "can:slcan", "can:virtual", "socket", "not let in"])
+def test_a_device_that_never_sends_keeps_nothing_from_stopping(folder, started, kind):
+    with silent_line(kind) as (url, asked):
+        option = f"source.a.url={url}?codec=native&start_s=60"
+        process = started("--set", option, until=("daemon", "starting"))
+        while not asked():
+            time.sleep(0.02)
+        process.send_signal(signal.SIGTERM)
+        code, log = ended(process)
+    assert code == 0, log  # 4: something did not end within 2 s
+    assert "source.a stopped" in log and "abandoned" not in log and "Traceback" not in log
 
 
 def test_what_hangs_at_the_end_is_left_behind(folder, started):

@@ -1,31 +1,37 @@
 """What systemd is told, at a notify socket of the test; the unit file; the install script."""
 
+import contextlib
+import os
 import shutil
 import socket
 import subprocess
 import sys
+import threading
 import time
+from queue import SimpleQueue
+from typing import ClassVar
 
 import pytest
-from published import View, busy_snapshot, event, part, running, until
+from published import PATIENCE_S, View, busy_snapshot, event, running, until
 
 from tactile_rt.cli import main
 from tactile_rt.daemon.config_check import check_config
 from tactile_rt.daemon.config_file import load_config
 from tactile_rt.daemon.daemon import Daemon
-from tactile_rt.daemon.snapshot import ModelState, Snapshot, SourceState
-from tactile_rt.daemon.systemd import Systemd, alive, status_of
+from tactile_rt.daemon.runner import _serve
+from tactile_rt.daemon.snapshot import Snapshot
+from tactile_rt.daemon.systemd import Systemd, hanging, status_of
 from tactile_rt.daemon.unit import install_script, unit_text, written_folders
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import ConfigError, Source
+from tactile_rt.testing import small_spec
 
 SMALL = 'version = 1\n[[source]]\nname = "a"\nurl = "synthetic:2x2"\n'
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 
 
-@pytest.fixture(params=["path", "abstract"])
-def manager(request, tmp_path):
-    """(what $NOTIFY_SOCKET says, what has come: lines)"""
-    name = str(tmp_path / "notify") if request.param == "path" else f"\0tactile-test-{tmp_path}"
+@contextlib.contextmanager
+def managing(name):
+    """(what $NOTIFY_SOCKET says, what has come since the last look: lines)"""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as bound:
         bound.bind(name)
         bound.settimeout(0.2)
@@ -39,6 +45,13 @@ def manager(request, tmp_path):
                 return lines
 
         yield name.replace("\0", "@"), told
+
+
+@pytest.fixture(params=["path", "abstract"])
+def manager(request, tmp_path):
+    name = str(tmp_path / "notify") if request.param == "path" else f"\0tactile-test-{tmp_path}"
+    with managing(name) as made:
+        yield made
 
 
 def notifier(address, **environment):
@@ -83,30 +96,43 @@ def test_a_daemon_that_starts_degraded_is_ready_and_says_what_it_lacks(manager):
     assert lines[1] == "STATUS=degraded: no samples: source.finger: the device is lost"
 
 
-def stalled(*names):
-    """A daemon of two sources and one model, of which some hang."""
-    made = {n: part(n, "stalled" if n in names else "waiting") for n in ("s.a", "s.b", "m.c")}
-    return Snapshot(
-        "0", 1, "x", 5, 5, 1, 0, "degraded", (), 0,
-        (SourceState(made["s.a"], "u"), SourceState(made["s.b"], "u")),
-        (ModelState(made["m.c"], "a", "f"),),
-    )  # fmt: skip
+class Turning(View):
+    """A daemon whose threads have been at their turn for so long, s."""
+
+    turns: ClassVar = {}
+
+    def silent(self):
+        return self.turns
 
 
-def test_the_watchdog_is_fed_while_something_works(manager):
+def test_the_watchdog_is_fed_while_every_thread_that_matters_turns(manager):
     address, told = manager
-    view = View(snapshot=stalled("s.a"))
-    consumer = notifier(address, WATCHDOG_USEC="2000000")
-    assert consumer.tick_s == 0.5
+    view = Turning()
+    consumer = notifier(address, WATCHDOG_USEC="4000000")
+    assert consumer.tick_s == 1.0
     with running(consumer, view):
+        view.turns = {"main": 0.3, "source.a": 1.9, "model.a": 0.0}
         consumer.handle([])
         assert told().count("WATCHDOG=1") == 1
-        view.shown = stalled("s.a", "s.b")
-        consumer.handle([])
+        view.turns = {"main": 0.3, "source.a": 2.1, "model.a": 0.0}
+        for _ in range(3):
+            consumer.handle([])
         assert "WATCHDOG=1" not in told()
-        assert consumer.details()["pings"] == consumer.details()["withheld"] == 1
-    assert not alive(stalled("m.c"))
-    assert alive(stalled()) and alive(Snapshot("0", 1, "x", 5, 5, 1, 0, "starting"))
+        assert view.reports == [("systemd", "withheld", "error")]  # once
+        assert (consumer.details()["pings"], consumer.details()["withheld"]) == (1, 3)
+        view.turns = {"main": 0.3, "source.a": 0.0, "model.a": 0.0}
+        consumer.handle([])
+        assert told().count("WATCHDOG=1") == 1
+        assert view.reports[1:] == [("systemd", "fed", "info")]
+
+
+def test_what_hangs_is_named():
+    turns = {"main": 9, "watch": 9, "source.a": 9, "source.b": 0, "model.a": 9, "model.b": 0}
+    assert hanging(turns, 5) == ("main", "watch", "source.a")
+    assert hanging({**turns, "model.b": 9}, 5) == (
+        "main", "watch", "source.a", "model.a", "model.b",
+    )  # fmt: skip
+    assert hanging(turns, 10) == hanging({}, 0) == ()
 
 
 def test_without_a_watchdog_or_with_another_process_s_it_is_not_fed(manager):
@@ -146,6 +172,114 @@ def test_a_real_daemon_tells_a_manager_that_goes_and_comes(manager, tmp_path, mo
     lines += told()
     assert lines.index("READY=1") < lines.index("STOPPING=1")
     assert "STATUS=running: 1 source, 0 models, 0 publishers" in lines
+
+
+class Hanging(Source):
+    """Silent, until reading it hangs."""
+
+    goes_on = threading.Event()
+
+    def read(self, timeout=None):
+        self.goes_on.wait(PATIENCE_S)
+        time.sleep(0.01)
+
+    def close(self):
+        pass
+
+
+@pytest.fixture
+def watched(tmp_path, monkeypatch):
+    """Start a daemon under a watchdog of three seconds: (the daemon, its notifier, what came)"""
+    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+    monkeypatch.setenv("WATCHDOG_USEC", "3000000")
+    started = []
+
+    def start(text):
+        file = tmp_path / "robot.toml"
+        file.write_text(f'version = 1\n[log]\nfile = "{tmp_path}/log"\n{text}')
+        loaded = load_config(file)
+        check_config(loaded)
+        started.append(Daemon(loaded))
+        started[0].start()
+        notifies = started[0]._consumers["systemd"][1].consumer
+        until(lambda: notifies.details()["pings"] > 1)
+        return started[0], notifies, told
+
+    with managing(str(tmp_path / "notify")) as (_, told):
+        yield start
+        started[0].stop()
+
+
+def lines_of(log, *words):
+    return [line for line in log.read_text().splitlines() if all(w in line for w in words)]
+
+
+def test_a_source_that_hangs_starves_the_watchdog_and_is_told_once(watched, tmp_path, monkeypatch):
+    opened = "tactile_rt.daemon.source_part.open_source"
+    monkeypatch.setattr(opened, lambda url: Hanging(small_spec()))
+    Hanging.goes_on.set()
+    one = '[[source]]\nname = "a"\nurl = "synthetic:"\n'
+    _, notifies, told = watched(one + "[limits]\nstall_s = 0.5\n")
+    Hanging.goes_on.clear()
+    until(lambda: notifies.details()["withheld"] > 0)
+    told()
+    before = notifies.details()
+    until(lambda: notifies.details()["withheld"] > before["withheld"] + 2)
+    assert notifies.details()["pings"] == before["pings"] and "WATCHDOG=1" not in told()
+    Hanging.goes_on.set()
+    until(lambda: notifies.details()["pings"] > before["pings"] + 1)
+    assert "WATCHDOG=1" in told()
+    log = tmp_path / "log"
+    until(lambda: lines_of(log, "systemd fed"))
+    assert len(lines_of(log, "source.a stalled")) == len(lines_of(log, "systemd withheld")) == 1
+    assert "source.a: not a turn for 1.5 s" in lines_of(log, "systemd withheld")[0]
+
+
+def test_a_queue_that_hangs_starves_the_watchdog(watched, tmp_path):
+    """Whoever posts into it, and be it a source, waits for ever."""
+    one = '[[source]]\nname = "a"\nurl = "synthetic:2x2"\n[limits]\nstall_s = 0.5\n'
+    daemon, notifies, told = watched(
+        one + '[[publisher]]\nkind = "jsonl"\noptions = { file = "out", samples = true }\n'
+    )
+    source, log = daemon._sources["a"], tmp_path / "log"
+    until(lambda: source.source_state.samples and lines_of(log, "daemon running"))
+    with daemon._consumers["publisher.jsonl"][1].box._changed:
+        until(lambda: source.silent_s > 1.7)
+        told()
+        before = notifies.details()["pings"]
+        until(lambda: source.silent_s > 3.5)
+        assert notifies.details()["pings"] == before and "WATCHDOG=1" not in told()
+    until(lambda: notifies.details()["pings"] > before)
+    assert len(lines_of(log, "source.a stalled")) == len(lines_of(log, "systemd withheld")) == 1
+
+
+def test_a_main_loop_that_hangs_starves_the_watchdog(watched, tmp_path):
+    daemon, notifies, _ = watched('[[source]]\nname = "a"\nurl = "synthetic:2x2"\n')
+    daemon.turned("main")
+    until(lambda: notifies.details()["withheld"] > 0)
+    until(lambda: lines_of(tmp_path / "log", "systemd withheld", "main: not a turn"))
+    pings = notifies.details()["pings"]
+    before = daemon.silent()["main"]
+    _serve(daemon, tmp_path, (), SimpleQueue(), 0.6)  # the main loop tells that it turns
+    assert daemon.silent()["main"] < before
+    until(lambda: daemon.turned("main") or notifies.details()["pings"] > pings)
+
+
+def test_a_device_that_is_not_there_or_silent_does_not(watched, tmp_path):
+    master, slave = os.openpty()
+    daemon, notifies, told = watched(
+        '[[source]]\nname = "gone"\nurl = "serial:/dev/gone?codec=native"\n'
+        f'[[source]]\nname = "mute"\nurl = "serial:{os.ttyname(slave)}?codec=native&start_s=60"\n'
+        "[limits]\nstall_s = 0.5\n"
+    )
+    until(lambda: daemon._sources["mute"]._opening)
+    end = time.monotonic_ns() + 3_000_000_000  # twice the time that a hanging thread is given
+    until(lambda: time.monotonic_ns() > end)
+    assert notifies.details()["withheld"] == 0
+    assert "WATCHDOG=1" in told()
+    assert daemon.stop() == [] and not lines_of(tmp_path / "log", "stalled")
+    for handle in (master, slave):
+        os.close(handle)  # and with it the wait
 
 
 def configured(tmp_path, text=""):

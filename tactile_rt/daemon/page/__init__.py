@@ -183,7 +183,7 @@ class Page(Consumer):
 
 def _is_loopback(host: str) -> bool:
     # Late: the configuration's check imports all consumers.
-    from tactile_rt.daemon.config_check import is_loopback
+    from tactile_rt.daemon.config_shared import is_loopback
 
     return is_loopback(host)
 

@@ -17,6 +17,7 @@ from foxglove.messages import Log, LogLevel, Timestamp
 from foxglove.websocket import WebSocketServer
 
 from tactile_rt.daemon.consumer import Consumer, View
+from tactile_rt.daemon.digits import shortest
 from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Item, Opened, Samples
 from tactile_rt.daemon.messages import (
     DecisionMessage,
@@ -192,7 +193,7 @@ class FoxglovePublisher(Consumer):
                 self._channels[f"{base}/scene"].log(update, log_time=utc_ns)
                 self._messages += 1
         if self._channels[f"{base}/values"].has_sinks():
-            found = _values(item.spec, values.tolist(), valid.tolist())
+            found = _values(item.spec, shortest(values).tolist(), valid.tolist())
             message = {"t_ns": t_ns, "utc_ns": utc_ns, "frame": item.spec.frame, **found}
             self._channels[f"{base}/values"].log(msgspec.json.encode(message), log_time=utc_ns)
             self._messages += 1

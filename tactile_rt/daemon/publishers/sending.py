@@ -6,14 +6,16 @@ from typing import Annotated
 
 import msgspec
 
-from tactile_rt.daemon.config_check import is_loopback
+from tactile_rt.daemon.config_shared import is_loopback
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Samples
 from tactile_rt.daemon.messages import Message, message_of, state_message
 
-__all__ = ["Repeated", "Sender", "SenderOptions", "tell_exposed"]
+__all__ = ["Repeated", "Sender", "SenderOptions", "is_port", "tell_exposed"]
 
-Prefix = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64}){0,7}$")]
+Prefix = Annotated[
+    str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64}){0,7}\Z")
+]
 StateSeconds = Annotated[float, msgspec.Meta(ge=0, le=86400)]
 
 
@@ -88,6 +90,11 @@ class Sender(Consumer):
     @abc.abstractmethod
     def _send(self, message: Message) -> int:
         """Hand a message over without waiting for anyone; its size in bytes."""
+
+
+def is_port(text: str) -> bool:
+    """Whether it is the number of a TCP port."""
+    return text.isdecimal() and len(text) < 6 and 1 <= int(text) <= 65535
 
 
 def tell_exposed(view: View, name: str, host: str) -> None:

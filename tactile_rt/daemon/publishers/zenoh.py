@@ -3,6 +3,7 @@
 Messages for a peer that cannot keep up are dropped by Zenoh, which does not say how many.
 """
 
+import re
 from typing import Any
 
 import msgspec
@@ -10,11 +11,17 @@ import zenoh
 
 from tactile_rt.daemon.consumer import View
 from tactile_rt.daemon.messages import Message, encode, topic_of
-from tactile_rt.daemon.publishers.sending import Sender, SenderOptions, tell_exposed
+from tactile_rt.daemon.publishers.sending import (
+    Sender,
+    SenderOptions,
+    is_port,
+    tell_exposed,
+)
 from tactile_rt.stream import ConfigError, SourceError
 
 __all__ = ["ZenohOptions", "ZenohPublisher"]
 
+ON_PORTS = ("tcp", "udp", "tls", "quic", "ws")
 DROP = zenoh.CongestionControl.DROP
 
 
@@ -39,6 +46,9 @@ class ZenohOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_on
             protocol, slash, address = endpoint.partition("/")
             if not (protocol.isalnum() and slash and address):
                 raise ValueError(f"an endpoint is like tcp/127.0.0.1:7447, not {endpoint}")
+            port = re.split("[?#]", address)[0].rpartition(":")[2]
+            if protocol in ON_PORTS and port != "0" and not is_port(port):
+                raise ValueError(f"{endpoint}: a port is a number from 0 to 65535, not {port}")
         if not (self.listen or self.connect or self.scouting or self.config_file):
             raise ValueError("nobody could be reached: give listen, connect, scouting or a file")
 

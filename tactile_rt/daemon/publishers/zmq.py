@@ -9,7 +9,12 @@ import zmq
 
 from tactile_rt.daemon.consumer import View
 from tactile_rt.daemon.messages import Message, encode, topic_of
-from tactile_rt.daemon.publishers.sending import Sender, SenderOptions, tell_exposed
+from tactile_rt.daemon.publishers.sending import (
+    Sender,
+    SenderOptions,
+    is_port,
+    tell_exposed,
+)
 from tactile_rt.stream import SourceError
 
 __all__ = ["ZmqOptions", "ZmqPublisher"]
@@ -35,6 +40,9 @@ class ZmqOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_only
             raise ValueError(
                 f"bind must be like tcp://127.0.0.1:5556 or ipc:///run/x, not {self.bind}"
             )
+        port = rest.rpartition(":")[2]
+        if scheme == "tcp" and port != "*" and not is_port(port):
+            raise ValueError(f"bind: a port is a number from 1 to 65535, or *, not {port}")
         if not 1 <= self.queue <= 1_000_000:
             raise ValueError(f"queue must be from 1 to 1000000, not {self.queue}")
 

@@ -145,7 +145,8 @@ function tellLink() {
   const rate = recent && arrivals.length > 1
     ? Math.round((arrivals.length - 1) / ((arrivals.at(-1) - arrivals[0]) / 1000)) : 0;
   const live = link === "live";
-  $("link").textContent = live ? `live, ${rate} updates/s` : words[link] || link;
+  const told = rate ? `live, ${rate} updates/s` : "connected, no samples";
+  $("link").textContent = live ? told : words[link] || link;
   $("link").dataset.rate = live ? rate : 0;
   $("link").className = "chip " + (live ? (rate ? "good" : "warn") : "bad");
 }
@@ -193,6 +194,8 @@ function central(array) {
 function show() {
   const array = arrays.get(source);
   if (!array) return;
+  document.body.classList.remove("empty");
+  $("empty-card").hidden = true;
   document.title = `${array.name} · tactile_rt`;
   $("title").textContent = array.name;
   const { elements, channels, rate_hz, frame } = array;
@@ -262,7 +265,8 @@ function states() {
     return choose(open.find((name) => s.models.some((m) => m.source === name)) || open[0]);
   }
   options($("source"), names, source);
-  $("source-label").hidden = s.sources.length < 2;
+  $("source-label").hidden = s.sources.length < 2 || !arrays.has(source);
+  nothing(s);
   const models = s.models.filter((m) => m.source === source).map((m) => m.part.name.slice(6));
   if (!models.includes(model)) {
     model = models[0] || "";
@@ -282,6 +286,18 @@ function states() {
   parts(s);
   recording(s.consumers.find((c) => c.kind === "recorder"));
   tellLink();
+}
+
+// Without an array there is nothing to draw: say why instead.
+function nothing(s) {
+  const empty = !arrays.has(source);
+  document.body.classList.toggle("empty", empty);
+  $("empty-card").hidden = !empty;
+  if (!empty) return;
+  const words = { starting: "is being opened", waiting: "cannot be opened, and is tried again",
+    ended: "is over", stopped: "was stopped" };
+  $("empty").replaceChildren(...s.sources.map(({ part }) => make("li",
+    `${part.name.slice(7)} ${words[part.state] || part.state}${part.reason ? ": " + part.reason : ""}`)));
 }
 
 function figures(s, now) {

@@ -148,7 +148,7 @@ function drawArrow(g, x, y, dx, dy, longest) {
   g.fill();
 }
 
-const LEFT = 66, BOTTOM = 18;
+const LEFT = 72, BOTTOM = 18;
 
 function axes(g, width, height, window_s) {
   g.strokeStyle = colours.line;
@@ -190,7 +190,8 @@ export function drawTraces(canvas, frames, array, element, channels, zero, windo
   g.fillStyle = colours.quiet;
   const tick = top / 1.08;
   [[tick, y(tick) + 4], [0, middle], [-tick, y(-tick) - 4]].forEach(([v, at]) =>
-    g.fillText(v ? si(v, unit, 2) : "0", LEFT - 6, at));
+    // A label that is too long is squeezed: cut, it would lose its sign.
+    g.fillText(v ? si(v, unit, 2) : "0", LEFT - 6, at, LEFT - 8));
   g.strokeStyle = colours.quiet;
   g.globalAlpha = 0.5;
   g.beginPath();
