@@ -45,7 +45,7 @@ class ModelPart(Part):
         self._classifier: Classifier | None = None
         self._refused: tuple[object, TactileError] | None = None
         self._half_ns = 0  # half the resampler's kernel
-        self._sha256 = ""
+        self._sha256 = _sha256(self.file)  # a recording tells it from its first byte
         self._labels: tuple[str, ...] = ()
         self._decisions = self._final = self._late = self._bad_samples = 0
         self._newest: Classification | None = None
@@ -115,7 +115,7 @@ class ModelPart(Part):
             raise
         self._opened = opened
         self._labels = self._classifier.card.labels
-        self._sha256 = hashlib.sha256(self.file.read_bytes()).hexdigest()
+        self._sha256 = _sha256(self.file)
         card = self._classifier.card
         self._half_ns = max(card.period_ns, round(NS_PER_S / opened.spec.rate_hz))
 
@@ -192,6 +192,14 @@ def _host_time(stream: Source) -> bool:
 def model_path(config: ModelConfig) -> Path:
     """The model's file; that of the package if the configuration names none."""
     return Path(config.file) if config.file else shipped_model()
+
+
+def _sha256(file: Path) -> str:
+    """Of a file; empty if it cannot be read, which loading it will tell."""
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError:
+        return ""
 
 
 def file_stamp(file: Path) -> tuple[int, ...]:

@@ -45,6 +45,7 @@ from tactile_rt.stream_recording.writer import WriterStats, describe
 __all__ = ["Recorder"]
 
 FLUSH_S = 0.4  # with the gathering still well under the second that may be lost
+LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
 RING_BYTES = 64 << 20  # of each source, before a trigger
 MB, NS = 1e6, 1e9
 
@@ -60,6 +61,7 @@ class _Track:
         self.ring: deque[Message] = deque()
         self.ring_bytes = 0
         self.until_ns = 0  # of a trigger; 0: none
+        self.closed_ns = 0  # when its source ended; 0: it has not
         self.lost = WriterStats()  # for want of room on the disk
 
     def keep(self, message: Message, before_ns: int) -> None:
@@ -158,7 +160,8 @@ class Recorder(Consumer):
             if known is None or known.opened.t_ns != item.t_ns:
                 self._begin(item)
         elif isinstance(item, Closed):
-            self._end(item.source)
+            if (track := self._tracks.get(item.source)) is not None:
+                track.closed_ns = time.monotonic_ns()
         elif isinstance(item, Samples):
             if (track := self._tracks.get(item.source)) is not None:
                 chunk = item.chunk
@@ -254,14 +257,14 @@ class Recorder(Consumer):
             self._finish_file(track)
 
     def _start_file(self, track: _Track) -> None:
-        if track.file is not None or not self._room():
+        if track.file is not None or track.closed_ns or not self._room():
             return
         snapshot = self._view.snapshot()
         session = {
             "by": f"tactile_rt {__version__}",
             "daemon_source": track.opened.source,
             "config": self._view.config_text(),
-            **{f"model.{m.part.name}": f"{m.file} sha256:{m.sha256}" for m in snapshot.models},
+            **{m.part.name: f"{m.file} sha256:{m.sha256}" for m in snapshot.models},
         }
         try:
             track.file = RecordingFile(self._folder, track.opened, session, track.lost)
@@ -302,9 +305,17 @@ class Recorder(Consumer):
             self._start_file(track)
 
     def _look_after(self) -> None:
-        """Flush, rotate, end what a trigger began, look at the disk."""
+        """Flush, rotate, end what a trigger began or whose source ended, look at the disk."""
         self._room()
         now, config = time.monotonic_ns(), self._config
+        closed = [
+            n for n, t in self._tracks.items() if t.closed_ns and now > t.closed_ns + LINGER_NS
+        ]
+        if closed:
+            deciding = {m.source for m in self._view.snapshot().models if m.queue.waiting_bytes}
+            for name in closed:
+                if name not in deciding:
+                    self._end(name)
         for track in self._tracks.values():
             file = track.file
             if file is None:

@@ -113,7 +113,7 @@ class ModelState:
         part: of the daemon.
         source: name of its source.
         file: the model's.
-        sha256: of that file; empty before it was loaded.
+        sha256: of that file; empty if it cannot be read.
         labels: its classes.
         queue: of samples for it.
         decisions: so far; `final`: of these the last ones of their episode.

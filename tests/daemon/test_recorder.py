@@ -29,6 +29,7 @@ from tactile_rt.stream_recording import (
     read_stream,
     recover,
 )
+from tactile_rt.stream_recording.reader import is_finished
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
 
 pytest.importorskip("mcap")
@@ -131,6 +132,19 @@ def test_all_that_happens_is_in_the_file(daemon, tmp_path):
     about = read_description(path)
     assert about.session["config"] == "version = 1\n"
     assert about.source == "synthetic:whiskers"
+
+
+def test_a_decision_about_the_last_samples_comes_after_the_end(daemon, tmp_path, monkeypatch):
+    made = begun(daemon, tmp_path, min_free_mb=0)
+    made.handle([opened(), samples(cut(VALUES, 1000.0)[0]), Closed("whiskers", "over", 0)])
+    made.handle([decision()])
+    (path,) = files(tmp_path)
+    assert not is_finished(path)
+    monkeypatch.setattr("tactile_rt.daemon.recorder.LINGER_NS", 0)
+    look(made)
+    assert is_finished(path)
+    assert len(list(read_decisions(path))) == 1
+    made.close()
 
 
 def test_each_source_has_its_own_file(daemon, tmp_path):
