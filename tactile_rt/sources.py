@@ -13,7 +13,7 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 from tactile_rt.options import parse_options
 from tactile_rt.stream import ConfigError, Source
 
-__all__ = ["open_source"]
+__all__ = ["ENTRY_POINTS", "SCHEMES", "open_source", "opener"]
 
 # scheme: (module, what opens it, extra that it needs). What opens it is a function of the target
 # and the options as written, or a class of the target and an `Options` dataclass that it names.
@@ -45,7 +45,7 @@ def open_source(url: str) -> Source:
     fields = dict(pairs)
     if len(fields) < len(pairs):
         raise ConfigError(f"source {url!r}: an option is given twice")
-    make = _lookup(url, parts.scheme)
+    make = opener(url, parts.scheme)
     target = unquote(parts.netloc + parts.path)
     options = getattr(make, "Options", None)
     if options is not None:
@@ -54,7 +54,16 @@ def open_source(url: str) -> Source:
     return source
 
 
-def _lookup(url: str, scheme: str) -> Any:
+def opener(url: str, scheme: str) -> Any:
+    """What opens sources of a scheme: see `SCHEMES`.
+
+    Args:
+        url: for the message.
+        scheme: without the colon.
+
+    Raises:
+        ConfigError: unknown scheme, or an extra is not installed.
+    """
     if scheme in SCHEMES:
         module, attribute, extra = SCHEMES[scheme]
         try:

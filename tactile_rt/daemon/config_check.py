@@ -32,7 +32,7 @@ from tactile_rt.drivers.synthetic import SyntheticOptions, SyntheticSource
 from tactile_rt.inference.providers import onnxruntime_names
 from tactile_rt.model_file import load_model
 from tactile_rt.options import parse_options, take_options
-from tactile_rt.sources import ENTRY_POINTS, SCHEMES, _lookup
+from tactile_rt.sources import ENTRY_POINTS, SCHEMES, opener
 from tactile_rt.stream import TactileError
 
 __all__ = ["check_config"]
@@ -137,7 +137,7 @@ def _check_options(scheme: str, target: str, fields: dict[str, str]) -> None:
     if scheme == "synthetic":
         SyntheticSource(target, parse_options("source synthetic:", fields, SyntheticOptions))
     elif scheme not in SCHEMES or scheme in SIMULATED:
-        options = getattr(_lookup(f"{scheme}:", scheme), "Options", None)
+        options = getattr(opener(f"{scheme}:", scheme), "Options", None)
         if options is not None:
             parse_options(f"source {scheme}:", fields, options)
     if scheme not in ("serial", "can"):
