@@ -36,18 +36,18 @@ class DeviceClock:
 
     Attributes:
         drift: how much faster the host's clock runs than the device's, as a fraction.
-        steps: times that the device's clock jumped or began anew.
+        steps: times that the device's clock jumped or began anew, as long as it was connected.
     """
 
     def __init__(self, tick_ns: float, bits: int, tolerance: float = 5e-4) -> None:
         self.drift = 0.0
-        self.steps = -1  # the beginning is none
+        self.steps = 0
         self._tick_ns, self._wrap, self._tolerance = tick_ns, 1 << bits, tolerance
         self._drift_after_ns = min(5 * S, round(S * DRIFT_SEEN_AFTER / tolerance))
         self._tick: int | None = None  # of the last sample
         self._arrived = self._told = 0
         self._x = 0.0  # device time of the last sample since the base
-        self._begin(0, 0)
+        self._begin(0)
 
     @property
     def drift_ppm(self) -> float:
@@ -68,9 +68,11 @@ class DeviceClock:
             x = self._x + step
             early = arrived - self._base - x - self._a - self.drift * x < -EARLY_NS
             if self._tick is None or early:
+                # In a backlog, samples are early only against a first one that came late.
+                self.steps += step - (arrived - self._arrived) > EARLY_NS
                 told += self._tell(waiting)
                 waiting, x, step = [], 0.0, 0.0
-                self._begin(arrived, self._arrived)
+                self._begin(arrived)
             self._x, self._tick, self._arrived = x, tick, arrived
             self._observe(x, arrived)
             waiting.append((x, step, arrived))
@@ -102,8 +104,7 @@ class DeviceClock:
             ticks += self._wrap * round(missed / self._wrap)
         return ticks * self._tick_ns
 
-    def _begin(self, arrived: int, before: int) -> None:
-        self.steps += 1 if before or self.steps < 0 else 0
+    def _begin(self, arrived: int) -> None:
         self._base, self._x = arrived, 0.0
         self._points: list[tuple[float, float]] = []  # promptest of each bucket
         self._bucket_ns = FIRST_BUCKET_NS

@@ -95,6 +95,25 @@ def test_a_host_that_slept_does_not_move_the_clock():
     assert np.abs(told - world.taken).max() < 1 * MS
 
 
+def test_a_host_that_slept_as_the_device_began_saw_no_jump():
+    world = World(10)
+    world.arrived[:1100] = world.arrived[1100]  # read one by one, all of them late
+    told = np.concatenate(
+        [world.clock.to_host(world.ticks[k : k + 1], world.arrived[k : k + 1]) for k in range(9000)]
+    )
+    assert world.clock.steps == 0
+    assert np.abs(told - world.taken[:9000])[2000:].max() < 1 * MS
+
+
+def test_a_device_that_was_away_did_not_jump():
+    world = World(10)
+    world.clock.to_host(world.ticks[:5000], world.arrived[:5000])
+    world.clock.resume()
+    told = world.clock.to_host(world.ticks[:5000], world.arrived[5000:])
+    assert world.clock.steps == 0
+    assert np.abs(told - world.taken[5000:]).max() < 1 * MS
+
+
 def test_samples_without_time_or_count_are_spread_before_their_arrival():
     arrived = np.full(4, 100 * MS)
     assert host_stamps(arrived, 0, 10 * MS).tolist() == [70 * MS, 80 * MS, 90 * MS, 100 * MS]
