@@ -49,6 +49,7 @@ class Heard:
 
     Attributes:
         messages: of all kinds.
+        frames: of these, the page's: what to draw.
         sources: names, by the number in `source`.
         source: (n,) of each decision.
         t_ns: (n,) stream time of its last sample.
@@ -58,6 +59,7 @@ class Heard:
     """
 
     messages: int
+    frames: int
     sources: tuple[str, ...]
     source: NDArray[np.int8]
     t_ns: NDArray[np.int64]
@@ -89,7 +91,7 @@ class _Ear:
     """Notes what comes."""
 
     def __init__(self) -> None:
-        self.messages = self.connections = 0
+        self.messages = self.frames = self.connections = 0
         self._names: list[str] = []
         self._source, self._t_ns, self._at_ns = array("b"), array("q"), array("q")
         self._decoder = msgspec.json.Decoder(_Decision)
@@ -102,6 +104,7 @@ class _Ear:
         if self._last:
             self._longest = max(self._longest, now - self._last)
         self._last = now
+        self.frames += line.startswith(b'{"type":"frame"')
         if line.startswith(b'{"type":"decision"'):
             decision = self._decoder.decode(line)
             if decision.source not in self._names:
@@ -112,7 +115,7 @@ class _Ear:
 
     def heard(self) -> Heard:
         return Heard(
-            self.messages, tuple(self._names), np.array(self._source, np.int8),
+            self.messages, self.frames, tuple(self._names), np.array(self._source, np.int8),
             np.array(self._t_ns, np.int64), np.array(self._at_ns, np.int64), self.connections,
             self._longest / 1e9,
         )  # fmt: skip

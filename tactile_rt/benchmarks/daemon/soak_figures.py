@@ -80,6 +80,10 @@ def _queues(result: Soak) -> list[Record]:
             f"made: {', '.join(f'{n} of {s}' for s, n in made.items())}",
             f"by any of {', '.join(result.heard)}",
         ),
+        Record(
+            "daemon.soak.page_updates", result.heard["page"].frames / result.seconds, "1/s",
+            ">= 20", "what to draw, silences of the array included", "one open page",
+        ),
     ]  # fmt: skip
 
 
