@@ -65,8 +65,9 @@ def draw_grid(results: Results, path: Path) -> None:
     seeds = max((row.seeds for row in networks), default=0)
     figure.suptitle(
         f"What touched the whiskers? {results.classes} kinds of object, {results.objects} unseen "
-        f"objects, {results.sweeps} sweeps\nevery network under the same budget; mean of up to "
-        f"{seeds} seeds, lines: 95 % by object and seed",
+        f"objects, {results.sweeps} sweeps\nevery network under the same budget; "
+        + (f"mean of up to {seeds} seeds" if seeds > 1 else "one seed")
+        + ", lines: 95 % by object and seed",
         fontsize=11,
     )
     figure.savefig(path, dpi=120)
@@ -80,7 +81,10 @@ def _bars(axes: Axes, rows: list[Row]) -> None:
         if row.top1 is not None:
             _bar(axes, k + BAR / 2, row.top1, colour, 0.9)
             end = 100 * max(row.top1.high, row.top1.value) + 1
-            axes.text(end, k + BAR / 2, f"{100 * row.top1.value:.1f}", va="center", fontsize=7.5)
+            axes.text(
+                end, k + BAR / 2, f"{100 * row.top1.value:.1f}", va="center", fontsize=7.5,
+                bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},  # on the SVM's line
+            )  # fmt: skip
         elif row.failed:
             axes.text(1, k + BAR / 2, "training diverged", va="center", fontsize=7.5)
     axes.set_yticks(range(len(rows)), [_label(row) for row in rows], fontsize=8.5)
