@@ -118,10 +118,13 @@ class SweepManifest:
         """
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / MANIFEST
-        if not path.exists() and (other := next(folder.iterdir(), None)) is not None:
-            raise ConfigError(
-                f"{folder} holds {other.name!r} and no sweep set: choose a new or an empty folder"
-            )
+        if not path.exists() and not any(has_object(folder, name) for name in self.names()):
+            others = [other.name for other in folder.iterdir() if other.name[0] != "."]
+            if others:
+                raise ConfigError(
+                    f"{folder} holds {min(others)!r} and no sweep set: choose a new or an empty "
+                    "folder"
+                )
         text = msgspec.json.encode(self)
         if path.exists():
             # Compared as JSON, which knows no tuples: a recipe may have been written with some.
