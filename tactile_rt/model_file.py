@@ -14,6 +14,7 @@ A file of kind "window" takes a whole episode instead: ``samples (batch, step, s
 channel)``, no state, and gives ``logits (batch, step, class)``.
 """
 
+import hashlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,6 +37,7 @@ __all__ = [
     "ModelCard",
     "StateTensor",
     "element_order",
+    "hash_of",
     "load_model",
     "read_model",
     "shipped_model",
@@ -49,6 +51,18 @@ SHIPPED = Path(__file__).parent / "assets" / "mouse24.onnx"
 def shipped_model() -> Path:
     """The model that comes with the package: 24 categories on the right mouse array."""
     return SHIPPED
+
+
+def hash_of(model: Path) -> str:
+    """The sha256 of a model's file.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    try:
+        return hashlib.sha256(model.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ConfigError(f"model {model} cannot be read: {error.strerror}") from None
 
 
 def read_model(path: Path) -> tuple[ModelCard, Contents, bytes]:

@@ -89,7 +89,8 @@ class _Replay:
         check: bool,
         fields: dict[str, str],
     ) -> None:
-        from tactile_rt.stream_recording.checking import file_of_model, hash_of, live_model
+        from tactile_rt.model_file import hash_of
+        from tactile_rt.stream_recording.checking import file_of_model, live_model
 
         self.files, self._fields = files, fields
         self.samples = 0

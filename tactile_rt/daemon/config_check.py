@@ -34,13 +34,14 @@ from tactile_rt.model_file import load_model
 from tactile_rt.options import parse_options, take_options
 from tactile_rt.sources import ENTRY_POINTS, SCHEMES, opener
 from tactile_rt.stream import TactileError
+from tactile_rt.stream_recording.reader import MAGIC
 
 __all__ = ["check_config"]
 
 SHORTEST_TOKEN = 16  # of a page that others can reach
 SCHEME_FILES = ("replay", "combined")
 SIMULATED = ("sim", "whisking")
-MCAP, NPZ = b"\x89MCAP0\r\n", b"PK"  # how they begin
+NPZ = b"PK"  # how it begins
 
 
 def check_config(loaded: Loaded) -> None:
@@ -117,10 +118,10 @@ def _check_url(loaded: Loaded, i: int, url: str) -> None:
     if parts.scheme == "replay":
         try:
             with open(target, "rb") as file:
-                begins = file.read(len(MCAP))
+                begins = file.read(len(MAGIC))
         except OSError as error:
             loaded.refuse(path, f"{target}: {error.strerror}")
-        if begins != MCAP and not begins.startswith(NPZ):
+        if begins != MAGIC and not begins.startswith(NPZ):
             loaded.refuse(path, f"{target} is no recording: it is neither MCAP nor npz")
 
 

@@ -1,7 +1,7 @@
 """A classifier in a thread of its own, fed from a mailbox."""
 
-import hashlib
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from tactile_rt.daemon.mailbox import Mailbox
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.snapshot import ModelState
 from tactile_rt.daemon.source_part import device_of
-from tactile_rt.model_file import shipped_model
+from tactile_rt.model_file import hash_of, shipped_model
 from tactile_rt.stream import ConfigError, Source, TactileError, concatenate
 from tactile_rt.timebase import NS_PER_S
 
@@ -45,7 +45,9 @@ class ModelPart(Part):
         self._classifier: Classifier | None = None
         self._refused: tuple[object, TactileError] | None = None
         self._half_ns = 0  # half the resampler's kernel
-        self._sha256 = _sha256(self.file)  # a recording tells it from its first byte
+        self._sha256 = ""
+        self._hashed: tuple[int, ...] = ()
+        self._hash()  # a recording tells it from its first byte
         self._labels: tuple[str, ...] = ()
         self._decisions = self._final = self._late = self._bad_samples = 0
         self._newest: Classification | None = None
@@ -115,9 +117,16 @@ class ModelPart(Part):
             raise
         self._opened = opened
         self._labels = self._classifier.card.labels
-        self._sha256 = _sha256(self.file)
+        self._hash()
         card = self._classifier.card
         self._half_ns = max(card.period_ns, round(NS_PER_S / opened.spec.rate_hz))
+
+    def _hash(self) -> None:
+        """Note the file's hash, anew only if it is another file; loading tells if it is none."""
+        stamp = file_stamp(self.file)
+        if stamp != self._hashed:
+            with suppress(ConfigError):
+                self._sha256, self._hashed = hash_of(self.file), stamp
 
     def _take(self, items: list[Item]) -> None:
         run: list[Samples] = []
@@ -192,14 +201,6 @@ def _host_time(stream: Source) -> bool:
 def model_path(config: ModelConfig) -> Path:
     """The model's file; that of the package if the configuration names none."""
     return Path(config.file) if config.file else shipped_model()
-
-
-def _sha256(file: Path) -> str:
-    """Of a file; empty if it cannot be read, which loading it will tell."""
-    try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()
-    except OSError:
-        return ""
 
 
 def file_stamp(file: Path) -> tuple[int, ...]:

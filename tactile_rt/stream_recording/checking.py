@@ -5,14 +5,13 @@ part of it. A model's step does not depend on how its stream was cut or paced, s
 the same samples decides the same, digit for digit.
 """
 
-import hashlib
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from tactile_rt.model_file import shipped_model
+from tactile_rt.model_file import hash_of, shipped_model
 from tactile_rt.stream import ConfigError
 from tactile_rt.stream_recording.description import Description
 from tactile_rt.timebase import NS_PER_S
@@ -23,7 +22,6 @@ __all__ = [
     "RecordedModel",
     "check_decisions",
     "file_of_model",
-    "hash_of",
     "live_model",
     "recorded_models",
 ]
@@ -123,18 +121,6 @@ def file_of_model(model: Path | None, live: RecordedModel | None) -> Path:
         f"the model that decided, {live.file} (sha256 {live.sha256[:16] or 'unknown'}), is not "
         "there any more: name one by --model"
     )
-
-
-def hash_of(model: Path) -> str:
-    """The sha256 of a model's file.
-
-    Raises:
-        ConfigError: it cannot be read.
-    """
-    try:
-        return hashlib.sha256(model.read_bytes()).hexdigest()
-    except OSError as error:
-        raise ConfigError(f"model {model} cannot be read: {error.strerror}") from None
 
 
 @dataclass(frozen=True)
