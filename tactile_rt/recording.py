@@ -11,18 +11,17 @@ that a split can never put one object on two sides. The archive's own checksums 
 file at every reading.
 """
 
-import os
-import tempfile
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.files import write_whole
 from tactile_rt.stream import ArraySpec, ConfigError, RecordingError
 
 __all__ = [
@@ -39,7 +38,6 @@ __all__ = [
     "split_by_object",
     "write_object",
     "write_skipped",
-    "write_whole",
 ]
 
 SET_VERSION = 2
@@ -371,22 +369,6 @@ def write_skipped(folder: Path, skipped: dict[str, str]) -> None:
     """Replace the list of objects that could not be made."""
     text = msgspec.json.format(msgspec.json.encode(dict(sorted(skipped.items()))), indent=1)
     write_whole(folder / SKIPPED, lambda file: file.write(text))
-
-
-def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Let `write(file)` fill a file that appears under its name only when complete.
-
-    Until then it is hidden: ``.NAME.XXXXXXXX`` in the same folder.
-    """
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            write(file)
-        os.chmod(name, 0o644)  # a temporary file is its owner's alone; a set is for others too
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
 
 
 def split_by_object(

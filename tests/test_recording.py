@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt import recording
+from tactile_rt.files import write_whole
 from tactile_rt.recording import (
     SPLITS,
     SweepManifest,
@@ -397,7 +397,7 @@ def test_more_test_objects_never_come_from_validation_to_training() -> None:
 def test_the_temporary_file_is_hidden_and_in_the_same_folder(tmp_path: Path) -> None:
     """The same file system, or the final rename could not be atomic; hidden from `*.npz`."""
     seen = []
-    recording.write_whole(tmp_path / "a.npz", lambda file: seen.append(file.name))
+    write_whole(tmp_path / "a.npz", lambda file: seen.append(file.name))
     (handle,) = seen
     assert isinstance(handle, int)
     assert listing(tmp_path) == ["a.npz"]

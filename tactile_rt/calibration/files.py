@@ -17,7 +17,7 @@ import msgspec
 
 from tactile_rt.calibration.correction import Calibration, check_device, nearest
 from tactile_rt.calibration.mirroring import Mirror
-from tactile_rt.recording import write_whole
+from tactile_rt.files import write_whole
 from tactile_rt.stream import ConfigError
 
 __all__ = ["calibration_path", "load_calibration", "save_calibration"]

@@ -344,7 +344,7 @@ def _plain(record: Any) -> dict[str, Any]:
 def _write(path: Path, what: Any) -> None:
     import msgspec
 
-    from tactile_rt.recording import write_whole
+    from tactile_rt.files import write_whole
 
     text = msgspec.json.format(msgspec.json.encode(what), indent=1)
     write_whole(path, lambda file: file.write(text + b"\n"))

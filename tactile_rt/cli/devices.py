@@ -46,7 +46,7 @@ def doctor(
 
     from tactile_rt.drivers.discovery import can_buses, serial_ports
     from tactile_rt.drivers.doctor import diagnose, udev_rules
-    from tactile_rt.recording import write_whole
+    from tactile_rt.files import write_whole
 
     check_output(udev)
     ports = serial_ports()
@@ -98,7 +98,7 @@ def describe(
     """Write a source's array (elements, poses, channels, units, rate) as JSON."""
     import msgspec
 
-    from tactile_rt.recording import write_whole
+    from tactile_rt.files import write_whole
     from tactile_rt.sources import open_source
 
     check_output(out)

@@ -60,7 +60,7 @@ def replay(
     if "from" in fields:
         _compare(told.files, {k: v for k, v in fields.items() if k not in ("from", "speed")})
     if out is not None:
-        from tactile_rt.recording import write_whole
+        from tactile_rt.files import write_whole
 
         write_whole(out, told.write)
     elif check:

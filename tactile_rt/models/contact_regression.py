@@ -18,8 +18,9 @@ from torch.nn import functional as F
 
 from tactile_rt.contact import CHANNEL_FLOOR
 from tactile_rt.contact_point import WhiskerShapes
+from tactile_rt.files import write_whole
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.recording import contacts_of, write_whole
+from tactile_rt.recording import contacts_of
 from tactile_rt.stream import ConfigError
 
 __all__ = [

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt import __version__
-from tactile_rt.recording import write_whole
+from tactile_rt.files import write_whole
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.whisking import WhiskSimulation
 from tactile_rt.sim_backend.world import SAMPLE_MS

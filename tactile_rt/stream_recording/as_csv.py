@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.recording import write_whole
+from tactile_rt.files import write_whole
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError, RecordingError, concatenate
 from tactile_rt.stream_recording.description import Description
 from tactile_rt.stream_recording.flat import ABOUT, COLUMNS, Told, about_of, about_text, raws_of

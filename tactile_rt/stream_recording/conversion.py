@@ -5,7 +5,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO
 
-from tactile_rt.recording import write_whole
+from tactile_rt.files import write_whole
 from tactile_rt.stream import ConfigError
 from tactile_rt.stream_recording.as_csv import beside, read_csv, write_csv
 from tactile_rt.stream_recording.as_hdf5 import need_h5py, read_hdf5, write_hdf5

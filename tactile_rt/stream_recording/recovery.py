@@ -5,7 +5,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
-from tactile_rt.recording import write_whole
+from tactile_rt.files import write_whole
 from tactile_rt.stream import ConfigError, RecordingError
 from tactile_rt.stream_recording.description import METADATA, RECOVERED, SESSION, Description
 from tactile_rt.stream_recording.layout import (

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile_rt.files import write_whole
 from tactile_rt.models.alignment.pictures import Bar, Level, Point, bars, heat_map, scatter
 from tactile_rt.models.alignment.results import Control, ModelResult, Number, Results
-from tactile_rt.recording import write_whole
 
 __all__ = ["page", "write_page"]
 

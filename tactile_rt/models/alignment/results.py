@@ -8,13 +8,13 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tactile_rt.files import write_whole
 from tactile_rt.models.alignment.benchmark import Benchmark
 from tactile_rt.models.alignment.benchmark_file import benchmark_sha256
 from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, rdm
 from tactile_rt.models.alignment.scoring import Score, score
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
-from tactile_rt.recording import write_whole
 from tactile_rt.stream import ConfigError
 
 __all__ = [

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.files import write_whole
 from tactile_rt.models.data_checks import check_sets, check_split
 from tactile_rt.models.datasets import STEPS, SweepSet, windows
 from tactile_rt.models.disturbances import CLEAN, Disturbance
@@ -25,7 +26,7 @@ from tactile_rt.models.training import (
     run_on,
     train,
 )
-from tactile_rt.recording import SweepManifest, write_whole
+from tactile_rt.recording import SweepManifest
 from tactile_rt.stream import ConfigError, ModelError
 
 __all__ = ["Outcome", "Workbench", "outcome_path", "read_outcome", "settings_of"]

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch.optim.lr_scheduler import LRScheduler
 
+from tactile_rt.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import TactileClassifier, reason, save_whole
 from tactile_rt.models.data_checks import check_sets, check_split
@@ -32,7 +33,7 @@ from tactile_rt.models.training.feeding import Feed, Share, generator_of
 from tactile_rt.models.training.logs import Board, log_epoch
 from tactile_rt.models.training.optimizers import build_optimizer, build_schedule
 from tactile_rt.models.training.validation import Validation
-from tactile_rt.recording import SweepManifest, write_whole
+from tactile_rt.recording import SweepManifest
 from tactile_rt.stream import ConfigError, ModelError
 
 if TYPE_CHECKING:
