@@ -195,6 +195,10 @@ def export(
     kind: Annotated[
         str, typer.Option(help="step: one step of a stream; window: a whole episode at once.")
     ] = "step",
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Where the sweep set it was trained on lies now; default: where it lay."),
+    ] = None,
 ) -> None:
     """Export a trained network as a streaming ONNX step, with everything needed to run it."""
     try:
@@ -216,6 +220,7 @@ def export(
             name or model.stem,
             precision,
             "window" if kind == "window" else "step",
+            data,
         )
     console.print(
         f"{model}: {model.stat().st_size / 1e6:.1f} MB, parity {card.figures['parity']:.1e}, "

@@ -30,6 +30,7 @@ from tactile_rt.export.windows import window_graph
 from tactile_rt.model_card import Kind
 from tactile_rt.model_checks import probe_logits
 from tactile_rt.model_file import METADATA_KEY, ModelCard, StateTensor, load_model
+from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import STEPS, SUBSTEPS, channel_values
 from tactile_rt.models.training import TactileClassifier, load_checkpoint
 from tactile_rt.onnx_reading import graph_sha256
@@ -84,6 +85,7 @@ def export_checkpoint(
     commands: Sequence[str] = (),
     precision: Precision = "fp32",
     kind: Kind = "step",
+    data: Path | None = None,
 ) -> ModelCard:
     """Export what `training.train` saved.
 
@@ -96,12 +98,15 @@ def export_checkpoint(
         commands: that remake the file.
         precision: of the weights, and of products with them.
         kind: "step" or "window".
+        data: where the sweep set that it was trained on lies now; default: where it lay.
 
     Raises:
         ModelError: the checkpoint cannot be read, or the exported graph misses the parity bar.
+        SpecMismatch: the set is of another array, or of other categories.
+        RecordingError: there is no set.
     """
     model, saved = load_checkpoint(checkpoint)
-    manifest = SweepManifest.read(Path(saved["config"]["data"]))
+    manifest = SweepManifest.read(trained_on(checkpoint, saved, data))
     card = ModelCard(
         name=name,
         spec=saved["spec"],

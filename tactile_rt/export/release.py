@@ -12,6 +12,7 @@ from tactile_rt.export.onnx_step import export_checkpoint, file_logits
 from tactile_rt.export.precision import Precision
 from tactile_rt.model_card import Kind
 from tactile_rt.model_file import METADATA_KEY, ModelCard, load_model
+from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import Step, hits, predict
 from tactile_rt.models.training import load_checkpoint, run_on
@@ -27,17 +28,23 @@ def release(
     name: str,
     precision: Precision = "fp32",
     kind: Kind = "step",
+    data: Path | None = None,
 ) -> ModelCard:
     """Fit the temperature on the validation split, then export.
 
     What a precision below fp32 costs on validation sweeps is measured and stored.
 
+    Args:
+        data: where the sweep set that it was trained on lies now; default: where it lay.
+
     Raises:
         ModelError, RecordingError: the checkpoint or its sweep set cannot be read.
+        SpecMismatch: the set is of another array, or of other categories.
     """
     model, saved = load_checkpoint(checkpoint)
     config = saved["config"]
-    validation = SweepSet.read(Path(config["data"]), "validation")
+    folder = trained_on(checkpoint, saved, data)
+    validation = SweepSet.read(folder, "validation")
     # Half clean, half at rated noise: what the checkpoint was chosen by, too.
     posteriors = np.concatenate([predict(validation, run_on(model), level) for level in (0.0, 1.0)])
     labels = np.tile(validation.sweeps.labels, 2)
@@ -62,6 +69,7 @@ def release(
         ),
         precision=precision,
         kind=kind,
+        data=folder,
     )
     if precision == "fp32":
         return card

@@ -1,16 +1,59 @@
 """What would spoil a training run, found before it starts."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from tactile_rt.models.datasets import STEPS, SUBSTEPS, SweepSet
 from tactile_rt.recording import WITHHELD, SweepManifest, object_path
-from tactile_rt.stream import RecordingError
+from tactile_rt.stream import ArraySpec, RecordingError, SpecMismatch
 
-__all__ = ["check_sets", "check_split"]
+__all__ = ["check_array", "check_sets", "check_split", "trained_on"]
+
+
+def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManifest) -> None:
+    """A set that a checkpoint is to be used on is of the array that it was made for.
+
+    Raises:
+        SpecMismatch: otherwise.
+    """
+    spec = ArraySpec.from_json(saved["spec"])
+    if differences := spec.differences(manifest.spec, ("name", "rate_hz")):
+        raise SpecMismatch(f"{checkpoint} was made for another array: {differences[0]}")
+
+
+def trained_on(checkpoint: Path, saved: Mapping[str, Any], data: Path | None = None) -> Path:
+    """The sweep set that a checkpoint was trained on: where it lies now.
+
+    Args:
+        checkpoint: for messages.
+        saved: what is in it.
+        data: the set; default: where it lay when it was trained on.
+
+    Raises:
+        RecordingError: it is not there, or no sweep set.
+        SpecMismatch: it is of another array, or holds other categories.
+    """
+    folder = data or Path(saved["config"]["data"])
+    if data is None and not folder.exists():
+        raise RecordingError(
+            f"{folder}, the sweep set that {checkpoint} was trained on, is not here: name it by "
+            "--data"
+        )
+    manifest = SweepManifest.read(folder)
+    check_array(checkpoint, saved, manifest)
+    held, classes = list(manifest.categories), saved["network"]["classes"]
+    told = saved.get("categories", held[:classes])  # of an early checkpoint, only how many
+    if told != held or len(held) != classes:
+        other = ", ".join(sorted({*told} ^ {*held})[:3]) or "the same in another order"
+        raise SpecMismatch(
+            f"{checkpoint} tells other categories apart than {folder} holds ({other}): name the "
+            "set that it was trained on by --data"
+        )
+    return folder
 
 
 def check_split(folder: Path, manifest: SweepManifest) -> None:

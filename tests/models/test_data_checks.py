@@ -9,6 +9,7 @@ import pytest
 from tiny_sweeps import write_tiny_set
 
 from tactile_rt.cli import main
+from tactile_rt.model_file import load_model
 from tactile_rt.recording import SweepManifest, object_path, read_object, write_object
 
 
@@ -111,11 +112,37 @@ def test_an_object_on_two_sides_under_two_names(folder, refused):
     assert "cube-1 is cube-0 by another name, on another side of the split" in refused()
 
 
-def test_good_data_is_trained_on(folder, tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def run_command(capsys, monkeypatch):
+    def run(*arguments):
+        """(exit code, what it said)."""
+        monkeypatch.setattr(sys, "argv", ["tactile-rt", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            main()
+        return left.value.code or 0, " ".join(capsys.readouterr().err.split())
+
+    return run
+
+
+def test_good_data_is_trained_on_and_exported_wherever_it_lies_then(folder, tmp_path, run_command):
+    run, moved, model = tmp_path / "run", tmp_path / "moved", tmp_path / "model.onnx"
     options = ("--batch", 2, "--encoder", "gru", "--width", 1 / 32, "--updates", 1)
-    arguments = ("tactile-rt", "train", folder, tmp_path / "run", *options)
-    monkeypatch.setattr(sys, "argv", list(map(str, arguments)))
-    with pytest.raises(SystemExit) as left:
-        main()
-    assert not left.value.code, capsys.readouterr().err
-    assert (tmp_path / "run" / "best.pt").exists()
+    code, said = run_command("train", folder, run, "--attender", "none", *options)
+    assert not code, said
+    folder.rename(moved)
+    code, said = run_command("export", run / "best.pt", model)
+    assert code == 2
+    assert f"{folder}, the sweep set that {run}/best.pt was trained on, is not here" in said
+
+    # As many categories, in another order: every name that it told would be wrong.
+    manifest = SweepManifest.read(moved)
+    resplit(moved, categories=manifest.categories[::-1])
+    code, said = run_command("export", run / "best.pt", model, "--data", moved)
+    assert (code, model.exists()) == (2, False)
+    assert "best.pt tells other categories apart than" in said
+    assert "(the same in another order): name the set that it was trained on by --data" in said
+
+    resplit(moved, categories=manifest.categories)
+    code, said = run_command("export", run / "best.pt", model, "--data", moved)
+    assert not code, said
+    assert load_model(model)[1].labels == manifest.categories

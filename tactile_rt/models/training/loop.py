@@ -272,6 +272,7 @@ def _card(
         "config": asdict(config),
         "network": asdict(objective.model.network.config),
         "spec": data.manifest.spec.to_json(),
+        "categories": list(data.manifest.categories),
         "metrics": metrics,
     }
 

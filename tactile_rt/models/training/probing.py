@@ -13,14 +13,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
-from tactile_rt.models.data_checks import check_sets, check_split
+from tactile_rt.models.data_checks import check_array, check_sets, check_split
 from tactile_rt.models.datasets import SweepSet, TrainingBatches, find_onsets, windows
 from tactile_rt.models.ead import READOUTS
 from tactile_rt.models.evaluation import hits, predict
 from tactile_rt.models.training.config import Progress
 from tactile_rt.models.training.logs import log_epoch
 from tactile_rt.recording import SweepManifest
-from tactile_rt.stream import ConfigError, SpecMismatch
+from tactile_rt.stream import ConfigError
 
 __all__ = ["ProbeConfig", "linear_probe", "probe"]
 
@@ -87,9 +87,7 @@ def probe(
     trained, saved = load_checkpoint(checkpoint)
     path = Path(config.data or saved["config"]["data"])
     manifest = SweepManifest.read(path)
-    from_spec = type(manifest.spec).from_json(saved["spec"])
-    if differences := from_spec.differences(manifest.spec, ("name", "rate_hz")):
-        raise SpecMismatch(f"{checkpoint} was made for another array: {differences[0]}")
+    check_array(checkpoint, saved, manifest)
     if splits is None:
         check_split(path, manifest)
         splits = SweepSet.read(path, "train"), SweepSet.read(path, "validation")
@@ -130,6 +128,7 @@ def probe(
         "config": {**saved["config"], "data": str(path), "probe": asdict(config)},
         "network": asdict(network),
         "spec": manifest.spec.to_json(),
+        "categories": list(manifest.categories),
         "metrics": metrics,
     }
     save_whole(folder / "best.pt", card)
