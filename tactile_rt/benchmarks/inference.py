@@ -94,12 +94,12 @@ def run(quick: bool) -> list[Record]:
         Record("inference.machine.memory", machine.memory / 1e9, "GB/s", how=f"{how}, 134 MB read"),
     ]
     shipped = Subject("shipped", shipped_model(), step_ms="<= 2")
-    records += measure_model(shipped, machine, 300 if quick else 3000)
+    records += measure_model(shipped, 300 if quick else 3000, 5 if quick else 10)
     lacking = ["full size: left out of a quick look"] if quick else []
     measured = 0
     with tempfile.TemporaryDirectory() as folder:
         for subject in () if quick else full_size(Path(folder), lacking):
-            records += measure_model(subject, machine, 300)
+            records += measure_model(subject, 500)
             subject.path.unlink()
             measured += 1
     how = "; ".join(lacking) or "random weights"

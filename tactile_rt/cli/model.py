@@ -97,14 +97,13 @@ def bench(
     """How fast it is here: size, loading, memory, CPU time of a step, and the machine's limit."""
     from tactile_rt.benchmarks.model_steps import Subject, measure_model
     from tactile_rt.benchmarks.records import show as show_records
-    from tactile_rt.benchmarks.roofline import measure_machine
     from tactile_rt.model_file import read_model
 
     card, _, _ = read_model(file)
     if card.kind != "step":
         raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
     with Console(stderr=True).status("measuring"):
-        records = measure_model(Subject("model", file), measure_machine(10), steps)
+        records = measure_model(Subject("model", file), steps)
     show_records(records, Console())
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tactile_rt.benchmarks import roofline
+from tactile_rt.benchmarks import model_steps, roofline
 from tactile_rt.model_checks import probe_logits
 from tactile_rt.model_file import METADATA_KEY, load_model, read_model, shipped_model
 from tactile_rt.onnx_reading import graph_sha256
@@ -179,7 +179,7 @@ def test_a_broken_file_is_one_line_whatever_is_asked_of_it(call, tmp_path, monke
     path = tmp_path / "m.onnx"
     path.write_bytes(changed)
     monkeypatch.setattr("onnxruntime.InferenceSession", None)  # none of it is run
-    monkeypatch.setattr(roofline, "measure_machine", None)
+    monkeypatch.setattr(model_steps, "measure_machine", None)
     opened = []
     monkeypatch.setattr(Path, "read_bytes", watched(Path.read_bytes, opened))
     refused(call, what, path, said)
@@ -196,9 +196,10 @@ def watched(read, opened):
 
 def test_bench_times_steps_beside_the_machine_s_limit(call, sealed, monkeypatch):
     machine = roofline.Machine(1e11, 4e11, 3e10)
-    monkeypatch.setattr(roofline, "measure_machine", lambda repetitions: machine)
+    monkeypatch.setattr(model_steps, "measure_machine", lambda repetitions: machine)
     code, out, _ = call("model", "bench", shipped_model(), "--steps", 50)
     assert code == 0
+    assert f"median of {model_steps.TURNS} turns" in " ".join(out.replace("│", "").split())
     for said in ("step_p50", "step_tail", "over_roofline", "load", "size", "memory"):
         assert f"inference.model.{said}" in out
 
