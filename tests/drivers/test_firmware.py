@@ -18,14 +18,9 @@ from codec_contract import T0, mutations
 
 from tactile_rt.drivers.codec import Event, Frame, Samples
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
-from tactile_rt.drivers.codecs.native import (
-    Description,
-    Message,
-    NativeOptions,
-    NativeSerial,
-    frame,
-)
+from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_can import NativeCan, NativeCanOptions
+from tactile_rt.drivers.codecs.native_common import Description, Message
 from tactile_rt.stream import ArraySpec, Chunk
 from tactile_rt.testing import small_spec
 

@@ -9,7 +9,8 @@ from codec_contract import T0, CodecCase, CodecContract, chunk_of
 
 from tactile_rt.drivers.codec import Event
 from tactile_rt.drivers.codecs.framing import crc16_modbus, crc16_x25, crc16_xmodem
-from tactile_rt.drivers.codecs.native import Message, NativeOptions, NativeSerial, frame
+from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
+from tactile_rt.drivers.codecs.native_common import Message
 from tactile_rt.stream import ConfigError
 from tactile_rt.testing import small_spec
 

@@ -9,8 +9,8 @@ import pytest
 from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, join, stacked
 
 from tactile_rt.drivers.codec import Event, Frame
-from tactile_rt.drivers.codecs.native import Description
 from tactile_rt.drivers.codecs.native_can import NativeCan, NativeCanOptions
+from tactile_rt.drivers.codecs.native_common import Description
 from tactile_rt.stream import ArraySpec, ConfigError
 from tactile_rt.testing import small_spec
 

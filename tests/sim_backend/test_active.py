@@ -14,7 +14,8 @@ pytest.importorskip("trimesh")
 
 from scipy.integrate import solve_ivp
 
-from tactile_rt.drivers.codecs.native import IMPOSSIBLE, Message, NativeOptions, NativeSerial, frame
+from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
+from tactile_rt.drivers.codecs.native_common import IMPOSSIBLE, Message
 from tactile_rt.sim_backend.active import WhiskingOptions, WhiskingSource
 from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
 from tactile_rt.sim_backend.trajectories import ELEVATION_SLOPES, Whisk

@@ -23,7 +23,16 @@ from typing import Final
 import numpy as np
 
 from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
-from tactile_rt.drivers.codecs.native import (
+from tactile_rt.drivers.codecs.native_can_parts import (
+    FLOAT32,
+    LONG,
+    DescriptionParts,
+    SampleParts,
+    cut_description,
+    head_of,
+    sample_parts,
+)
+from tactile_rt.drivers.codecs.native_common import (
     FORMATS,
     IMPOSSIBLE,
     RANGE_N,
@@ -36,15 +45,6 @@ from tactile_rt.drivers.codecs.native import (
     pack_valid,
     quantise,
     read_array,
-)
-from tactile_rt.drivers.codecs.native_can_parts import (
-    FLOAT32,
-    LONG,
-    DescriptionParts,
-    SampleParts,
-    cut_description,
-    head_of,
-    sample_parts,
 )
 from tactile_rt.stream import Chunk, ConfigError
 

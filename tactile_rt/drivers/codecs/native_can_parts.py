@@ -8,7 +8,7 @@ import numpy as np
 
 from tactile_rt.drivers.codec import Batch, WireStats
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
-from tactile_rt.drivers.codecs.native import Description, unpack_valid
+from tactile_rt.drivers.codecs.native_common import Description, unpack_valid
 
 __all__ = ["DescriptionParts", "SampleParts", "cut_description", "head_of", "sample_parts"]
 

@@ -1,0 +1,138 @@
+"""What the native protocol says on every line: see docs/native-protocol.md."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.stream import ArraySpec, ConfigError
+
+__all__ = [
+    "FORMATS",
+    "IMPOSSIBLE",
+    "RANGE_N",
+    "RANGE_NM",
+    "STATUS",
+    "UNKNOWN",
+    "Description",
+    "Message",
+    "check_ranges",
+    "pack_valid",
+    "quantise",
+    "read_array",
+    "unpack_valid",
+]
+
+# What an ACK says went wrong: a type or length that the device does not know; a thing it cannot do.
+UNKNOWN: Final = 1
+IMPOSSIBLE: Final = 2
+
+FORMATS: Final = {"float32": 0, "int16": 1}
+# What int16's largest value stands for, by SI unit, unless the device describes another scale.
+RANGE_N: Final = 0.1
+RANGE_NM: Final = 1e-3
+RANGE_RAD: Final = float(np.pi)
+LARGEST: Final = 1e30  # scale: any count times it is a float32
+# Bits of the status; 4 to 7 are ours to give a meaning later, 8 to 15 the device's own (serial).
+STATUS: Final = {
+    0: "a channel is at the end of its range",
+    1: "a sensor fails",
+    2: "the device lost samples before this one",
+    3: "the whisking drive fails",
+}
+
+
+class Message:
+    """Types of frames."""
+
+    SAMPLE = 0
+    DESCRIBE = 1  # host: what are you?
+    DESCRIPTION = 2  # device: JSON, see `Description`
+    START = 3
+    STOP = 4
+    WHISK = 5  # host: move the whiskers like this
+    ACK = 6  # device: payload is the type acknowledged and 0, UNKNOWN or IMPOSSIBLE
+
+    FROM_DEVICE = (SAMPLE, DESCRIPTION, ACK)
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a native device says of itself.
+
+    Attributes:
+        spec: the array.
+        scale: SI units per count of int16, by channel.
+    """
+
+    spec: ArraySpec
+    scale: tuple[float, ...]
+
+    @classmethod
+    def of(
+        cls, spec: ArraySpec, range_n: float = RANGE_N, range_nm: float = RANGE_NM
+    ) -> "Description":
+        """With scales for these largest forces and moments, and +-pi rad."""
+        full = {"N": range_n, "N m": range_nm, "rad": RANGE_RAD}
+        return cls(spec, tuple(full.get(unit, 1.0) / 32767 for unit in spec.units))
+
+    def to_json(self) -> bytes:
+        """The payload of a DESCRIPTION."""
+        spec = msgspec.Raw(self.spec.to_json().encode())
+        return msgspec.json.encode({"spec": spec, "scale": self.scale})
+
+    @classmethod
+    def from_json(cls, text: bytes) -> "Description | None":
+        """Read a payload; None if it is not one."""
+        try:
+            fields = msgspec.json.decode(text, type=dict[str, msgspec.Raw])
+            spec = ArraySpec.from_json(bytes(fields["spec"]).decode())
+            scale = msgspec.json.decode(fields["scale"], type=tuple[float, ...])
+        except (msgspec.MsgspecError, ConfigError, KeyError, UnicodeDecodeError):
+            return None
+        good = len(scale) == len(spec.channels) and all(0 < s <= LARGEST for s in scale)
+        return cls(spec, scale) if good else None
+
+
+def pack_valid(valid: NDArray[np.bool_]) -> bytes:
+    """(element,) bool as bits, the first element lowest."""
+    return np.packbits(valid, bitorder="little").tobytes()
+
+
+def unpack_valid(bits: bytes, elements: int) -> NDArray[np.bool_]:
+    """What `pack_valid` packed."""
+    return np.unpackbits(np.frombuffer(bits, np.uint8), count=elements, bitorder="little").view(
+        np.bool_
+    )
+
+
+def quantise(values: NDArray[np.float32], scale: tuple[float, ...]) -> NDArray[np.int16]:
+    """Values as counts, rounded to the nearest and saturated."""
+    counts = np.rint(np.nan_to_num(values.astype(np.float64) / scale))
+    return np.clip(counts, -32767, 32767).astype(np.int16)
+
+
+def read_array(path: str) -> ArraySpec | None:
+    """The array that a file describes; None without a path.
+
+    Raises:
+        ConfigError: it cannot be read or is not one.
+    """
+    if not path:
+        return None
+    try:
+        with open(path, encoding="utf-8") as file:
+            return ArraySpec.from_json(file.read())
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise ConfigError(f"{path}: {why}") from None
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def check_ranges(*ranges: float) -> None:
+    """Raise a `ConfigError` if one cannot be a range."""
+    if not all(0 < r <= LARGEST for r in ranges):
+        raise ConfigError("range_n and range_nm must be above 0")
