@@ -49,7 +49,7 @@ def test_the_default_set_has_the_size_that_training_needs() -> None:
     assert set(manifest.withheld) == set(objects.WITHHELD)
     assert not set(manifest.categories) & set(manifest.withheld)
     counts = {split: len(names) for split, names in manifest.split.items()}
-    assert counts == {"train": 24 * 44, "validation": 24 * 4, "test": 24 * 12, WITHHELD: 4 * 12}
+    assert counts == {"train": 24 * 44, "validation": 24 * 4, "test": 24 * 13, WITHHELD: 4 * 12}
     assert len(recipe.sweeps) == 12
     assert (recipe.period_ns, recipe.lead, recipe.samples) == (9_000_000, 24, 164)
     assert recipe.profile == "realtime"
