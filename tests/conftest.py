@@ -38,3 +38,17 @@ def no_thread_left() -> Iterator[None]:
 def _threads() -> set[threading.Thread]:
     # tqdm keeps one thread for the bars of whoever imports it, and renews it
     return {t for t in threading.enumerate() if type(t).__name__ != "TMonitor"}
+
+
+@pytest.fixture
+def call(capsys, monkeypatch):
+    """Call `tactile-rt` in this process with these arguments: (exit code, stdout, stderr)."""
+    from tactile_rt.cli import main
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["tactile-rt", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            main()
+        return left.value.code or 0, *capsys.readouterr()
+
+    return run

@@ -112,37 +112,25 @@ def test_an_object_on_two_sides_under_two_names(folder, refused):
     assert "cube-1 is cube-0 by another name, on another side of the split" in refused()
 
 
-@pytest.fixture
-def run_command(capsys, monkeypatch):
-    def run(*arguments):
-        """(exit code, what it said)."""
-        monkeypatch.setattr(sys, "argv", ["tactile-rt", *map(str, arguments)])
-        with pytest.raises(SystemExit) as left:
-            main()
-        return left.value.code or 0, " ".join(capsys.readouterr().err.split())
-
-    return run
-
-
-def test_good_data_is_trained_on_and_exported_wherever_it_lies_then(folder, tmp_path, run_command):
+def test_good_data_is_trained_on_and_exported_wherever_it_lies_then(folder, tmp_path, call):
     run, moved, model = tmp_path / "run", tmp_path / "moved", tmp_path / "model.onnx"
     options = ("--batch", 2, "--encoder", "gru", "--width", 1 / 32, "--updates", 1)
-    code, said = run_command("train", folder, run, "--attender", "none", *options)
+    code, _, said = call("train", folder, run, "--attender", "none", *options)
     assert not code, said
     folder.rename(moved)
-    code, said = run_command("export", run / "best.pt", model)
+    code, _, said = call("export", run / "best.pt", model)
     assert code == 2
     assert f"{folder}, the sweep set that {run}/best.pt was trained on, is not here" in said
 
     # As many categories, in another order: every name that it told would be wrong.
     manifest = SweepManifest.read(moved)
     resplit(moved, categories=manifest.categories[::-1])
-    code, said = run_command("export", run / "best.pt", model, "--data", moved)
+    code, _, said = call("export", run / "best.pt", model, "--data", moved)
     assert (code, model.exists()) == (2, False)
     assert "best.pt tells other categories apart than" in said
     assert "(the same in another order): name the set that it was trained on by --data" in said
 
     resplit(moved, categories=manifest.categories)
-    code, said = run_command("export", run / "best.pt", model, "--data", moved)
+    code, _, said = call("export", run / "best.pt", model, "--data", moved)
     assert not code, said
     assert load_model(model)[1].labels == manifest.categories
