@@ -4,7 +4,9 @@ Small networks: the streaming rewrite against the trained window (bar 2e-6, also
 every step, and in the form that is quantised), the same in double precision (bar 1e-9, where a
 mistake cannot pass for rounding), and the file in fp32 against the window (bar 1e-5), as a step
 over many episodes in a row and as a window. And the file in the classifier: a stream cut at random
-must give the very decisions of the whole. Prints the worst of each and fails if one misses its bar.
+must give the very decisions of the whole. Wide networks take other forms of their products: with
+one decoder, so do the small ones here, once more. Prints the worst of each and fails if one misses
+its bar.
 """
 
 import os
@@ -23,9 +25,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 from tactile_rt.classifier import Classifier
+from tactile_rt.export import streaming as streaming_module
+from tactile_rt.export import streaming_gpt
 from tactile_rt.export.full_size import random_model
 from tactile_rt.export.onnx_step import PARITY_BAR, step_graph, write_model
 from tactile_rt.export.streaming import streaming
@@ -51,7 +55,8 @@ STEPS, CLASSES, WIDTH = 22, 7, 1 / 32
 # A GRU's initial weights grow as it gets smaller, and its drives are sums of 1,050 inputs: one of
 # 16 features is driven five times as hard as one of 512, and rounds as much more.
 WIDTHS = {"gru": 1 / 4}
-Combination = tuple[str, str, str]
+FORMS = {"": (streaming_module.LARGE, streaming_gpt.WIDE), "as if wide": (0, 0)}
+Combination = tuple[str, str, str, str]
 SPEC = read_model(shipped_model())[0].array
 
 
@@ -63,14 +68,19 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     args = parser.parse_args()
     encoders = args.encoder or [name for name in ENCODERS if name != "graph"]
-    grid = list(itertools.product(encoders, ATTENDERS, DECODERS))
+    grid = list(itertools.product(encoders, ATTENDERS, DECODERS, [""]))
+    grid += [
+        (encoder, attender, DECODERS[-1], "as if wide")
+        for encoder, attender in itertools.product(encoders, ATTENDERS)
+        if encoder.startswith("zhuang") or attender == "gpt"
+    ]
     began, found, console = time.perf_counter(), {}, Console()
     jobs = [(c, 0 if args.torch_only else args.episodes) for c in grid]
     with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
         for combination, figures in pool.imap_unordered(measure, jobs):
             found[combination] = figures
             console.print(*combination, *(f"{f:.1e}" for f in figures), highlight=False)
-    table = Table("encoder", *BARS)
+    table = Table(Column("encoder", no_wrap=True), *BARS)
     for encoder in encoders:
         rows = [f for c, f in found.items() if c[0] == encoder]
         table.add_row(encoder, *(f"{worst:.1e}" for worst in np.max(rows, axis=0)))
@@ -89,7 +99,8 @@ def main() -> int:
 
 def measure(job: tuple[Combination, int]) -> tuple[Combination, list[float]]:
     """Largest differences, in the order of `BARS`: of logits, and last of posteriors."""
-    (encoder, attender, decoder), episodes = job
+    (encoder, attender, decoder, form), episodes = job
+    streaming_module.LARGE, streaming_gpt.WIDE = FORMS[form]
     torch.set_num_threads(1)
     torch.manual_seed(1)  # not of the weights (0) nor of the input (2), which would go together
     readout = "mean" if decoder == "mlp" else "last"

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.export.products import Columns, Product
+from tactile_rt.export.products import Columns, Pointwise, Product
 from tactile_rt.export.streaming_gpt import StreamingGPT
 from tactile_rt.models.attenders import GPT
 from tactile_rt.models.ead import EAD
@@ -30,6 +30,9 @@ __all__ = [
     "StreamingResNet18",
     "streaming",
 ]
+
+
+LARGE = 2**18  # numbers of a convolution's weights, from where on `Pointwise` was the faster form
 
 
 def streaming(network: EAD, integer: bool = False) -> EAD:
@@ -54,7 +57,7 @@ def streaming(network: EAD, integer: bool = False) -> EAD:
     elif hasattr(encoder, "deployed"):
         out.encoder = encoder.deployed()
     if isinstance(network.attender, GPT):
-        out._modules["attender"] = StreamingGPT(network.attender)
+        out._modules["attender"] = StreamingGPT(network.attender, integer)
     return out.eval()
 
 
@@ -74,7 +77,7 @@ class Taps(nn.Module):
         size: rows and columns of the maps that come in.
         valid: without the padding that makes the output as large as the input.
         whole: gather all four taps; else add the lower two as a product of their own, of fewer
-            sites: what lies below the map needs no product.
+            sites or of none: what lies below the map needs no product.
     """
 
     taps: Tensor
@@ -92,13 +95,16 @@ class Taps(nn.Module):
             site = site[:-1, :-1]
         taps = torch.stack([site[:-1, :-1], site[:-1, 1:], site[1:, :-1], site[1:, 1:]], -1)
         taps = taps.flatten(0, 1)
-        self.lower: Product | None = None
+        self.product: Pointwise | Product
+        self.lower: Pointwise | Product | None = None
         if whole or valid:
             self.product = Product(weight.flatten(1), bias)
         else:
             taps = taps[:, :2]
             upper, lower = weight.flatten(2).unbind(1)
-            self.product, self.lower = Product(upper, bias), Product(lower, None)
+            form = Pointwise if upper.numel() >= LARGE else Product
+            self.product = form(upper, bias)
+            self.lower = form(lower, None) if rows > 1 else None
         self.outputs = len(taps)
         self.register_buffer("taps", taps.flatten())
 

@@ -1,7 +1,7 @@
 """The GPT attender rewritten for streaming: see `streaming`.
 
-Tokens are the rows of one matrix, (lane * token, width), and the cache of a layer is written by
-rows: what was attended before stays where it is.
+The cache of a layer is written by rows: what was attended before stays where it is. Tokens are the
+rows of one matrix, (lane * token, width), or where that is faster (lane, 1, token, width).
 """
 
 from __future__ import annotations
@@ -13,19 +13,26 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.export.products import Product, product_of
+from tactile_rt.export.products import Pointwise, Product, product_of
 from tactile_rt.models.attenders import GPT, HEADS, TOKENS
 from tactile_rt.models.attenders.gpt import Block
 
 __all__ = ["StreamingGPT"]
 
+WIDE = 256  # features, from where on convolutions were the faster products
+
 
 class StreamingGPT(nn.Module):
-    """A `GPT` whose cache is one tensor per layer and kind, of which a step writes its own rows."""
+    """A `GPT` whose cache is one tensor per layer and kind, of which a step writes its own rows.
+
+    Args:
+        gpt: as trained.
+        integer: its products will be quantised.
+    """
 
     positions: Tensor
 
-    def __init__(self, gpt: GPT) -> None:
+    def __init__(self, gpt: GPT, integer: bool = False) -> None:
         super().__init__()
         self.features, self.max_steps = gpt.features, gpt.max_steps
         self.head = gpt.features // HEADS
@@ -38,7 +45,9 @@ class StreamingGPT(nn.Module):
         self.project_in = Product(gpt.project_in.weight, None)
         self.project_out = product_of(gpt.project_out)
         self.norm = gpt.norm
-        self.blocks = nn.ModuleList(StreamingBlock(block) for block in gpt.blocks)
+        convolve = not integer and gpt.features >= WIDE
+        self.rows = (1, TOKENS, gpt.features) if convolve else (gpt.features,)
+        self.blocks = nn.ModuleList(StreamingBlock(block, self.rows) for block in gpt.blocks)
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
         """Zeros: keys and values of each layer, (batch, head, step * token, width / head)."""
@@ -60,7 +69,7 @@ class StreamingGPT(nn.Module):
         head = torch.arange(HEADS)[:, None]
         here = Rows(*torch.broadcast_tensors(lane, head, query), unseen=unseen)  # type: ignore[misc]
         pair = F.pad(self.project_in(features), (0, self.features))
-        x = (pair + self.positions[index]).view(-1, self.features)
+        x = (pair + self.positions[index]).view(-1, *self.rows)
         new: dict[str, Tensor] = {}
         for layer, block in enumerate(self.blocks):
             names = (f"gpt_k{layer}", f"gpt_v{layer}")
@@ -88,21 +97,28 @@ class Rows:
 
 
 class StreamingBlock(nn.Module):
-    """One layer of `StreamingGPT`."""
+    """One layer of `StreamingGPT`.
 
-    def __init__(self, block: nn.Module) -> None:
+    Args:
+        block: as trained.
+        rows: shape of a lane's tokens, or of one token where they are rows of one matrix.
+    """
+
+    def __init__(self, block: nn.Module, rows: tuple[int, ...]) -> None:
         super().__init__()
         assert isinstance(block, Block)
         self.norm1, self.norm2 = block.norm1, block.norm2
         width = block.proj.in_features
-        self.width, self.head = width, width // HEADS
+        self.head, self.rows = width // HEADS, rows
         # The attention's scale is in the queries' weights.
         scale = torch.ones(3 * width)
         scale[:width] = 1 / math.sqrt(self.head)
         qkv = block.qkv
-        self.qkv = Product(qkv.weight * scale[:, None], qkv.bias * scale)
-        self.proj, self.mlp_in = product_of(block.proj), product_of(block.mlp_in)
-        self.mlp_out = product_of(block.mlp_out)
+        form = Product if len(rows) == 1 else Pointwise
+        self.qkv = form(qkv.weight * scale[:, None], qkv.bias * scale)
+        self.proj, self.mlp_in, self.mlp_out = (
+            form(linear.weight, linear.bias) for linear in (block.proj, block.mlp_in, block.mlp_out)
+        )
 
     def forward(
         self, x: Tensor, k_cache: Tensor, v_cache: Tensor, here: Rows
@@ -112,7 +128,7 @@ class StreamingBlock(nn.Module):
         k_cache, v_cache = here.write(k_cache, k), here.write(v_cache, v)
         scores = torch.matmul(q, k_cache.transpose(-1, -2))
         weights = torch.softmax(scores + here.unseen, dim=-1)
-        attended = torch.matmul(weights, v_cache).transpose(1, 2).reshape(-1, self.width)
+        attended = torch.matmul(weights, v_cache).transpose(1, 2).reshape(-1, *self.rows)
         x = x + self.proj(attended)
         hidden = F.gelu(self.mlp_in(self.norm2(x)), approximate="tanh")
         return x + self.mlp_out(hidden), k_cache, v_cache

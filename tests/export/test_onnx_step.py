@@ -19,7 +19,7 @@ import torch
 import tactile_rt
 from tactile_rt.classifier import Classifier
 from tactile_rt.contact import CHANNEL_FLOOR
-from tactile_rt.export import onnx_step
+from tactile_rt.export import onnx_step, streaming, streaming_gpt
 from tactile_rt.export.onnx_step import (
     PARITY_BAR,
     export_checkpoint,
@@ -144,15 +144,12 @@ def in_torch(model: TactileClassifier, *arrays: np.ndarray) -> np.ndarray:
         return model(*(torch.from_numpy(a) for a in arrays)).numpy()
 
 
-@pytest.mark.parametrize("batch", [1, 3])
-def test_the_file_alone_gives_the_trained_window_s_logits(
-    exported: SimpleNamespace, batch: int
-) -> None:
+def follow(path: Path, model: TactileClassifier, batch: int) -> None:
     """A stream loop as a stranger would write it, from the file's metadata."""
-    card = metadata(exported.path)
+    card = metadata(path)
     samples, offset, sigma = episodes(batch, seed=batch)
-    expected = in_torch(exported.model, samples, offset, sigma)
-    session = onnxruntime.InferenceSession(exported.path, providers=["CPUExecutionProvider"])
+    expected = in_torch(model, samples, offset, sigma)
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     state = {s["name"]: np.zeros((batch, *s["shape"]), s["dtype"]) for s in card["state"]}
     outputs = ["logits", *(f"{name}_next" for name in state)]
     assert card["steps"] == STEPS
@@ -163,6 +160,26 @@ def test_the_file_alone_gives_the_trained_window_s_logits(
         assert abs(logits - expected[:, t]).max() <= 1e-5, f"step {t}"
     assert np.ptp(expected) > 0.5, "logits that say nothing would agree in any graph"
     assert all(np.any(value) for value in state.values()), "a state that is never written"
+
+
+@pytest.mark.parametrize("batch", [1, 3])
+def test_the_file_alone_gives_the_trained_window_s_logits(
+    exported: SimpleNamespace, batch: int
+) -> None:
+    follow(exported.path, exported.model, batch)
+
+
+def test_so_it_does_in_the_forms_of_a_wide_network(
+    exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(streaming, "LARGE", 0)
+    monkeypatch.setattr(streaming_gpt, "WIDE", 0)
+    path = tmp_path / "wide.onnx"
+    export_step(exported.model, exported.card, path)
+    operators = [node.op_type for node in onnx.load(path).graph.node]
+    assert operators.count("Conv") > 30, "four products in each of eight layers, and more"
+    for batch in (1, 3):
+        follow(path, exported.model, batch)
 
 
 def test_parity_is_measured_and_stored(exported: SimpleNamespace) -> None:

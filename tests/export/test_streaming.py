@@ -9,6 +9,9 @@ pytest.importorskip("torch")
 import torch
 from small_networks import TOLERANCE, build, frames, stream
 
+from tactile_rt.export import streaming as streaming_module
+from tactile_rt.export import streaming_gpt
+from tactile_rt.export.products import Pointwise
 from tactile_rt.export.streaming import (
     StreamingGPT,
     StreamingGraph,
@@ -56,6 +59,25 @@ def test_steps_give_the_window_s_logits(encoder: str, attender: str, decoder: st
     assert expected.std() > 1e-3, "logits that say nothing would agree in any network"
     for integer in (False, True):
         assert abs(stream(streaming(ead, integer), x) - expected).max() <= TOLERANCE
+
+
+@pytest.fixture
+def as_if_wide(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small networks take the forms of wide ones."""
+    monkeypatch.setattr(streaming_module, "LARGE", 0)
+    monkeypatch.setattr(streaming_gpt, "WIDE", 0)
+
+
+@pytest.mark.usefixtures("as_if_wide")
+@pytest.mark.parametrize(("encoder", "attender", "decoder"), SAMPLE)
+def test_so_they_do_in_the_forms_of_wide_networks(
+    encoder: str, attender: str, decoder: str
+) -> None:
+    ead = build(encoder, attender, "mean" if decoder == "mlp" else "last", decoder=decoder)
+    deployed, x = streaming(ead), frames()
+    convolves = any(isinstance(module, Pointwise) for module in deployed.modules())
+    assert convolves == (encoder.startswith("zhuang") or attender == "gpt")
+    assert abs(stream(deployed, x) - ead(x)).max() <= TOLERANCE
 
 
 @pytest.mark.parametrize("encoder", ["zhuang-lstm-ln", "s4"])
@@ -131,4 +153,27 @@ def test_a_graph_with_sums_and_gates_streams_as_it_was_trained() -> None:
     """
     ead = build("graph", "none", graph=graph, width=1.0)
     x = frames()
+    assert abs(stream(streaming(ead), x) - ead(x)).max() <= TOLERANCE
+
+
+@pytest.mark.usefixtures("as_if_wide")
+def test_maps_of_one_row_have_no_site_below() -> None:
+    graph = """
+    readout = "out"
+    [inputs.frame]
+    channels = 30
+    rows = 1
+    columns = 7
+    [nodes.a]
+    channels = 16
+    kind = "same"
+    cell = "intersection"
+    reads = ["frame"]
+    [nodes.out]
+    channels = 16
+    kind = "dense"
+    reads = ["a"]
+    """
+    ead = build("graph", "none", graph=graph, width=1.0)
+    x = frames()[..., :1, :]
     assert abs(stream(streaming(ead), x) - ead(x)).max() <= TOLERANCE
