@@ -1,5 +1,6 @@
 """`tactile-rt train`, `recipes`, `probe` and `export`: from a sweep set to a model file."""
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -90,7 +91,8 @@ def train(
     }
     given = {name: value for name, value in asked.items() if value is not None}
     config = training.read_recipe(recipe, str(data), **given)
-    console = Console(stderr=True)
+    # Under torchrun every process has the same to say.
+    console = Console(stderr=True, quiet=os.environ.get("RANK", "0") != "0")
     with progress_bar(console, "finding onsets") as update:
 
         def show(at: "training.Progress") -> None:

@@ -281,6 +281,26 @@ def test_tensorboard_is_asked_for_by_name(tiny, tmp_path, monkeypatch):
     config = TrainingConfig(tiny, **SMALL, updates=1)
     with pytest.raises(ConfigError, match="pip install tensorboard"):
         train(config, tmp_path / "run", tensorboard=True)
+    assert not (tmp_path / "run").exists(), "nothing is begun"
+
+
+def test_tensorboard_shows_a_run_that_went_on_as_one(tiny, tmp_path):
+    """Read by TensorBoard itself. The update after the last that was saved is made again."""
+    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
+
+    def cut(at):
+        if at.update == 4 and not at.metrics:
+            raise KeyboardInterrupt
+
+    config = TrainingConfig(tiny, **SMALL, epochs=3)
+    with pytest.raises(KeyboardInterrupt):
+        train(config, tmp_path / "run", cut, tensorboard=True)
+    train(config, tmp_path / "run", tensorboard=True)
+    found = accumulator.EventAccumulator(str(tmp_path / "run" / "tensorboard"))
+    found.Reload()
+    steps = [event.step for event in found.Scalars("loss")]
+    assert steps == list(range(1, len(steps) + 1)), "each update once"
+    assert len(found.Scalars("epoch/validation_top1")) == 3
 
 
 def test_the_initialised_network_is_what_training_begins_with(tiny, tmp_path):
@@ -373,6 +393,12 @@ def test_two_devices_train_as_one(tiny, tmp_path, objective):
     train(TrainingConfig(tiny, **whole), tmp_path / "one")
     one, two = weights(tmp_path / "one" / "last.pt"), weights(tmp_path / "two" / "last.pt")
     assert digest(two) == ranks[0]["digest"]
+    losses = []
+    for run in ("one", "two"):
+        with (tmp_path / run / "history.csv").open() as file:
+            losses.append([float(line["loss"]) for line in csv.DictReader(file)])
+    if objective == "supervised":  # the other compares what is in a batch
+        assert losses[1] == pytest.approx(losses[0], abs=1e-4), "of both shares"
     if objective == "supervised":  # batch norm sees half of the batch in the other
         for name in one:
             torch.testing.assert_close(one[name], two[name], atol=2e-5, rtol=1e-3)

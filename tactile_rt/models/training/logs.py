@@ -26,28 +26,34 @@ def log_epoch(path: Path, metrics: dict[str, float]) -> None:
 
 
 class Board:
-    """TensorBoard's view of a run, if it is wanted.
+    """TensorBoard's view of a run, if it is wanted. Nothing is written before `begin`.
 
     Args:
         folder: the run's.
-        wanted: False: nothing is written.
-        update: the first that will be written; what a killed run wrote from there on is dropped.
+        wanted: False: nothing is ever written.
 
     Raises:
         ConfigError: wanted, but tensorboard is not installed.
     """
 
-    def __init__(self, folder: Path, wanted: bool, update: int = 0) -> None:
+    def __init__(self, folder: Path, wanted: bool) -> None:
+        self._folder = folder / "tensorboard"
+        self._kind: Any = None
         self._writer: Any = None
-        if not wanted:
-            return
-        try:
-            from torch.utils.tensorboard import SummaryWriter
-        except ImportError:
-            raise ConfigError(
-                "--tensorboard needs tensorboard, which is not installed: pip install tensorboard"
-            ) from None
-        self._writer = SummaryWriter(str(folder / "tensorboard"), purge_step=update)
+        if wanted:
+            try:
+                from torch.utils.tensorboard import SummaryWriter
+            except ImportError:
+                raise ConfigError(
+                    "--tensorboard needs tensorboard, which is not installed: "
+                    "pip install tensorboard"
+                ) from None
+            self._kind = SummaryWriter
+
+    def begin(self, done: int) -> None:
+        """Go on after so many updates: what a killed run wrote of later ones is dropped."""
+        if self._kind is not None:
+            self._writer = self._kind(str(self._folder), purge_step=done + 1)
 
     def write(self, update: int, values: dict[str, float]) -> None:
         """Scalars after an update."""

@@ -75,9 +75,9 @@ def train(
     torch.manual_seed(config.seed)
     training, validating = splits or read_splits(Path(config.data), config)
     objective = build_objective(config, training.manifest)
+    board = Board(folder, tensorboard and fabric.is_global_zero)
     if fabric.is_global_zero:
         _begin_run(config, folder)
-    board = Board(folder, tensorboard and fabric.is_global_zero)
 
     share = Share(fabric.global_rank, fabric.world_size)
     batches = TrainingBatches(training, config.batch, config.seed)
@@ -88,6 +88,7 @@ def train(
     run = _Run(objective, optimizer, config, len(batches))
     fabric.barrier()
     run.resume(folder / "last.pt")
+    board.begin(run.done)
     wrapped, _ = fabric.setup(objective, optimizer)
     bf16 = config.precision == "bf16"
 
@@ -133,7 +134,7 @@ def train(
         found, score = fabric.broadcast(validate(objective))
         metrics = {
             "epoch": epoch + 1,
-            "loss": float(np.mean(losses)),
+            "loss": _mean(fabric, losses),
             **found,
             "seconds": time.monotonic() - began,
         }
@@ -142,7 +143,7 @@ def train(
             if better:
                 save_whole(folder / "best.pt", _card(config, objective, training, metrics))
             log_epoch(folder / "history.csv", metrics)
-            board.write(run.done, {k: v for k, v in metrics.items() if k != "epoch"})
+            board.write(run.done, {f"epoch/{k}": v for k, v in metrics.items() if k != "epoch"})
             save_whole(folder / "last.pt", run.state())
         shown = {**metrics, "waiting": feed.waited / metrics["seconds"]}
         report(Progress(epoch + 1, run.epochs, run.done, run.updates, metrics["loss"], shown))
@@ -262,6 +263,16 @@ def _launched(config: TrainingConfig, device: str) -> "Fabric":
     )
     fabric.launch()
     return fabric
+
+
+def _mean(fabric: "Fabric", losses: list[float]) -> float:
+    """Over an epoch's updates and all devices, each of which has its share of every batch."""
+    mean = float(np.mean(losses))
+    if fabric.world_size == 1:
+        return mean
+    shared = fabric.all_reduce(torch.tensor(mean))
+    assert isinstance(shared, torch.Tensor)
+    return shared.item()
 
 
 def _card(
