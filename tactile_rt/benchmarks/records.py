@@ -46,6 +46,7 @@ class Record:
 def show(records: list[Record], console: Console) -> None:
     """Print records as a table, each with how it was measured on the line below."""
     table = Table("figure", "value", "bar", "met", leading=1)
+    table.columns[0].overflow = "fold"  # a name is one long word
     for column in table.columns[1:]:
         column.no_wrap = True
     marks = {True: "[green]yes[/]", False: "[bold red]NO[/]", None: ""}
