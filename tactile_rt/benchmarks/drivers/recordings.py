@@ -95,11 +95,10 @@ def _ended(folder: Path, times: int) -> list[Record]:
     draw, lost_s, bad = np.random.default_rng(0), [], 0
     for i in range(times):
         path = folder / f"killed-{i}.mcap"
-        process = _recorder(path)
-        time.sleep(draw.uniform(0, 2))
-        killed = time.monotonic_ns()
-        process.kill()
-        process.wait()
+        with _recorder(path) as process:
+            time.sleep(draw.uniform(0, 2))
+            killed = time.monotonic_ns()
+            process.kill()
         last, whole = 0, True
         expected = 0
         for chunk in read_stream(recover(path)):
@@ -107,12 +106,12 @@ def _ended(folder: Path, times: int) -> list[Record]:
             expected, last = int(chunk.seq[-1]) + 1, int(chunk.t_ns[-1])
         lost_s.append((killed - last) / 1e9)
         bad += not whole
-    process = _recorder(folder / "ended.mcap")
-    time.sleep(0.5)
-    began = time.monotonic()
-    process.send_signal(signal.SIGTERM)
-    code = process.wait()
-    took = time.monotonic() - began
+    with _recorder(folder / "ended.mcap") as process:
+        time.sleep(0.5)
+        began = time.monotonic()
+        process.send_signal(signal.SIGTERM)
+        code = process.wait()
+        took = time.monotonic() - began
     bad += code != 0 or not list(read_stream(folder / "ended.mcap"))
     how = f"{times} recorders of 35 x 6 at 1 kHz, killed within 2 s of their first second"
     return [
