@@ -74,12 +74,14 @@ def main() -> int:
         for encoder, attender in itertools.product(encoders, ATTENDERS)
         if encoder.startswith("zhuang") or attender == "gpt"
     ]
-    began, found, console = time.perf_counter(), {}, Console()
+    began, found, console = time.perf_counter(), {}, Console(width=120)
     jobs = [(c, 0 if args.torch_only else args.episodes) for c in grid]
     with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
         for combination, figures in pool.imap_unordered(measure, jobs):
             found[combination] = figures
             console.print(*combination, *(f"{f:.1e}" for f in figures), highlight=False)
+        pool.close()
+        pool.join()  # else their semaphores are thought to be lost
     table = Table(Column("encoder", no_wrap=True), *BARS)
     for encoder in encoders:
         rows = [f for c, f in found.items() if c[0] == encoder]
