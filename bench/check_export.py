@@ -63,12 +63,14 @@ SPEC = read_model(shipped_model())[0].array
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--encoder", action="append", help="only this one; may be repeated")
+    parser.add_argument("--wide-only", action="store_true", help="only the forms of wide networks")
     parser.add_argument("--torch-only", action="store_true", help="export nothing: seconds")
     parser.add_argument("--episodes", type=int, default=500, help="in a row, through each file")
     parser.add_argument("--workers", type=int, default=os.cpu_count())
     args = parser.parse_args()
     encoders = args.encoder or [name for name in ENCODERS if name != "graph"]
-    grid = list(itertools.product(encoders, ATTENDERS, DECODERS, [""]))
+    small = [] if args.wide_only else [""]
+    grid = list(itertools.product(encoders, ATTENDERS, DECODERS, small))
     grid += [
         (encoder, attender, DECODERS[-1], "as if wide")
         for encoder, attender in itertools.product(encoders, ATTENDERS)

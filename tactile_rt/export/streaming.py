@@ -165,7 +165,11 @@ class StreamingGraph(nn.Module):
                 linear = encoder.dense[node.name]
                 assert isinstance(linear, nn.Linear)
                 maps = all(self.sizes[e.source] != (1, 1) for e in node.reads)
-                kind = Columns if maps and not integer else Product
+                kind: type[Columns | Pointwise | Product] = Product
+                if not integer and linear.weight.numel() >= 4 * LARGE:
+                    kind = Pointwise  # one row gains less than several
+                elif maps and not integer:
+                    kind = Columns
                 self.drives[node.name] = kind(linear.weight, linear.bias)
             else:
                 conv: Any = encoder.convs[node.name]

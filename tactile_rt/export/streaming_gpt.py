@@ -1,7 +1,7 @@
 """The GPT attender rewritten for streaming: see `streaming`.
 
 The cache of a layer is written by rows: what was attended before stays where it is. Tokens are the
-rows of one matrix, (lane * token, width), or where that is faster (lane, 1, token, width).
+rows of one matrix, (lane * token, width), or where that is faster (1, lane, token, width).
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class StreamingGPT(nn.Module):
         self.project_out = product_of(gpt.project_out)
         self.norm = gpt.norm
         convolve = not integer and gpt.features >= WIDE
-        self.rows = (1, TOKENS, gpt.features) if convolve else (gpt.features,)
-        self.blocks = nn.ModuleList(StreamingBlock(block, self.rows) for block in gpt.blocks)
+        self.layout = (1, -1, TOKENS, gpt.features) if convolve else (-1, gpt.features)
+        self.blocks = nn.ModuleList(StreamingBlock(block, self.layout) for block in gpt.blocks)
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
         """Zeros: keys and values of each layer, (batch, head, step * token, width / head)."""
@@ -69,7 +69,7 @@ class StreamingGPT(nn.Module):
         head = torch.arange(HEADS)[:, None]
         here = Rows(*torch.broadcast_tensors(lane, head, query), unseen=unseen)  # type: ignore[misc]
         pair = F.pad(self.project_in(features), (0, self.features))
-        x = (pair + self.positions[index]).view(-1, *self.rows)
+        x = (pair + self.positions[index]).view(self.layout)
         new: dict[str, Tensor] = {}
         for layer, block in enumerate(self.blocks):
             names = (f"gpt_k{layer}", f"gpt_v{layer}")
@@ -101,20 +101,20 @@ class StreamingBlock(nn.Module):
 
     Args:
         block: as trained.
-        rows: shape of a lane's tokens, or of one token where they are rows of one matrix.
+        layout: of all tokens.
     """
 
-    def __init__(self, block: nn.Module, rows: tuple[int, ...]) -> None:
+    def __init__(self, block: nn.Module, layout: tuple[int, ...]) -> None:
         super().__init__()
         assert isinstance(block, Block)
         self.norm1, self.norm2 = block.norm1, block.norm2
         width = block.proj.in_features
-        self.head, self.rows = width // HEADS, rows
+        self.head, self.layout = width // HEADS, layout
         # The attention's scale is in the queries' weights.
         scale = torch.ones(3 * width)
         scale[:width] = 1 / math.sqrt(self.head)
         qkv = block.qkv
-        form = Product if len(rows) == 1 else Pointwise
+        form = Product if len(layout) == 2 else Pointwise
         self.qkv = form(qkv.weight * scale[:, None], qkv.bias * scale)
         self.proj, self.mlp_in, self.mlp_out = (
             form(linear.weight, linear.bias) for linear in (block.proj, block.mlp_in, block.mlp_out)
@@ -128,7 +128,7 @@ class StreamingBlock(nn.Module):
         k_cache, v_cache = here.write(k_cache, k), here.write(v_cache, v)
         scores = torch.matmul(q, k_cache.transpose(-1, -2))
         weights = torch.softmax(scores + here.unseen, dim=-1)
-        attended = torch.matmul(weights, v_cache).transpose(1, 2).reshape(-1, *self.rows)
+        attended = torch.matmul(weights, v_cache).transpose(1, 2).reshape(self.layout)
         x = x + self.proj(attended)
         hidden = F.gelu(self.mlp_in(self.norm2(x)), approximate="tanh")
         return x + self.mlp_out(hidden), k_cache, v_cache
