@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from rich.console import Console
-from rich.table import Column, Table
+from rich.table import Table
 
 from tactile_rt.classifier import Classifier
 from tactile_rt.export import streaming as streaming_module
@@ -84,7 +84,7 @@ def main() -> int:
             console.print(*combination, *(f"{f:.1e}" for f in figures), highlight=False)
         pool.close()
         pool.join()  # else their semaphores are thought to be lost
-    table = Table(Column("encoder", no_wrap=True), *BARS)
+    table = Table("encoder", *BARS)
     for encoder in encoders:
         rows = [f for c, f in found.items() if c[0] == encoder]
         table.add_row(encoder, *(f"{worst:.1e}" for worst in np.max(rows, axis=0)))
