@@ -17,16 +17,16 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -m "slow or not slow"
-	$(BIN)/python bench/check_wheel.py
+	$(BIN)/python -m bench.check_wheel
 
 check-export: $(VENV)/.dev
-	$(BIN)/python bench/check_export.py
+	$(BIN)/python -m bench.check_export
 
 bench: $(VENV)/.dev
 	$(BIN)/tactile-rt bench
 
 fuzz: $(VENV)/.dev
-	$(BIN)/python bench/fuzz_codecs.py
+	$(BIN)/python -m bench.fuzz_codecs
 
 format: $(VENV)/.dev
 	$(BIN)/ruff format .

@@ -27,14 +27,14 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.classifier import Classifier
+from bench.inference.full_size import random_model
+from tactile_rt.classifier.classifier import Classifier
+from tactile_rt.classifier.model_file import load_model, read_model, shipped_model
+from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.export import streaming as streaming_module
 from tactile_rt.export import streaming_gpt
-from tactile_rt.export.full_size import random_model
 from tactile_rt.export.onnx_step import PARITY_BAR, step_graph, write_model
 from tactile_rt.export.streaming import streaming
-from tactile_rt.inference.stepper import Stepper
-from tactile_rt.model_file import load_model, read_model, shipped_model
 from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, EADConfig
 from tactile_rt.models.training import TactileClassifier
 from tactile_rt.stream import Chunk

@@ -27,7 +27,7 @@ def main() -> None:
             subprocess.run([script, *arguments], check=True, cwd=out, stdout=subprocess.DEVNULL)
         # A robot's install: the model loads, and a missing extra is named.
         code = (
-            "from tactile_rt.model_file import load_model, shipped_model;"
+            "from tactile_rt.classifier.model_file import load_model, shipped_model;"
             "print(load_model(shipped_model())[1].labels)"
         )
         python = str(environment / "bin" / "python")

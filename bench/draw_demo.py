@@ -1,6 +1,6 @@
 """Draw docs/demo.svg: the demonstration's view in the middle of a real, seeded run.
 
-Run: python bench/draw_demo.py [--model FILE] [--out FILE]
+Run: python -m bench.draw_demo [--model FILE] [--out FILE]
 """
 
 import argparse
@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from tactile_rt.cli.demonstration import Demonstration
-from tactile_rt.cli.demonstration_view import WIDTH, draw
-from tactile_rt.model_file import shipped_model
+from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.cli.demo import Demonstration
+from tactile_rt.cli.demo_view import WIDTH, draw
 
 # The moment: so many objects have passed, and the next is so many steps under way and well felt.
 OBJECTS, STEP, WHISKERS, FELT_N = 12, 8, 6, 1e-5

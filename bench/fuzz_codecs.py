@@ -1,11 +1,11 @@
 """Fuzz every codec with at least 10^7 mutated bytes, one after another (`make fuzz`).
 
-python bench/fuzz_codecs.py [BYTES] [CODEC ...]      e.g. 1000000 "serial bota" "can xela"
+python -m bench.fuzz_codecs [BYTES] [CODEC ...]      e.g. 1000000 "serial bota" "can xela"
 """
 
 import sys
 
-from tactile_rt.benchmarks.drivers.fuzzing import HELD_MOST, WHOLE, all_codecs, fuzz
+from bench.drivers.fuzzing import HELD_MOST, WHOLE, all_codecs, fuzz
 
 
 def main() -> int:

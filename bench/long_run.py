@@ -1,6 +1,6 @@
 """The shipped model in the classifier for days: nothing grows, and the end is like the beginning.
 
-python bench/long_run.py [STEPS]      1,000,000 by default, some 20 minutes of CPU
+python -m bench.long_run [STEPS]      1,000,000 by default, some 20 minutes of CPU
 
 Touches of every length and strength, rests, silences of the line, NaN and infinite samples, dead
 and stuck whiskers, denormals and values past the clip, in chunks of random sizes. Prints resident
@@ -18,10 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_rt.classifier import Classification, Classifier
-from tactile_rt.model_file import read_model, shipped_model
-from tactile_rt.stream import Chunk
-from tactile_rt.timebase import NS_PER_S
+from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.classifier.model_file import read_model, shipped_model
+from tactile_rt.stream import NS_PER_S, Chunk
 
 STEPS, WARM_UP, REPORTS = 1_000_000, 20_000, 10
 GROWTH, DIFFERENCE = 2e6, 1e-4  # bytes; of a posterior, from the tare's sums in another order

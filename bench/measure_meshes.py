@@ -3,23 +3,20 @@
 Beside each, what CoACD (Wei et al. 2022) makes of the same mesh at its finest threshold, measured
 in the same way. Needs the package coacd.
 
-Run: python bench/measure_meshes.py
+Run: python -m bench.measure_meshes
 """
 
-import sys
 import tempfile
 import time
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))  # the meshes live in the tests
-
 import coacd
-import mesh_truth
 import trimesh
 
-from tactile_rt.sim_backend.objects.deviation import Surface, deviation
+from tactile_rt.sim_backend.objects.deviation import TriangleSurface, deviation
 from tactile_rt.sim_backend.objects.meshes import MeshDetail, load_mesh
 from tactile_rt.sim_backend.objects.solids import normalised
+from tests.helpers import mesh_truth
 
 MM = 40.0
 FINEST = 0.01  # CoACD's smallest threshold
@@ -72,7 +69,7 @@ def _coacd(mesh: trimesh.Trimesh) -> str:
     pieces = normalised([trimesh.Trimesh(*part).convex_hull for part in cut])
     mesh.apply_translation(-mesh.bounds.mean(axis=0))
     mesh.apply_scale(1 / mesh.extents.max())
-    off = deviation(Surface(mesh.triangles), pieces).largest
+    off = deviation(TriangleSurface(mesh.triangles), pieces).largest
     return f"| {len(pieces)} | {MM * off:.3f} | {took:.1f} "
 
 

@@ -1,6 +1,6 @@
 """Draw docs/contacts.png: error of contact distance against the force, clean and at rated noise.
 
-python bench/plot_contacts.py runs/locate/best.pt data/contacts
+python -m bench.plot_contacts runs/locate/best.pt data/contacts
 """
 
 import sys
@@ -13,7 +13,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from tactile_rt.benchmarks.locating import LEVELS, distance_estimates, measure_contacts
+from tactile_rt.evidence.locating import LEVELS, distance_estimates, measure_contacts
 from tactile_rt.models.contact_regression import load_contacts
 from tactile_rt.models.datasets import SweepSet
 

@@ -1,13 +1,12 @@
 """Measure the physics, draw its pictures and write the tables of docs/physics.md.
 
-python bench/plot_physics.py                # everything: some 3 minutes of CPU
-python bench/plot_physics.py --json FILE    # take the figures of `tactile-rt bench sim --json FILE`
-python bench/plot_physics.py --only peg     # one of bars, whiskers, peg, creep, cost
+python -m bench.plot_physics                # everything: some 3 minutes of CPU
+python -m bench.plot_physics --json FILE    # take the figures of `tactile-rt bench sim --json FILE`
+python -m bench.plot_physics --only peg     # one of bars, whiskers, peg, creep, cost
 """
 
 import argparse
 import json
-import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -20,15 +19,12 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))  # the elastica lives in the tests
-
-import beams as theory
-
-from tactile_rt.benchmarks import sim
-from tactile_rt.benchmarks.beams import beams, flat, measure
-from tactile_rt.benchmarks.pegs import PEG_RADIUS_MM, Press, press, press_states, presses
-from tactile_rt.benchmarks.reference_model import reference_cost
+from bench.sim import area as sim
+from bench.sim.beams import beams, flat, measure
+from bench.sim.pegs import PEG_RADIUS_MM, Press, press, press_states, presses
+from bench.sim.reference_model import reference_cost
 from tactile_rt.sim_backend.world import PROFILES
+from tests.helpers import beams as theory
 
 DOCS = Path(__file__).parents[1] / "docs"
 INK, BLUE, ORANGE, GREY = "#20262e", "#1f6fb2", "#d95f0e", "#9aa3ad"

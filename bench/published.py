@@ -14,9 +14,9 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from tactile_rt.benchmarks.training_speed import CLASSES, STEPS
-from tactile_rt.export.full_size import random_model
-from tactile_rt.model_file import read_model, shipped_model
+from bench.inference.full_size import random_model
+from bench.models.training_speed import CLASSES, STEPS
+from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.encoders.cells import Cell
 from tactile_rt.stream import ConfigError

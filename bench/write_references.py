@@ -1,28 +1,24 @@
-"""Write what beam theory says of the mouse's whiskers into tactile_rt/benchmarks/data.
+"""Write what beam theory says of the mouse's whiskers into bench/sim/data.
 
-The benchmarks ship these figures; the theory itself, `tests/beams.py`, is not in the wheel.
+The benchmarks compare with these figures; the theory itself is in `tests/helpers/beams.py`.
 """
 
-import sys
 from itertools import product
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))  # the elastica lives in the tests
-
-import beams as theory
-
-from tactile_rt.benchmarks.beams import GRAVITY, flat
-from tactile_rt.benchmarks.pegs import PEG_RADIUS_MM
+from bench.sim.beams import GRAVITY, flat
+from bench.sim.pegs import PEG_RADIUS_MM
 from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tests.helpers import beams as theory
 
-DATA = Path(__file__).parents[1] / "tactile_rt" / "benchmarks" / "data"
+DATA = Path(__file__).parent / "sim" / "data"
 BENDS = {"straight": 1, "convex": -1, "concave": 1}  # and the side that the peg comes from
 
 
 def write_beams() -> None:
     """Compliance, first resonance and sag of every whisker."""
     lines = [
-        "# Euler-Bernoulli beams of the mouse's whiskers: see benchmarks/beams.py.",
+        "# Euler-Bernoulli beams of the mouse's whiskers: see bench/sim/beams.py.",
         "whisker,compliance_mm_per_N,resonance_hz,sag_mm",
     ]
     for w in mouse_whiskers():
@@ -35,7 +31,7 @@ def write_elastica() -> None:
     """A short, a middle and a long whisker on a peg."""
     lines = [
         "# Planar elastica of mouse whiskers pressed by a peg of 1 mm radius: "
-        "see benchmarks/pegs.py.",
+        "see bench/sim/pegs.py.",
         "whisker,bend,place,depth,friction,centre_x_mm,centre_y_mm,moment_uNm,force_x_mN,"
         "force_y_mN,contact_x_mm,contact_y_mm",
     ]

@@ -1,3 +1,85 @@
-"""tactile_rt: whisker and taxel arrays in, what they touch out, in real time."""
+"""tactile_rt: whisker and taxel arrays in, what they touch out, in real time.
 
-__version__ = "0.1.0"
+    from tactile_rt import Classifier, Session, open_source, shipped_model
+
+    with open_source("sim:mouse?sweeps=4&pace=fast") as source:
+        with Session(source, Classifier(shipped_model(), source.spec)) as session:
+            for chunk, decisions in session:
+                print([(decision.step, decision.label) for decision in decisions])
+
+What is imported from here is loaded when it is first used, so that a program pays only for what it
+takes: the sources need no ONNX Runtime, and reading a recording needs no serial port.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from tactile_rt.version import VERSION as __version__
+
+if TYPE_CHECKING:
+    from tactile_rt.classifier.classifier import Classifier
+    from tactile_rt.classifier.decisions import Classification, fuse
+    from tactile_rt.classifier.model_file import load_model, shipped_model
+    from tactile_rt.classifier.session import Session
+    from tactile_rt.drivers.codec import Codec
+    from tactile_rt.sources.opening import open_source
+    from tactile_rt.stream import (
+        ArraySpec,
+        Chunk,
+        ConfigError,
+        EndOfStream,
+        ModelError,
+        RecordingError,
+        Source,
+        SourceError,
+        SourceStats,
+        SpecMismatch,
+        TactileError,
+    )
+
+__all__ = [
+    "ArraySpec",
+    "Chunk",
+    "Classification",
+    "Classifier",
+    "Codec",
+    "ConfigError",
+    "EndOfStream",
+    "ModelError",
+    "RecordingError",
+    "Session",
+    "Source",
+    "SourceError",
+    "SourceStats",
+    "SpecMismatch",
+    "TactileError",
+    "__version__",
+    "fuse",
+    "load_model",
+    "open_source",
+    "shipped_model",
+]
+
+_STREAM = "tactile_rt.stream"
+_WHERE = {
+    "Classification": "tactile_rt.classifier.decisions",
+    "Classifier": "tactile_rt.classifier.classifier",
+    "Codec": "tactile_rt.drivers.codec",
+    "Session": "tactile_rt.classifier.session",
+    "fuse": "tactile_rt.classifier.decisions",
+    "load_model": "tactile_rt.classifier.model_file",
+    "open_source": "tactile_rt.sources.opening",
+    "shipped_model": "tactile_rt.classifier.model_file",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(_WHERE.get(name, _STREAM)), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 __all__ = [
+    "NS_PER_S",
     "ArraySpec",
     "Chunk",
     "ConfigError",
@@ -40,6 +41,7 @@ __all__ = [
     "concatenate",
 ]
 
+NS_PER_S = 1_000_000_000
 SPEC_VERSION = 1
 POSE_TOLERANCE = 1e-6  # m and quaternion units: below what anyone can mount or measure
 

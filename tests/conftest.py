@@ -3,7 +3,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from pathlib import Path
 
 # Before numpy, torch and onnxruntime start their pools: on a shared machine more threads than one
 # make small tests slower, not faster.
@@ -12,9 +11,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import pytest
 from hypothesis import settings
 
-# Helpers that several test modules share, `contract.py` for one, are imported by their bare names.
-sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent / "drivers")]
-pytest.register_assert_rewrite("contract", "codec_contract", "tiny_model")
+pytest.register_assert_rewrite("tests.helpers")
 
 # No deadline: another process on the machine must not fail a test. Derandomised: whoever runs the
 # tests gets the same examples, so a pass stays a pass.

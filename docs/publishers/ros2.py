@@ -20,7 +20,7 @@ from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from tactile_rt.daemon.consumer import View
-from tactile_rt.daemon.items import Item, Samples
+from tactile_rt.daemon.items import Item, SourceChunk
 from tactile_rt.daemon.messages import Message, encode, topic_of
 from tactile_rt.daemon.publishers.sending import Sender, SenderOptions
 
@@ -44,7 +44,7 @@ class Ros2Publisher(Sender):
         super().__init__(name, options)
         self._options = options
         if options.wrenches:
-            self.wants = frozenset({*self.wants, Samples})
+            self.wants = frozenset({*self.wants, SourceChunk})
         self._context: Any = None
         self._node: Any = None
         self._topics: dict[str, Any] = {}
@@ -59,10 +59,10 @@ class Ros2Publisher(Sender):
             super().handle(items)
             return
         for item in items:
-            if isinstance(item, Samples) and item.spec.channels == CHANNELS:
+            if isinstance(item, SourceChunk) and item.spec.channels == CHANNELS:
                 self._wrenches(item)
         wanted = self._options.samples
-        super().handle([i for i in items if wanted or not isinstance(i, Samples)])
+        super().handle([i for i in items if wanted or not isinstance(i, SourceChunk)])
 
     def _send(self, message: Message) -> int:
         data = encode(message)
@@ -70,7 +70,7 @@ class Ros2Publisher(Sender):
         topic.publish(String(data=data.decode()))
         return len(data)
 
-    def _wrenches(self, item: Samples) -> None:
+    def _wrenches(self, item: SourceChunk) -> None:
         utc_ns = int(item.chunk.t_ns[-1]) + item.utc_offset_ns
         values, valid = item.chunk.values[-1].tolist(), item.chunk.valid[-1].tolist()
         for element, row, ok in zip(item.spec.elements, values, valid, strict=True):

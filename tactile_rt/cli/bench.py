@@ -1,23 +1,25 @@
 """`tactile-rt bench`: measure this installation and compare with what is promised."""
 
+import sys
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
-from tactile_rt.cli import app, check_output, needs
+from tactile_rt.cli.app import app, check_output, needs
 from tactile_rt.stream import ConfigError
 
+CHECKOUT = Path(__file__).parents[2]
 # area: (module with `run(quick) -> list[Record]`, extra that it needs), None: no figures yet
 AREAS: dict[str, tuple[str, str] | None] = {
-    "sim": ("tactile_rt.benchmarks.sim", "sim"),
-    "drivers": ("tactile_rt.benchmarks.drivers.area", "record"),
-    "models": ("tactile_rt.benchmarks.models", "train"),
-    "inference": ("tactile_rt.benchmarks.inference", ""),
-    "daemon": ("tactile_rt.benchmarks.daemon.area", "train"),
-    "align": ("tactile_rt.benchmarks.alignment", ""),
+    "sim": ("bench.sim.area", "sim"),
+    "drivers": ("bench.drivers.area", "record"),
+    "models": ("bench.models.area", "train"),
+    "inference": ("bench.inference.area", ""),
+    "daemon": ("bench.daemon.area", "train"),
+    "align": ("bench.align.area", ""),
 }
 
 
@@ -30,7 +32,7 @@ def bench(
     json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
 ) -> None:
     """Measure speed and accuracy, each figure beside its bar and what it is compared to."""
-    from tactile_rt.benchmarks.records import show, write
+    from tactile_rt.evidence.records import show, write
 
     if area is not None and area not in AREAS:
         raise ConfigError(f"no benchmark area {area!r}: there are {', '.join(AREAS)}")
@@ -44,7 +46,7 @@ def bench(
         module, extra = there
         with progress.status(f"measuring {name}"):
             try:
-                records += import_module(module).run(quick)
+                records += _rig(name, module).run(quick)
             except ModuleNotFoundError as error:
                 raise needs(extra, error) from None
     if records:
@@ -55,3 +57,12 @@ def bench(
         typer.echo(f"no figures yet for: {', '.join(without)}")
     if json:
         write(records, json)
+
+
+def _rig(area: str, module: str) -> Any:
+    """The rig of an area: it stands beside the package in a checkout, and in no wheel."""
+    if not (CHECKOUT / "bench" / "__init__.py").is_file():
+        raise ConfigError(f"bench {area} measures from a checkout: this install has no rigs")
+    if str(CHECKOUT) not in sys.path:
+        sys.path.insert(0, str(CHECKOUT))
+    return import_module(module)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from tactile_rt.cli import app, check_output
+from tactile_rt.cli.app import app, check_output
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Settings", "serve"]

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from tactile_rt.cli import app, check_output, starting
-from tactile_rt.cli.live import Seconds, leaving
+from tactile_rt.cli.app import app, check_output, starting
+from tactile_rt.cli.run import Seconds, leaving
 
 Url = Annotated[str, typer.Argument(help="URL of a source, e.g. serial:///dev/ttyUSB0?codec=bota.")]
 WINDOW_S = 1.0
@@ -99,7 +99,7 @@ def describe(
     import msgspec
 
     from tactile_rt.files import write_whole
-    from tactile_rt.sources import open_source
+    from tactile_rt.sources.opening import open_source
 
     check_output(out)
     with starting(), open_source(source) as opened:
@@ -115,7 +115,7 @@ def echo(source: Url, seconds: Seconds = None) -> None:
     """Print every sample as one line of JSON: seq, t_ns, values (element by channel), valid."""
     import msgspec
 
-    from tactile_rt.sources import open_source
+    from tactile_rt.sources.opening import open_source
 
     with starting():
         opened = open_source(source)
@@ -136,7 +136,7 @@ def hz(source: Url, seconds: Seconds = None) -> None:
     """Print once a second: the rate, the jitter of arrival, what was lost, the device's state."""
     import numpy as np
 
-    from tactile_rt.sources import open_source
+    from tactile_rt.sources.opening import open_source
     from tactile_rt.stream import EndOfStream
 
     with starting():

@@ -8,13 +8,13 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli import INTERRUPTED, app, starting
-from tactile_rt.cli.emulating import codec_options
-from tactile_rt.cli.live import leaving
+from tactile_rt.cli.app import INTERRUPTED, app, starting
+from tactile_rt.cli.emulate import codec_options
+from tactile_rt.cli.run import leaving
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
-    from tactile_rt.hil import LoopReport
+    from tactile_rt.evidence.hil import LoopReport
 
 SWEEPS = 6  # unless told otherwise
 
@@ -57,10 +57,10 @@ def hil(
     have the same label; with --faults, each loss must be counted. Exit code
     1 if it is not so.
     """
+    from tactile_rt.classifier.model_file import load_model, shipped_model
     from tactile_rt.drivers.emulation.faults import read_faults
-    from tactile_rt.hil import Loop, check_line
-    from tactile_rt.model_file import load_model, shipped_model
-    from tactile_rt.sources import open_source
+    from tactile_rt.evidence.hil import Loop, check_line
+    from tactile_rt.sources.opening import open_source
 
     file = model or shipped_model()
     if source is None:

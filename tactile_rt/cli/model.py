@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tactile_rt.cli import app
+from tactile_rt.cli.app import app
 from tactile_rt.stream import ModelError
 
 model = typer.Typer(help="Look into a model file, check it, time it.", no_args_is_help=True)
@@ -22,9 +22,9 @@ MANY = 8  # classes named before "..."
 @model.command()
 def show(file: File) -> None:
     """What a model is: read, not run."""
-    from tactile_rt.model_card import one_line
-    from tactile_rt.model_file import read_model
-    from tactile_rt.timebase import NS_PER_S
+    from tactile_rt.classifier.model_card import one_line
+    from tactile_rt.classifier.model_file import read_model
+    from tactile_rt.stream import NS_PER_S
 
     card, contents, data = read_model(file)
     spec = card.array
@@ -77,8 +77,8 @@ def verify(file: File) -> None:
     """
     import hashlib
 
-    from tactile_rt.model_checks import verify_model
-    from tactile_rt.model_file import load_model, read_model
+    from tactile_rt.classifier.model_check import verify_model
+    from tactile_rt.classifier.model_file import load_model, read_model
 
     _, contents, data = read_model(file)
     typer.echo(f"sha256 {hashlib.sha256(data).hexdigest()}")
@@ -95,9 +95,9 @@ def bench(
     steps: Annotated[int, typer.Option(min=10, max=1_000_000, help="Steps to time.")] = 2000,
 ) -> None:
     """How fast it is here: size, loading, memory, CPU time of a step, and the machine's limit."""
-    from tactile_rt.benchmarks.model_steps import Subject, measure_model
-    from tactile_rt.benchmarks.records import show as show_records
-    from tactile_rt.model_file import read_model
+    from tactile_rt.classifier.model_file import read_model
+    from tactile_rt.evidence.model_steps import Subject, measure_model
+    from tactile_rt.evidence.records import show as show_records
 
     card, _, _ = read_model(file)
     if card.kind != "step":

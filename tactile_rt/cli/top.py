@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 import typer
 
-from tactile_rt.cli import app
+from tactile_rt.cli.app import app
 from tactile_rt.stream import ConfigError, SourceError
 
 if TYPE_CHECKING:

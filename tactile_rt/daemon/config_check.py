@@ -14,6 +14,8 @@ from typing import Any
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from tactile_rt.calibration import load_calibration
+from tactile_rt.classifier.model_file import load_model
+from tactile_rt.classifier.providers import onnxruntime_names
 from tactile_rt.daemon.config import Config
 from tactile_rt.daemon.config_file import Loaded
 from tactile_rt.daemon.config_shared import (
@@ -28,13 +30,11 @@ from tactile_rt.daemon.consumers import wanted_consumers
 from tactile_rt.daemon.lock import lock_keys
 from tactile_rt.drivers.codec import codec_class
 from tactile_rt.drivers.opening import CanOptions, SerialOptions
-from tactile_rt.drivers.synthetic import SyntheticOptions, SyntheticSource
-from tactile_rt.inference.providers import onnxruntime_names
-from tactile_rt.model_file import load_model
-from tactile_rt.options import parse_options, take_options
-from tactile_rt.sources import ENTRY_POINTS, SCHEMES, opener
+from tactile_rt.recording.reader import MAGIC
+from tactile_rt.settings import parse_options, take_options
+from tactile_rt.sources.opening import ENTRY_POINTS, SCHEMES, opener
+from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource
 from tactile_rt.stream import TactileError
-from tactile_rt.stream_recording.reader import MAGIC
 
 __all__ = ["check_config"]
 

@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 import msgspec
 
 from tactile_rt.daemon.config import CONFIG_VERSION, Config
-from tactile_rt.daemon.config_nodes import Node, make_node, merge, named, read_nodes
+from tactile_rt.daemon.config_nodes import TomlNode, make_node, merge, named, read_nodes
 from tactile_rt.daemon.config_tables import convert_table, is_list, is_text, nearest, refusal
 from tactile_rt.stream import ConfigError
 
@@ -38,7 +38,7 @@ class Loaded:
     """
 
     config: Config
-    nodes: Node
+    nodes: TomlNode
     path: Path
     sets: tuple[str, ...] = ()
 
@@ -75,7 +75,7 @@ def load_config(path: Path, sets: Sequence[str] = ()) -> Loaded:
 # reading
 
 
-def _with_bases(path: Path, above: list[Path]) -> Node:
+def _with_bases(path: Path, above: list[Path]) -> TomlNode:
     nodes = read_nodes(path)
     if "version" in nodes.value:
         _check_version(nodes)  # of a base, too: its keys may mean something else
@@ -101,7 +101,7 @@ def _with_bases(path: Path, above: list[Path]) -> Node:
     return merge(under, nodes)
 
 
-def _set(nodes: Node, text: str) -> Node:
+def _set(nodes: TomlNode, text: str) -> TomlNode:
     key, equals, written = text.partition("=")
     origin = f"--set {text}"
     steps = key.split(".")
@@ -132,7 +132,7 @@ def _set(nodes: Node, text: str) -> Node:
     return nodes
 
 
-def _item(node: Node, step: str, origin: str, where: str) -> int:
+def _item(node: TomlNode, step: str, origin: str, where: str) -> int:
     names = [
         n.value[key].value
         for n in node.value
@@ -158,7 +158,7 @@ def _value(written: str) -> Any:
         return written
 
 
-def _absolute(nodes: Node) -> None:
+def _absolute(nodes: TomlNode) -> None:
     """Relative paths from the folder of the file that they stand in."""
     for path, node in nodes.walk():
         if not isinstance(node.value, str) or not node.value or "\0" in node.value:
@@ -180,7 +180,7 @@ def _absolute(nodes: Node) -> None:
                 node.value = f"{scheme}:{_from(node, target)}{question}{options}"
 
 
-def _from(node: Node, value: str) -> Path:
+def _from(node: TomlNode, value: str) -> Path:
     path = Path(value)
     if value.startswith("~"):
         try:
@@ -234,7 +234,7 @@ def _free(name: str, taken: set[str], given: bool, loaded: Loaded, path: list[st
     return made
 
 
-def _check_version(nodes: Node) -> None:
+def _check_version(nodes: TomlNode) -> None:
     version = nodes.value.get("version")
     if version is None:
         raise ConfigError(

@@ -10,7 +10,7 @@ from typing import Any
 
 from tactile_rt.stream import ConfigError
 
-__all__ = ["Node", "make_node", "merge", "named", "read_nodes"]
+__all__ = ["TomlNode", "make_node", "merge", "named", "read_nodes"]
 
 LARGEST = 1 << 20
 BARE = re.compile(r"[A-Za-z0-9_-]+")
@@ -18,7 +18,7 @@ INT64 = 2**63
 
 
 @dataclass
-class Node:
+class TomlNode:
     """A value; of a table a dict of nodes, of a list a list of nodes.
 
     Attributes:
@@ -46,7 +46,7 @@ class Node:
             return [node.plain() for node in self.value]
         return self.value
 
-    def at(self, path: list[str | int]) -> "Node":
+    def at(self, path: list[str | int]) -> "TomlNode":
         """The node at a path, or the last one there is on the way."""
         node = self
         for step in path:
@@ -72,12 +72,12 @@ def named(path: Sequence[str | int]) -> str:
     return "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
 
 
-def make_node(value: Any, file: str, line: int, folder: Path) -> Node:
+def make_node(value: Any, file: str, line: int, folder: Path) -> TomlNode:
     """Nodes of a plain value, all of one line."""
     return _build(value, (), {(): line}, file, folder, line)
 
 
-def read_nodes(path: Path) -> Node:
+def read_nodes(path: Path) -> TomlNode:
     """Read a TOML file.
 
     Raises:
@@ -107,13 +107,13 @@ def read_nodes(path: Path) -> Node:
     return _build(parsed, (), find_lines(text), str(path), folder, 0)
 
 
-def merge(base: Node, over: Node) -> Node:
+def merge(base: TomlNode, over: TomlNode) -> TomlNode:
     """`over` on top of `base`: tables by key, lists of tables by the items' name, else replaced."""
     if isinstance(base.value, dict) and isinstance(over.value, dict):
         both = dict(base.value)
         for key, node in over.value.items():
             both[key] = merge(both[key], node) if key in both else node
-        return Node(both, over.file, over.line, over.folder)
+        return TomlNode(both, over.file, over.line, over.folder)
     if _tables(base) and _tables(over):
         items = list(base.value)
         places = {_name(item): i for i, item in enumerate(items) if _name(item)}
@@ -123,15 +123,15 @@ def merge(base: Node, over: Node) -> Node:
                 items.append(item)
             else:
                 items[place] = merge(items[place], item)
-        return Node(items, over.file, over.line, over.folder)
+        return TomlNode(items, over.file, over.line, over.folder)
     return over
 
 
-def _tables(node: Node) -> bool:
+def _tables(node: TomlNode) -> bool:
     return isinstance(node.value, list) and all(isinstance(n.value, dict) for n in node.value)
 
 
-def _name(item: Node) -> str:
+def _name(item: TomlNode) -> str:
     """What identifies an item of a list: its name, or of a publisher its kind."""
     for key in ("name", "kind"):
         named = item.value.get(key)
@@ -147,14 +147,14 @@ def _build(
     file: str,
     folder: Path,
     line: int,
-) -> Node:
+) -> TomlNode:
     line = lines.get(path, line)
     made: Any = value
     if isinstance(value, dict):
         made = {k: _build(v, (*path, k), lines, file, folder, line) for k, v in value.items()}
     elif isinstance(value, list):
         made = [_build(v, (*path, i), lines, file, folder, line) for i, v in enumerate(value)]
-    node = Node(made, file, line, folder)
+    node = TomlNode(made, file, line, folder)
     if isinstance(value, float) and (value != value or value in (float("inf"), -float("inf"))):
         raise ConfigError(f"{node.where}: {named(path)}: {value} is no quantity")
     if isinstance(value, int) and not -INT64 <= value < INT64:

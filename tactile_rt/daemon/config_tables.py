@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 
 from tactile_rt.daemon.config import Config
-from tactile_rt.daemon.config_nodes import Node, named
+from tactile_rt.daemon.config_nodes import TomlNode, named
 from tactile_rt.stream import ConfigError
 
 __all__ = ["convert_table", "is_list", "is_text", "nearest", "refusal"]
@@ -29,7 +29,7 @@ WORDS = {  # of msgspec, in a user's words
 }  # fmt: skip
 
 
-def convert_table(root: Node, node: Node, path: list[str | int], kind: Any) -> Any:
+def convert_table(root: TomlNode, node: TomlNode, path: list[str | int], kind: Any) -> Any:
     """A table as a struct.
 
     Args:
@@ -60,7 +60,7 @@ def nearest(name: str, known: Sequence[str]) -> str:
     return f"there is {', '.join(known)}" if known else "there is none"
 
 
-def _check_keys(root: Node, node: Node, path: list[str | int], kind: Any) -> None:
+def _check_keys(root: TomlNode, node: TomlNode, path: list[str | int], kind: Any) -> None:
     """Unknown keys first: a misspelt key is the commonest mistake."""
     if not isinstance(node.value, dict):
         return
@@ -160,7 +160,7 @@ def _steps(at: str) -> list[str | int]:
     return [name if name else int(number) for name, number in found]
 
 
-def _said(message: str, node: Node, steps: list[str | int], kind: Any) -> str:
+def _said(message: str, node: TomlNode, steps: list[str | int], kind: Any) -> str:
     """What msgspec says, in a user's words."""
     missing = re.search(r"missing required field `(\w+)`", message)
     if missing:
@@ -203,7 +203,7 @@ def _leaf(kind: Any, steps: list[str | int]) -> Any:
     return kind
 
 
-def refusal(root: Node, path: list[str | int], why: str) -> ConfigError:
+def refusal(root: TomlNode, path: list[str | int], why: str) -> ConfigError:
     """The error of what stands at a path."""
     node = root.at(path)
     where = node.where if node.line or node.file != root.file else root.file

@@ -7,7 +7,6 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from tactile_rt import __version__
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config_file import Loaded
 from tactile_rt.daemon.config_text import config_text
@@ -21,6 +20,7 @@ from tactile_rt.daemon.model_part import ModelPart, file_stamp, model_path
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.snapshot import Snapshot
 from tactile_rt.daemon.source_part import SourcePart
+from tactile_rt.version import VERSION
 
 __all__ = ["Daemon"]
 
@@ -159,7 +159,7 @@ class Daemon:
         state = "degraded" if lines else "running"
         state = "stopping" if self._stopping else "starting" if self._starting else state
         return Snapshot(
-            __version__, os.getpid(), str(self._loaded.path), self._clock.monotonic_ns(),
+            VERSION, os.getpid(), str(self._loaded.path), self._clock.monotonic_ns(),
             self._clock.utc_ns(), self._started_ns, self._reloads, state, lines,
             self._clock_steps, sources, models, consumers,
         )  # fmt: skip

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
-from tactile_rt.classifier import Classification
+from tactile_rt.classifier.classifier import Classification
 from tactile_rt.stream import ArraySpec, Chunk, Source
 
 __all__ = [
@@ -15,7 +15,7 @@ __all__ = [
     "Item",
     "Opened",
     "Packet",
-    "Samples",
+    "SourceChunk",
 ]
 
 
@@ -53,7 +53,7 @@ class Closed:
 
 
 @dataclass(frozen=True)
-class Samples:
+class SourceChunk:
     """A chunk of a source as it came, calibrated.
 
     Attributes:
@@ -147,4 +147,4 @@ class Control:
     argument: str = ""
 
 
-Item = Opened | Closed | Samples | Packet | Decision | Contact | Event | Control
+Item = Opened | Closed | SourceChunk | Packet | Decision | Contact | Event | Control

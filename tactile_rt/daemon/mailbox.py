@@ -4,7 +4,7 @@ import threading
 from collections import deque
 from collections.abc import Iterable
 
-from tactile_rt.daemon.items import Decision, Item, Packet, Samples
+from tactile_rt.daemon.items import Decision, Item, Packet, SourceChunk
 from tactile_rt.daemon.snapshot import QueueState
 
 __all__ = ["Mailbox"]
@@ -131,7 +131,7 @@ class Mailbox:
 
 def _measure(item: Item) -> tuple[str, int, int]:
     """Class, count and bytes of an item."""
-    if isinstance(item, Samples):
+    if isinstance(item, SourceChunk):
         chunk = item.chunk
         size = chunk.values.nbytes + chunk.valid.nbytes + 16 * len(chunk)
         return "samples", len(chunk), size + AROUND_BYTES

@@ -12,7 +12,7 @@ from urllib.parse import quote
 import msgspec
 
 from tactile_rt.daemon.digits import shortest
-from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Samples
+from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.snapshot import Snapshot
 
 __all__ = [
@@ -155,7 +155,7 @@ def message_of(item: Item) -> Message | None:
     `Event`, `Packet` and `Control` are not published)."""
     if isinstance(item, Decision):
         return _decision(item)
-    if isinstance(item, Samples):
+    if isinstance(item, SourceChunk):
         return _samples(item)
     if isinstance(item, Event):
         utc_ns = item.t_ns + item.utc_offset_ns
@@ -190,7 +190,7 @@ def _decision(item: Decision) -> DecisionMessage:
     )  # fmt: skip
 
 
-def _samples(item: Samples) -> SamplesMessage:
+def _samples(item: SourceChunk) -> SamplesMessage:
     chunk, spec = item.chunk, item.spec
     values: list[list[list[float] | None]] = shortest(chunk.values).tolist()
     if not chunk.valid.all():

@@ -7,19 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_rt.classifier import Classification, Classifier
+from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.hub import Hub
-from tactile_rt.daemon.items import Contact, Decision, Item, Opened, Samples
+from tactile_rt.daemon.items import Contact, Decision, Item, Opened, SourceChunk
 from tactile_rt.daemon.latency import LatencyMeter
 from tactile_rt.daemon.mailbox import Mailbox
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.snapshot import ModelState
 from tactile_rt.daemon.source_part import device_of
-from tactile_rt.model_file import hash_of, shipped_model
-from tactile_rt.stream import ConfigError, Source, TactileError, concatenate
-from tactile_rt.timebase import NS_PER_S
+from tactile_rt.stream import NS_PER_S, ConfigError, Source, TactileError, concatenate
 
 __all__ = ["ModelPart", "file_stamp", "model_path"]
 
@@ -37,7 +36,7 @@ class ModelPart(Part):
         self.config = config
         self.file = model_path(config)
         self.box = Mailbox(
-            {Opened, Samples}, limits.model_queue_items, MODEL_BYTES, limits.gather_ms / 1e3,
+            {Opened, SourceChunk}, limits.model_queue_items, MODEL_BYTES, limits.gather_ms / 1e3,
             source=config.source,
         )  # fmt: skip
         self._hub, self._clock = hub, clock
@@ -129,9 +128,9 @@ class ModelPart(Part):
                 self._sha256, self._hashed = hash_of(self.file), stamp
 
     def _take(self, items: list[Item]) -> None:
-        run: list[Samples] = []
+        run: list[SourceChunk] = []
         for item in items:
-            if isinstance(item, Samples):
+            if isinstance(item, SourceChunk):
                 run.append(item)
             elif isinstance(item, Opened):
                 self._classify(run)
@@ -140,7 +139,7 @@ class ModelPart(Part):
                     self._make(item)
         self._classify(run)
 
-    def _classify(self, run: list[Samples]) -> None:
+    def _classify(self, run: list[SourceChunk]) -> None:
         opened, classifier = self._opened, self._classifier
         # What is left of a stream before this one is of no use to its classifier.
         run = [s for s in run if opened is not None and s.arrived_ns >= opened.t_ns]
@@ -170,7 +169,7 @@ class ModelPart(Part):
             for box in self._hub.wanted(Decision):
                 box.wait_for_room(1.0)
 
-    def _completed(self, d: Classification, run: list[Samples], stream: Source) -> int:
+    def _completed(self, d: Classification, run: list[SourceChunk], stream: Source) -> int:
         """Host time of the sample that completed a step."""
         end = d.t_ns + self._half_ns
         for samples in run:

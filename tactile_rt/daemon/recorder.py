@@ -13,7 +13,6 @@ import time
 from collections import deque
 from pathlib import Path
 
-from tactile_rt import __version__
 from tactile_rt.daemon.config import RecorderConfig
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import (
@@ -25,12 +24,11 @@ from tactile_rt.daemon.items import (
     Item,
     Opened,
     Packet,
-    Samples,
+    SourceChunk,
 )
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.recording_file import Message, RecordingFile
-from tactile_rt.stream import RecordingError
-from tactile_rt.stream_recording.layout import (
+from tactile_rt.recording.layout import (
     DECISIONS,
     EVENTS,
     SAMPLES,
@@ -39,8 +37,10 @@ from tactile_rt.stream_recording.layout import (
     encode_samples,
     need_mcap,
 )
-from tactile_rt.stream_recording.reader import is_finished
-from tactile_rt.stream_recording.writer import WriterStats, describe
+from tactile_rt.recording.reader import is_finished
+from tactile_rt.recording.writer import WriterStats, describe
+from tactile_rt.stream import RecordingError
+from tactile_rt.version import VERSION
 
 __all__ = ["Recorder"]
 
@@ -96,7 +96,7 @@ class Recorder(Consumer):
         ConfigError: the extra is not installed.
     """
 
-    wants = frozenset({Opened, Closed, Samples, Packet, Decision, Contact, Event, Control})
+    wants = frozenset({Opened, Closed, SourceChunk, Packet, Decision, Contact, Event, Control})
     gather_s = 0.05
     tick_s = 0.2
 
@@ -162,7 +162,7 @@ class Recorder(Consumer):
         elif isinstance(item, Closed):
             if (track := self._tracks.get(item.source)) is not None:
                 track.closed_ns = time.monotonic_ns()
-        elif isinstance(item, Samples):
+        elif isinstance(item, SourceChunk):
             if (track := self._tracks.get(item.source)) is not None:
                 chunk = item.chunk
                 data = encode_samples(chunk)
@@ -261,7 +261,7 @@ class Recorder(Consumer):
             return
         snapshot = self._view.snapshot()
         session = {
-            "by": f"tactile_rt {__version__}",
+            "by": f"tactile_rt {VERSION}",
             "daemon_source": track.opened.source,
             "config": self._view.config_text(),
             **{m.part.name: f"{m.file} sha256:{m.sha256}" for m in snapshot.models},

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from tactile_rt.daemon.items import Opened
-from tactile_rt.stream_recording.description import SUMMARY
-from tactile_rt.stream_recording.layout import WIRE, encode_packet
-from tactile_rt.stream_recording.mcap_file import McapFile
-from tactile_rt.stream_recording.writer import HealthTeller, WriterStats, describe
+from tactile_rt.recording.description import SUMMARY
+from tactile_rt.recording.layout import WIRE, encode_packet
+from tactile_rt.recording.mcap_file import McapFile
+from tactile_rt.recording.writer import HealthTeller, WriterStats, describe
 
 __all__ = ["Message", "RecordingFile"]
 

@@ -9,12 +9,12 @@ from tactile_rt.calibration import CalibratedSource, load_calibration
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, SourceConfig
 from tactile_rt.daemon.hub import Hub
-from tactile_rt.daemon.items import Closed, Opened, Packet, Samples
+from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.snapshot import SourceState
 from tactile_rt.drivers.device_source import DeviceSource
 from tactile_rt.drivers.health import Health, State
-from tactile_rt.sources import open_source
+from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ArraySpec, EndOfStream, Source, SourceStats
 
 __all__ = ["SourcePart", "device_of"]
@@ -25,7 +25,7 @@ AWAY_S = 0.3  # how long a source whose device is away may take to end
 
 
 class SourcePart(Part):
-    """Posts `Opened`, `Packet`, `Samples` and `Closed` of one source."""
+    """Posts `Opened`, `Packet`, `SourceChunk` and `Closed` of one source."""
 
     def __init__(
         self, config: SourceConfig, hub: Hub, report: Report, limits: LimitsConfig, clock: Clock
@@ -115,7 +115,7 @@ class SourcePart(Part):
                 continue
             self._samples += len(chunk)
             self._newest_ns = now
-            self._hub.post(Samples(self.config.name, stream.spec, chunk, now, self._offset_ns))
+            self._hub.post(SourceChunk(self.config.name, stream.spec, chunk, now, self._offset_ns))
             if not stream.live:
                 self._await_room()
 
@@ -193,7 +193,7 @@ class SourcePart(Part):
 
     def _await_room(self) -> None:
         """A source that waits for its reader is read no faster than all can take."""
-        for box in self._hub.wanted(Samples):
+        for box in self._hub.wanted(SourceChunk):
             self._busy_ns = time.monotonic_ns()
             box.wait_for_room(min(1.0, self.limits.stall_s / 2))
 

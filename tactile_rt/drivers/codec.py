@@ -23,9 +23,9 @@ from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 __all__ = [
     "CODECS",
     "CanCodec",
+    "CanFrame",
     "Codec",
-    "Event",
-    "Frame",
+    "Command",
     "Samples",
     "SerialCodec",
     "Step",
@@ -59,7 +59,7 @@ CODECS = {
 }
 
 
-class Event(StrEnum):
+class Command(StrEnum):
     """What a host tells a device; see `Codec.commands`."""
 
     START = "start"  # after connecting: configure it and let it stream
@@ -67,7 +67,7 @@ class Event(StrEnum):
     POLL = "poll"  # ask for one sample
 
 
-class Frame(NamedTuple):
+class CanFrame(NamedTuple):
     """One CAN frame.
 
     Attributes:
@@ -85,7 +85,7 @@ class Frame(NamedTuple):
     remote: bool = False
 
 
-Packet = TypeVar("Packet", bytes, Sequence[Frame])
+Packet = TypeVar("Packet", bytes, Sequence[CanFrame])
 
 
 @dataclass(frozen=True)
@@ -200,7 +200,7 @@ class Codec(abc.ABC, Generic[Packet]):
             One packet per sample.
         """
 
-    def commands(self, event: Event) -> tuple[Step[Packet], ...]:
+    def commands(self, event: Command) -> tuple[Step[Packet], ...]:
         """What to send to the device when this happens."""
         return ()
 
@@ -213,7 +213,7 @@ class Codec(abc.ABC, Generic[Packet]):
 
     streaming = True  # the device's side: whether it sends without being asked, now
     polled = 0  # the device's side: samples asked for and not yet sent
-    polls = False  # the host's side: whether each sample must be asked for (`Event.POLL`)
+    polls = False  # the host's side: whether each sample must be asked for (`Command.POLL`)
 
     @abc.abstractmethod
     def forget(self) -> None:
@@ -233,7 +233,7 @@ class SerialCodec(Codec[bytes]):
     parity: ClassVar[str] = "N"
 
 
-class CanCodec(Codec[Sequence[Frame]]):
+class CanCodec(Codec[Sequence[CanFrame]]):
     """A protocol over a CAN bus.
 
     Attributes:
@@ -247,7 +247,7 @@ class CanCodec(Codec[Sequence[Frame]]):
 
 
 @dataclass
-class Batch:
+class SampleBatch:
     """Samples collected while a packet is decoded; `take` makes one `Samples` of them."""
 
     values: list[Any] = field(default_factory=list)  # each (element, channel), or flat

@@ -11,13 +11,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from tactile_rt.drivers.codec import Codec, Event, Samples, Step
+from tactile_rt.drivers.codec import Codec, Command, Samples, Step
 from tactile_rt.drivers.device_time import DeviceTime
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.drivers.links import Link
 from tactile_rt.drivers.stamping import Stamper
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError
-from tactile_rt.timebase import NS_PER_S
+from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, EndOfStream, Source, SourceError
 
 __all__ = ["DeviceOptions", "DeviceSource", "Tap"]
 
@@ -127,7 +126,7 @@ class DeviceSource(Source):
         self._early.clear()
         if self._link is not None:
             try:
-                for step in self.codec.commands(Event.STOP):
+                for step in self.codec.commands(Command.STOP):
                     self._link.send(step.send)
             except SourceError:
                 pass  # it is gone, which is what we want
@@ -223,7 +222,7 @@ class DeviceSource(Source):
     def _poll(self, link: Link[Any], now: float, left: float) -> float:
         if now >= self._poll_at:
             try:
-                for step in self.codec.commands(Event.POLL):
+                for step in self.codec.commands(Command.POLL):
                     link.send(step.send)
             except SourceError as error:
                 self._lose(str(error))
@@ -251,7 +250,7 @@ class DeviceSource(Source):
         if self._stamper is not None:
             self._stamper.resume()
         self._turn(State.CONNECTING, "")
-        for step in self.codec.commands(Event.START):
+        for step in self.codec.commands(Command.START):
             self._do(step)
 
     def _do(self, step: Step[Any]) -> None:
@@ -300,7 +299,7 @@ class DeviceSource(Source):
         came = 0
         while not (self._early and self.codec.spec) and time.monotonic() < end:
             if self.codec.polls:
-                for step in self.codec.commands(Event.POLL):
+                for step in self.codec.commands(Command.POLL):
                     self._link.send(step.send)
             found = self._link.receive(min(SLICE_S, max(0.0, end - time.monotonic())))
             if found is None:

@@ -8,7 +8,7 @@ import time
 from collections.abc import Sequence
 from typing import Any, Generic
 
-from tactile_rt.drivers.codec import Frame, Packet
+from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.stream import ConfigError, SourceError
 
 __all__ = ["CanLink", "Link", "SerialLink", "SlcanLink"]
@@ -124,7 +124,7 @@ class SerialLink(Link[bytes]):
             pass  # it is gone, which is what we want
 
 
-class CanLink(Link[Sequence[Frame]]):
+class CanLink(Link[Sequence[CanFrame]]):
     """Any interface of python-can: socketcan, pcan, kvaser, virtual, ...
 
     Args:
@@ -154,10 +154,10 @@ class CanLink(Link[Sequence[Frame]]):
         except (can.CanError, OSError, ValueError, ImportError, NotImplementedError) as error:
             raise SourceError(f"can:{self.name}: {_why_bus(channel, error)}") from None
 
-    def receive(self, timeout_s: float) -> tuple[Sequence[Frame], int] | None:
+    def receive(self, timeout_s: float) -> tuple[Sequence[CanFrame], int] | None:
         import can
 
-        frames: list[Frame] = []
+        frames: list[CanFrame] = []
         try:
             message = self._bus.recv(timeout_s)
             while message is not None:
@@ -165,7 +165,7 @@ class CanLink(Link[Sequence[Frame]]):
                     self.can_errors += 1
                 else:
                     frames.append(
-                        Frame(
+                        CanFrame(
                             message.arbitration_id, bytes(message.data), message.is_extended_id,
                             message.is_fd, message.is_remote_frame,
                         )
@@ -180,7 +180,7 @@ class CanLink(Link[Sequence[Frame]]):
             raise SourceError(f"can:{self.name}: the bus is gone ({_reason(error)})") from None
         return (frames, time.monotonic_ns()) if frames else None
 
-    def send(self, packet: Sequence[Frame]) -> None:
+    def send(self, packet: Sequence[CanFrame]) -> None:
         import can
 
         try:
@@ -212,7 +212,7 @@ class CanLink(Link[Sequence[Frame]]):
             return False
 
 
-class SlcanLink(Link[Sequence[Frame]]):
+class SlcanLink(Link[Sequence[CanFrame]]):
     """A CAN adapter that speaks slcan (LAWICEL) over a serial port.
 
     python-can speaks it too, byte by byte: 5,500 frames/s where a saturated bus carries 9,000.
@@ -233,7 +233,7 @@ class SlcanLink(Link[Sequence[Frame]]):
         for command in opening(bitrate):
             self._serial.send(command)
 
-    def receive(self, timeout_s: float) -> tuple[Sequence[Frame], int] | None:
+    def receive(self, timeout_s: float) -> tuple[Sequence[CanFrame], int] | None:
         end = time.monotonic() + timeout_s
         while True:
             found = self._serial.receive(max(0.0, end - time.monotonic()))
@@ -243,7 +243,7 @@ class SlcanLink(Link[Sequence[Frame]]):
             if frames:
                 return frames, found[1]
 
-    def send(self, packet: Sequence[Frame]) -> None:
+    def send(self, packet: Sequence[CanFrame]) -> None:
         self._serial.send(self._encode(packet))
 
     def close(self) -> None:

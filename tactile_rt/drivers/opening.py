@@ -14,7 +14,7 @@ from tactile_rt.calibration import CalibratedSource, load_calibration
 from tactile_rt.drivers.codec import CanCodec, Codec, SerialCodec, codec_class
 from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
 from tactile_rt.drivers.links import CanLink, Link, SerialLink, SlcanLink
-from tactile_rt.options import take_options
+from tactile_rt.settings import take_options
 from tactile_rt.stream import ConfigError, Source
 
 __all__ = ["CanOptions", "SerialOptions", "make_codec", "open_can", "open_line", "open_serial"]

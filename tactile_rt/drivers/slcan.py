@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable
 from typing import Final
 
-from tactile_rt.drivers.codec import Frame
+from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.stream import ConfigError
 
 __all__ = ["SlcanAdapter", "SlcanDecoder", "closing", "encode", "opening"]
@@ -62,7 +62,7 @@ class SlcanDecoder:
         self._stamp: int | None = None  # digits of a time stamp
         self._other: int | None = None  # of the line before, if it differed
 
-    def feed(self, data: bytes) -> list[Frame]:
+    def feed(self, data: bytes) -> list[CanFrame]:
         """The frames that these bytes complete; the result does not depend on how they were cut."""
         data = self._rest + data
         if BELL in data:
@@ -104,7 +104,7 @@ class SlcanDecoder:
             if ident > highest:
                 self.corrupt += 1
                 continue
-            frames.append(Frame(ident, body, extended, fd, remote))
+            frames.append(CanFrame(ident, body, extended, fd, remote))
         return frames
 
     def forget(self) -> None:
@@ -136,7 +136,7 @@ class SlcanDecoder:
             self.corrupt += 1
 
 
-def encode(frames: Iterable[Frame], stamp_ms: int | None = None) -> bytes:
+def encode(frames: Iterable[CanFrame], stamp_ms: int | None = None) -> bytes:
     """Frames as lines; FD frames with bit-rate switching.
 
     Args:
@@ -216,7 +216,7 @@ class SlcanAdapter:
     def hears(self) -> bool:
         return self.open and self._rate == (self._right or self._rate)
 
-    def respond(self, data: bytes) -> tuple[bytes, list[Frame]]:
+    def respond(self, data: bytes) -> tuple[bytes, list[CanFrame]]:
         """What the host has sent: (the answer, the frames for the bus)."""
         *lines, rest = (self._rest + data).split(CR)
         self._rest = rest[: _LONGEST + 1]
@@ -231,7 +231,7 @@ class SlcanAdapter:
                 answers.append(self._command(line))
         return b"".join(answers), frames
 
-    def encode(self, frames: Iterable[Frame], time_ns: int = 0) -> bytes:
+    def encode(self, frames: Iterable[CanFrame], time_ns: int = 0) -> bytes:
         """Frames from the bus as the host gets them; nothing unless `hears`."""
         if not self.hears:
             return b""

@@ -11,8 +11,7 @@ from tactile_rt.drivers.accounting import Sequencer
 from tactile_rt.drivers.codec import Codec, Samples
 from tactile_rt.drivers.device_clock import DeviceClock, host_stamps
 from tactile_rt.drivers.device_time import DeviceTime
-from tactile_rt.stream import ArraySpec, Chunk, SourceStats
-from tactile_rt.timebase import NS_PER_S
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, SourceStats
 
 __all__ = ["Stamper"]
 

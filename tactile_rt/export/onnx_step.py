@@ -1,7 +1,8 @@
 """A trained network as one ONNX file: a streaming step with explicit state.
 
-The graph and its metadata are specified in `tactile_rt.model_file`; the file alone is enough to
-run the model. Before it is written, it is run against the torch window that was trained.
+The graph and its metadata are specified in `tactile_rt.classifier.model_file`; the file alone
+is enough to run the model. Before it is written, it is run against the torch window that was
+trained.
 """
 
 import hashlib
@@ -22,20 +23,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from tactile_rt import __version__
-from tactile_rt.contact import CHANNEL_FLOOR
+from tactile_rt.classifier.contact import CHANNEL_FLOOR
+from tactile_rt.classifier.model_card import Kind
+from tactile_rt.classifier.model_check import probe_logits
+from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, StateTensor, load_model
+from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.export.precision import Precision, in_precision
 from tactile_rt.export.streaming import streaming
 from tactile_rt.export.windows import window_graph
-from tactile_rt.model_card import Kind
-from tactile_rt.model_checks import probe_logits
-from tactile_rt.model_file import METADATA_KEY, ModelCard, StateTensor, load_model
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import STEPS, SUBSTEPS, channel_values
 from tactile_rt.models.training import TactileClassifier, load_checkpoint
-from tactile_rt.onnx_reading import graph_sha256
-from tactile_rt.recording import SweepManifest
 from tactile_rt.stream import ModelError
+from tactile_rt.sweep_set import SweepManifest
+from tactile_rt.version import VERSION
 
 __all__ = [
     "OPSET",
@@ -126,7 +127,7 @@ def export_checkpoint(
             "sweep_set": manifest.recipe,
             "unseen_objects": list(manifest.split["test"]),
             "commands": list(commands),
-            "tactile_rt": __version__,
+            "tactile_rt": VERSION,
             "torch": str(torch.__version__),  # not a plain str, which msgspec insists on
             "onnx": onnx.__version__,
             "onnxruntime": onnxruntime.__version__,

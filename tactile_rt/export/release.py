@@ -8,10 +8,10 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
+from tactile_rt.classifier.model_card import Kind
+from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, load_model
 from tactile_rt.export.onnx_step import export_checkpoint, file_logits
 from tactile_rt.export.precision import Precision
-from tactile_rt.model_card import Kind
-from tactile_rt.model_file import METADATA_KEY, ModelCard, load_model
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import Step, hits, predict

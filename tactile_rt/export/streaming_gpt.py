@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 from tactile_rt.export.products import Pointwise, Product, product_of
 from tactile_rt.models.attenders import GPT, HEADS, TOKENS
-from tactile_rt.models.attenders.gpt import Block
+from tactile_rt.models.attenders.gpt import TransformerBlock
 
 __all__ = ["StreamingGPT"]
 
@@ -106,7 +106,7 @@ class StreamingBlock(nn.Module):
 
     def __init__(self, block: nn.Module, layout: tuple[int, ...]) -> None:
         super().__init__()
-        assert isinstance(block, Block)
+        assert isinstance(block, TransformerBlock)
         self.norm1, self.norm2 = block.norm1, block.norm2
         width = block.proj.in_features
         self.head, self.layout = width // HEADS, layout

@@ -12,7 +12,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from tactile_rt.model_card import StateTensor
+from tactile_rt.classifier.model_card import StateTensor
 
 __all__ = ["window_graph"]
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from tactile_rt.models.datasets import STEPS, SUBSTEPS, SweepSet
-from tactile_rt.recording import WITHHELD, SweepManifest, object_path
 from tactile_rt.stream import ArraySpec, RecordingError, SpecMismatch
+from tactile_rt.sweep_set import WITHHELD, SweepManifest, object_path
 
 __all__ = ["check_array", "check_sets", "check_split", "trained_on"]
 

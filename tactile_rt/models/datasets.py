@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactile_rt.contact import CHANNEL_FLOOR
+from tactile_rt.classifier.contact import CHANNEL_FLOOR
 from tactile_rt.models.onsets import Onsets, find_onsets
-from tactile_rt.recording import SweepManifest, Sweeps, read_sweeps
 from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.sweep_set import SweepManifest, Sweeps, read_sweeps
 
 __all__ = [
     "RATED_NOISE",

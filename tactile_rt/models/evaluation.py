@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.classifier import fuse
+from tactile_rt.classifier.classifier import fuse
 from tactile_rt.models.datasets import STEPS, SweepSet, windows
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.intervals import Interval, accuracy, bootstrap

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.contact import (
+from tactile_rt.classifier.contact import (
     BASELINE_SAMPLES,
     FIRST_GUARD_SAMPLES,
     GUARD_SAMPLES,

@@ -4,8 +4,7 @@ import abc
 import time
 from typing import Final
 
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError, EndOfStream, Source
-from tactile_rt.timebase import NS_PER_S
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStream, Source
 
 __all__ = ["CHUNK_SAMPLES", "PACES", "PacedSource", "check_pace"]
 

@@ -14,8 +14,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
-from tactile_rt.timebase import NS_PER_S
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError
 
 __all__ = ["Sensor", "SensorModel"]
 

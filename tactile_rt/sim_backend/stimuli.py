@@ -23,13 +23,13 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt import __version__
+from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.files import write_whole
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.whisking import WhiskSimulation
 from tactile_rt.sim_backend.world import SAMPLE_MS
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
-from tactile_rt.timebase import Resampler
+from tactile_rt.version import VERSION
 
 __all__ = [
     "DISTANCES",
@@ -259,7 +259,7 @@ def write_input(
         "period_ns": PERIOD_NS,
         "array": msgspec.to_builtins(spec),
         "versions": {
-            "tactile_rt": __version__,
+            "tactile_rt": VERSION,
             "mujoco": mujoco.__version__,
             "numpy": np.__version__,
         },

@@ -1,20 +1,15 @@
 """`tactile-rt align`, on the shipped model and synthetic animals."""
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "models" / "alignment"))  # for `brains`
-
-import brains
-
-from tactile_rt.model_file import shipped_model
+from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.models.alignment import save_benchmark
 from tactile_rt.models.alignment.published import write_published
 from tactile_rt.models.alignment.strict import freeze_strict
+from tests.helpers import brains
 
 pytest.importorskip("onnx")
 

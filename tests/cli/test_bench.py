@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from tactile_rt.benchmarks import roofline
-from tactile_rt.benchmarks.drivers import fuzzing, losses, unplugging
-from tactile_rt.benchmarks.records import Record
+from bench.drivers import fuzzing, losses, unplugging
 from tactile_rt.cli import bench
+from tactile_rt.evidence import roofline
+from tactile_rt.evidence.records import Record
 
 
 def test_an_unknown_area_lists_the_areas(call):

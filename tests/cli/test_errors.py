@@ -9,16 +9,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_rt.cli import starting
+from tactile_rt.cli.app import starting
 
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
 import trimesh
 
-from tactile_rt.recording import write_object
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
+from tactile_rt.sweep_set import write_object
 
 TINY = ("--recipe", "mouse12", "--objects", 3, "--validation", 1, "--test", 1, "--sweeps", 1)
 
@@ -230,11 +230,11 @@ def tiny_model(torch, tmp_path, sweep_set):
     import msgspec
     import onnx
 
+    from tactile_rt.classifier.model_file import METADATA_KEY
     from tactile_rt.export.onnx_step import export_checkpoint
-    from tactile_rt.model_file import METADATA_KEY
     from tactile_rt.models.ead import EADConfig
     from tactile_rt.models.training import TactileClassifier, TrainingConfig
-    from tactile_rt.recording import SweepManifest
+    from tactile_rt.sweep_set import SweepManifest
 
     spec = SweepManifest.read(sweep_set).spec
     network = EADConfig(classes=12, attender="none", width=1 / 32)

@@ -6,16 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from tactile_rt.benchmarks import model_steps, roofline
-from tactile_rt.model_checks import probe_logits
-from tactile_rt.model_file import METADATA_KEY, load_model, read_model, shipped_model
-from tactile_rt.onnx_reading import graph_sha256
+from tactile_rt.classifier.model_check import probe_logits
+from tactile_rt.classifier.model_file import METADATA_KEY, load_model, read_model, shipped_model
+from tactile_rt.classifier.onnx_check import graph_sha256
+from tactile_rt.evidence import model_steps, roofline
 
 pytest.importorskip("onnx")
 
 import onnx
 from onnx import helper
-from tiny_model import WINDOW, write_model
+
+from tests.helpers.tiny_model import WINDOW, write_model
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
-from tactile_rt.recording import SweepManifest
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
+from tactile_rt.sweep_set import SweepManifest
 
 TINY = """
 name = "tiny"

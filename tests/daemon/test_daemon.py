@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_model import write_model
 
-from tactile_rt.classifier import Classifier
+from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.daemon import consumers
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config_check import check_config
@@ -25,13 +24,14 @@ from tactile_rt.daemon.items import (
     Event,
     Opened,
     Packet,
-    Samples,
+    SourceChunk,
 )
 from tactile_rt.daemon.lock import AlreadyRunning, Locks
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
-from tactile_rt.sources import open_source
+from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError, SourceError
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
+from tests.helpers.tiny_model import write_model
 
 SPEC = small_spec()
 PATIENCE_S = 30.0
@@ -58,7 +58,7 @@ class Spy(Consumer):
     """Keeps all that it is given; does as the test says."""
 
     made: list["Spy"] = []  # noqa: RUF012
-    wants = frozenset({Opened, Closed, Samples, Packet, Decision, Contact, Event, Control})
+    wants = frozenset({Opened, Closed, SourceChunk, Packet, Decision, Contact, Event, Control})
 
     def __init__(self, name, options):
         self.items, self.log = [], []
@@ -134,7 +134,7 @@ def state_of(daemon, name):
 
 
 def seqs(spy, name):
-    found = [i.chunk.seq for i in spy.of(Samples, name)]
+    found = [i.chunk.seq for i in spy.of(SourceChunk, name)]
     return np.concatenate(found) if found else np.zeros(0, int)
 
 
@@ -376,7 +376,7 @@ def test_a_reload_disturbs_only_what_has_changed(robot, tmp_path, spy):
             )
         )
         assert len(spy) == 1  # what goes on is not made again
-        until(lambda: first.of(Samples, "b"))
+        until(lambda: first.of(SourceChunk, "b"))
         until(lambda: '"source":"b"' in (tmp_path / "out").read_text())
         snapshot = daemon.snapshot()
         assert snapshot.reloads == 1 and first.told("daemon", "reloaded")
@@ -413,7 +413,7 @@ def test_a_source_that_is_still_being_opened_disturbs_no_other_after_a_reload(ro
     until(lambda: daemon._sources["a"]._opening)
     old = daemon._sources["a"]
     daemon.reload(configured(Path(daemon.snapshot().config).parent, source("a", "synthetic:2x2")))
-    until(lambda: spy.of(Samples, "a"))
+    until(lambda: spy.of(SourceChunk, "a"))
     assert not closed and [e.reason for e in spy.told("source.a", "stopped")] == [
         "while it waited for its device"
     ]
@@ -441,7 +441,7 @@ def test_a_reload_that_needs_a_device_of_another_process_changes_nothing(robot, 
 
 def test_closing_drains_what_waits(robot, tmp_path):
     daemon, spy = robot(source("a", "synthetic:35x6"))
-    until(lambda: len(spy.of(Samples)) > 3)
+    until(lambda: len(spy.of(SourceChunk)) > 3)
     hold = threading.Event()
     spy.handling = lambda: hold.wait(0.3)
     until(lambda: daemon._consumers["publisher.spy"][1].box.state.waiting["samples"] > 20)
@@ -476,13 +476,17 @@ def test_the_wall_clock_may_jump(robot):
 
     clock = Stepped()
     daemon, spy = robot(source("a", "synthetic:"), clock=clock)
-    until(lambda: len(spy.of(Samples)) > 3)
+    until(lambda: len(spy.of(SourceChunk)) > 3)
     clock.by = 3600 * 10**9
     until(lambda: spy.told("daemon", "clock"))
     assert spy.told("daemon", "clock")[0].reason.startswith("the wall clock jumped by +3600.")
-    until(lambda: spy.of(Samples)[-1].utc_offset_ns - spy.of(Samples)[0].utc_offset_ns > 3599e9)
+    until(
+        lambda: (
+            spy.of(SourceChunk)[-1].utc_offset_ns - spy.of(SourceChunk)[0].utc_offset_ns > 3599e9
+        )
+    )
     assert daemon.snapshot().clock_steps == 1
-    t_ns = np.concatenate([s.chunk.t_ns for s in spy.of(Samples)])
+    t_ns = np.concatenate([s.chunk.t_ns for s in spy.of(SourceChunk)])
     assert (np.diff(t_ns) > 0).all()
 
 

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from published import samples
 
 from tactile_rt.daemon.digits import shortest
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.testing import small_spec
+from tests.helpers.published import samples
 
 
 def digits(text):

@@ -12,7 +12,6 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from published import FORCES, View, busy_snapshot, contact, decision, event, running, samples
 
 from tactile_rt.daemon.config_check import check_config
 from tactile_rt.daemon.config_file import load_config
@@ -22,6 +21,16 @@ from tactile_rt.daemon.publishers.foxglove import FoxgloveOptions, FoxglovePubli
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions, ZenohPublisher
 from tactile_rt.daemon.publishers.zmq import ZmqOptions, ZmqPublisher
 from tactile_rt.daemon.runner import ExitCode
+from tests.helpers.published import (
+    FORCES,
+    View,
+    busy_snapshot,
+    contact,
+    decision,
+    event,
+    running,
+    samples,
+)
 
 DOCS = Path(__file__).parents[2] / "docs"
 pytestmark = pytest.mark.skipif(

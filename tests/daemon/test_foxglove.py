@@ -13,7 +13,15 @@ import msgspec
 import numpy as np
 import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
-from published import (
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from tactile_rt.daemon.publishers.foxglove import FoxgloveOptions, FoxglovePublisher
+from tactile_rt.daemon.publishers.scene import rotate, turn_x_to
+from tactile_rt.daemon.publishers.sending import Repeated
+from tactile_rt.stream import SourceError
+from tactile_rt.testing import small_spec
+from tests.helpers.published import (
     FORCES,
     UTC,
     View,
@@ -26,14 +34,6 @@ from published import (
     running,
     samples,
 )
-from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
-
-from tactile_rt.daemon.publishers.foxglove import FoxgloveOptions, FoxglovePublisher
-from tactile_rt.daemon.publishers.scene import rotate, turn_x_to
-from tactile_rt.daemon.publishers.sending import Repeated
-from tactile_rt.stream import SourceError
-from tactile_rt.testing import small_spec
 
 PROTOCOL = "foxglove.sdk.v1"
 pytestmark = pytest.mark.usefixtures("no_thread_left")

@@ -8,7 +8,8 @@ import struct
 from pathlib import Path
 
 import pytest
-from published import until
+
+from tests.helpers.published import until
 
 pytest.importorskip("uvicorn", reason="needs uvicorn: pip install 'tactile-rt[ui]'")
 pytest.importorskip("zmq", reason="needs pyzmq: pip install 'tactile-rt[publish]'")

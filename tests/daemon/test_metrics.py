@@ -11,7 +11,6 @@ import urllib.request
 import msgspec
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
-from published import View, busy_snapshot, part, running, until
 
 from tactile_rt.daemon import metrics as module
 from tactile_rt.daemon.config import MetricsConfig
@@ -20,6 +19,7 @@ from tactile_rt.daemon.metrics import Metrics
 from tactile_rt.daemon.prometheus import exposition
 from tactile_rt.daemon.snapshot import SourceState
 from tactile_rt.stream import SourceError
+from tests.helpers.published import View, busy_snapshot, part, running, until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 

@@ -14,9 +14,9 @@ import pytest
 
 pytest.importorskip("uvicorn", reason="needs uvicorn: pip install 'tactile-rt[ui]'")
 
-from tactile_rt.classifier import Classification
+from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.config import PageConfig
-from tactile_rt.daemon.items import Control, Decision, Event, Opened, Samples
+from tactile_rt.daemon.items import Control, Decision, Event, Opened, SourceChunk
 from tactile_rt.daemon.page import Page
 from tactile_rt.daemon.page import feed as feed_module
 from tactile_rt.daemon.page import server as server_module
@@ -48,7 +48,7 @@ def samples(values, name="a", valid=None):
     chunk = cut(np.asarray(values, np.float32), 1000.0, samples=len(values))[0]
     if valid is not None:
         chunk = replace(chunk, valid=np.asarray(valid))
-    return Samples(name, SPEC, chunk, 5, 0)
+    return SourceChunk(name, SPEC, chunk, 5, 0)
 
 
 def decision(label="y"):

@@ -16,11 +16,11 @@ pytest.importorskip(
 
 from playwright.sync_api import sync_playwright
 
-from tactile_rt.classifier import Classification
+from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.config import PageConfig
 from tactile_rt.daemon.config_file import load_config
 from tactile_rt.daemon.daemon import Daemon
-from tactile_rt.daemon.items import Decision, Event, Opened, Samples
+from tactile_rt.daemon.items import Decision, Event, Opened, SourceChunk
 from tactile_rt.daemon.page import Page
 from tactile_rt.daemon.snapshot import ModelState, PartState, Snapshot, SourceState
 from tactile_rt.testing import ArraySource, cut, small_spec
@@ -216,7 +216,7 @@ class Fed:
             made = Classification(now - 10**8, now, 2, False, EVIL, (EVIL, "y"), p, 0.001)
             self.page.handle(
                 [
-                    Samples("a", spec, chunk, now, 0),
+                    SourceChunk("a", spec, chunk, now, 0),
                     Decision("a", "m", EVIL, made, now, now, 0),
                     Event("source.a", "waiting", EVIL, "error", now, 0),
                 ]

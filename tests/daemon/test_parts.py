@@ -11,7 +11,7 @@ import types
 import numpy as np
 import pytest
 
-from tactile_rt.classifier import Classification
+from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon import mailbox as mailbox_module
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, LogConfig
@@ -24,7 +24,7 @@ from tactile_rt.daemon.items import (
     Event,
     Opened,
     Packet,
-    Samples,
+    SourceChunk,
 )
 from tactile_rt.daemon.latency import EDGES_S, LatencyMeter
 from tactile_rt.daemon.lock import AlreadyRunning, Locks, lock_keys
@@ -45,7 +45,7 @@ pytestmark = pytest.mark.usefixtures("no_thread_left")
 def samples(n=1, source="a", seq=0):
     chunk = cut(np.arange(n * 6).reshape(n, 3, 2), 1000.0, samples=n)[0]
     chunk = Chunk(chunk.seq + seq, chunk.t_ns, chunk.values, chunk.valid)
-    return Samples(source, SPEC, chunk, 5, OFFSET_NS)
+    return SourceChunk(source, SPEC, chunk, 5, OFFSET_NS)
 
 
 def event(reason="", part="source.a", state="waiting", level="warning"):
@@ -68,7 +68,7 @@ def until(condition):
 
 
 def test_a_mailbox_drops_the_oldest_and_counts_them():
-    box = Mailbox({Samples, Event}, items=4, size=1 << 20)
+    box = Mailbox({SourceChunk, Event}, items=4, size=1 << 20)
     for seq in range(10):
         box.put(samples(3, seq=seq))
     box.put(event())
@@ -93,7 +93,7 @@ def test_a_mailbox_is_bounded_in_bytes_but_takes_one_of_any_size():
 
 
 def test_a_mailbox_takes_what_it_wants_of_the_source_that_it_wants():
-    box = Mailbox({Samples}, 10, 1 << 20, source="a")
+    box = Mailbox({SourceChunk}, 10, 1 << 20, source="a")
     box.put(samples(source="b"))
     box.put(event())
     box.put(samples(source="a"))
@@ -101,7 +101,7 @@ def test_a_mailbox_takes_what_it_wants_of_the_source_that_it_wants():
 
 
 def test_a_closed_mailbox_gives_out_what_it_has_and_waits_no_more():
-    box = Mailbox({Samples}, 10, 1 << 20)
+    box = Mailbox({SourceChunk}, 10, 1 << 20)
     box.put(samples())
     box.close()
     box.put(samples())
@@ -109,7 +109,7 @@ def test_a_closed_mailbox_gives_out_what_it_has_and_waits_no_more():
 
 
 def test_what_is_urgent_does_not_wait_for_what_is_gathered():
-    box = Mailbox({Samples, Event}, 100, 1 << 20, gather_s=1000.0)
+    box = Mailbox({SourceChunk, Event}, 100, 1 << 20, gather_s=1000.0)
     box.put(samples())
     taken = []
     thread = threading.Thread(target=lambda: taken.extend(box.take()))
@@ -122,7 +122,7 @@ def test_what_is_urgent_does_not_wait_for_what_is_gathered():
 
 
 def test_many_writers_and_a_reader_lose_nothing_that_is_not_counted():
-    box, taken = Mailbox({Samples}, 16, 1 << 20, gather_s=0.001), []
+    box, taken = Mailbox({SourceChunk}, 16, 1 << 20, gather_s=0.001), []
 
     def read():
         while items := box.take():
@@ -143,7 +143,7 @@ def test_many_writers_and_a_reader_lose_nothing_that_is_not_counted():
 
 
 def test_whoever_waits_for_room_gets_it_from_the_reader_or_when_there_is_none():
-    box = Mailbox({Samples}, 4, 1 << 20)
+    box = Mailbox({SourceChunk}, 4, 1 << 20)
     for _ in range(4):
         box.put(samples())
     box.wait_for_room(PATIENCE_S)  # nobody takes: there is nobody to wait for

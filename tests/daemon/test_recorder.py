@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_rt.classifier import Classification
+from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.config import RecorderConfig
 from tactile_rt.daemon.items import (
     Closed,
@@ -17,11 +17,10 @@ from tactile_rt.daemon.items import (
     Event,
     Opened,
     Packet,
-    Samples,
+    SourceChunk,
 )
 from tactile_rt.daemon.snapshot import Snapshot
-from tactile_rt.sources import open_source
-from tactile_rt.stream_recording import (
+from tactile_rt.recording import (
     read_decisions,
     read_description,
     read_events,
@@ -29,7 +28,8 @@ from tactile_rt.stream_recording import (
     read_stream,
     recover,
 )
-from tactile_rt.stream_recording.reader import is_finished
+from tactile_rt.recording.reader import is_finished
+from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
 
 pytest.importorskip("mcap")
@@ -76,7 +76,7 @@ def opened(name="whiskers", stream=None):
 
 
 def samples(chunk, name="whiskers", at=None):
-    return Samples(name, SPEC, chunk, at or time.monotonic_ns(), UTC)
+    return SourceChunk(name, SPEC, chunk, at or time.monotonic_ns(), UTC)
 
 
 def decision(step=1):
@@ -175,7 +175,7 @@ def test_a_device_s_packets_decode_again_from_every_rotated_file(daemon, tmp_pat
             if chunk is None:
                 continue
             got.append(chunk)
-            came = Samples("whiskers", source.spec, chunk, time.monotonic_ns(), UTC)
+            came = SourceChunk("whiskers", source.spec, chunk, time.monotonic_ns(), UTC)
             made.handle([*(Packet("whiskers", *p) for p in heard), came])
             if len(got) == 3:
                 made.handle([Control("rotate")])

@@ -12,7 +12,6 @@ from queue import SimpleQueue
 from typing import ClassVar
 
 import pytest
-from published import PATIENCE_S, View, busy_snapshot, event, running, until
 
 from tactile_rt.cli import main
 from tactile_rt.daemon.config_check import check_config
@@ -24,6 +23,7 @@ from tactile_rt.daemon.systemd import Systemd, hanging, status_of
 from tactile_rt.daemon.unit import install_script, unit_text, written_folders
 from tactile_rt.stream import ConfigError, Source
 from tactile_rt.testing import small_spec
+from tests.helpers.published import PATIENCE_S, View, busy_snapshot, event, running, until
 
 SMALL = 'version = 1\n[[source]]\nname = "a"\nurl = "synthetic:2x2"\n'
 pytestmark = pytest.mark.usefixtures("no_thread_left")

@@ -8,7 +8,6 @@ import sys
 import threading
 
 import pytest
-from published import View, busy_snapshot, decision, event, running
 from rich.console import Console
 
 from tactile_rt.cli import main
@@ -18,6 +17,7 @@ from tactile_rt.daemon.config import MetricsConfig
 from tactile_rt.daemon.messages import encode, message_of, state_message
 from tactile_rt.daemon.metrics import Metrics
 from tactile_rt.stream import ConfigError, SourceError
+from tests.helpers.published import View, busy_snapshot, decision, event, running
 
 SHOWN = """\
 tactile_rt 1.2.3 degraded  up 0:00:10  pid 77  reloaded 1x  clock stepped 2x  /etc/robot.toml

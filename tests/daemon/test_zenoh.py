@@ -7,12 +7,21 @@ import time
 import msgspec
 import pytest
 import zenoh
-from published import View, busy_snapshot, contact, decision, event, opened, running, until
 
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions, ZenohPublisher
 from tactile_rt.stream import ConfigError, SourceError
 from tactile_rt.testing import small_spec
+from tests.helpers.published import (
+    View,
+    busy_snapshot,
+    contact,
+    decision,
+    event,
+    opened,
+    running,
+    until,
+)
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 

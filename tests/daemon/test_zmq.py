@@ -5,12 +5,22 @@ import json
 import msgspec
 import pytest
 import zmq
-from published import View, busy_snapshot, contact, decision, event, opened, running, samples, until
 
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.publishers.zmq import ZmqOptions, ZmqPublisher
 from tactile_rt.stream import SourceError
 from tactile_rt.testing import small_spec
+from tests.helpers.published import (
+    View,
+    busy_snapshot,
+    contact,
+    decision,
+    event,
+    opened,
+    running,
+    samples,
+    until,
+)
 
 FREE = "tcp://127.0.0.1:*"
 pytestmark = pytest.mark.usefixtures("no_thread_left")

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
-from tactile_rt.drivers.codec import Event, Frame
+from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.aft200 import Aft200, Aft200Options
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 
 def aft200(**options: float) -> Aft200:
@@ -24,8 +24,8 @@ class TestAft200(CodecContract):
 
 def test_a_golden_sample() -> None:
     # by hand: force = count / 100 - 300 N, torque = count / 500 - 50 N m; two bytes are not used
-    force = Frame(1, bytes.fromhex("7530 7531 ffff aabb"))  # 30,000, 30,001, 65,535
-    torque = Frame(2, bytes.fromhex("61a8 0000 61a7 aabb"))  # 25,000, 0, 24,999
+    force = CanFrame(1, bytes.fromhex("7530 7531 ffff aabb"))  # 30,000, 30,001, 65,535
+    torque = CanFrame(2, bytes.fromhex("61a8 0000 61a7 aabb"))  # 25,000, 0, 24,999
     samples = aft200().feed([force, torque], T0)
     assert samples is not None and samples.valid.all()
     expected = [0.0, 0.01, 355.35, 0.0, -50.0, -0.002]
@@ -46,13 +46,13 @@ def test_forces_and_torques_of_one_sample_only() -> None:
 
 def test_commands() -> None:
     host, device = aft200(rate_hz=300, bias=True, sensor=5), aft200(sensor=5)
-    sent = [step.send[0] for step in host.commands(Event.START)]
+    sent = [step.send[0] for step in host.commands(Command.START)]
     assert sent == [
-        Frame(0x102, bytes.fromhex("05 05 0d05 00000000")),  # 3,333 us
-        Frame(0x102, bytes.fromhex("05 02 01 0000000000")),
-        Frame(0x102, bytes.fromhex("05 03 01 0000000000")),
+        CanFrame(0x102, bytes.fromhex("05 05 0d05 00000000")),  # 3,333 us
+        CanFrame(0x102, bytes.fromhex("05 02 01 0000000000")),
+        CanFrame(0x102, bytes.fromhex("05 03 01 0000000000")),
     ]
-    assert host.commands(Event.START)[1].pause_s == 1.0
+    assert host.commands(Command.START)[1].pause_s == 1.0
     assert host.spec.rate_hz == pytest.approx(1e6 / 3333)
     device.respond(sent[:2])
     assert not device.streaming
@@ -70,7 +70,9 @@ def test_beyond_the_wire() -> None:
 
 def test_other_frames() -> None:
     host = aft200()
-    assert host.feed([Frame(3, bytes(8)), Frame(0, bytes(8)), Frame(1, bytes(5))], T0) is None
+    assert (
+        host.feed([CanFrame(3, bytes(8)), CanFrame(0, bytes(8)), CanFrame(1, bytes(5))], T0) is None
+    )
     assert (host.stats.skipped, host.stats.corrupt) == (2, 1)
 
 

@@ -5,10 +5,18 @@ import struct
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, mutations, stacked
 
 from tactile_rt.drivers.codecs.anyskin import AnySkin, AnySkinOptions
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import (
+    T0,
+    CodecCase,
+    CodecContract,
+    chunk_of,
+    decode,
+    mutations,
+    stacked,
+)
 
 MILLI = 1e-3  # T
 

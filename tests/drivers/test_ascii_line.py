@@ -5,14 +5,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, mutations, stacked
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.drivers.codec import Event
+from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.ascii_line import AsciiLine, AsciiLineOptions
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import (
+    T0,
+    CodecCase,
+    CodecContract,
+    chunk_of,
+    decode,
+    mutations,
+    stacked,
+)
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "codecs" / "ascii_line.toml"
 PLAIN = "A0.fx,A0.fy,B1.fx,B1.fy"
@@ -119,7 +127,7 @@ def test_a_board_is_started_stopped_and_polled() -> None:
     host = AsciiLine(AsciiLineOptions(mapping=str(EXAMPLE)))
     device = AsciiLine(AsciiLineOptions(mapping=str(EXAMPLE)))
     assert not device.streaming and not host.polls
-    (start,), (stop,) = host.commands(Event.START), host.commands(Event.STOP)
+    (start,), (stop,) = host.commands(Command.START), host.commands(Command.STOP)
     assert start.send == b"s\n" and stop.send == b"e\n"
     for part in (b"s", b"\n"):  # in pieces, as a line brings it
         device.respond(part)
@@ -129,10 +137,10 @@ def test_a_board_is_started_stopped_and_polled() -> None:
 
     asked = ascii_line(poll="r\n")
     assert asked.polls and not asked.streaming
-    (poll,) = asked.commands(Event.POLL)
+    (poll,) = asked.commands(Command.POLL)
     asked.respond(poll.send * 2)
     assert asked.polled == 2 and not asked.streaming
-    assert ascii_line().streaming and ascii_line().commands(Event.START) == ()
+    assert ascii_line().streaming and ascii_line().commands(Command.START) == ()
 
 
 def test_labels_before_numbers() -> None:

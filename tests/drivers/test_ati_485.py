@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
-from tactile_rt.drivers.codec import Event
+from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.ati_485 import Ati485, Ati485Options
 from tactile_rt.drivers.links import SerialLink
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 # Request and answer as constants of a public firmware for this sensor.
 REQUEST, ANSWER = bytes.fromhex("0a4655a39d"), bytes.fromhex("0a4601a262")
@@ -188,12 +188,12 @@ def test_a_wrong_matrix_is_named(tmp_path: Path, text: str, why: str) -> None:
 
 def test_the_commands() -> None:
     host, device = ati(), ati()
-    jam, start = host.commands(Event.START)
+    jam, start = host.commands(Command.START)
     assert jam.send == bytes(14) and jam.pause_s > 0
     assert (start.send, start.expect) == (REQUEST, ANSWER)
     assert device.respond(jam.send + REQUEST) == ANSWER and device.streaming
     assert device.respond(REQUEST) == b""  # deaf to Modbus
-    device.respond(host.commands(Event.STOP)[0].send)
+    device.respond(host.commands(Command.STOP)[0].send)
     assert not device.streaming
 
 

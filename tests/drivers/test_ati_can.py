@@ -4,11 +4,11 @@ import struct
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
-from tactile_rt.drivers.codec import Event, Frame
+from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.ati_can import AtiCan, AtiCanOptions
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 RESOLUTION = [290 / 32767 / 2] * 3 + [10 / 32767 / 2] * 3
 
@@ -20,7 +20,7 @@ def ati(**options: float) -> AtiCan:
 def started() -> AtiCan:
     """A host that has read an emulated board's calibration."""
     device, host = ati(), ati()
-    for step in host.commands(Event.START):
+    for step in host.commands(Command.START):
         answer = device.respond(step.send)
         assert any(f.id == step.expect for f in answer)
         host.feed(answer, T0)
@@ -36,7 +36,7 @@ class TestAti(CodecContract):
     case = CodecCase(started, signal, RESOLUTION, checked=False)
 
 
-def wire(device: AtiCan, n: int) -> tuple[list[Frame], list[Frame], np.ndarray]:
+def wire(device: AtiCan, n: int) -> tuple[list[CanFrame], list[CanFrame], np.ndarray]:
     """First frames, second frames and values of n samples."""
     values = signal(n)
     packets = device.encode(chunk_of(device, values))
@@ -47,17 +47,19 @@ def test_a_golden_sample() -> None:
     """By hand from the board's manual as the public driver reads it, base identifier 0x7F."""
     host = ati()
     # 1,000 counts per lbf, 500 counts per lbf-in
-    host.feed([Frame(0x7F7, bytes.fromhex("000003e8 000001f4")), Frame(0x7F8, b"\x01\x01")], T0)
+    host.feed(
+        [CanFrame(0x7F7, bytes.fromhex("000003e8 000001f4")), CanFrame(0x7F8, b"\x01\x01")], T0
+    )
     matrix = np.array(
         [[0.5, -1, 2, 0, 0, 0], [0, 3, 0, 0, 0.25, 0], [1, 1, 1, 1, 1, 1],
          [0, 0, 0, 0, 0, 4], [0, 0, -2, 0, 0, 0], [8, 0, 0, 0.125, 0, 0]]
     )  # fmt: skip
     for row in matrix:
         for i in range(3):
-            host.feed([Frame(0x7F2 + i, struct.pack(">2f", *row[2 * i : 2 * i + 2]))], T0)
+            host.feed([CanFrame(0x7F2 + i, struct.pack(">2f", *row[2 * i : 2 * i + 2]))], T0)
     # status 0; gauges 0, 2, 4 = 1000, -2, 256; gauges 1, 3, 5 = -32768, 7, 1
-    first = Frame(0x7F0, bytes.fromhex("0000 03e8 fffe 0100"))
-    second = Frame(0x7F1, bytes.fromhex("8000 0007 0001"))
+    first = CanFrame(0x7F0, bytes.fromhex("0000 03e8 fffe 0100"))
+    second = CanFrame(0x7F1, bytes.fromhex("8000 0007 0001"))
     samples = host.feed([first, second], T0)
     assert samples is not None and samples.valid.all()
     counts = matrix @ [1000, -32768, -2, 7, 256, 1]
@@ -100,7 +102,7 @@ def test_without_the_matrix_there_is_no_sample() -> None:
 
 def test_a_row_that_comes_twice() -> None:
     device, host = ati(), ati()
-    for step in host.commands(Event.START):
+    for step in host.commands(Command.START):
         host.feed(device.respond(step.send), T0)
         if step.send[0].id == 0x7F2:
             host.feed(device.respond(step.send), T0)
@@ -114,7 +116,7 @@ def test_status_bits() -> None:
     host = started()
     for bit, valid in ((4, False), (6, False), (11, True), (14, True)):
         status = (1 << bit | 1 << 15).to_bytes(2, "big")
-        samples = host.feed([Frame(0x7F0, status + bytes(6)), Frame(0x7F1, bytes(6))], T0)
+        samples = host.feed([CanFrame(0x7F0, status + bytes(6)), CanFrame(0x7F1, bytes(6))], T0)
         assert samples is not None and samples.status is not None
         assert samples.status.tolist() == [1 << bit | 1 << 15] and bit in host.status_bits
         assert samples.valid.tolist() == [[valid]]
@@ -123,11 +125,11 @@ def test_status_bits() -> None:
 def test_commands() -> None:
     host, device = ati(base=2, calibration=3), ati(base=2)
     assert host.polls and not device.streaming
-    asked = [(f.id, f.data) for step in host.commands(Event.START) for f in step.send]
+    asked = [(f.id, f.data) for step in host.commands(Command.START) for f in step.send]
     rows = [(0x22, bytes((i,))) for i in range(6)]
     assert asked == [(0x26, b"\x03"), (0x27, b""), (0x28, b""), *rows]
-    (poll,) = host.commands(Event.POLL)
-    assert list(poll.send) == [Frame(0x20)]
+    (poll,) = host.commands(Command.POLL)
+    assert list(poll.send) == [CanFrame(0x20)]
     device.respond(poll.send)
     device.respond(poll.send)
     assert device.polled == 2
@@ -136,8 +138,8 @@ def test_commands() -> None:
 def test_what_is_no_reply_is_refused() -> None:
     host = started()
     wrong = [
-        Frame(0x7F0, bytes(7)), Frame(0x7F1, bytes(8)), Frame(0x7F7, bytes(8)),
-        Frame(0x7F8, b"\x09\x01"), Frame(0x7F3, bytes(8)),
+        CanFrame(0x7F0, bytes(7)), CanFrame(0x7F1, bytes(8)), CanFrame(0x7F7, bytes(8)),
+        CanFrame(0x7F8, b"\x09\x01"), CanFrame(0x7F3, bytes(8)),
     ]  # fmt: skip
     assert host.feed(wrong, T0) is None and host.stats.corrupt == 5
 

@@ -4,11 +4,11 @@ import struct
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
-from tactile_rt.drivers.codec import Event
+from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.bota import Bota, BotaOptions
 from tactile_rt.stream import Chunk, ConfigError
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 # By hand from the format: AA, status 0, the loads 1, -2, 0.5, -0.25, 0.125 and 4, 305419896 us,
 # 25 degrees; the checksum with the bitwise CRC below.
@@ -110,7 +110,7 @@ def test_a_device_is_configured_and_runs() -> None:
     host = Bota(BotaOptions(sinc=64, skip_fir=True, temperature_compensation=True))
     assert host.spec.rate_hz == pytest.approx(800)
     assert Bota(BotaOptions()).spec.rate_hz == pytest.approx(100)  # 0.00001953125 s x 512
-    start = host.commands(Event.START)
+    start = host.commands(Command.START)
     assert [step.send for step in start] == [b"C", b"c,1,1,0,4", b"f,64,0,0,1", b"R"]
     assert all(len(step.send) <= 64 for step in start)
     device = Bota(BotaOptions())
@@ -124,9 +124,9 @@ def test_a_device_is_configured_and_runs() -> None:
     assert running == [False, False, False, True]
     assert sum(map(len, decode(host, b"".join(device.encode(chunk_of(device, signal())))))) == 30
     assert host.stats.corrupt == 0
-    for step in host.commands(Event.STOP):
+    for step in host.commands(Command.STOP):
         assert step.expect in device.respond(step.send)
-    assert not device.streaming and host.commands(Event.POLL) == ()
+    assert not device.streaming and host.commands(Command.POLL) == ()
 
 
 def test_a_running_device_takes_no_settings() -> None:

@@ -5,11 +5,11 @@ from pathlib import Path
 import cantools
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
-from tactile_rt.drivers.codec import Event, Frame
+from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.can_dbc import CanDbc, CanDbcOptions
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 DOCS = Path(__file__).parents[2] / "docs" / "codecs"
 
@@ -105,11 +105,11 @@ class TestNested(CodecContract):
 # 0x801 is -2047, in 0.5 mN; Normal0, 16 bits big-endian from the top of byte 3: 0x1234 = 4660, in
 # 0.25 mN from -100; Warmth0 in bytes 6-7: 0xff9c = -100, in 0.01 degC from 20. Warmth3 is a float.
 GOLDEN = [
-    Frame(0x210, bytes.fromhex("07 10 27 00 02")),  # counter 7, time 0x002710 = 10,000, fault 2
-    Frame(0x211, bytes.fromhex("00 01 08 12 34 00 9c ff")),
-    Frame(0x211, bytes.fromhex("01 00 00 01 90 00 00 00")),
-    Frame(0x211, bytes.fromhex("02 ff 07 ff ff 00 e8 03")),
-    Frame(0x212, bytes.fromhex("02 00 00 00 0000c841")),  # 25.0
+    CanFrame(0x210, bytes.fromhex("07 10 27 00 02")),  # counter 7, time 0x002710 = 10,000, fault 2
+    CanFrame(0x211, bytes.fromhex("00 01 08 12 34 00 9c ff")),
+    CanFrame(0x211, bytes.fromhex("01 00 00 01 90 00 00 00")),
+    CanFrame(0x211, bytes.fromhex("02 ff 07 ff ff 00 e8 03")),
+    CanFrame(0x212, bytes.fromhex("02 00 00 00 0000c841")),  # 25.0
 ]
 
 
@@ -172,9 +172,9 @@ def test_nested_multiplexers(folder: Path) -> None:
     codec = CanDbc(CanDbcOptions(str(folder / "nested.toml")))
     # byte 0: counter in the high nibble, row in bits 2-3, side in bits 0-1
     frames = [
-        Frame(0x2F0, bytes((0x30, 10, 0, 0, 0, 0, 0, 0)), True),
-        Frame(0x2F0, bytes((0x31, 20, 0, 0, 0, 30, 0, 0)), True),
-        Frame(0x2F0, bytes((0x35, 40, 0, 0, 0, 30, 0, 0)), True),
+        CanFrame(0x2F0, bytes((0x30, 10, 0, 0, 0, 0, 0, 0)), True),
+        CanFrame(0x2F0, bytes((0x31, 20, 0, 0, 0, 30, 0, 0)), True),
+        CanFrame(0x2F0, bytes((0x35, 40, 0, 0, 0, 30, 0, 0)), True),
     ]
     samples = codec.feed(frames, T0)
     assert samples is not None and samples.valid.all()
@@ -218,9 +218,9 @@ def test_lost_frames() -> None:
 
 def test_commands() -> None:
     device = pad()
-    (start,), (stop,) = device.commands(Event.START), device.commands(Event.STOP)
-    assert list(start.send) == [Frame(0x200, b"\x01\x64")] and start.expect == 0x201
-    assert not device.streaming and not device.polls and not device.commands(Event.POLL)
+    (start,), (stop,) = device.commands(Command.START), device.commands(Command.STOP)
+    assert list(start.send) == [CanFrame(0x200, b"\x01\x64")] and start.expect == 0x201
+    assert not device.streaming and not device.polls and not device.commands(Command.POLL)
     assert device.respond(start.send)[0].id == 0x201 and device.streaming
     assert not device.respond(stop.send) and not device.streaming
 
@@ -229,7 +229,7 @@ def test_polling(folder: Path) -> None:
     path = folder / "polled.toml"
     path.write_text(PATCH_TOML + '[[command]]\nwhen = "poll"\nid = 0x201\ndata = "0700"\n')
     device = CanDbc(CanDbcOptions(str(path)))
-    (poll,) = device.commands(Event.POLL)
+    (poll,) = device.commands(Command.POLL)
     assert device.polls and device.streaming
     device.respond(poll.send)
     assert device.polled == 1

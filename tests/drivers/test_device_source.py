@@ -10,7 +10,7 @@ import pytest
 from tactile_rt.drivers.emulation.damage import Fate
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.drivers.health import State
-from tactile_rt.sources import open_source
+from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError, EndOfStream, SourceError
 from tactile_rt.testing import FakeCan, FakeSerial
 

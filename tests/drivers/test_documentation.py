@@ -7,13 +7,13 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from codec_contract import CodecCase, CodecContract
 
-from tactile_rt.combined import _File
 from tactile_rt.drivers.codec import CODECS, Codec
 from tactile_rt.drivers.device_source import DeviceOptions
 from tactile_rt.drivers.emulation.faults import KINDS, read_faults
 from tactile_rt.drivers.opening import CanOptions, SerialOptions
+from tactile_rt.sources.combined import _File
+from tests.helpers.codec_contract import CodecCase, CodecContract
 
 GUIDE = (Path(__file__).parents[2] / "docs" / "drivers.md").read_text(encoding="utf-8")
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import serial
 
-from tactile_rt.drivers.codec import Event, Samples, SerialCodec
+from tactile_rt.drivers.codec import Command, Samples, SerialCodec
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial
 from tactile_rt.drivers.codecs.native_can import NativeCan, NativeCanOptions
 from tactile_rt.drivers.emulation.damage import Fate
@@ -22,9 +22,9 @@ from tactile_rt.drivers.emulation.endpoints import BusEndpoint, SerialEndpoint, 
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.drivers.emulation.fitting import fit
 from tactile_rt.drivers.slcan import SlcanDecoder, encode, opening
-from tactile_rt.pytest_fixtures import fake_can, fake_serial  # noqa: F401
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
+from tactile_rt.testing.fixtures import fake_can, fake_serial  # noqa: F401
 
 SPEC = small_spec(4)
 PATIENCE_S = 20.0  # a test that waits so long has failed
@@ -64,7 +64,7 @@ class Host:
         self.codec = codec or NativeSerial(NativeOptions())
         self.came = b""
         self.samples: list[Samples] = []
-        for step in self.codec.commands(Event.START) if start else ():
+        for step in self.codec.commands(Command.START) if start else ():
             os.write(self.fd, step.send)
             while step.expect is not None and step.expect not in self.came:
                 assert self.read(PATIENCE_S), "no answer"
@@ -111,7 +111,7 @@ def test_every_sample_comes_as_it_is_over_a_pty() -> None:
 def test_pyserial_reads_it_too() -> None:
     with native(300) as device, serial.Serial(device.endpoint.pty.path, timeout=0.1) as port:
         codec = NativeSerial(NativeOptions())
-        port.write(codec.commands(Event.START)[0].send + codec.commands(Event.START)[1].send)
+        port.write(codec.commands(Command.START)[0].send + codec.commands(Command.START)[1].send)
         counts: list[int] = []
         end = time.monotonic() + PATIENCE_S
         while len(counts) < 300 and time.monotonic() < end:
@@ -137,13 +137,13 @@ def test_it_waits_for_its_host_and_stops_when_told() -> None:
         host = Host(device.endpoint.pty.path)
         while device.log.sent < 100:
             host.read(PATIENCE_S)
-        os.write(host.fd, host.codec.commands(Event.STOP)[0].send)
+        os.write(host.fd, host.codec.commands(Command.STOP)[0].send)
         eventually(lambda: not device.codec.streaming)
         while host.read(0.2):
             pass
         sent = device.log.sent
         assert sent < 5000 and len(host.count) == sent
-        os.write(host.fd, host.codec.commands(Event.START)[-1].send)
+        os.write(host.fd, host.codec.commands(Command.START)[-1].send)
         host.read_all(device)
     assert host.count.tolist() == list(range(5000)), "the counter stands still meanwhile"
 
@@ -311,7 +311,7 @@ def test_slcan_sends_nothing_before_the_channel_is_open() -> None:
     with native_can(400, SlcanEndpoint()) as device:
         fd = os.open(device.endpoint.pty.path, os.O_RDWR | os.O_NOCTTY)
         host, decoder = NativeCan(NativeCanOptions()), SlcanDecoder()
-        asked = b"".join(encode(step.send) for step in host.commands(Event.START))
+        asked = b"".join(encode(step.send) for step in host.commands(Command.START))
         os.write(fd, asked)
         time.sleep(0.05)
         while select.select([fd], [], [], 0.1)[0]:
@@ -336,7 +336,7 @@ def test_python_can_reads_it(kind: str) -> None:
         options = {"sleep_after_open": 0, "bitrate": 1_000_000} if kind == "slcan" else {}
         with can.Bus(channel, kind, **options) as bus:
             host = NativeCan(NativeCanOptions())
-            for step in host.commands(Event.START):
+            for step in host.commands(Command.START):
                 for frame in step.send:
                     bus.send(can.Message(arbitration_id=frame.id, data=frame.data,
                                          is_extended_id=False))  # fmt: skip
@@ -546,7 +546,7 @@ def test_closing_needs_nobody() -> None:
 
 
 def test_fakes_are_opened_by_their_url(fake_serial: Any, fake_can: Any) -> None:  # noqa: F811
-    from tactile_rt.sources import open_source
+    from tactile_rt.sources.opening import open_source
 
     values = signal(300)
     serial_device = fake_serial(values, "native", spec=SPEC, pace="fast")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from tactile_rt.drivers.codec import Frame
+from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.emulation.damage import DeviceLog, Fate, damaged
 from tactile_rt.drivers.emulation.faults import KINDS, Fault, FaultSchedule, read_faults
 from tactile_rt.stream import ConfigError
@@ -147,7 +147,7 @@ def test_what_damage_does_to_a_packet() -> None:
         Fate.TRUNCATED,
     )
     assert damaged(packet, Fault("truncate", rate=1, amount=99), draw)[0] == packet[:1]
-    frames = [Frame(i) for i in range(9)]
+    frames = [CanFrame(i) for i in range(9)]
     left, fate = damaged(frames, Fault("bit_flip", rate=1, amount=2), draw)
     assert fate == Fate.CORRUPTED and len(left) == 7
     assert [f for f in frames if f in left] == left

@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from codec_contract import T0, mutations
 
-from tactile_rt.drivers.codec import Event, Frame, Samples
+from tactile_rt.drivers.codec import CanFrame, Command, Samples
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_can import NativeCan, NativeCanOptions
-from tactile_rt.drivers.codecs.native_common import Description, Message
+from tactile_rt.drivers.codecs.native_common import DeviceDescription, MessageType
 from tactile_rt.stream import ArraySpec, Chunk
 from tactile_rt.testing import small_spec
+from tests.helpers.codec_contract import T0, mutations
 
 FIRMWARE = Path(__file__).parents[2] / "docs" / "firmware"
 SPEC = small_spec(5)
@@ -188,11 +188,11 @@ def sanitized(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build(tmp_path_factory.mktemp("sanitized"), HARNESS, *flags)
 
 
-def frames_of(data: bytes, fd: bool) -> list[Frame]:
+def frames_of(data: bytes, fd: bool) -> list[CanFrame]:
     found, at = [], 0
     while at < len(data):
         identifier, n = struct.unpack_from("<IB", data, at)
-        found.append(Frame(identifier, data[at + 5 : at + 5 + n], fd=fd))
+        found.append(CanFrame(identifier, data[at + 5 : at + 5 + n], fd=fd))
         at += 5 + n
     return found
 
@@ -209,7 +209,7 @@ class Case:
 
     @property
     def scale(self) -> np.ndarray:
-        return np.asarray(Description.of(self.spec).scale)
+        return np.asarray(DeviceDescription.of(self.spec).scale)
 
     @property
     def values(self) -> np.ndarray:
@@ -337,11 +337,16 @@ def hosts(wire: bytes, cuts: list[int], json: bytes) -> bytes:
 
 def test_commands_are_obeyed_and_answered_as_by_the_codec(program: Path) -> None:
     host, emulated = NativeSerial(NativeOptions()), device()
-    packets = [s.send for s in host.commands(Event.START)]
+    packets = [s.send for s in host.commands(Command.START)]
     packets += [host.whisk(8.0, 0.5, -0.25).send, host.whisk(float("nan"), 0, 0).send]
-    packets += [frame(9), frame(Message.WHISK, b"four"), frame(Message.ACK, b"\3\0"), frame(0)]
+    packets += [
+        frame(9),
+        frame(MessageType.WHISK, b"four"),
+        frame(MessageType.ACK, b"\3\0"),
+        frame(0),
+    ]
     wire = b"T noise TR" + b"R".join(packets)
-    json = Description.of(SPEC).to_json()
+    json = DeviceDescription.of(SPEC).to_json()
     draw = random.Random(1)
     for cuts in ([], range(1, len(wire)), draw.sample(range(1, len(wire)), 12)):
         answer, state = run(program, "h", hosts(wire, list(cuts), json))
@@ -352,23 +357,25 @@ def test_commands_are_obeyed_and_answered_as_by_the_codec(program: Path) -> None
     found = NativeSerial(NativeOptions())
     found.feed(answer, T0)
     assert found.spec == SPEC
-    _, state = run(program, "h", hosts(frame(Message.START) + frame(Message.STOP), [], json))
+    _, state = run(
+        program, "h", hosts(frame(MessageType.START) + frame(MessageType.STOP), [], json)
+    )
     assert state.startswith("0 ")
     # a device without a description says so
-    answer, _ = run(program, "h", hosts(frame(Message.DESCRIBE), [], b""))
-    assert answer == frame(Message.ACK, b"\1\2")
+    answer, _ = run(program, "h", hosts(frame(MessageType.DESCRIBE), [], b""))
+    assert answer == frame(MessageType.ACK, b"\1\2")
 
 
 def test_messages_too_long_or_of_a_later_version_are_passed_over(sanitized: Path) -> None:
-    later = bytearray(frame(Message.STOP))
+    later = bytearray(frame(MessageType.STOP))
     later[2] = 0x24
     later[18:20] = crc16_xmodem(bytes(later[2:18])).to_bytes(2, "little")
     later[-4:] = zlib.crc32(bytes(later[:-4])).to_bytes(4, "little")
     long = [frame(9, bytes(n)) for n in (33, 1000, 60_000)]
-    start = frame(Message.START)
+    start = frame(MessageType.START)
     for odd in (*long, bytes(later)):
         answer, state = run(sanitized, "h", hosts(odd + start, [], b""))
-        assert answer == frame(Message.ACK, b"\3\0") and state[0] == "1"
+        assert answer == frame(MessageType.ACK, b"\3\0") and state[0] == "1"
     assert run(sanitized, "h", hosts(frame(9, bytes(32)), [], b""))[0] == frame(6, b"\x09\1")
 
 
@@ -377,10 +384,14 @@ def test_can_commands_are_obeyed_and_answered_as_by_the_codec(program: Path, fd:
     options = NativeCanOptions(base=BASE, fd=fd)
     host, emulated = NativeCan(options), NativeCan(options)
     emulated.spec = SPEC
-    sent = [f for s in host.commands(Event.START) for f in s.send]
-    sent += [*host.whisk(8.0, 0.5, -0.25).send, Frame(BASE, b"\x09", fd=fd), Frame(BASE, b"\5\1")]
-    sent += [Frame(BASE, b""), Frame(BASE + 1, b"\3"), Frame(BASE + 2, bytes(8))]
-    json = Description.of(SPEC).to_json()
+    sent = [f for s in host.commands(Command.START) for f in s.send]
+    sent += [
+        *host.whisk(8.0, 0.5, -0.25).send,
+        CanFrame(BASE, b"\x09", fd=fd),
+        CanFrame(BASE, b"\5\1"),
+    ]
+    sent += [CanFrame(BASE, b""), CanFrame(BASE + 1, b"\3"), CanFrame(BASE + 2, bytes(8))]
+    json = DeviceDescription.of(SPEC).to_json()
     data = len(json).to_bytes(2, "little") + json + records(sent)
     answer, state = run(program, "bd" if fd else "bc", data)
     got = frames_of(answer, fd)
@@ -392,16 +403,16 @@ def test_can_commands_are_obeyed_and_answered_as_by_the_codec(program: Path, fd:
     assert found.spec == SPEC
 
 
-def records(frames: list[Frame]) -> bytes:
+def records(frames: list[CanFrame]) -> bytes:
     return b"".join(struct.pack("<IB", f.id, len(f.data)) + f.data for f in frames)
 
 
 def test_no_input_leads_astray(sanitized: Path) -> None:
     """10^5 bytes of damaged commands: the sanitizers find nothing, the answers are the codec's."""
     host = NativeSerial(NativeOptions())
-    commands = [s.send for s in (*host.commands(Event.START), *host.commands(Event.STOP))]
+    commands = [s.send for s in (*host.commands(Command.START), *host.commands(Command.STOP))]
     commands += [host.whisk(8.0, 0.5, -0.25).send, frame(12, bytes(32)), frame(7, b"TR\x10")]
-    wire, json = b"".join(commands * 3), Description.of(SPEC).to_json()
+    wire, json = b"".join(commands * 3), DeviceDescription.of(SPEC).to_json()
     packets = mutations(wire, random.Random(3), 100_000)
     given = [json, *packets]
     data = b"".join(len(b).to_bytes(2, "little") + b for b in given)
@@ -415,10 +426,10 @@ def test_no_frame_leads_astray(sanitized: Path) -> None:
     draw = random.Random(4)
     kinds = [bytes((k,)) + draw.randbytes(draw.randrange(8)) for k in (1, 2, 3, 4, 5, 5, 5, 6, 255)]
     frames = [
-        Frame(draw.choice((BASE, BASE, BASE + 1, 0)), draw.choice(kinds)) for _ in range(3000)
+        CanFrame(draw.choice((BASE, BASE, BASE + 1, 0)), draw.choice(kinds)) for _ in range(3000)
     ]
-    json = Description.of(SPEC).to_json()[:100]
-    data = len(json).to_bytes(2, "little") + json + records([*frames, Frame(BASE, b"")])
+    json = DeviceDescription.of(SPEC).to_json()[:100]
+    data = len(json).to_bytes(2, "little") + json + records([*frames, CanFrame(BASE, b"")])
     answer, _ = run(sanitized, "bc", data)
     acks = [f for f in frames_of(answer, False) if f.id == BASE + 1]
     assert len(acks) == sum(f.id == BASE for f in frames)
@@ -435,7 +446,7 @@ def fenced(language: str = "") -> list[str]:
 
 def test_the_documents_frames_and_description_are_the_codecs() -> None:
     (json,) = fenced("json")
-    described = Description.from_json(json.encode())
+    described = DeviceDescription.from_json(json.encode())
     assert described is not None and described.scale == pytest.approx(
         (0.1 / 32767, 1e-3 / 32767), 1e-4
     )
@@ -450,7 +461,7 @@ def test_the_documents_frames_and_description_are_the_codecs() -> None:
     bus = NativeCan(NativeCanOptions(base=0x100))
     bus.spec = described.spec
     lines = re.findall(r"^(10\d) ((?: [0-9A-F]{2})+)", can, re.M)
-    samples = bus.feed([Frame(int(i, 16), bytes.fromhex(d)) for i, d in lines], T0)
+    samples = bus.feed([CanFrame(int(i, 16), bytes.fromhex(d)) for i, d in lines], T0)
     assert samples.values.tolist() == [[[1.5, -2.0]]] and samples.count.tolist() == [7]
     assert bus.stats.intact == 3 and bus.stats.corrupt == 0
 
@@ -488,11 +499,11 @@ def test_the_documents_rates_are_those_of_the_frames() -> None:
 
 
 def test_the_example_runs(tmp_path: Path) -> None:
-    quoted = Description.of(SPEC).to_json().decode().replace("\\", "\\\\").replace('"', '\\"')
+    quoted = DeviceDescription.of(SPEC).to_json().decode().replace("\\", "\\\\").replace('"', '\\"')
     board = BOARD.replace("DESCRIPTION;", f'"{quoted}";')
     program = build(tmp_path, board, "-Wno-overlength-strings", str(FIRMWARE / "example.c"))
     host = NativeSerial(NativeOptions())
-    steps = host.commands(Event.START)
+    steps = host.commands(Command.START)
     wire, _ = run(program, "", b"".join(s.send for s in steps) + bytes(140))
     for step in steps:
         assert step.expect is None or step.expect in wire

@@ -6,13 +6,13 @@ import re
 
 import numpy as np
 import pytest
-from codec_contract import chunk_of, decode, held
 
 from tactile_rt.drivers.codec import SerialCodec, WireStats
 from tactile_rt.drivers.codecs.bota import Bota
 from tactile_rt.drivers.codecs.frame_finder import FrameFinder
 from tactile_rt.drivers.codecs.ft300 import Ft300
 from tactile_rt.drivers.codecs.optoforce import OptoForceSerial
+from tests.helpers.codec_contract import chunk_of, decode, held
 
 SIZE = 6  # "<>", three bytes, their sum
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
-from tactile_rt.drivers.codec import Event
+from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.ft300 import Ft300, Ft300Options
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 
 def bitwise_modbus(data: bytes) -> bytes:
@@ -57,7 +57,7 @@ def test_the_golden_frame() -> None:
 def test_a_streaming_device_takes_no_request_until_it_is_jammed() -> None:
     host, device = ft300(), ft300()
     assert not device.streaming
-    jam, request = host.commands(Event.START)
+    jam, request = host.commands(Command.START)
     assert jam.send == b"\xff" * 50 and jam.pause_s >= 0.1 and request.send == START
     for _ in range(2):  # the second time it streams
         assert device.respond(jam.send[:20]) == device.respond(jam.send[20:]) == b""
@@ -68,9 +68,9 @@ def test_a_streaming_device_takes_no_request_until_it_is_jammed() -> None:
         assert device.streaming
         assert device.respond(START) == b"" and device.streaming
         assert device.respond(b"\xff" * 49 + b"\0") == b"" and device.streaming
-    (stop,) = host.commands(Event.STOP)
+    (stop,) = host.commands(Command.STOP)
     device.respond(stop.send)
-    assert not device.streaming and host.commands(Event.POLL) == ()
+    assert not device.streaming and host.commands(Command.POLL) == ()
 
 
 def test_a_request_that_is_damaged_or_for_another_is_not_answered() -> None:

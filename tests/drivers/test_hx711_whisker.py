@@ -5,11 +5,19 @@ import struct
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, mutations, stacked
 
-from tactile_rt.drivers.codec import Event
+from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.hx711_whisker import Hx711Whisker, Hx711WhiskerOptions
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import (
+    T0,
+    CodecCase,
+    CodecContract,
+    chunk_of,
+    decode,
+    mutations,
+    stacked,
+)
 
 
 def hx711(**options: float) -> Hx711Whisker:
@@ -42,7 +50,7 @@ def test_a_golden_frame() -> None:
 
 def test_the_board_is_told_how_many_whiskers_after_its_reset() -> None:
     host, device = hx711(whiskers=3, indicator=True), hx711(whiskers=3)
-    wait, tell, mark = host.commands(Event.START)
+    wait, tell, mark = host.commands(Command.START)
     assert wait.send == b"" and wait.pause_s == 1.5
     assert tell.send == b"N=3\n" and tell.expect == b"OK" and mark.send == b"S"
     assert not device.streaming
@@ -51,7 +59,7 @@ def test_the_board_is_told_how_many_whiskers_after_its_reset() -> None:
     assert answer == b"OK\r\n" and device.streaming
     device.respond(mark.send)
     assert device.recording
-    (end,) = host.commands(Event.STOP)
+    (end,) = host.commands(Command.STOP)
     device.respond(end.send)
     assert not device.recording and device.streaming  # the board knows no stop
     # the answer stands before the first frame
@@ -60,9 +68,9 @@ def test_the_board_is_told_how_many_whiskers_after_its_reset() -> None:
     assert samples is not None and len(samples) == 3
     assert host.stats.skipped == 4 and host.stats.corrupt == 0
 
-    (tell,) = hx711(reset=False).commands(Event.START)
+    (tell,) = hx711(reset=False).commands(Command.START)
     assert tell.send == b"N=9\n" and tell.expect is None
-    assert hx711().commands(Event.STOP) == ()
+    assert hx711().commands(Command.STOP) == ()
 
 
 def test_a_saturated_converter_is_not_valid() -> None:

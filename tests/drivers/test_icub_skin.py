@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
-from tactile_rt.drivers.codec import Event, Frame
+from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.icub_skin import IcubSkin, IcubSkinOptions
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 
 def icub_skin(**options: object) -> IcubSkin:
@@ -30,10 +30,10 @@ class TestOneTriangle(CodecContract):
 def test_a_golden_sample() -> None:
     """By hand from the reading code of icub-main: board 9, triangles 2 and 14."""
     frames = [
-        Frame(0x492, bytes.fromhex("40 f4f3f2f1f0efee")),
-        Frame(0x492, bytes.fromhex("c0 edecebeae9 0000")),
-        Frame(0x49E, bytes.fromhex("40 01020304050607")),
-        Frame(0x49E, bytes.fromhex("c0 08090a0b0c 8010")),  # taxels 0 and 11 are stuck
+        CanFrame(0x492, bytes.fromhex("40 f4f3f2f1f0efee")),
+        CanFrame(0x492, bytes.fromhex("c0 edecebeae9 0000")),
+        CanFrame(0x49E, bytes.fromhex("40 01020304050607")),
+        CanFrame(0x49E, bytes.fromhex("c0 08090a0b0c 8010")),  # taxels 0 and 11 are stuck
     ]
     host = icub_skin(board=9, triangles="2,14")
     samples = host.feed(frames, T0)
@@ -53,8 +53,8 @@ def test_a_golden_sample() -> None:
 def test_a_triangle_that_was_not_read_is_invalid() -> None:
     host = icub_skin(triangles="0-1")
     frames = [
-        Frame(0x410, b"\x40" + bytes(7)), Frame(0x410, b"\xc0" + bytes(6) + b"\x01"),
-        Frame(0x411, b"\x40" + bytes(7)), Frame(0x411, b"\xc0" + bytes(7)),
+        CanFrame(0x410, b"\x40" + bytes(7)), CanFrame(0x410, b"\xc0" + bytes(6) + b"\x01"),
+        CanFrame(0x411, b"\x40" + bytes(7)), CanFrame(0x411, b"\xc0" + bytes(7)),
     ]  # fmt: skip
     samples = host.feed(frames, T0)
     assert samples is not None and samples.valid[0].tolist() == [False] * 12 + [True] * 12
@@ -88,7 +88,7 @@ def test_an_invalid_taxel_is_sent_as_stuck() -> None:
 
 def test_commands() -> None:
     host, device = icub_skin(board=8, triangles="0,15"), icub_skin(board=8)
-    sent = [step.send[0] for step in host.commands(Event.START)]
+    sent = [step.send[0] for step in host.commands(Command.START)]
     assert {f.id for f in sent} == {0x208}
     assert [f.data.hex() for f in sent] == [
         "4d0014f5", "50000f02000022", "50000002010022", "500f0f02010022", "0700",
@@ -96,20 +96,24 @@ def test_commands() -> None:
     assert not device.streaming
     device.respond(sent)
     assert device.streaming
-    for step in host.commands(Event.STOP):
+    for step in host.commands(Command.STOP):
         device.respond(step.send)
     assert not device.streaming
     old = icub_skin(board=8, triangles="0,15", firmware="old")
-    assert [s.send[0].data.hex() for s in old.commands(Event.START)] == [
+    assert [s.send[0].data.hex() for s in old.commands(Command.START)] == [
         "4c01010100200000", "4e0222f00001800a",
     ]  # fmt: skip
-    assert old.streaming and not old.commands(Event.STOP)
+    assert old.streaming and not old.commands(Command.STOP)
 
 
 def test_other_frames() -> None:
     host = icub_skin(triangles="0-3")
-    foreign = [Frame(0x414, bytes(8)), Frame(0x310, bytes(8)), Frame(0x420, bytes(8))]
-    wrong = [Frame(0x410, b""), Frame(0x410, b"\x40" + bytes(6)), Frame(0x411, b"\xc0" + bytes(4))]
+    foreign = [CanFrame(0x414, bytes(8)), CanFrame(0x310, bytes(8)), CanFrame(0x420, bytes(8))]
+    wrong = [
+        CanFrame(0x410, b""),
+        CanFrame(0x410, b"\x40" + bytes(6)),
+        CanFrame(0x411, b"\xc0" + bytes(4)),
+    ]
     assert host.feed([*foreign, *wrong], T0) is None
     assert (host.stats.skipped, host.stats.corrupt) == (3, 3)
 

@@ -4,11 +4,11 @@ import struct
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
-from tactile_rt.drivers.codec import Event
+from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.kwr75 import Kwr75, Kwr75Options
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 # By hand: 1, -2, 0.5 kgf, 0.25, -0.125, 0 kgf m as float32 (1 is 3F800000, and so on).
 GOLDEN = bytes.fromhex("48aa 0000803f 000000c0 0000003f 0000803e 000000be 00000000 0d0a")
@@ -76,16 +76,16 @@ def test_what_is_no_number_is_invalid_and_what_is_too_large_saturates() -> None:
 
 def test_the_commands() -> None:
     host, device = kwr75(), kwr75()
-    assert [s.send for s in host.commands(Event.START)] == [STOP, START]
+    assert [s.send for s in host.commands(Command.START)] == [STOP, START]
     assert not device.streaming
     for byte in STOP + START:
         assert device.respond(bytes((byte,))) == b""
-    assert device.streaming and host.commands(Event.POLL) == () and not host.polls
-    device.respond(b"\xaa\x0d" + host.commands(Event.STOP)[0].send)
+    assert device.streaming and host.commands(Command.POLL) == () and not host.polls
+    device.respond(b"\xaa\x0d" + host.commands(Command.STOP)[0].send)
     assert not device.streaming
     asks = kwr75(poll=True)
-    assert asks.polls and [s.send for s in asks.commands(Event.START)] == [STOP]
-    device.respond(asks.commands(Event.POLL)[0].send + ASK)
+    assert asks.polls and [s.send for s in asks.commands(Command.START)] == [STOP]
+    device.respond(asks.commands(Command.POLL)[0].send + ASK)
     assert device.polled == 2 and not device.streaming
 
 

@@ -4,10 +4,18 @@ import random
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, mutations, stacked
 
 from tactile_rt.drivers.codecs.mlx_hex import MlxHex, MlxHexOptions
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import (
+    T0,
+    CodecCase,
+    CodecContract,
+    chunk_of,
+    decode,
+    mutations,
+    stacked,
+)
 
 
 def mlx_hex(**options: float) -> MlxHex:

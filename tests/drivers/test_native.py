@@ -5,14 +5,14 @@ import json
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of
 
-from tactile_rt.drivers.codec import Event
+from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.framing import crc16_modbus, crc16_x25, crc16_xmodem
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
-from tactile_rt.drivers.codecs.native_common import Message
+from tactile_rt.drivers.codecs.native_common import MessageType
 from tactile_rt.stream import ConfigError
 from tactile_rt.testing import small_spec
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of
 
 SPEC = small_spec(5)
 
@@ -80,13 +80,13 @@ def test_a_header_and_the_payload_of_another_frame_do_not_pass() -> None:
 
 
 def test_a_description_is_plain_json() -> None:
-    answer = native().respond(frame(Message.DESCRIBE))
+    answer = native().respond(frame(MessageType.DESCRIBE))
     fields = json.loads(answer[20:-4])
     assert fields["spec"]["elements"] == ["A0", "A1", "A2", "A3", "A4"]
     assert fields["scale"] == pytest.approx([0.1 / 32767, 1e-3 / 32767])
     host = NativeSerial(NativeOptions())
     # what a later version of the firmware adds does not disturb
-    host.feed(frame(Message.DESCRIPTION, json.dumps({**fields, "serial": "X1"}).encode()), T0)
+    host.feed(frame(MessageType.DESCRIPTION, json.dumps({**fields, "serial": "X1"}).encode()), T0)
     assert host.spec == SPEC
 
 
@@ -98,7 +98,7 @@ def test_a_description_is_plain_json() -> None:
 )  # fmt: skip
 def test_what_is_no_description_is_refused(text: bytes) -> None:
     host = NativeSerial(NativeOptions())
-    assert host.feed(frame(Message.DESCRIPTION, text), T0) is None
+    assert host.feed(frame(MessageType.DESCRIPTION, text), T0) is None
     assert host.spec is None and host.stats.corrupt == 1
 
 
@@ -121,12 +121,14 @@ def test_an_array_too_large_for_the_format_is_named() -> None:
 def test_an_echo_is_not_answered() -> None:
     device = native()
     wire = b"".join(device.encode(chunk_of(device, signal(2))))
-    wire += frame(Message.ACK, b"\x03\x00") + frame(Message.DESCRIPTION, b"{}")
+    wire += frame(MessageType.ACK, b"\x03\x00") + frame(MessageType.DESCRIPTION, b"{}")
     assert device.respond(wire) == b""
-    assert device.respond(frame(9)) == frame(Message.ACK, b"\x09\x01")  # but what it does not know
+    assert device.respond(frame(9)) == frame(
+        MessageType.ACK, b"\x09\x01"
+    )  # but what it does not know
     nan = device.whisk(float("nan"), 0, 0).send
-    assert device.respond(nan) == frame(Message.ACK, b"\x05\x02") and device.whisking is None
-    assert device.respond(frame(Message.WHISK, b"short")) == frame(Message.ACK, b"\x05\x01")
+    assert device.respond(nan) == frame(MessageType.ACK, b"\x05\x02") and device.whisking is None
+    assert device.respond(frame(MessageType.WHISK, b"short")) == frame(MessageType.ACK, b"\x05\x01")
 
 
 def test_both_formats_may_be_mixed() -> None:
@@ -141,12 +143,12 @@ def test_both_formats_may_be_mixed() -> None:
 def test_a_device_describes_itself_and_starts_when_told() -> None:
     device, host = native(), NativeSerial(NativeOptions())
     assert not device.streaming
-    for step in host.commands(Event.START):
+    for step in host.commands(Command.START):
         answer = device.respond(step.send)
         assert step.expect is None or step.expect in answer
         host.feed(answer, T0)
     assert host.spec == SPEC and device.streaming
-    for step in host.commands(Event.STOP):
+    for step in host.commands(Command.STOP):
         device.respond(step.send)
     assert not device.streaming
     device.respond(host.whisk(8.0, 0.5, -0.1).send)

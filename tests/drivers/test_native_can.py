@@ -6,13 +6,21 @@ import zlib
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, join, stacked
 
-from tactile_rt.drivers.codec import Event, Frame
+from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.native_can import NativeCan, NativeCanOptions
-from tactile_rt.drivers.codecs.native_common import Description
+from tactile_rt.drivers.codecs.native_common import DeviceDescription
 from tactile_rt.stream import ArraySpec, ConfigError
 from tactile_rt.testing import small_spec
+from tests.helpers.codec_contract import (
+    T0,
+    CodecCase,
+    CodecContract,
+    chunk_of,
+    decode,
+    join,
+    stacked,
+)
 
 SPEC = small_spec(5)
 
@@ -53,11 +61,11 @@ class TestFd(CodecContract):
 # 03 | 0000c03f 000000c0 | 0000803e 00000000 | CRC: 19 bytes in parts of 6, 6, 6 and 1. The CRC is
 # computed below bit by bit from its polynomial.
 GOLDEN = [
-    Frame(0x102, bytes.fromhex("3412 87d61200 00 e1")),
-    Frame(0x103, bytes.fromhex("34 00 03 0000c03f 00")),
-    Frame(0x103, bytes.fromhex("34 01 0000c0 000080")),
-    Frame(0x103, bytes.fromhex("34 02 3e 00000000 1b")),
-    Frame(0x103, bytes.fromhex("34 03 7e")),
+    CanFrame(0x102, bytes.fromhex("3412 87d61200 00 e1")),
+    CanFrame(0x103, bytes.fromhex("34 00 03 0000c03f 00")),
+    CanFrame(0x103, bytes.fromhex("34 01 0000c0 000080")),
+    CanFrame(0x103, bytes.fromhex("34 02 3e 00000000 1b")),
+    CanFrame(0x103, bytes.fromhex("34 03 7e")),
 ]
 
 
@@ -89,10 +97,10 @@ def test_a_golden_sample() -> None:
 
 def test_a_golden_int16_sample_in_one_long_frame() -> None:
     # 03 | 0x4000 0xc000 | 0x0001 0x7fff | CRC: 11 bytes and 2 before them make 13, sent as 16
-    head = Frame(0x102, bytes.fromhex("0700 01000000 05 d2"), fd=True)
+    head = CanFrame(0x102, bytes.fromhex("0700 01000000 05 d2"), fd=True)
     payload = bytes.fromhex("03 0040 00c0 0100 ff7f")
     check = divided(head.data + payload).to_bytes(2, "little")
-    part = Frame(0x103, b"\x07\x00" + payload + check + bytes(3), fd=True)
+    part = CanFrame(0x103, b"\x07\x00" + payload + check + bytes(3), fd=True)
     samples = native(small_spec(2)).feed([head, part], T0)
     assert samples is not None and samples.status is not None
     assert samples.status.tolist() == [5]
@@ -117,13 +125,13 @@ def test_a_device_describes_itself_and_starts_when_told() -> None:
     for fd in (False, True):
         device, host = native(fd=fd), NativeCan(NativeCanOptions(fd=fd))
         assert not device.streaming
-        for step in host.commands(Event.START):
+        for step in host.commands(Command.START):
             answer = device.respond(step.send)
             assert answer[-1].id == step.expect  # the description is whole when the answer is seen
             for frame in answer:
                 host.feed([frame], T0)
         assert host.spec == SPEC and device.streaming
-        for step in host.commands(Event.STOP):
+        for step in host.commands(Command.STOP):
             device.respond(step.send)
         assert not device.streaming
         device.respond(host.whisk(8.0, 0.5, -0.1).send)
@@ -141,22 +149,22 @@ def test_what_a_device_answers() -> None:
         (b"\x06\x03\x00", []),  # an echo
         (b"", []),
     ):
-        assert [f.data for f in device.respond([Frame(0x100, data)])] == answer
+        assert [f.data for f in device.respond([CanFrame(0x100, data)])] == answer
     nameless = NativeCan(NativeCanOptions())
-    assert [f.data for f in nameless.respond([Frame(0x100, b"\x01")])] == [b"\x06\x01\x02"]
+    assert [f.data for f in nameless.respond([CanFrame(0x100, b"\x01")])] == [b"\x06\x01\x02"]
 
 
 def test_a_description_by_hand() -> None:
-    text = Description.of(SPEC).to_json()
+    text = DeviceDescription.of(SPEC).to_json()
     whole = len(text).to_bytes(2, "little") + text + zlib.crc32(text).to_bytes(4, "little")
     pieces = [
-        Frame(0x104, bytes((2, i & 255, i >> 8)) + whole[5 * i : 5 * i + 5])
+        CanFrame(0x104, bytes((2, i & 255, i >> 8)) + whole[5 * i : 5 * i + 5])
         for i in range(-(-len(whole) // 5))
     ]
     host = NativeCan(NativeCanOptions())
     host.feed(pieces, T0)
     assert host.spec == SPEC
-    for wrong in (pieces[:3] + pieces[4:], [*pieces[:-1], Frame(0x104, b"\x02\x00\x01\x00")]):
+    for wrong in (pieces[:3] + pieces[4:], [*pieces[:-1], CanFrame(0x104, b"\x02\x00\x01\x00")]):
         host = NativeCan(NativeCanOptions())
         host.feed(wrong, T0)
         assert host.spec is None
@@ -192,7 +200,7 @@ def test_an_inverted_bit_is_never_taken_for_a_value() -> None:
             data = bytearray(hurt.data)
             data[bit // 8] ^= 1 << bit % 8
             host = native()
-            middle = [*packets[1][:at], Frame(hurt.id, bytes(data)), *packets[1][at + 1 :]]
+            middle = [*packets[1][:at], CanFrame(hurt.id, bytes(data)), *packets[1][at + 1 :]]
             samples = decode(host, [*packets[0], *middle, *packets[2]])
             count, valid = stacked(samples, "count"), stacked(samples, "valid")
             assert count is not None and valid is not None
@@ -239,22 +247,22 @@ def test_a_frame_that_comes_twice_changes_nothing() -> None:
 def test_what_is_not_of_this_device_is_skipped() -> None:
     host = native()
     foreign = [
-        Frame(0x102, GOLDEN[0].data, extended=True),
-        Frame(0x0FF, GOLDEN[0].data),
-        Frame(0x105, GOLDEN[0].data),
-        Frame(0x103, b"", remote=True),
-        Frame(0x100, b"\x03"),  # another host's command
+        CanFrame(0x102, GOLDEN[0].data, extended=True),
+        CanFrame(0x0FF, GOLDEN[0].data),
+        CanFrame(0x105, GOLDEN[0].data),
+        CanFrame(0x103, b"", remote=True),
+        CanFrame(0x100, b"\x03"),  # another host's command
     ]
     assert host.feed(foreign, T0) is None
     assert host.stats.skipped == 5 and host.stats.intact == host.stats.corrupt == 0
-    host.feed([GOLDEN[0]._replace(data=GOLDEN[0].data[:7]), Frame(0x103, b"\x34\x00")], T0)
+    host.feed([GOLDEN[0]._replace(data=GOLDEN[0].data[:7]), CanFrame(0x103, b"\x34\x00")], T0)
     assert host.stats.corrupt == 2
 
 
 def test_another_array_does_not_slip_in_between_samples() -> None:
     device, host = native(), NativeCan(NativeCanOptions())
-    other = native(small_spec(4)).respond([Frame(0x100, b"\x01")])
-    mine = device.respond([Frame(0x100, b"\x01")])
+    other = native(small_spec(4)).respond([CanFrame(0x100, b"\x01")])
+    mine = device.respond([CanFrame(0x100, b"\x01")])
     packets = device.encode(chunk_of(device, signal(2)))
     samples = host.feed([*mine, *packets[0], *other, *packets[1]], T0)
     assert samples is not None and samples.values.shape == (2, 5, 2)

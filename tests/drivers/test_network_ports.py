@@ -10,7 +10,7 @@ import serial
 import serial.rfc2217
 
 from tactile_rt.drivers.health import State
-from tactile_rt.sources import open_source
+from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import FakeSerial
 
 SAMPLES = 600

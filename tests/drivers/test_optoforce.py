@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, join, stacked
 
-from tactile_rt.drivers.codec import Event, Frame
+from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.optoforce import (
     OptoForceCan,
     OptoForceCanOptions,
@@ -12,6 +11,15 @@ from tactile_rt.drivers.codecs.optoforce import (
     OptoForceSerial,
 )
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import (
+    T0,
+    CodecCase,
+    CodecContract,
+    chunk_of,
+    decode,
+    join,
+    stacked,
+)
 
 # The first bytes of a recording of an OMD-45-FH-2000N at 100 Hz: the end of something, the answer
 # to its settings, three samples and part of a fourth (alknemeyer/optoforce 0.2.1, MIT licence,
@@ -94,7 +102,7 @@ def test_the_capture() -> None:
 @pytest.mark.parametrize(("model", "message", "loads"), GOLDEN)
 def test_the_golden_messages(model: str, message: bytes, loads: int) -> None:
     expected = np.arange(1, loads + 1).reshape(serial(model).spec.shape)
-    pieces = [Frame(0x100, message[at : at + 8]) for at in range(0, len(message), 8)]
+    pieces = [CanFrame(0x100, message[at : at + 8]) for at in range(0, len(message), 8)]
     for codec, wire in ((serial(model), message), (can(model), pieces)):
         samples = codec.feed(wire, T0)
         assert samples is not None and samples.values[0].tolist() == expected.tolist()
@@ -130,9 +138,9 @@ def test_frames_of_others_on_can_are_passed_over() -> None:
     codec = can()
     one, two = codec.encode(chunk_of(codec, counts(1, 3, 1)))[0]
     others = [
-        Frame(0x101, b"\xaa\7\x08\x0a"),
+        CanFrame(0x101, b"\xaa\7\x08\x0a"),
         one._replace(extended=True),
-        Frame(0x100, remote=True),
+        CanFrame(0x100, remote=True),
     ]
     assert len(codec.feed([one, *others, two], T0)) == 1
     assert codec.stats.skipped == 3
@@ -182,13 +190,13 @@ def test_an_invalid_or_too_large_value_on_the_wire() -> None:
 
 def test_a_device_is_configured() -> None:
     # the settings of alknemeyer/optoforce, tests/test_all.py: 100 Hz, 15 Hz, no zero
-    (start,) = serial().commands(Event.START)
+    (start,) = serial().commands(Command.START)
     assert start.send == bytes([170, 0, 50, 3, 10, 4, 0, 0, 237])
     assert start.expect == bytes.fromhex("aa0050010000fb") and start.expect in CAPTURE
-    (start,) = serial(rate_hz=1000, filter_hz=1.5, zero=True).commands(Event.START)
+    (start,) = serial(rate_hz=1000, filter_hz=1.5, zero=True).commands(Command.START)
     assert start.send == bytes([170, 0, 50, 3, 1, 6, 255, 1, 229])
     device, host = serial(), serial()
-    (stop,) = host.commands(Event.STOP)
+    (stop,) = host.commands(Command.STOP)
     assert device.streaming
     device.respond(stop.send)
     assert not device.streaming
@@ -204,10 +212,10 @@ def test_a_device_is_configured() -> None:
 
 def test_a_device_on_can_is_configured() -> None:
     device, host = can(host_id="0x201", device_id="0x200"), can(host_id="0x201", device_id="0x200")
-    (start,) = host.commands(Event.START)
+    (start,) = host.commands(Command.START)
     # 16 bytes in two frames, as RCPRG-ros-pkg/optoforce_can sends them
     assert [f.id for f in start.send] == [0x201] * 2 and [len(f.data) for f in start.send] == [8, 8]
-    (stop,) = host.commands(Event.STOP)
+    (stop,) = host.commands(Command.STOP)
     device.respond(stop.send)
     assert not device.streaming
     answer = [f for sent in start.send for f in device.respond([sent])]

@@ -7,30 +7,30 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.drivers.codec import Frame
+from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.slcan import SlcanAdapter, SlcanDecoder, closing, encode, opening
 from tactile_rt.stream import ConfigError
 
 # CANUSB manual 1.0C, commands t, T, r, R and Z
 MANUAL = [
-    (b"t10021133\r", Frame(0x100, b"\x11\x33")),
-    (b"t0200\r", Frame(0x20)),
-    (b"T0000010021133\r", Frame(0x100, b"\x11\x33", extended=True)),
-    (b"r1002\r", Frame(0x100, remote=True)),
-    (b"R000001002\r", Frame(0x100, extended=True, remote=True)),
-    (b"t100211334D67\r", Frame(0x100, b"\x11\x33")),  # with a time stamp
+    (b"t10021133\r", CanFrame(0x100, b"\x11\x33")),
+    (b"t0200\r", CanFrame(0x20)),
+    (b"T0000010021133\r", CanFrame(0x100, b"\x11\x33", extended=True)),
+    (b"r1002\r", CanFrame(0x100, remote=True)),
+    (b"R000001002\r", CanFrame(0x100, extended=True, remote=True)),
+    (b"t100211334D67\r", CanFrame(0x100, b"\x11\x33")),  # with a time stamp
 ]
 # CANable 2 firmware: the length is a DLC: 9 is 12 bytes, F is 64; b and B switch the bit rate
 FD = [
-    (b"d10021133\r", Frame(0x100, b"\x11\x33", fd=True)),
-    (b"b1239" + b"0A" * 12 + b"\r", Frame(0x123, b"\n" * 12, fd=True)),
-    (b"D1ABCDEF0F" + b"5A" * 64 + b"\r", Frame(0x1ABCDEF0, b"Z" * 64, True, True)),
-    (b"B000001000\r", Frame(0x100, b"", True, True)),
+    (b"d10021133\r", CanFrame(0x100, b"\x11\x33", fd=True)),
+    (b"b1239" + b"0A" * 12 + b"\r", CanFrame(0x123, b"\n" * 12, fd=True)),
+    (b"D1ABCDEF0F" + b"5A" * 64 + b"\r", CanFrame(0x1ABCDEF0, b"Z" * 64, True, True)),
+    (b"B000001000\r", CanFrame(0x100, b"", True, True)),
 ]
 
 frames_strategy = st.lists(
     st.builds(
-        lambda extended, fd, ident, data: Frame(
+        lambda extended, fd, ident, data: CanFrame(
             ident if extended else ident & 0x7FF, data if fd else data[:8], extended, fd
         ),
         st.booleans(),
@@ -43,7 +43,7 @@ frames_strategy = st.lists(
 
 
 @pytest.mark.parametrize(("line", "frame"), MANUAL + FD)
-def test_the_manual_s_lines(line: bytes, frame: Frame) -> None:
+def test_the_manual_s_lines(line: bytes, frame: CanFrame) -> None:
     decoder = SlcanDecoder()
     assert decoder.feed(line) == [frame]
     assert decoder.feed(line[:3]) == []
@@ -53,18 +53,18 @@ def test_the_manual_s_lines(line: bytes, frame: Frame) -> None:
 
 
 def test_frames_are_written_as_the_manual_does() -> None:
-    assert encode([Frame(0x100, b"\x11\x33"), Frame(0x20)]) == b"t10021133\rt0200\r"
-    assert encode([Frame(0x100, b"\x11\x33")], 0x4D67) == b"t100211334D67\r"
-    assert encode([Frame(0x100, b"\x11\x33")], 60_000 + 0x4D67) == b"t100211334D67\r"
-    assert encode([Frame(0x100, b"\x11\x33", True)]) == b"T0000010021133\r"
-    assert encode([Frame(0x100, remote=True)]) == b"r1000\r"
-    assert encode([Frame(0x100, b"x" * 9, fd=True)]) == b"b1009" + b"78" * 9 + b"000000\r"
+    assert encode([CanFrame(0x100, b"\x11\x33"), CanFrame(0x20)]) == b"t10021133\rt0200\r"
+    assert encode([CanFrame(0x100, b"\x11\x33")], 0x4D67) == b"t100211334D67\r"
+    assert encode([CanFrame(0x100, b"\x11\x33")], 60_000 + 0x4D67) == b"t100211334D67\r"
+    assert encode([CanFrame(0x100, b"\x11\x33", True)]) == b"T0000010021133\r"
+    assert encode([CanFrame(0x100, remote=True)]) == b"r1000\r"
+    assert encode([CanFrame(0x100, b"x" * 9, fd=True)]) == b"b1009" + b"78" * 9 + b"000000\r"
     assert encode([]) == b""
 
 
 @given(frames_strategy, st.booleans(), st.lists(st.integers(0, 2000), max_size=5))
 def test_what_is_encoded_is_decoded_however_it_is_cut(
-    frames: list[Frame], stamped: bool, cuts: list[int]
+    frames: list[CanFrame], stamped: bool, cuts: list[int]
 ) -> None:
     wire = encode(frames, 12_345 if stamped else None)
     decoder = SlcanDecoder()
@@ -78,12 +78,12 @@ def test_what_is_encoded_is_decoded_however_it_is_cut(
 
 def test_answers_are_told_from_frames() -> None:
     decoder = SlcanDecoder()
-    frame = Frame(0x100, b"\x11\x33")
+    frame = CanFrame(0x100, b"\x11\x33")
     wire = b"\r\r\aV1013\r" + encode([frame]) + b"NA123\rz\rZ\r\aF08\r" + encode([frame])
     assert decoder.feed(wire) == [frame, frame]
     assert (decoder.acks, decoder.bells, decoder.corrupt) == (4, 2, 0)
     assert list(decoder.replies) == [b"V1013", b"NA123", b"F08"]
-    assert SlcanDecoder().feed(b"t10021133\r\nt0200\r\n") == [frame, Frame(0x20)]
+    assert SlcanDecoder().feed(b"t10021133\r\nt0200\r\n") == [frame, CanFrame(0x20)]
 
 
 @pytest.mark.parametrize(
@@ -96,25 +96,25 @@ def test_answers_are_told_from_frames() -> None:
 )  # fmt: skip
 def test_a_line_that_is_no_frame_is_counted(line: bytes) -> None:
     decoder = SlcanDecoder()
-    good = encode([Frame(0x20)] * 2)
-    assert decoder.feed(good + line + b"\r" + good) == [Frame(0x20)] * 4
+    good = encode([CanFrame(0x20)] * 2)
+    assert decoder.feed(good + line + b"\r" + good) == [CanFrame(0x20)] * 4
     assert decoder.corrupt == 1
 
 
 def test_a_shorter_length_is_not_taken_for_a_time_stamp() -> None:
     """Bit 1 of the length: 6 becomes 4, and the last two bytes look like a time stamp."""
-    line = encode([Frame(0x100, bytes(6))])
+    line = encode([CanFrame(0x100, bytes(6))])
     decoder = SlcanDecoder()
     assert len(decoder.feed(line + line.replace(b"t1006", b"t1004") + line)) == 2
     assert decoder.corrupt == 1
     # time stamps switched on meanwhile: believed from the second line on
-    assert len(decoder.feed(encode([Frame(0x100)] * 3, 7))) == 2
+    assert len(decoder.feed(encode([CanFrame(0x100)] * 3, 7))) == 2
 
 
 def test_no_input_raises_or_piles_up() -> None:
     draw = random.Random(3)
     decoder = SlcanDecoder()
-    wire = encode([Frame(draw.randrange(2048), draw.randbytes(8)) for _ in range(300)])
+    wire = encode([CanFrame(draw.randrange(2048), draw.randbytes(8)) for _ in range(300)])
     whole, pieces = SlcanDecoder(), SlcanDecoder()
     for _ in range(300):
         at = draw.randrange(len(wire))
@@ -130,15 +130,15 @@ def test_no_input_raises_or_piles_up() -> None:
     for _ in range(100):
         decoder.feed(b"t" * 10_000)  # no end of line
     assert len(decoder._rest) < 200
-    assert decoder.feed(b"\rt0200\r") == [Frame(0x20)]
+    assert decoder.feed(b"\rt0200\r") == [CanFrame(0x20)]
     decoder.feed(b"t10")
     decoder.forget()
-    assert decoder.feed(b"t0200\r") == [Frame(0x20)]
+    assert decoder.feed(b"t0200\r") == [CanFrame(0x20)]
 
 
 def test_a_host_opens_and_closes_an_adapter() -> None:
     adapter = SlcanAdapter()
-    frame = Frame(0x100, b"\x11\x33")
+    frame = CanFrame(0x100, b"\x11\x33")
     assert adapter.encode([frame]) == b""
     assert adapter.respond(b"t0200\r") == (b"\a", [])
     answers = [adapter.respond(command)[0] for command in opening(1_000_000)]
@@ -147,7 +147,7 @@ def test_a_host_opens_and_closes_an_adapter() -> None:
     assert adapter.respond(b"t100211") == (b"", [])
     assert adapter.respond(b"33\rT0000010021133\rr1002\r") == (
         b"z\rZ\rz\r",
-        [frame, frame._replace(extended=True), Frame(0x100, remote=True)],
+        [frame, frame._replace(extended=True), CanFrame(0x100, remote=True)],
     )
     assert adapter.respond(b"V\rN\rF\r")[0] == b"V1013\rNA123\rF00\r"
     assert adapter.respond(b"O\rS6\rK\rt10g0\r") == (b"\a\a\a\a", [])  # open already, and no such
@@ -171,11 +171,11 @@ def test_another_bit_rate_than_the_bus_s_hears_nothing() -> None:
     for command in opening(1_000_000):
         adapter.respond(command)
     assert adapter.open and not adapter.hears
-    assert adapter.encode([Frame(1)]) == b"" and adapter.respond(b"t0200\r") == (b"z\r", [])
+    assert adapter.encode([CanFrame(1)]) == b"" and adapter.respond(b"t0200\r") == (b"z\r", [])
     assert adapter.respond(b"F\r")[0] == b"F80\r"
     for command in opening(500_000):
         adapter.respond(command)
-    assert adapter.encode([Frame(0x20)]) == b"t0200\r"
+    assert adapter.encode([CanFrame(0x20)]) == b"t0200\r"
 
 
 def test_python_can_writes_what_we_read() -> None:
@@ -192,12 +192,12 @@ def test_python_can_writes_what_we_read() -> None:
     for message in sent:
         bus.send(message)
     assert SlcanDecoder().feed(port.read(port.in_waiting)) == [
-        Frame(0x123, bytes(range(8))),
-        Frame(0x1ABCDEF0, b"\xff", extended=True),
-        Frame(5, remote=True),
-        Frame(5, bytes(12), fd=True),
+        CanFrame(0x123, bytes(range(8))),
+        CanFrame(0x1ABCDEF0, b"\xff", extended=True),
+        CanFrame(5, remote=True),
+        CanFrame(5, bytes(12), fd=True),
     ]
-    port.write(encode([Frame(0x123, b"\x01\xab"), Frame(0x10, bytes(20), fd=True)]))
+    port.write(encode([CanFrame(0x123, b"\x01\xab"), CanFrame(0x10, bytes(20), fd=True)]))
     one, two = bus.recv(1), bus.recv(1)
     assert (one.arbitration_id, bytes(one.data)) == (0x123, b"\x01\xab")
     assert two.is_fd and two.bitrate_switch and bytes(two.data) == bytes(20)

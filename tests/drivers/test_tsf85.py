@@ -4,11 +4,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
-from tactile_rt.drivers.codec import Event
+from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.tsf85 import Tsf85, Tsf85Options
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 # By hand from the format: taxel k of finger 0 counts k, of finger 1 256 + k; then one packet with
 # both fingers' times (66,000 ms), finger 0's dynamic value, -2, and its temperature.
@@ -131,13 +131,13 @@ def test_what_the_wire_cannot_carry_saturates() -> None:
 
 def test_the_commands() -> None:
     host, device = tsf85(period_ms=20), tsf85()
-    stop, start = host.commands(Event.START)
+    stop, start = host.commands(Command.START)
     assert (stop.send[2:], start.send[2:]) == (b"\x58\x01\x00", b"\x58\x01\x14")
     assert host.spec.rate_hz == 50 and not device.streaming
     for byte in b"\x9a noise" + start.send:
         assert device.respond(bytes((byte,))) == b""
     assert device.streaming
-    device.respond(host.commands(Event.STOP)[0].send + bytes.fromhex("9a006100"))
+    device.respond(host.commands(Command.STOP)[0].send + bytes.fromhex("9a006100"))
     assert not device.streaming and device.polled == 1
 
 

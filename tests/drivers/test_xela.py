@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
-from tactile_rt.drivers.codec import Event, Frame
+from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.rounds import Rounds
 from tactile_rt.drivers.codecs.xela import Xela, XelaOptions
 from tactile_rt.stream import ConfigError
+from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 
 def xela(**options: int) -> Xela:
@@ -26,7 +26,7 @@ def test_a_golden_sample() -> None:
     # By hand from the reading code of the public driver: identifier 1808 + taxel, x, y and z in
     # bytes 1-2, 3-4 and 5-6, the high one first; byte 0 and what follows do not matter.
     frames = [
-        Frame(1808 + i, bytes((0xEE, 0x81, i, 0x7F, 0xFF, 0x00, 0x10, 0xDD))) for i in range(16)
+        CanFrame(1808 + i, bytes((0xEE, 0x81, i, 0x7F, 0xFF, 0x00, 0x10, 0xDD))) for i in range(16)
     ]
     samples = xela().feed(frames, T0)
     assert samples is not None and samples.valid.all()
@@ -67,8 +67,8 @@ def test_an_invalid_taxel_is_not_sent() -> None:
 
 def test_it_streams_when_told() -> None:
     device = xela(board=3)
-    (step,) = device.commands(Event.START)
-    assert list(step.send) == [Frame(0x203, b"\x07\x00")]
+    (step,) = device.commands(Command.START)
+    assert list(step.send) == [CanFrame(0x203, b"\x07\x00")]
     xela(board=2).respond(step.send)
     assert not device.streaming
     device.respond(step.send)
@@ -77,8 +77,12 @@ def test_it_streams_when_told() -> None:
 
 def test_other_frames() -> None:
     host = xela()
-    foreign = [Frame(0x70F, bytes(8)), Frame(0x720, bytes(8)), Frame(0x710, bytes(8), True)]
-    assert host.feed([*foreign, Frame(0x710, bytes(6))], T0) is None
+    foreign = [
+        CanFrame(0x70F, bytes(8)),
+        CanFrame(0x720, bytes(8)),
+        CanFrame(0x710, bytes(8), True),
+    ]
+    assert host.feed([*foreign, CanFrame(0x710, bytes(6))], T0) is None
     assert host.stats.skipped == 3 and host.stats.corrupt == 1
 
 

@@ -17,8 +17,11 @@ import onnx.parser
 import torch
 
 import tactile_rt
-from tactile_rt.classifier import Classifier
-from tactile_rt.contact import CHANNEL_FLOOR
+from tactile_rt.classifier.classifier import Classifier
+from tactile_rt.classifier.contact import CHANNEL_FLOOR
+from tactile_rt.classifier.model_file import ModelCard, load_model
+from tactile_rt.classifier.onnx_check import graph_sha256
+from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.export import onnx_step, streaming, streaming_gpt
 from tactile_rt.export.onnx_step import (
     PARITY_BAR,
@@ -27,14 +30,11 @@ from tactile_rt.export.onnx_step import (
     file_logits,
     parity,
 )
-from tactile_rt.inference.stepper import Stepper
-from tactile_rt.model_file import ModelCard, load_model
 from tactile_rt.models.datasets import STEPS, SUBSTEPS, find_onsets, windows
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.training import TactileClassifier
-from tactile_rt.onnx_reading import graph_sha256
-from tactile_rt.recording import SweepManifest
 from tactile_rt.stream import ArraySpec, ModelError
+from tactile_rt.sweep_set import SweepManifest
 from tactile_rt.testing import cut
 
 PERIOD_NS = 9_000_000

@@ -16,11 +16,11 @@ import onnx
 import torch
 from onnx import numpy_helper
 
-from tactile_rt.export.full_size import random_model
+from bench.inference.full_size import random_model
+from tactile_rt.classifier.model_check import verify_model
+from tactile_rt.classifier.model_file import load_model, read_model, shipped_model
 from tactile_rt.export.onnx_step import PARITY_BAR, file_logits, parity, step_graph, write_model
 from tactile_rt.export.precision import CONTRIB, PRECISIONS, in_precision
-from tactile_rt.model_checks import verify_model
-from tactile_rt.model_file import load_model, read_model, shipped_model
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.stream import ConfigError
 

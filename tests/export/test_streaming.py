@@ -7,7 +7,6 @@ import pytest
 pytest.importorskip("torch")
 
 import torch
-from small_networks import TOLERANCE, build, frames, stream
 
 from tactile_rt.export import streaming as streaming_module
 from tactile_rt.export import streaming_gpt
@@ -19,6 +18,7 @@ from tactile_rt.export.streaming import (
     StreamingResNet18,
     streaming,
 )
+from tests.helpers.small_networks import TOLERANCE, build, frames, stream
 
 STEPS = 22
 # Every cell, encoder, attender and decoder at least once; `make check-export` takes all of them.

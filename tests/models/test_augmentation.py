@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from tiny_sweeps import tiny_array
 
 from tactile_rt.calibration.mirroring import Mirror
 from tactile_rt.models import augmentation
 from tactile_rt.models.array_symmetries import compose, symmetries
 from tactile_rt.models.augmentation import Tactile, build, image, mask_steps, tactile_paper
 from tactile_rt.stream import ConfigError
+from tests.helpers.tiny_sweeps import tiny_array
 
 SPEC = tiny_array()
 NAMES = ("columns", "rows", "turn")

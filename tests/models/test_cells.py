@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from small_networks import STEPS, build, frames, stir
 from torch import Tensor
 from torch.nn import functional as F
 
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.encoders.cells import CELLS
 from tactile_rt.models.encoders.zhuang import GRAPH, ZhuangEncoder
+from tests.helpers.small_networks import STEPS, build, frames, stir
 
 READS = {2: (1, 3, 4), 3: (2, 4, 5), 4: (3, 5, 6), 5: (4, 6), 6: (5,)}
 EDGES = "1->2; 3,4->2; 2->3; 4,5->3; 3->4; 5,6->4; 4->5; 6->5; 5->6; 2,4,6->fc7"

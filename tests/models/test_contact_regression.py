@@ -10,12 +10,12 @@ pytest.importorskip("torch")
 import torch
 from sklearn.metrics import f1_score, roc_auc_score
 
-from tactile_rt.benchmarks.locating import (
+from tactile_rt.classifier.contact_point import WhiskerShapes
+from tactile_rt.evidence.locating import (
     contact_records,
     weighted_auroc,
     weighted_quantile,
 )
-from tactile_rt.contact_point import WhiskerShapes
 from tactile_rt.models.contact_regression import (
     ContactConfig,
     ContactNetwork,
@@ -25,8 +25,8 @@ from tactile_rt.models.contact_regression import (
     train_contacts,
 )
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.recording import SPLITS, SweepManifest, write_object
 from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.sweep_set import SPLITS, SweepManifest, write_object
 
 SHAPES = WhiskerShapes(*(np.array(v) for v in (
     [0.02, 0.01, 0.005], [0.0] * 3, [5e-5, 4e-5, 3e-5], [5e-6] * 3, [5e9] * 3

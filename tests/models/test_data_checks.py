@@ -6,11 +6,11 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
-from tiny_sweeps import write_tiny_set
 
+from tactile_rt.classifier.model_file import load_model
 from tactile_rt.cli import main
-from tactile_rt.model_file import load_model
-from tactile_rt.recording import SweepManifest, object_path, read_object, write_object
+from tactile_rt.sweep_set import SweepManifest, object_path, read_object, write_object
+from tests.helpers.tiny_sweeps import write_tiny_set
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tactile_rt.contact import ContactDetector
+from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.models.datasets import (
     RATED_NOISE,
     STEPS,
@@ -16,8 +16,8 @@ from tactile_rt.models.datasets import (
     find_onsets,
     windows,
 )
-from tactile_rt.recording import SweepManifest, Sweeps
 from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.sweep_set import SweepManifest, Sweeps
 
 ELEMENTS, CHANNELS, SAMPLES, LEAD = 4, 6, 170, 30
 SPEC = ArraySpec(

@@ -6,11 +6,11 @@ import itertools
 
 import pytest
 import torch
-from small_networks import STEPS, TOLERANCE, build, frames, stream
 from torch.nn import functional as F
 
 from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, READOUTS, EADConfig
 from tactile_rt.stream import ConfigError
+from tests.helpers.small_networks import STEPS, TOLERANCE, build, frames, stream
 
 NAMES = tuple(name for name in ENCODERS if name != "graph")  # which has its own tests
 ZHUANG = tuple(name for name in NAMES if name.startswith("zhuang"))

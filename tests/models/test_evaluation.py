@@ -9,14 +9,14 @@ pytest.importorskip("torch")
 
 from sklearn.metrics import roc_auc_score
 
-from tactile_rt.contact import CHANNEL_FLOOR, ContactDetector
+from tactile_rt.classifier.contact import CHANNEL_FLOOR, ContactDetector
 from tactile_rt.models import disturbances, evaluation, onsets
 from tactile_rt.models.datasets import RATED_NOISE, STEPS, SweepSet, channel_values, find_onsets
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.models.evaluation import at_temperature, auroc, deciding_step
 from tactile_rt.models.intervals import accuracy, bootstrap
-from tactile_rt.recording import SweepManifest, Sweeps
 from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.sweep_set import SweepManifest, Sweeps
 
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
 ELEMENTS = 8

@@ -2,7 +2,6 @@
 
 import pytest
 import torch
-from small_networks import TOLERANCE, frames, stir, stream
 
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
@@ -10,6 +9,7 @@ from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 from tactile_rt.models.encoders.graph_files import parse_graph, read_graph
 from tactile_rt.models.encoders.zhuang import GRAPH
 from tactile_rt.stream import ConfigError
+from tests.helpers.small_networks import TOLERANCE, frames, stir, stream
 
 TEXT = """
 readout = "fc"

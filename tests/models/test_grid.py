@@ -18,8 +18,8 @@ from tactile_rt.models.grid.plan import Task, read_grid, shipped_grids
 from tactile_rt.models.grid.pool import run_grid
 from tactile_rt.models.grid.results import gather, put_into, table, write_results
 from tactile_rt.models.grid.work import Outcome, Workbench, outcome_path, read_outcome, settings_of
-from tactile_rt.recording import SweepManifest, write_object
 from tactile_rt.stream import ArraySpec, ConfigError, ModelError, RecordingError
+from tactile_rt.sweep_set import SweepManifest, write_object
 
 SPEC = ArraySpec(
     name="row",

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 import torch
-from tiny_sweeps import tiny_array
 
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import TactileClassifier
@@ -19,6 +18,7 @@ from tactile_rt.models.objectives import (
     last_loss,
     nt_xent,
 )
+from tests.helpers.tiny_sweeps import tiny_array
 
 SPEC = tiny_array()
 STEPS = 5

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.models.encoders.resnet import Block, ConvNorm, ResNet18Encoder
+from tactile_rt.models.encoders.resnet import ConvNorm, ResidualBlock, ResNet18Encoder
 
 TOLERANCE = 2e-6
 
@@ -50,7 +50,7 @@ def oracle(encoder: ResNet18Encoder, x: Tensor) -> Tensor:
 
     x = F.max_pool2d(F.relu(layer(encoder.stem, x, 2)), 3, 2, 1)
     for i, block in enumerate(encoder.blocks):
-        assert isinstance(block, Block)
+        assert isinstance(block, ResidualBlock)
         stride = 2 if i in (2, 4, 6) else 1
         short = x if block.shortcut is None else layer(block.shortcut, x, stride)
         x = F.relu(short + layer(block.second, F.relu(layer(block.first, x, stride)), 1))

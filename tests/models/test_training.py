@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tiny_sweeps import write_tiny_set
 from torch import nn
 
 from tactile_rt.models.datasets import SweepSet
@@ -34,6 +33,7 @@ from tactile_rt.models.training.optimizers import (
 )
 from tactile_rt.models.training.probing import linear_probe
 from tactile_rt.stream import ConfigError, ModelError
+from tests.helpers.tiny_sweeps import write_tiny_set
 
 SMALL = {"encoder": "gru", "decoder": "linear", "width": 1 / 32, "batch": 6}
 CHILD = Path(__file__).parent / "train_child.py"

@@ -42,7 +42,7 @@ from tactile_rt.sim_backend.world import (
     read_base_loads,
     set_damping,
 )
-from tactile_rt.sources import open_source
+from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError
 
 Floats = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Whiskers against beam theory: `tests/beams.py` works the references out."""
+"""Whiskers against beam theory: `tests/helpers/beams.py` works the references out."""
 
 from dataclasses import replace
 
@@ -7,12 +7,11 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-import beams as theory
 import mujoco
 from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 
-from tactile_rt.benchmarks.beams import GRAVITY, ORIGIN, beams, flat, measure, ring
+from bench.sim.beams import GRAVITY, ORIGIN, beams, flat, measure, ring
 from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
 from tactile_rt.sim_backend.world import (
     PROFILES,
@@ -21,6 +20,7 @@ from tactile_rt.sim_backend.world import (
     empty_world,
     set_damping,
 )
+from tests.helpers import beams as theory
 
 Floats = NDArray[np.float64]
 

@@ -11,7 +11,6 @@ pytest.importorskip("sklearn")
 
 from matplotlib.image import imread
 
-from tactile_rt.recording import SweepManifest, write_object, write_skipped
 from tactile_rt.sim_backend.datasets import separability
 from tactile_rt.sim_backend.datasets.card import write_card
 from tactile_rt.sim_backend.datasets.card_survey import survey
@@ -21,6 +20,7 @@ from tactile_rt.sim_backend.datasets.separability import (
     window_features,
 )
 from tactile_rt.stream import RecordingError
+from tactile_rt.sweep_set import SweepManifest, write_object, write_skipped
 from tactile_rt.testing import small_spec
 
 SPEC = small_spec()  # 3 elements

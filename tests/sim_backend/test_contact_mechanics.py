@@ -9,13 +9,12 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-import beams as theory
-
-from tactile_rt.benchmarks.beams import flat
-from tactile_rt.benchmarks.pegs import PEG_RADIUS_MM, Press, press, presses
-from tactile_rt.benchmarks.reference_model import reference_cost
-from tactile_rt.benchmarks.sim import SweepErrors, compare, run
+from bench.sim.area import SweepErrors, compare, run
+from bench.sim.beams import flat
+from bench.sim.pegs import PEG_RADIUS_MM, Press, press, presses
+from bench.sim.reference_model import reference_cost
 from tactile_rt.sim_backend.world import PROFILES
+from tests.helpers import beams as theory
 
 CASES = {
     f"{p.whisker} {p.bend} {p.place} {p.depth} {p.friction:+}".replace("+0.0", "0"): p
@@ -140,7 +139,7 @@ def test_errors_of_a_sweep_are_what_they_say() -> None:
 
 
 def test_the_reference_model_is_frozen() -> None:
-    packed = resources.files("tactile_rt.benchmarks").joinpath("data/reference_model.xml.gz")
+    packed = resources.files("bench.sim").joinpath("data/reference_model.xml.gz")
     assert hashlib.sha256(packed.read_bytes()).hexdigest().startswith("34592f3af85df393")
     assert reference_cost(20) > 0
 

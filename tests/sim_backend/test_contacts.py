@@ -9,12 +9,10 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
-import beams as theory
 import mujoco
 
-from tactile_rt.benchmarks.beams import flat
-from tactile_rt.benchmarks.pegs import PEG_RADIUS_MM, SLIDE_MM_S, _window, presses
-from tactile_rt.recording import SweepManifest, contacts_of, read_object, read_sweeps
+from bench.sim.beams import flat
+from bench.sim.pegs import PEG_RADIUS_MM, SLIDE_MM_S, _window, presses
 from tactile_rt.sim_backend.arrays.whisker_array import load_array
 from tactile_rt.sim_backend.contacts import ContactProbe, contact_distances
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps, simulate_sweep
@@ -30,6 +28,8 @@ from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES, link_nodes
 from tactile_rt.stream import ConfigError, RecordingError
+from tactile_rt.sweep_set import SweepManifest, contacts_of, read_object, read_sweeps
+from tests.helpers import beams as theory
 
 PLAIN = SweepRecipe(
     lead_ms=45,

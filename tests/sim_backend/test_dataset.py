@@ -16,12 +16,7 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
-from tactile_rt.recording import (
-    SPLITS,
-    SweepManifest,
-    read_object,
-    read_sweeps,
-)
+from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.sim_backend.arrays.whisker_array import load_array
 from tactile_rt.sim_backend.datasets import dataset
 from tactile_rt.sim_backend.datasets.dataset import (
@@ -45,8 +40,13 @@ from tactile_rt.sim_backend.sensor import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, UNITS
 from tactile_rt.stream import ConfigError, RecordingError, SourceError, TactileError
+from tactile_rt.sweep_set import (
+    SPLITS,
+    SweepManifest,
+    read_object,
+    read_sweeps,
+)
 from tactile_rt.testing import cut
-from tactile_rt.timebase import Resampler
 
 # Short sweeps of few objects: what is tested here is where they end up.
 RECIPE = SweepRecipe(

@@ -6,11 +6,11 @@ import time
 from pathlib import Path
 
 import pytest
-from frail_work import FrailWork
 
 from tactile_rt.sim_backend.datasets import engines
 from tactile_rt.sim_backend.datasets.engines import DIED, run_processes, run_ray
 from tactile_rt.stream import ConfigError
+from tests.helpers.frail_work import FrailWork
 
 
 def tries(folder: Path, name: str) -> list[int]:
@@ -82,8 +82,8 @@ def test_no_process_outlives_a_parent_that_was_killed(tmp_path: Path) -> None:
         import sys
         from pathlib import Path
         if __name__ == "__main__":
-            sys.path.insert(0, {str(Path(__file__).parents[1])!r})
-            from frail_work import FrailWork
+            sys.path.insert(0, {str(Path(__file__).parents[2])!r})
+            from tests.helpers.frail_work import FrailWork
             from tactile_rt.sim_backend.datasets.engines import run_processes
             list(run_processes(FrailWork(Path({str(tmp_path)!r})), ["sleeps-60"], 1))
         """)

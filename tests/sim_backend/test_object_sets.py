@@ -9,7 +9,6 @@ import pytest
 
 pytest.importorskip("manifold3d")
 
-import mesh_truth
 import trimesh
 from scipy.spatial import ConvexHull
 
@@ -19,6 +18,7 @@ from tactile_rt.sim_backend.objects import meshes
 from tactile_rt.sim_backend.objects.meshes import MeshDetail, load_mesh
 from tactile_rt.sim_backend.objects.object_sets import open_objects
 from tactile_rt.stream import ConfigError
+from tests.helpers import mesh_truth
 
 MM = 40.0  # largest extent that errors are given at
 

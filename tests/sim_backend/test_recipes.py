@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
-from tactile_rt.recording import WITHHELD
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import (
     read_recipe,
@@ -31,6 +30,7 @@ from tactile_rt.sim_backend.datasets.recipes import (
 from tactile_rt.sim_backend.objects import catalogue as objects
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.stream import ConfigError
+from tactile_rt.sweep_set import WITHHELD
 
 
 def write(path: Path, text: str) -> str:

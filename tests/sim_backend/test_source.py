@@ -11,7 +11,7 @@ from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
 from tactile_rt.sim_backend.source import CHUNK_SAMPLES, REST_SAMPLES, SimOptions, SimSource
 from tactile_rt.sim_backend.world import array_spec
-from tactile_rt.sources import open_source
+from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, SourceStats, concatenate
 
 

@@ -11,7 +11,6 @@ import pytest
 pytest.importorskip("mujoco")
 
 import mujoco
-from beams import abscissa, compliance, line_mass
 from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
@@ -31,6 +30,7 @@ from tactile_rt.sim_backend.world import (
     read_base_loads,
     set_damping,
 )
+from tests.helpers.beams import abscissa, compliance, line_mass
 
 Floats = NDArray[np.float64]
 

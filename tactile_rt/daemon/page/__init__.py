@@ -15,7 +15,7 @@ import uvicorn
 
 from tactile_rt.daemon.config import PageConfig
 from tactile_rt.daemon.consumer import Consumer, View
-from tactile_rt.daemon.items import Contact, Control, Decision, Event, Item, Opened, Samples
+from tactile_rt.daemon.items import Contact, Control, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import encode, state_message
 from tactile_rt.daemon.page.feed import FEED_VERSION, Feed, array_line
 from tactile_rt.daemon.page.guard import Guard
@@ -40,7 +40,7 @@ class Page(Consumer):
         ConfigError: others could reach it without a token.
     """
 
-    wants = frozenset({Opened, Samples, Decision, Contact, Event})
+    wants = frozenset({Opened, SourceChunk, Decision, Contact, Event})
     gather_s = 0.025
     tick_s = STATE_S
 

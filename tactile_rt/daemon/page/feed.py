@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Samples
+from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.stream import ArraySpec
 
@@ -39,7 +39,7 @@ class _Fold:
         # (element, channel) each
         self.least = self.most = self.newest = np.empty((0, 0), np.float32)
 
-    def add(self, item: Samples) -> None:
+    def add(self, item: SourceChunk) -> None:
         chunk = item.chunk
         values: NDArray[np.float32] = chunk.values
         if not chunk.valid.all():
@@ -81,7 +81,7 @@ class Feed:
         """
         lines: list[Line] = []
         for item in items:
-            if isinstance(item, Samples):
+            if isinstance(item, SourceChunk):
                 if item.source in watched:
                     self._folds.setdefault(item.source, _Fold()).add(item)
             elif isinstance(item, Opened):

@@ -18,7 +18,7 @@ from foxglove.websocket import WebSocketServer
 
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.digits import shortest
-from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Item, Opened, Samples
+from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import (
     DecisionMessage,
     HealthMessage,
@@ -59,7 +59,7 @@ class FoxglovePublisher(Consumer):
     """Serves the Foxglove WebSocket protocol (``foxglove.sdk.v1``)."""
 
     Options = FoxgloveOptions
-    wants = frozenset({Opened, Closed, Samples, Decision, Contact, Event})
+    wants = frozenset({Opened, Closed, SourceChunk, Decision, Contact, Event})
     tick_s = REPEAT_S
 
     def __init__(self, name: str, options: FoxgloveOptions) -> None:
@@ -98,9 +98,9 @@ class FoxglovePublisher(Consumer):
         self._repeat(view)
 
     def handle(self, items: list[Item]) -> None:
-        newest: dict[str, Samples] = {}
+        newest: dict[str, SourceChunk] = {}
         for item in items:
-            if isinstance(item, Samples):
+            if isinstance(item, SourceChunk):
                 newest[item.source] = item
                 continue
             if isinstance(item, Opened):
@@ -178,7 +178,7 @@ class FoxglovePublisher(Consumer):
             utc_ns = item.t_ns + self._view.utc_offset_ns()
             channel.log(scene.gone(utc_ns), log_time=utc_ns)
 
-    def _show(self, item: Samples) -> None:
+    def _show(self, item: SourceChunk) -> None:
         scene, now = self._scenes.get(item.source), time.monotonic()
         if scene is None or now < self._due.get(item.source, 0.0):
             return

@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
+from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
 from tactile_rt.drivers.codecs.rounds import Rounds
 from tactile_rt.drivers.codecs.six_axis import six_axis
 from tactile_rt.stream import Chunk, ConfigError
@@ -71,8 +71,8 @@ class Aft200(CanCodec):
     def forget(self) -> None:
         self._rounds.forget()
 
-    def feed(self, packet: Sequence[Frame], t_ns: int) -> Samples | None:
-        batch, stats = Batch(), self.stats
+    def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
+        batch, stats = SampleBatch(), self.stats
         for identifier, data, extended, _, remote in packet:
             part = identifier - self._first
             if extended or remote or not 0 <= part <= 1:
@@ -89,27 +89,30 @@ class Aft200(CanCodec):
                     batch.valid.append((whole,))
         return batch.take((1, 6), t_ns)
 
-    def commands(self, event: Event) -> tuple[Step[Sequence[Frame]], ...]:
-        if event != Event.START:  # how to stop it is not public
+    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+        if event != Command.START:  # how to stop it is not public
             return ()
         steps = [self._command(PERIOD, *self._period_us.to_bytes(2, "big"))]
         if self._options.bias:
             steps.append(self._command(BIAS, 1, pause_s=BIAS_S))
         return (*steps, self._command(TRANSMIT, 1))
 
-    def _command(self, *data: int, pause_s: float = 0.0) -> Step[Sequence[Frame]]:
+    def _command(self, *data: int, pause_s: float = 0.0) -> Step[Sequence[CanFrame]]:
         whole = bytes((self._options.sensor, *data)).ljust(8, b"\0")
-        return Step((Frame(COMMAND_ID, whole),), pause_s=pause_s)
+        return Step((CanFrame(COMMAND_ID, whole),), pause_s=pause_s)
 
-    def encode(self, chunk: Chunk) -> list[Sequence[Frame]]:
+    def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:
         counts = np.rint((np.nan_to_num(chunk.values[:, 0].astype(np.float64)) - ZERO) / SCALE)
         words = np.clip(counts, 0, 0xFFFF).astype(">u2")
         return [
-            [Frame(self._first + part, w[3 * part : 3 * part + 3].tobytes()) for part in range(2)]
+            [
+                CanFrame(self._first + part, w[3 * part : 3 * part + 3].tobytes())
+                for part in range(2)
+            ]
             for w in words
         ]
 
-    def respond(self, packet: Sequence[Frame]) -> Sequence[Frame]:
+    def respond(self, packet: Sequence[CanFrame]) -> Sequence[CanFrame]:
         for frame in packet:
             mine = frame.id == COMMAND_ID and len(frame.data) >= 3 and not frame.extended
             if mine and frame.data[:2] == bytes((self._options.sensor, TRANSMIT)):

@@ -13,8 +13,13 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.drivers.codec import Event, Samples, SerialCodec, Step
-from tactile_rt.drivers.codecs.ascii_mapping import Mapping, array_of, parse_column, read_mapping
+from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
+from tactile_rt.drivers.codecs.ascii_mapping import (
+    LineMapping,
+    array_of,
+    parse_column,
+    read_mapping,
+)
 from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = ["AsciiLine", "AsciiLineOptions"]
@@ -82,7 +87,7 @@ class AsciiLine(SerialCodec):
         if options.mapping:
             mapping = read_mapping(options.mapping)
         else:
-            mapping = Mapping(tuple(w.strip() for w in options.columns.split(",")))
+            mapping = LineMapping(tuple(w.strip() for w in options.columns.split(",")))
         if options.rate_hz:
             mapping = msgspec.structs.replace(mapping, rate_hz=options.rate_hz)
         prefix = f"{where}: columns" if options.mapping else where
@@ -137,8 +142,10 @@ class AsciiLine(SerialCodec):
         self.stats.intact += len(rows)
         return self._samples(np.array(rows), damaged, t_ns) if rows else None
 
-    def commands(self, event: Event) -> tuple[Step[bytes], ...]:
-        send = {Event.START: self._start, Event.STOP: self._stop, Event.POLL: self._poll}[event]
+    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
+        send = {Command.START: self._start, Command.STOP: self._stop, Command.POLL: self._poll}[
+            event
+        ]
         return (Step(send),) if send else ()
 
     def forget(self) -> None:

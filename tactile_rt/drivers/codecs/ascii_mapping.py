@@ -21,7 +21,7 @@ import numpy as np
 
 from tactile_rt.stream import ArraySpec, ConfigError
 
-__all__ = ["UNITS", "Column", "Element", "Mapping", "array_of", "parse_column", "read_mapping"]
+__all__ = ["UNITS", "Column", "Element", "LineMapping", "array_of", "parse_column", "read_mapping"]
 
 VERSION: Final = 1
 MOST_BITS: Final = 53  # of a counter: what a float64 holds
@@ -67,7 +67,7 @@ class Element(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
 
-class Mapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class LineMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a board prints, key by key as in its TOML file; docs/codecs/ascii_line.toml is one.
 
     Attributes:
@@ -117,7 +117,7 @@ class Column:
     unit: str = ""
 
 
-def read_mapping(path: str) -> Mapping:
+def read_mapping(path: str) -> LineMapping:
     """Read a mapping file.
 
     Raises:
@@ -126,7 +126,7 @@ def read_mapping(path: str) -> Mapping:
     try:
         with open(path, "rb") as file:
             fields = tomllib.load(file)
-        mapping = msgspec.convert(fields, Mapping)
+        mapping = msgspec.convert(fields, LineMapping)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     except UnicodeDecodeError:
@@ -172,7 +172,7 @@ def parse_column(word: str, where: str) -> Column:
     return Column("value", _scale(scale, where) * factor, offset, 0, element, channel, si)
 
 
-def array_of(mapping: Mapping, columns: tuple[Column, ...], where: str) -> ArraySpec:
+def array_of(mapping: LineMapping, columns: tuple[Column, ...], where: str) -> ArraySpec:
     """The array that the columns make up, elements and channels as they first come.
 
     Args:

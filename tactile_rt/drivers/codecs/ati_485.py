@@ -22,7 +22,7 @@ from typing import Any, ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.drivers.codec import Event, Samples, SerialCodec, Step
+from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import crc16_modbus
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
@@ -223,11 +223,11 @@ class Ati485(SerialCodec):
             self.stats.corrupt += frames
             self._damaged += frames
 
-    def commands(self, event: Event) -> tuple[Step[bytes], ...]:
+    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
         jam = Step(JAM, pause_s=SILENCE_S)
-        if event == Event.START:  # it may be streaming, and then takes no request
+        if event == Command.START:  # it may be streaming, and then takes no request
             return jam, Step(self._request, self._answer, what="the request to stream")
-        return (jam,) if event == Event.STOP else ()
+        return (jam,) if event == Command.STOP else ()
 
     # the device's side
 

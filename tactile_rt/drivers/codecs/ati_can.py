@@ -9,7 +9,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
+from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
 from tactile_rt.drivers.codecs.six_axis import six_axis
 from tactile_rt.stream import Chunk, ConfigError
 
@@ -110,8 +110,8 @@ class AtiCan(CanCodec):
 
     # the host's side
 
-    def feed(self, packet: Sequence[Frame], t_ns: int) -> Samples | None:
-        batch = Batch()
+    def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
+        batch = SampleBatch()
         for identifier, data, extended, _, remote in packet:
             code = identifier - self._base
             if extended or remote or not 0 <= code <= 15:
@@ -122,7 +122,7 @@ class AtiCan(CanCodec):
                 self.stats.intact += 1
         return batch.take((1, 6), t_ns)
 
-    def _take(self, batch: Batch, code: int, data: bytes) -> bool:
+    def _take(self, batch: SampleBatch, code: int, data: bytes) -> bool:
         """Take a reply; False if it is not one."""
         if code == GAUGES_A:
             if len(data) != FRAME_A.size:
@@ -150,7 +150,7 @@ class AtiCan(CanCodec):
             self._rows, self._row = [], []  # the matrix is asked for next
         return True
 
-    def _pair(self, batch: Batch, second: bytes) -> None:
+    def _pair(self, batch: SampleBatch, second: bytes) -> None:
         if not self._first:
             self.stats.incomplete += 1
             return
@@ -191,10 +191,10 @@ class AtiCan(CanCodec):
             self._matrix = np.repeat(scale, 3)[:, None] * matrix
         return len(self._rows) <= 6
 
-    def commands(self, event: Event) -> tuple[Step[Sequence[Frame]], ...]:
-        if event == Event.POLL:
-            return (Step((Frame(self._base | GAUGES_A),)),)
-        if event != Event.START:
+    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+        if event == Command.POLL:
+            return (Step((CanFrame(self._base | GAUGES_A),)),)
+        if event != Command.START:
             return ()
         steps = [
             self._ask(COUNTS, b"", COUNTS, "its counts per unit"),
@@ -208,8 +208,8 @@ class AtiCan(CanCodec):
             steps.append(self._ask(ROW_A, bytes((row,)), ROW_C, what))
         return tuple(steps)
 
-    def _ask(self, code: int, data: bytes, answer: int, what: str) -> Step[Sequence[Frame]]:
-        return Step((Frame(self._base | code, data),), self._base | answer, what=what)
+    def _ask(self, code: int, data: bytes, answer: int, what: str) -> Step[Sequence[CanFrame]]:
+        return Step((CanFrame(self._base | code, data),), self._base | answer, what=what)
 
     # the device's side: a transducer without cross-talk, a million counts per N and N m
 
@@ -217,19 +217,19 @@ class AtiCan(CanCodec):
         full = [self._options.force_n] * 3 + [self._options.torque_nm] * 3
         return np.diag(np.array(full) * 1e6 / 32767).astype(np.float32)
 
-    def encode(self, chunk: Chunk) -> list[Sequence[Frame]]:
+    def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:
         counts = np.nan_to_num(chunk.values[:, 0].astype(np.float64)) * 1e6
         gauges = np.clip(np.rint(counts / np.diag(self._emulated())), -32767, 32767).astype(int)
         return [
             [
-                Frame(self._base | GAUGES_A, FRAME_A.pack(0, g[0], g[2], g[4])),
-                Frame(self._base | GAUGES_B, FRAME_B.pack(g[1], g[3], g[5])),
+                CanFrame(self._base | GAUGES_A, FRAME_A.pack(0, g[0], g[2], g[4])),
+                CanFrame(self._base | GAUGES_B, FRAME_B.pack(g[1], g[3], g[5])),
             ]
             for g in gauges.tolist()
         ]
 
-    def respond(self, packet: Sequence[Frame]) -> Sequence[Frame]:
-        answers: list[Frame] = []
+    def respond(self, packet: Sequence[CanFrame]) -> Sequence[CanFrame]:
+        answers: list[CanFrame] = []
         for frame in packet:
             if frame.extended or frame.remote:
                 continue
@@ -238,11 +238,13 @@ class AtiCan(CanCodec):
                 self.polled += 1
             elif code == ROW_A and len(frame.data) == 1 and frame.data[0] < 6:
                 row = self._emulated()[frame.data[0]].astype(">f4").tobytes()
-                answers += [Frame(self._base | ROW_A + i, row[8 * i : 8 * i + 8]) for i in range(3)]
+                answers += [
+                    CanFrame(self._base | ROW_A + i, row[8 * i : 8 * i + 8]) for i in range(3)
+                ]
             elif code == CALIBRATION and len(frame.data) == 1:
                 answers.append(frame)
             elif code == COUNTS and not frame.data:
-                answers.append(Frame(frame.id, struct.pack(">2I", 1_000_000, 1_000_000)))
+                answers.append(CanFrame(frame.id, struct.pack(">2I", 1_000_000, 1_000_000)))
             elif code == UNITS and not frame.data:
-                answers.append(Frame(frame.id, b"\x02\x03"))
+                answers.append(CanFrame(frame.id, b"\x02\x03"))
         return answers

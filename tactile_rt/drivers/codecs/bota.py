@@ -16,7 +16,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.drivers.codec import Event, Samples, SerialCodec, Step
+from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.frame_finder import FrameFinder
 from tactile_rt.drivers.codecs.framing import crc16_x25
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
@@ -141,12 +141,12 @@ class Bota(SerialCodec):
             status=frames["status"].astype(np.int64),
         )
 
-    def commands(self, event: Event) -> tuple[Step[bytes], ...]:
+    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
         o = self._options
         configure = Step(b"C", b"r,0,C,0", what="the command to configure it")
-        if event == Event.STOP:
+        if event == Command.STOP:
             return (configure,)
-        if event != Event.START:
+        if event != Command.START:
             return ()
         line = f"c,{o.temperature_compensation:d},1,0,{BAUDS[o.baud]}"  # calibrated, binary
         filters = f"f,{o.sinc},{o.chop:d},{o.fast:d},{o.skip_fir:d}"

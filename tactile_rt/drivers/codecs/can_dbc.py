@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
-from tactile_rt.drivers.codecs.dbc_layout import Part, Signal
+from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
+from tactile_rt.drivers.codecs.dbc_layout import FramePart, Signal
 from tactile_rt.drivers.codecs.dbc_mapping import read_mapping
 from tactile_rt.drivers.codecs.rounds import Rounds
 from tactile_rt.stream import Chunk, ConfigError
@@ -55,9 +55,9 @@ class CanDbc(CanCodec):
             self.count_bits = self._map.counter[0].length
         if self._map.time:
             self.tick_bits = self._map.time[0].length
-        self.polls = any(when == Event.POLL for when, *_ in self._map.commands)
-        self.streaming = not any(when == Event.START for when, *_ in self._map.commands)
-        self._parts: dict[tuple[int, bool], list[tuple[int, Part]]] = {}
+        self.polls = any(when == Command.POLL for when, *_ in self._map.commands)
+        self.streaming = not any(when == Command.START for when, *_ in self._map.commands)
+        self._parts: dict[tuple[int, bool], list[tuple[int, FramePart]]] = {}
         for index, part in enumerate(self._map.parts):
             self._parts.setdefault((part.id, part.extended), []).append((index, part))
         self._rounds: Rounds[bytes] = Rounds(len(self._map.parts))
@@ -67,8 +67,8 @@ class CanDbc(CanCodec):
         self._rounds.forget()
         self._count = None
 
-    def feed(self, packet: Sequence[Frame], t_ns: int) -> Samples | None:
-        batch, stats, ids = Batch(), self.stats, self._parts
+    def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
+        batch, stats, ids = SampleBatch(), self.stats, self._parts
         for identifier, data, extended, _, remote in packet:
             parts = ids.get((identifier, extended))
             if parts is None or remote:
@@ -85,7 +85,7 @@ class CanDbc(CanCodec):
                     break
         return batch.take(self._map.spec.shape, t_ns)
 
-    def _part(self, batch: Batch, index: int, data: bytes) -> None:
+    def _part(self, batch: SampleBatch, index: int, data: bytes) -> None:
         ended: list[list[bytes | None]] = []
         counter = self._map.counter
         if counter and index in counter[1]:
@@ -96,7 +96,7 @@ class CanDbc(CanCodec):
         for parts in ended + self._rounds.add(index, data):
             self._sample(batch, parts)
 
-    def _sample(self, batch: Batch, parts: list[bytes | None]) -> None:
+    def _sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
         mapping = self._map
         self.stats.incomplete += None in parts
         numbers = [_read(cell, parts) for cell in mapping.cells]
@@ -121,19 +121,19 @@ class CanDbc(CanCodec):
             if single:
                 numbers_so_far.append(number & (1 << single[0].length) - 1)
 
-    def commands(self, event: Event) -> tuple[Step[Sequence[Frame]], ...]:
+    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
         return tuple(
             Step((frame,), answer, what=f"the {when} command {frame.id:#x}")
             for when, frame, answer in self._map.commands
             if when == event
         )
 
-    def encode(self, chunk: Chunk) -> list[Sequence[Frame]]:
+    def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:
         mapping = self._map
         values = np.nan_to_num(chunk.values.astype(np.float64))
         raw = ((values - mapping.bias) / mapping.gain).reshape(len(chunk), -1)
         tick_ns = mapping.tick_ns or 1.0
-        packets: list[Sequence[Frame]] = []
+        packets: list[Sequence[CanFrame]] = []
         for seq, t_ns, numbers in zip(
             chunk.seq.tolist(), chunk.t_ns.tolist(), raw.tolist(), strict=True
         ):
@@ -150,18 +150,18 @@ class CanDbc(CanCodec):
             packets.append([_encoded(i, p, fields) for i, p in enumerate(mapping.parts)])
         return packets
 
-    def respond(self, packet: Sequence[Frame]) -> Sequence[Frame]:
+    def respond(self, packet: Sequence[CanFrame]) -> Sequence[CanFrame]:
         answers = []
         for frame in packet:
             for when, command, answer in self._map.commands:
                 if frame[:3] != command[:3]:
                     continue
-                if when == Event.POLL:
+                if when == Command.POLL:
                     self.polled += 1
                 else:
-                    self.streaming = when == Event.START
+                    self.streaming = when == Command.START
                 if answer is not None:
-                    answers.append(Frame(answer, extended=answer > 0x7FF))
+                    answers.append(CanFrame(answer, extended=answer > 0x7FF))
         return answers
 
 
@@ -182,9 +182,11 @@ def _wrapped(signal: Signal, number: int) -> int:
     )
 
 
-def _encoded(index: int, part: Part, fields: list[tuple[Signal, tuple[int, ...], float]]) -> Frame:
+def _encoded(
+    index: int, part: FramePart, fields: list[tuple[Signal, tuple[int, ...], float]]
+) -> CanFrame:
     numbers: dict[str, float] = {s.name: 0 for s in part.message.signals}
     numbers.update((signal.name, min(values)) for signal, values in part.when)
     numbers.update((signal.name, x) for signal, inside, x in fields if index in inside)
     data = part.message.encode(numbers, scaling=False, padding=False, strict=False)
-    return Frame(part.id, bytes(data), part.extended, fd=part.length > 8)
+    return CanFrame(part.id, bytes(data), part.extended, fd=part.length > 8)

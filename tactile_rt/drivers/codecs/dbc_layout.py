@@ -8,10 +8,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.drivers.codec import Frame
+from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.stream import ArraySpec
 
-__all__ = ["Mapping", "Part", "Signal"]
+__all__ = ["DbcMapping", "FramePart", "Signal"]
 
 FLOATS: Final = {16: ">e", 32: ">f", 64: ">d"}
 
@@ -65,7 +65,7 @@ class Signal:
 
 
 @dataclass(frozen=True)
-class Part:
+class FramePart:
     """A frame that every sample has: a message, with these values of its multiplexers.
 
     Attributes:
@@ -88,7 +88,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Mapping:
+class DbcMapping:
     """How a sample is put together.
 
     Attributes:
@@ -104,7 +104,7 @@ class Mapping:
     """
 
     spec: ArraySpec
-    parts: tuple[Part, ...]
+    parts: tuple[FramePart, ...]
     cells: tuple[tuple[Signal, tuple[int, ...]], ...]
     gain: NDArray[np.float64]
     bias: NDArray[np.float64]
@@ -113,4 +113,4 @@ class Mapping:
     status: tuple[Signal, tuple[int, ...]] | None
     tick_ns: float | None
     invalid: int
-    commands: tuple[tuple[str, Frame, int | None], ...]
+    commands: tuple[tuple[str, CanFrame, int | None], ...]

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 from cantools.database.errors import Error as DatabaseError
 
-from tactile_rt.drivers.codec import Frame
-from tactile_rt.drivers.codecs.dbc_layout import Mapping, Part, Signal
+from tactile_rt.drivers.codec import CanFrame
+from tactile_rt.drivers.codecs.dbc_layout import DbcMapping, FramePart, Signal
 from tactile_rt.stream import ArraySpec, ConfigError
 
 __all__ = ["read_mapping"]
@@ -74,7 +74,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 _STRUCTS = (_File, _Channel, _Element, _Time, _Status, _Command)
 
 
-def read_mapping(path: Path) -> Mapping:
+def read_mapping(path: Path) -> DbcMapping:
     """Read a mapping and the DBC file that it names.
 
     Raises:
@@ -118,7 +118,7 @@ class _Reader:
         # (message, multiplexers' values) of each signal that is used
         self.used: dict[tuple[str, str], tuple[tuple[str, frozenset[int]], ...]] = {}
 
-    def mapping(self) -> Mapping:
+    def mapping(self) -> DbcMapping:
         file, path = self.file, self.path
         spec = self._spec()
         names = [c.name for c in file.channel]
@@ -144,7 +144,7 @@ class _Reader:
         ]
         parts = self._parts()
         counter, time, status = (None if s is None else (s, self._in(s, parts)) for s in singles)
-        return Mapping(
+        return DbcMapping(
             spec,
             parts,
             tuple((s, self._in(s, parts)) for s in signals),
@@ -212,7 +212,7 @@ class _Reader:
             raise ConfigError(f"{self.path}, {what}: {wanted.signal} must be of whole numbers")
         return signal
 
-    def _parts(self) -> tuple[Part, ...]:
+    def _parts(self) -> tuple[FramePart, ...]:
         chains = {(of, frozenset(chain)) for (of, _), chain in self.used.items()}
         # what every frame of a message has belongs to each of its multiplexed parts
         last = [c for c in chains if not any(c[0] == o[0] and c[1] < o[1] for o in chains)]
@@ -232,12 +232,12 @@ class _Reader:
                 )
             )
             extended = bool(message.is_extended_frame)
-            part = Part(message.frame_id, extended, message.length, when, message)
+            part = FramePart(message.frame_id, extended, message.length, when, message)
             rank = order.index(of) if order else message.frame_id
             parts.append((rank, sorted(min(v) for _, v in when), part))
         return tuple(part for *_, part in sorted(parts, key=lambda p: p[:2]))
 
-    def _in(self, signal: Signal, parts: Sequence[Part]) -> tuple[int, ...]:
+    def _in(self, signal: Signal, parts: Sequence[FramePart]) -> tuple[int, ...]:
         needs = self.used[signal.message, signal.name]
         return tuple(
             i
@@ -246,7 +246,7 @@ class _Reader:
             and {(m, v) for m, v in needs} <= {(s.name, v) for s, v in part.when}
         )
 
-    def _command(self, number: int, command: _Command) -> tuple[str, Frame, int | None]:
+    def _command(self, number: int, command: _Command) -> tuple[str, CanFrame, int | None]:
         where = f"{self.path}, command {number}"
         try:
             data = bytes.fromhex(command.data)
@@ -256,7 +256,7 @@ class _Reader:
             raise ConfigError(f"{where}: id {command.id:#x} has over 11 bits: add extended = true")
         if len(data) > 64:
             raise ConfigError(f"{where}: a CAN frame has at most 64 bytes, not {len(data)}")
-        frame = Frame(command.id, data, command.extended, fd=len(data) > 8)
+        frame = CanFrame(command.id, data, command.extended, fd=len(data) > 8)
         return command.when, frame, command.answer
 
 

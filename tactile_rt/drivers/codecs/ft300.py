@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.drivers.codec import Event, Samples, SerialCodec, Step
+from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.frame_finder import FrameFinder
 from tactile_rt.drivers.codecs.framing import crc16_modbus
 from tactile_rt.drivers.codecs.six_axis import six_axis
@@ -87,11 +87,11 @@ class Ft300(SerialCodec):
             np.array(damaged, np.int64),
         )
 
-    def commands(self, event: Event) -> tuple[Step[bytes], ...]:
+    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
         jam = Step(b"\xff" * JAM, pause_s=SILENCE_S)
-        if event == Event.START:  # it may be streaming, and then takes no request
+        if event == Command.START:  # it may be streaming, and then takes no request
             return (jam, Step(self._request, self._echo, what="the request to stream"))
-        return (jam,) if event == Event.STOP else ()
+        return (jam,) if event == Command.STOP else ()
 
     def forget(self) -> None:
         self._finder.forget()

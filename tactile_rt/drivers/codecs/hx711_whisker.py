@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.drivers.codec import Batch, Event, Samples, SerialCodec, Step
+from tactile_rt.drivers.codec import Command, SampleBatch, Samples, SerialCodec, Step
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
 __all__ = ["Hx711Whisker", "Hx711WhiskerOptions"]
@@ -99,7 +99,7 @@ class Hx711Whisker(SerialCodec):
 
     def feed(self, packet: bytes, t_ns: int) -> Samples | None:
         self._data += packet
-        batch = Batch()
+        batch = SampleBatch()
         at = 0
         while (end := self._data.find(END, at)) >= 0:
             self._between(self._data[at:end], batch)
@@ -112,9 +112,9 @@ class Hx711Whisker(SerialCodec):
             del self._data[:-keep]
         return batch.take(self._shape, t_ns)
 
-    def commands(self, event: Event) -> tuple[Step[bytes], ...]:
+    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
         tell = f"N={self._options.whiskers}\n".encode()
-        if event == Event.START:
+        if event == Command.START:
             begin: tuple[Step[bytes], ...] = (Step(tell),)
             if self._options.reset:
                 begin = (
@@ -122,7 +122,7 @@ class Hx711Whisker(SerialCodec):
                     Step(tell, b"OK", timeout_s=2.0, what="the number of whiskers"),
                 )
             return (*begin, Step(b"S")) if self._options.indicator else begin
-        return (Step(b"E"),) if event == Event.STOP and self._options.indicator else ()
+        return (Step(b"E"),) if event == Command.STOP and self._options.indicator else ()
 
     def forget(self) -> None:
         self._data.clear()
@@ -148,7 +148,7 @@ class Hx711Whisker(SerialCodec):
         self._heard = heard[last:][-3:]
         return answer
 
-    def _between(self, segment: bytearray, batch: Batch) -> None:
+    def _between(self, segment: bytearray, batch: SampleBatch) -> None:
         """Take what came between two endings: one frame, if nothing is damaged."""
         size = self._body + len(END)
         length = self._dropped + len(segment)

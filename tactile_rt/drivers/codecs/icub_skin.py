@@ -6,7 +6,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
+from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
 from tactile_rt.drivers.codecs.rounds import Rounds
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
@@ -109,8 +109,8 @@ class IcubSkin(CanCodec):
     def forget(self) -> None:
         self._rounds.forget()
 
-    def feed(self, packet: Sequence[Frame], t_ns: int) -> Samples | None:
-        batch, stats, parts = Batch(), self.stats, self._part
+    def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
+        batch, stats, parts = SampleBatch(), self.stats, self._part
         for identifier, data, extended, _, remote in packet:
             part = parts.get(identifier - self._first)
             if part is None or extended or remote:
@@ -125,7 +125,7 @@ class IcubSkin(CanCodec):
                 self._sample(batch, ended)
         return batch.take((len(self._numbers) * TAXELS, 1), t_ns)
 
-    def _sample(self, batch: Batch, parts: list[bytes | None]) -> None:
+    def _sample(self, batch: SampleBatch, parts: list[bytes | None]) -> None:
         self.stats.incomplete += None in parts
         counts = bytearray()
         valid: list[bool] = []
@@ -143,10 +143,10 @@ class IcubSkin(CanCodec):
         batch.valid.append(valid)
         batch.status.append(status)
 
-    def commands(self, event: Event) -> tuple[Step[Sequence[Frame]], ...]:
+    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
         options = self._options
         if options.firmware == "old":
-            if event != Event.START:
+            if event != Command.START:
                 return ()
             mask = sum(1 << n for n in self._numbers)
             # the makers' defaults but for the mask of triangles
@@ -154,9 +154,9 @@ class IcubSkin(CanCodec):
                 self._send(OLD_SETUP, 1, 1, 1, 0, 0x20, 0, 0),
                 self._send(OLD_SETUP_2, 2, 0x22, 0xF0, 0, *mask.to_bytes(2, "little"), 0x0A),
             )
-        if event == Event.STOP:
+        if event == Command.STOP:
             return (self._send(SET_TX_MODE, 1),)
-        if event == Event.START:
+        if event == Command.START:
             offset = OFFSET.to_bytes(2, "little")
             return (
                 # skin type 0: triangles with temperature compensation; counts at rest: 245
@@ -167,26 +167,26 @@ class IcubSkin(CanCodec):
             )
         return ()
 
-    def _send(self, *data: int) -> Step[Sequence[Frame]]:
-        return Step((Frame(CONFIGURE_ID | self._options.board, bytes(data)),), pause_s=0.01)
+    def _send(self, *data: int) -> Step[Sequence[CanFrame]]:
+        return Step((CanFrame(CONFIGURE_ID | self._options.board, bytes(data)),), pause_s=0.01)
 
-    def encode(self, chunk: Chunk) -> list[Sequence[Frame]]:
+    def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:
         counts = np.clip(np.rint(np.nan_to_num(chunk.values[..., 0])), 0, 255).astype(np.uint8)
         shape = (-1, len(self._numbers), TAXELS)
         stuck = ~(chunk.valid & np.isfinite(chunk.values[..., 0]))
         errors = (stuck.reshape(shape) << np.arange(4, 4 + TAXELS)).sum(axis=2)
-        packets: list[Sequence[Frame]] = []
+        packets: list[Sequence[CanFrame]] = []
         for sample, error in zip(counts.reshape(shape), errors.tolist(), strict=True):
             packet = []
             for n, taxels, word in zip(self._numbers, sample, error, strict=True):
                 raw = taxels.tobytes()
                 tail = raw[IN_HEAD:] + word.to_bytes(2, "big")
-                packet.append(Frame(self._first | n, bytes((HEAD,)) + raw[:IN_HEAD]))
-                packet.append(Frame(self._first | n, bytes((TAIL,)) + tail))
+                packet.append(CanFrame(self._first | n, bytes((HEAD,)) + raw[:IN_HEAD]))
+                packet.append(CanFrame(self._first | n, bytes((TAIL,)) + tail))
             packets.append(packet)
         return packets
 
-    def respond(self, packet: Sequence[Frame]) -> Sequence[Frame]:
+    def respond(self, packet: Sequence[CanFrame]) -> Sequence[CanFrame]:
         for frame in packet:
             mine = frame.id == CONFIGURE_ID | self._options.board and not frame.extended
             if mine and len(frame.data) == 2 and frame.data[0] == SET_TX_MODE:

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.drivers.codec import Event, Samples, SerialCodec, Step
+from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.frame_finder import FrameFinder
 from tactile_rt.drivers.codecs.six_axis import six_axis
 from tactile_rt.stream import Chunk, ConfigError
@@ -85,11 +85,11 @@ class Kwr75(SerialCodec):
             np.array(damaged, np.int64),
         )
 
-    def commands(self, event: Event) -> tuple[Step[bytes], ...]:
+    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
         stop = Step(STOP, pause_s=SETTLE_S)
-        if event == Event.START:
+        if event == Command.START:
             return (stop,) if self.polls else (stop, Step(STREAM))
-        if event == Event.POLL:
+        if event == Command.POLL:
             return (Step(ONCE),) if self.polls else ()
         return (stop,)
 

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.drivers.codec import Batch, Samples, SerialCodec
+from tactile_rt.drivers.codec import SampleBatch, Samples, SerialCodec
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
 __all__ = ["MlxHex", "MlxHexOptions"]
@@ -111,7 +111,7 @@ class MlxHex(SerialCodec):
     def feed(self, packet: bytes, t_ns: int) -> Samples | None:
         self._data += packet
         *lines, self._data = self._data.split(b"\n")
-        batch, digits = Batch(), bytearray()
+        batch, digits = SampleBatch(), bytearray()
         for line in lines:
             self._line(line.removesuffix(b"\r"), batch, digits)
         if len(self._data) > LONGEST:
@@ -144,7 +144,7 @@ class MlxHex(SerialCodec):
             for row, ok in zip(raw, good.tolist(), strict=True)
         ]
 
-    def _line(self, line: bytearray, batch: Batch, digits: bytearray) -> None:
+    def _line(self, line: bytearray, batch: SampleBatch, digits: bytearray) -> None:
         overlong, self._overlong = self._overlong, False
         found = None if overlong or len(line) > LONGEST else _LINE.fullmatch(line)
         if found is None:

@@ -17,7 +17,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.drivers.codec import Event, Samples, SerialCodec, Step
+from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
 from tactile_rt.drivers.codecs.native_common import (
     FORMATS,
@@ -26,8 +26,8 @@ from tactile_rt.drivers.codecs.native_common import (
     RANGE_NM,
     STATUS,
     UNKNOWN,
-    Description,
-    Message,
+    DeviceDescription,
+    MessageType,
     check_ranges,
     pack_valid,
     quantise,
@@ -101,7 +101,7 @@ class NativeSerial(SerialCodec):
     def __init__(self, options: NativeOptions) -> None:
         super().__init__(read_array(options.array))
         self._format, self._ranges = FORMATS[options.format], (options.range_n, options.range_nm)
-        self._described: Description | None = None
+        self._described: DeviceDescription | None = None
         self._rest = b""  # of a frame that is not complete
         self._synchronised = True
         self._damaged = 0  # samples, since the last intact one
@@ -118,7 +118,7 @@ class NativeSerial(SerialCodec):
         parts: list[NDArray[Any]] = []
         flags = b""
         for kind, head, payload in self._frames(packet):
-            if kind == Message.SAMPLE:
+            if kind == MessageType.SAMPLE:
                 if self.spec is None:
                     continue  # nothing can be said of it yet
                 shape = head[7:9]
@@ -133,8 +133,8 @@ class NativeSerial(SerialCodec):
                 flags += payload[:bits]
                 rows.append((t_ns, self._damaged, head[5], head[6], head[4]))
                 self._damaged = 0
-            elif kind == Message.DESCRIPTION:
-                found = Description.from_json(payload)
+            elif kind == MessageType.DESCRIPTION:
+                found = DeviceDescription.from_json(payload)
                 if found is None:
                     self._refuse()
                     continue
@@ -152,16 +152,20 @@ class NativeSerial(SerialCodec):
             valid &= finite.all(axis=2)
         return Samples(values, valid, *np.array(rows, np.int64).T)
 
-    def commands(self, event: Event) -> tuple[Step[bytes], ...]:
-        if event == Event.START:
-            ask = Step(frame(Message.DESCRIBE), _reply(Message.DESCRIPTION), what="its description")
-            start = Step(frame(Message.START))
+    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
+        if event == Command.START:
+            ask = Step(
+                frame(MessageType.DESCRIBE), _reply(MessageType.DESCRIPTION), what="its description"
+            )
+            start = Step(frame(MessageType.START))
             return (start,) if self.spec and not self._described else (ask, start)
-        return (Step(frame(Message.STOP)),) if event == Event.STOP else ()
+        return (Step(frame(MessageType.STOP)),) if event == Command.STOP else ()
 
     def whisk(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> Step[bytes]:
         """The command that sets an active array's whisking."""
-        return Step(frame(Message.WHISK, WHISKING.pack(frequency_hz, amplitude_rad, offset_rad)))
+        return Step(
+            frame(MessageType.WHISK, WHISKING.pack(frequency_hz, amplitude_rad, offset_rad))
+        )
 
     def forget(self) -> None:
         self._rest = b""
@@ -189,7 +193,7 @@ class NativeSerial(SerialCodec):
                 body = values.astype("<f4").tobytes()
             packets.append(
                 frame(
-                    Message.SAMPLE,
+                    MessageType.SAMPLE,
                     pack_valid(valid) + body,
                     format=self._format,
                     seq=seq,
@@ -203,14 +207,14 @@ class NativeSerial(SerialCodec):
         answer = b""
         for kind, _, payload in self._frames(packet):
             error = 0
-            if kind in Message.FROM_DEVICE:
+            if kind in MessageType.FROM_DEVICE:
                 continue  # an echo of our own; answering answers would never end
-            if kind == Message.DESCRIBE:
-                answer += frame(Message.DESCRIPTION, self._description().to_json())
+            if kind == MessageType.DESCRIBE:
+                answer += frame(MessageType.DESCRIPTION, self._description().to_json())
                 continue
-            if kind in (Message.START, Message.STOP):
-                self.streaming = kind == Message.START
-            elif kind == Message.WHISK and len(payload) == WHISKING.size:
+            if kind in (MessageType.START, MessageType.STOP):
+                self.streaming = kind == MessageType.START
+            elif kind == MessageType.WHISK and len(payload) == WHISKING.size:
                 asked = WHISKING.unpack(payload)
                 if np.isfinite(asked).all() and self.may_whisk(*asked):
                     self.whisking = asked
@@ -218,15 +222,15 @@ class NativeSerial(SerialCodec):
                     error = IMPOSSIBLE
             else:
                 error = UNKNOWN
-            answer += frame(Message.ACK, bytes((kind, error)))
+            answer += frame(MessageType.ACK, bytes((kind, error)))
         return answer
 
     # both
 
-    def _description(self) -> Description:
+    def _description(self) -> DeviceDescription:
         if self._described is None:
             assert self.spec is not None
-            self._described = Description.of(self.spec, *self._ranges)
+            self._described = DeviceDescription.of(self.spec, *self._ranges)
         return self._described
 
     def _scale(self) -> NDArray[np.float64]:
@@ -276,7 +280,7 @@ class NativeSerial(SerialCodec):
             at = end + CRC.size
             self._synchronised = True
             kind = head[1] & 15
-            if head[1] >> 4 != VERSION or (kind == Message.SAMPLE and not _fits(head)):
+            if head[1] >> 4 != VERSION or (kind == MessageType.SAMPLE and not _fits(head)):
                 self._refuse()
                 continue
             self.stats.intact += 1

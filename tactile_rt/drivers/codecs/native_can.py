@@ -22,7 +22,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
+from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
 from tactile_rt.drivers.codecs.native_can_parts import (
     FLOAT32,
     LONG,
@@ -39,8 +39,8 @@ from tactile_rt.drivers.codecs.native_common import (
     RANGE_NM,
     STATUS,
     UNKNOWN,
-    Description,
-    Message,
+    DeviceDescription,
+    MessageType,
     check_ranges,
     pack_valid,
     quantise,
@@ -107,7 +107,7 @@ class NativeCan(CanCodec):
         self._base, self._fd = options.base, options.fd
         self._float32 = options.format == "float32"
         self._ranges = options.range_n, options.range_nm
-        self._described: Description | None = None
+        self._described: DeviceDescription | None = None
         self._sample = SampleParts(self.stats)
         self._text = DescriptionParts()
         self.streaming = False
@@ -120,8 +120,8 @@ class NativeCan(CanCodec):
 
     # the host's side
 
-    def feed(self, packet: Sequence[Frame], t_ns: int) -> Samples | None:
-        batch = Batch()
+    def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
+        batch = SampleBatch()
         first, stats, sample = self._base, self.stats, self._sample
         described = self._description()
         for identifier, data, extended, _, remote in packet:
@@ -140,12 +140,12 @@ class NativeCan(CanCodec):
         return batch.take(self.spec.shape, t_ns) if self.spec else None
 
     def _describe(self, data: bytes) -> None:
-        if len(data) < 4 or data[0] != Message.DESCRIPTION:
+        if len(data) < 4 or data[0] != MessageType.DESCRIPTION:
             self._sample.refuse()
             return
         self.stats.intact += 1
         found = self._text.add(data)
-        if not isinstance(found, Description):
+        if not isinstance(found, DeviceDescription):
             if found is False:
                 self._sample.refuse()
             return
@@ -155,35 +155,35 @@ class NativeCan(CanCodec):
         else:
             self._described, self.spec = found, found.spec
 
-    def commands(self, event: Event) -> tuple[Step[Sequence[Frame]], ...]:
-        if event == Event.START:
-            ask = self._command(Message.DESCRIBE, "its description", 2.0)
-            start = self._command(Message.START, "the answer to START", 1.0)
+    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+        if event == Command.START:
+            ask = self._command(MessageType.DESCRIBE, "its description", 2.0)
+            start = self._command(MessageType.START, "the answer to START", 1.0)
             return (start,) if self.spec and not self._described else (ask, start)
-        if event == Event.STOP:
-            return (Step((self._frame(COMMAND, bytes((Message.STOP,))),)),)
+        if event == Command.STOP:
+            return (Step((self._frame(COMMAND, bytes((MessageType.STOP,))),)),)
         return ()
 
-    def _command(self, kind: int, what: str, timeout_s: float) -> Step[Sequence[Frame]]:
+    def _command(self, kind: int, what: str, timeout_s: float) -> Step[Sequence[CanFrame]]:
         frame = self._frame(COMMAND, bytes((kind,)))
         return Step((frame,), self._base + ACK, timeout_s, what=what)
 
     def whisk(
         self, frequency_hz: float, amplitude_rad: float, offset_rad: float
-    ) -> Step[Sequence[Frame]]:
+    ) -> Step[Sequence[CanFrame]]:
         """The command that sets an active array's whisking (to 65 Hz and 3.2 rad)."""
         wanted = np.array([frequency_hz * 1e3, amplitude_rad * 1e4, offset_rad * 1e4])
         counts = np.clip(np.rint(np.nan_to_num(wanted)), (0, -32767, -32767), (65535, 32767, 32767))
-        data = WHISKING.pack(Message.WHISK, *counts.astype(int).tolist())
+        data = WHISKING.pack(MessageType.WHISK, *counts.astype(int).tolist())
         return Step((self._frame(COMMAND, data),))
 
     # the device's side
 
-    def encode(self, chunk: Chunk) -> list[Sequence[Frame]]:
+    def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:
         described = self._description()
         assert described is not None
         flags = (LONG if self._fd else 0) | (FLOAT32 if self._float32 else 0)
-        packets: list[Sequence[Frame]] = []
+        packets: list[Sequence[CanFrame]] = []
         for seq, t_ns, values, valid in zip(
             chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True
         ):
@@ -205,29 +205,29 @@ class NativeCan(CanCodec):
             )
         return packets
 
-    def respond(self, packet: Sequence[Frame]) -> Sequence[Frame]:
-        answer: list[Frame] = []
+    def respond(self, packet: Sequence[CanFrame]) -> Sequence[CanFrame]:
+        answer: list[CanFrame] = []
         for frame in packet:
             mine = frame.id == self._base + COMMAND and not frame.extended and not frame.remote
-            if not mine or not frame.data or frame.data[0] in Message.FROM_DEVICE:
+            if not mine or not frame.data or frame.data[0] in MessageType.FROM_DEVICE:
                 continue
             kind = frame.data[0]
             error = self._obey(kind, frame.data, answer)
-            answer.append(self._frame(ACK, bytes((Message.ACK, kind, error))))
+            answer.append(self._frame(ACK, bytes((MessageType.ACK, kind, error))))
         return answer
 
-    def _obey(self, kind: int, data: bytes, answer: list[Frame]) -> int:
+    def _obey(self, kind: int, data: bytes, answer: list[CanFrame]) -> int:
         """Do what the host says, adding to the answer; the error number of the ACK."""
-        if kind == Message.DESCRIBE:
+        if kind == MessageType.DESCRIBE:
             described = self._description()
             if described is None:
                 return IMPOSSIBLE
             size = 64 if self._fd else 8
-            pieces = cut_description(Message.DESCRIPTION, described.to_json(), size)
+            pieces = cut_description(MessageType.DESCRIPTION, described.to_json(), size)
             answer += [self._frame(DESCRIPTION, piece) for piece in pieces]
-        elif kind in (Message.START, Message.STOP):
-            self.streaming = kind == Message.START
-        elif kind == Message.WHISK and len(data) >= WHISKING.size:
+        elif kind in (MessageType.START, MessageType.STOP):
+            self.streaming = kind == MessageType.START
+        elif kind == MessageType.WHISK and len(data) >= WHISKING.size:
             _, mhz, amplitude, offset = WHISKING.unpack_from(data)
             asked = (mhz / 1e3, amplitude / 1e4, offset / 1e4)
             if not self.may_whisk(*asked):
@@ -239,12 +239,12 @@ class NativeCan(CanCodec):
 
     # both
 
-    def _frame(self, which: int, data: bytes) -> Frame:
+    def _frame(self, which: int, data: bytes) -> CanFrame:
         if self._fd and len(data) > 8:
             data = data.ljust(next(n for n in LENGTHS if n >= len(data)), b"\0")
-        return Frame(self._base + which, data, fd=self._fd)
+        return CanFrame(self._base + which, data, fd=self._fd)
 
-    def _description(self) -> Description | None:
+    def _description(self) -> DeviceDescription | None:
         if self._described is None and self.spec is not None:
-            return Description.of(self.spec, *self._ranges)
+            return DeviceDescription.of(self.spec, *self._ranges)
         return self._described

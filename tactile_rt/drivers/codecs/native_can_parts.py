@@ -6,9 +6,9 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.drivers.codec import Batch, WireStats
+from tactile_rt.drivers.codec import SampleBatch, WireStats
 from tactile_rt.drivers.codecs.framing import crc16_xmodem
-from tactile_rt.drivers.codecs.native_common import Description, unpack_valid
+from tactile_rt.drivers.codecs.native_common import DeviceDescription, unpack_valid
 
 __all__ = ["DescriptionParts", "SampleParts", "cut_description", "head_of", "sample_parts"]
 
@@ -66,7 +66,7 @@ class SampleParts:
         self._stats.corrupt += 1
         self._damaged += 1
 
-    def header(self, batch: Batch, data: bytes, described: Description | None) -> None:
+    def header(self, batch: SampleBatch, data: bytes, described: DeviceDescription | None) -> None:
         """Take a header; what came before it has ended."""
         if len(data) != HEAD.size or data[7] not in FLAGS:
             self.refuse()
@@ -87,7 +87,7 @@ class SampleParts:
         self._parts, self._missing = [None] * parts, parts
         self._last = self._payload - self._size * (parts - 1)
 
-    def part(self, batch: Batch, data: bytes, described: Description | None) -> None:
+    def part(self, batch: SampleBatch, data: bytes, described: DeviceDescription | None) -> None:
         """Take a part; deliver the sample that it completes."""
         if len(data) < 3:
             self.refuse()
@@ -115,14 +115,14 @@ class SampleParts:
             self._head = None
             self.refuse()
 
-    def _without_header(self, batch: Batch, low: int) -> None:
+    def _without_header(self, batch: SampleBatch, low: int) -> None:
         """A part of a sample whose header was lost: the one before it has ended."""
         self._close(batch)
         if self._low >= 0:  # else it began before we listened
             self._stats.incomplete += 1
         self._low = low
 
-    def _close(self, batch: Batch) -> None:
+    def _close(self, batch: SampleBatch) -> None:
         """Deliver the open sample, whole or not."""
         head, self._head = self._head, None
         if head is None:
@@ -168,7 +168,7 @@ class DescriptionParts:
         self._text = bytearray()
         self._next = -1  # index; -1: none before the first
 
-    def add(self, data: bytes) -> Description | bool | None:
+    def add(self, data: bytes) -> DeviceDescription | bool | None:
         """Take a part.
 
         Returns:
@@ -188,7 +188,7 @@ class DescriptionParts:
         self._text, self._next = bytearray(), -1
         if zlib.crc32(text).to_bytes(4, "little") != check:
             return False
-        return Description.from_json(text) or False
+        return DeviceDescription.from_json(text) or False
 
 
 def cut_description(kind: int, text: bytes, size: int) -> list[bytes]:

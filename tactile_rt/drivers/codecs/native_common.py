@@ -16,8 +16,8 @@ __all__ = [
     "RANGE_NM",
     "STATUS",
     "UNKNOWN",
-    "Description",
-    "Message",
+    "DeviceDescription",
+    "MessageType",
     "check_ranges",
     "pack_valid",
     "quantise",
@@ -44,12 +44,12 @@ STATUS: Final = {
 }
 
 
-class Message:
+class MessageType:
     """Types of frames."""
 
     SAMPLE = 0
     DESCRIBE = 1  # host: what are you?
-    DESCRIPTION = 2  # device: JSON, see `Description`
+    DESCRIPTION = 2  # device: JSON, see `DeviceDescription`
     START = 3
     STOP = 4
     WHISK = 5  # host: move the whiskers like this
@@ -59,7 +59,7 @@ class Message:
 
 
 @dataclass(frozen=True)
-class Description:
+class DeviceDescription:
     """What a native device says of itself.
 
     Attributes:
@@ -73,7 +73,7 @@ class Description:
     @classmethod
     def of(
         cls, spec: ArraySpec, range_n: float = RANGE_N, range_nm: float = RANGE_NM
-    ) -> "Description":
+    ) -> "DeviceDescription":
         """With scales for these largest forces and moments, and +-pi rad."""
         full = {"N": range_n, "N m": range_nm, "rad": RANGE_RAD}
         return cls(spec, tuple(full.get(unit, 1.0) / 32767 for unit in spec.units))
@@ -84,7 +84,7 @@ class Description:
         return msgspec.json.encode({"spec": spec, "scale": self.scale})
 
     @classmethod
-    def from_json(cls, text: bytes) -> "Description | None":
+    def from_json(cls, text: bytes) -> "DeviceDescription | None":
         """Read a payload; None if it is not one."""
         try:
             fields = msgspec.json.decode(text, type=dict[str, msgspec.Raw])

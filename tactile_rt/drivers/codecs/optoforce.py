@@ -18,7 +18,15 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.drivers.codec import CanCodec, Event, Frame, Samples, SerialCodec, Step, WireStats
+from tactile_rt.drivers.codec import (
+    CanCodec,
+    CanFrame,
+    Command,
+    Samples,
+    SerialCodec,
+    Step,
+    WireStats,
+)
 from tactile_rt.drivers.codecs.frame_finder import FrameFinder
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
@@ -190,10 +198,10 @@ class OptoForceSerial(SerialCodec):
     def feed(self, packet: bytes, t_ns: int) -> Samples | None:
         return self._messages.decode(*self._messages.finder.find(packet), t_ns)
 
-    def commands(self, event: Event) -> tuple[Step[bytes], ...]:
-        if event == Event.START:
+    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
+        if event == Command.START:
             return (Step(_settings(self._options), _summed(ANSWER + b"\0"), what="its settings"),)
-        return (Step(_settings(self._options, stop=True)),) if event == Event.STOP else ()
+        return (Step(_settings(self._options, stop=True)),) if event == Command.STOP else ()
 
     def forget(self) -> None:
         self._messages.finder.forget()
@@ -252,16 +260,16 @@ class OptoForceCan(CanCodec):
         self.spec = self._messages.spec
         self._id, self._host_id = options.ids()
 
-    def feed(self, packet: Sequence[Frame], t_ns: int) -> Samples | None:
+    def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
         mine = [f.data for f in packet if f.id == self._id and not (f.extended or f.remote)]
         self.stats.skipped += len(packet) - len(mine)
         return self._messages.decode(*self._messages.finder.find(b"".join(mine)), t_ns)
 
-    def commands(self, event: Event) -> tuple[Step[Sequence[Frame]], ...]:
-        if event == Event.START:
+    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+        if event == Command.START:
             settings = self._frames(self._host_id, _settings(self._options), fill=True)
             return (Step(settings, self._id, what="its settings"),)
-        if event == Event.STOP:
+        if event == Command.STOP:
             settings = self._frames(self._host_id, _settings(self._options, stop=True), fill=True)
             return (Step(settings),)
         return ()
@@ -269,20 +277,20 @@ class OptoForceCan(CanCodec):
     def forget(self) -> None:
         self._messages.finder.forget()
 
-    def encode(self, chunk: Chunk) -> list[Sequence[Frame]]:
+    def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:
         return [self._frames(self._id, message) for message in self._messages.encode(chunk)]
 
-    def respond(self, packet: Sequence[Frame]) -> Sequence[Frame]:
+    def respond(self, packet: Sequence[CanFrame]) -> Sequence[CanFrame]:
         heard = b"".join(f.data for f in packet if f.id == self._host_id and not f.extended)
         answer, streaming = self._messages.respond(heard)
         self.streaming = self.streaming if streaming is None else streaming
         return self._frames(self._id, answer)
 
     @staticmethod
-    def _frames(id: int, message: bytes, fill: bool = False) -> list[Frame]:
+    def _frames(id: int, message: bytes, fill: bool = False) -> list[CanFrame]:
         if fill:  # the board wants whole frames
             message += bytes(-len(message) % 8)
-        return [Frame(id, message[at : at + 8]) for at in range(0, len(message), 8)]
+        return [CanFrame(id, message[at : at + 8]) for at in range(0, len(message), 8)]
 
 
 def _summed(message: bytes) -> bytes:

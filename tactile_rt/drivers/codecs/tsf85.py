@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.drivers.codec import Batch, Event, Samples, SerialCodec, Step
+from tactile_rt.drivers.codec import Command, SampleBatch, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import ByteBuffer
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
@@ -110,7 +110,7 @@ class Tsf85(SerialCodec):
     # the host's side
 
     def feed(self, packet: bytes, t_ns: int) -> Samples | None:
-        batch = Batch()
+        batch = SampleBatch()
         for command, signals in self._packets(self._buffer, packet):
             if command in (READ, SEND, SEND_WHEN_NEW):
                 for signal, data in signals:
@@ -118,7 +118,7 @@ class Tsf85(SerialCodec):
         assert self.spec is not None
         return batch.take(self.spec.shape, t_ns)
 
-    def _take(self, batch: Batch, signal: tuple[int, int], data: bytes) -> None:
+    def _take(self, batch: SampleBatch, signal: tuple[int, int], data: bytes) -> None:
         if signal not in self._needed:
             return
         if self._ends_sample(signal):
@@ -138,7 +138,7 @@ class Tsf85(SerialCodec):
             return signal in self._set
         return self._order.index(signal) <= self._order.index(next(reversed(self._set)))
 
-    def _deliver(self, batch: Batch) -> None:
+    def _deliver(self, batch: SampleBatch) -> None:
         assert self.spec is not None
         got: list[NDArray[np.float64]] = []
         valid: list[bool] = []
@@ -162,11 +162,11 @@ class Tsf85(SerialCodec):
             ticks = int.from_bytes(self._set[TIME, 0], "big")
             batch.ticks.append(ticks % 2**self.tick_bits)
 
-    def commands(self, event: Event) -> tuple[Step[bytes], ...]:
+    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
         stop = Step(_packet(SEND, b"\0"), pause_s=SETTLE_S)
-        if event == Event.START:
+        if event == Command.START:
             return stop, Step(_packet(SEND, bytes((self._options.period_ms,))))
-        return (stop,) if event == Event.STOP else ()
+        return (stop,) if event == Command.STOP else ()
 
     # the device's side
 

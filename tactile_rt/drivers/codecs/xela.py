@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.drivers.codec import Batch, CanCodec, Event, Frame, Samples, Step
+from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
 from tactile_rt.drivers.codecs.rounds import Rounds
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
@@ -84,8 +84,8 @@ class Xela(CanCodec):
     def forget(self) -> None:
         self._rounds.forget()
 
-    def feed(self, packet: Sequence[Frame], t_ns: int) -> Samples | None:
-        batch, stats, first = Batch(), self.stats, self._first
+    def feed(self, packet: Sequence[CanFrame], t_ns: int) -> Samples | None:
+        batch, stats, first = SampleBatch(), self.stats, self._first
         for identifier, data, extended, _, remote in packet:
             taxel = identifier - first
             if extended or remote or not 0 <= taxel < TAXELS:
@@ -98,27 +98,31 @@ class Xela(CanCodec):
                     self._sample(batch, taxels)
         return batch.take((TAXELS, 3), t_ns)
 
-    def _sample(self, batch: Batch, taxels: list[bytes | None]) -> None:
+    def _sample(self, batch: SampleBatch, taxels: list[bytes | None]) -> None:
         valid = [t is not None for t in taxels]
         self.stats.incomplete += not all(valid)
         raw = b"".join([t or bytes(XYZ.size) for t in taxels])
         batch.values.append(np.frombuffer(raw, ">u2"))
         batch.valid.append(valid)
 
-    def commands(self, event: Event) -> tuple[Step[Sequence[Frame]], ...]:
-        if event == Event.START:  # how to stop it is not public: it stops without power
-            return (Step((Frame(CONTROL_ID | self._board, START),)),)
+    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+        if event == Command.START:  # how to stop it is not public: it stops without power
+            return (Step((CanFrame(CONTROL_ID | self._board, START),)),)
         return ()
 
-    def encode(self, chunk: Chunk) -> list[Sequence[Frame]]:
+    def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:
         counts = np.clip(np.rint(np.nan_to_num(chunk.values)), 0, 0xFFFF).astype(">u2")
         valid = chunk.valid & np.isfinite(chunk.values).all(axis=2)
         return [
-            [Frame(self._first + i, b"\0" + sample[i].tobytes()) for i in range(TAXELS) if there[i]]
+            [
+                CanFrame(self._first + i, b"\0" + sample[i].tobytes())
+                for i in range(TAXELS)
+                if there[i]
+            ]
             for sample, there in zip(counts, valid, strict=True)
         ]
 
-    def respond(self, packet: Sequence[Frame]) -> Sequence[Frame]:
+    def respond(self, packet: Sequence[CanFrame]) -> Sequence[CanFrame]:
         for frame in packet:
             if frame.id == CONTROL_ID | self._board and frame.data == START:
                 self.streaming = True

@@ -18,8 +18,7 @@ from tactile_rt.drivers.emulation.endpoints import Endpoint
 from tactile_rt.drivers.emulation.faults import QUIET_S, FaultSchedule
 from tactile_rt.drivers.emulation.fitting import fit
 from tactile_rt.drivers.emulation.transmitter import EmulatedClock, Transmitter
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source
-from tactile_rt.timebase import NS_PER_S
+from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, EndOfStream, Source
 
 __all__ = ["PACES", "Emulator"]
 

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Generic
 
-from tactile_rt.drivers.codec import Frame, Packet
+from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.emulation.pseudo_terminal import Pty
 from tactile_rt.drivers.slcan import SlcanAdapter
 from tactile_rt.stream import ConfigError
@@ -137,7 +137,7 @@ class SerialEndpoint(_PtyEndpoint[bytes]):
         self.pty.write(draw.randbytes(amount))
 
 
-class SlcanEndpoint(_PtyEndpoint[Sequence[Frame]]):
+class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
     """A device on a CAN bus with an slcan adapter on a pty: frames come once the channel is open.
 
     Args:
@@ -167,7 +167,7 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[Frame]]):
         self.pty.plug()
         self.address = f"can:slcan:{self.pty.name}"
 
-    def receive(self, timeout_s: float) -> Sequence[Frame]:
+    def receive(self, timeout_s: float) -> Sequence[CanFrame]:
         data = self.pty.read(timeout_s)
         if not data:
             return []
@@ -176,7 +176,7 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[Frame]]):
             self.pty.write(answer, answer=True)
         return frames
 
-    def send(self, packet: Sequence[Frame], answer: bool = False) -> bool:
+    def send(self, packet: Sequence[CanFrame], answer: bool = False) -> bool:
         with self.pty.lock:
             data = self.adapter.encode(packet, time.monotonic_ns())
             return bool(data) and self.pty.write(data, answer)
@@ -190,7 +190,7 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[Frame]]):
         self.adapter.flags |= BUS_ERROR
 
 
-class BusEndpoint(Endpoint[Sequence[Frame]]):
+class BusEndpoint(Endpoint[Sequence[CanFrame]]):
     """A device on a bus of python-can.
 
     Args:
@@ -243,20 +243,20 @@ class BusEndpoint(Endpoint[Sequence[Frame]]):
     def close(self) -> None:
         self.pull()
 
-    def receive(self, timeout_s: float) -> Sequence[Frame]:
+    def receive(self, timeout_s: float) -> Sequence[CanFrame]:
         import can
 
         bus = self._bus
         if bus is None:
             time.sleep(min(timeout_s, LOOK_S))
             return []
-        frames: list[Frame] = []
+        frames: list[CanFrame] = []
         try:
             message = bus.recv(min(timeout_s, WAIT_S))
             while message is not None:
                 if not message.is_error_frame:
                     frames.append(
-                        Frame(
+                        CanFrame(
                             message.arbitration_id, bytes(message.data), message.is_extended_id,
                             message.is_fd, message.is_remote_frame,
                         )
@@ -266,7 +266,7 @@ class BusEndpoint(Endpoint[Sequence[Frame]]):
             time.sleep(LOOK_S)  # pulled out meanwhile, or the bus is off
         return frames
 
-    def send(self, packet: Sequence[Frame], answer: bool = False) -> bool:
+    def send(self, packet: Sequence[CanFrame], answer: bool = False) -> bool:
         import can
 
         return self._put(
@@ -279,7 +279,7 @@ class BusEndpoint(Endpoint[Sequence[Frame]]):
 
     def disturb(self, amount: int, draw: random.Random) -> None:
         for _ in range(-(-amount // 8)):  # 29 bits: no device of ours has such an identifier
-            self.send([Frame(1 << 28 | draw.getrandbits(28), draw.randbytes(8), extended=True)])
+            self.send([CanFrame(1 << 28 | draw.getrandbits(28), draw.randbytes(8), extended=True)])
 
     def error(self, frames: int) -> None:
         import can

@@ -9,8 +9,7 @@ from tactile_rt.drivers.codec import Codec
 from tactile_rt.drivers.emulation.damage import DeviceLog, Fate, damaged
 from tactile_rt.drivers.emulation.endpoints import Endpoint
 from tactile_rt.drivers.emulation.faults import QUIET_S, Fault, FaultSchedule
-from tactile_rt.stream import Chunk
-from tactile_rt.timebase import NS_PER_S
+from tactile_rt.stream import NS_PER_S, Chunk
 
 __all__ = ["EmulatedClock", "Transmitter"]
 

@@ -23,7 +23,7 @@ from tactile_rt.models.alignment.benchmark_file import (
     save_benchmark,
 )
 from tactile_rt.models.alignment.building import build
-from tactile_rt.models.alignment.neural import Animal, Session
+from tactile_rt.models.alignment.neural import Animal, NeuralSession
 from tactile_rt.models.alignment.rdm import STIMULI, rsa, stimulus_index
 from tactile_rt.models.alignment.scoring import Score, layer_rdms, score, score_rdms
 
@@ -34,8 +34,8 @@ __all__ = [
     "Benchmark",
     "Consistency",
     "Frozen",
+    "NeuralSession",
     "Score",
-    "Session",
     "Target",
     "benchmark_sha256",
     "build",

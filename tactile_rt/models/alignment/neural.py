@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.stream import ConfigError
 
-__all__ = ["Animal", "Session", "by_animal", "pad", "published_layout", "rates_sha256"]
+__all__ = ["Animal", "NeuralSession", "by_animal", "pad", "published_layout", "rates_sha256"]
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Session:
+class NeuralSession:
     """One recording of one animal.
 
     Attributes:
@@ -51,10 +51,10 @@ class Animal:
     """An animal and its sessions; every session recorded units of its own."""
 
     name: str
-    sessions: tuple[Session, ...]
+    sessions: tuple[NeuralSession, ...]
 
 
-def by_animal(sessions: Sequence[Session]) -> tuple[Animal, ...]:
+def by_animal(sessions: Sequence[NeuralSession]) -> tuple[Animal, ...]:
     """Sessions gathered by animal, animals in the order of their names."""
     names = sorted({session.animal for session in sessions})
     return tuple(Animal(n, tuple(s for s in sessions if s.animal == n)) for n in names)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.models.alignment.neural import Session
+from tactile_rt.models.alignment.neural import NeuralSession
 from tactile_rt.models.alignment.nwb_parts import (
     TRIALS,
     animal_name,
@@ -70,7 +70,7 @@ def read_nwb(
     files: Iterable[Path],
     window: str = "contact",
     progress: Callable[[float], None] = lambda share: None,
-) -> tuple[list[Session], list[str]]:
+) -> tuple[list[NeuralSession], list[str]]:
     """Sessions of NWB files.
 
     Args:
@@ -98,7 +98,7 @@ def read_nwb(
 
 def read_session(
     path: Path, window: str = "contact", progress: Callable[[float], None] = lambda share: None
-) -> tuple[Session, list[str]]:
+) -> tuple[NeuralSession, list[str]]:
     """One NWB file; see `read_nwb`."""
     if window not in WINDOWS:
         raise ConfigError(f"no window {window!r}: there are {', '.join(WINDOWS)}")
@@ -117,7 +117,7 @@ def read_session(
 
 def _session(
     file: "h5py.File", path: Path, window: str, progress: Callable[[float], None]
-) -> tuple[Session, list[str]]:
+) -> tuple[NeuralSession, list[str]]:
     trials = trial_columns(file, path)
     kept = (
         ~booleans(trials["ignore_trial"], path)
@@ -157,7 +157,7 @@ def _session(
         )
     stimulus = np.array([stimulus_index(shapes[r], places[r]) for r in rows], dtype=np.int64)
     rates = _rates(spike_times(file, path), starting_time(file, path), start, stop, progress)
-    return Session(animal_name(file, path), path.stem, rates, stimulus), notes
+    return NeuralSession(animal_name(file, path), path.stem, rates, stimulus), notes
 
 
 def _first_contacts(contacts: Floats, start: Floats, stop: Floats) -> Floats:

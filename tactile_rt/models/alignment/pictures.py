@@ -47,7 +47,7 @@ class Point:
     error: float = 0.0
 
 
-class Frame:
+class PlotArea:
     """A plot's area and its vertical axis, which holds all finite values and 0."""
 
     def __init__(self, values: Values, width: float, height: float, bottom: float) -> None:
@@ -87,7 +87,7 @@ def bars(columns: Sequence[Bar], levels: Sequence[Level], title: str, label: str
     values = [v for b in columns for v in (b.value, b.mark, *(d for _, d in b.dots))]
     values += [v for at in levels for v in (at.value - at.half, at.value + at.half)]
     longest = max((len(b.name) for b in columns), default=0)
-    frame = Frame(values, 960.0, 330.0 + 5.0 * longest, 24.0 + 5.0 * longest)
+    frame = PlotArea(values, 960.0, 330.0 + 5.0 * longest, 24.0 + 5.0 * longest)
     out = []
     there = [at for at in levels if math.isfinite(at.value)]
     for at in there:
@@ -122,7 +122,9 @@ def scatter(
     points: Sequence[Point], x_title: str, y_title: str, label: str, log: bool = False
 ) -> str:
     """Models as points, each with its name, and the least-squares line through three or more."""
-    frame = Frame([v for p in points for v in (p.y - p.error, p.y + p.error)], 720.0, 400.0, 52.0)
+    frame = PlotArea(
+        [v for p in points for v in (p.y - p.error, p.y + p.error)], 720.0, 400.0, 52.0
+    )
     xs = np.array([p.x for p in points])
     xs = np.log10(xs) if log else xs
     ys = np.array([p.y for p in points])
@@ -219,7 +221,7 @@ def ticks(low: float, high: float, about: int = 6) -> list[float]:
     return [round(k * step, 10) for k in range(first, math.floor(high / step) + 1)]
 
 
-def _bar(bar: Bar, frame: Frame, x: float, wide: float) -> list[str]:
+def _bar(bar: Bar, frame: PlotArea, x: float, wide: float) -> list[str]:
     zero = frame.y(0)
     if math.isfinite(bar.value):
         y = frame.y(bar.value)

@@ -9,7 +9,7 @@ import numpy as np
 
 from tactile_rt.files import write_whole
 from tactile_rt.models.alignment.pictures import Bar, Level, Point, bars, heat_map, scatter
-from tactile_rt.models.alignment.results import Control, ModelResult, Number, Results
+from tactile_rt.models.alignment.results import AlignmentControl, ModelResult, Number, Results
 
 __all__ = ["page", "write_page"]
 
@@ -312,7 +312,7 @@ def _raw_bar(results: Results) -> Bar:
     return Bar("raw input", _means(results, results.raw)["raw"], "raw", _dots(results, row))
 
 
-def _means(results: Results, of: ModelResult | Control) -> dict[str, float]:
+def _means(results: Results, of: ModelResult | AlignmentControl) -> dict[str, float]:
     """By layer, mean over the reliable targets; NaN without any."""
     out = {}
     for layer, row in zip(of.layers, of.corrected, strict=True):

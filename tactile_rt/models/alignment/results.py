@@ -18,8 +18,8 @@ from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.stream import ConfigError
 
 __all__ = [
+    "AlignmentControl",
     "BenchmarkResult",
-    "Control",
     "ModelResult",
     "Results",
     "baseline_of",
@@ -33,7 +33,7 @@ VERSION = 1
 Number = float | None  # None in the file where there is no value
 
 
-class Control(msgspec.Struct, frozen=True):
+class AlignmentControl(msgspec.Struct, frozen=True):
     """What a score is compared with: raw sensor input, or an untrained network.
 
     Attributes:
@@ -79,7 +79,7 @@ class ModelResult(msgspec.Struct, frozen=True):
     null_95: Number
     performance: Number = None
     performance_of: str = ""
-    untrained: Control | None = None
+    untrained: AlignmentControl | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -111,7 +111,7 @@ class Results(msgspec.Struct, frozen=True):
 
     benchmark: BenchmarkResult
     models: tuple[ModelResult, ...]
-    raw: Control
+    raw: AlignmentControl
     raw_rdm: tuple[Number, ...]
     input: dict[str, str]
     stimuli: tuple[str, ...] = STIMULI
@@ -240,8 +240,8 @@ def baseline_of(path: Path, benchmark: Benchmark) -> Mapping[str, float]:
     }
 
 
-def _control(name: str, made: Score) -> Control:
-    return Control(
+def _control(name: str, made: Score) -> AlignmentControl:
+    return AlignmentControl(
         name=name,
         layers=made.layers,
         corrected=_table(made.corrected),

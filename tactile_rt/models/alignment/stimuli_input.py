@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.contact import CHANNEL_FLOOR
+from tactile_rt.classifier.contact import CHANNEL_FLOOR
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.stream import ArraySpec, ConfigError
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.models.alignment.benchmark import Benchmark, Consistency, Frozen, Target
-from tactile_rt.models.alignment.neural import Animal, Session, rates_sha256
+from tactile_rt.models.alignment.neural import Animal, NeuralSession, rates_sha256
 from tactile_rt.models.alignment.pooling import Moments, moments_of
 from tactile_rt.models.alignment.rdm import STIMULI, pearson
 from tactile_rt.models.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
@@ -149,18 +149,20 @@ def _refuse_copies(animals: Sequence[Animal]) -> None:
         seen[key] = session.name
 
 
-def _canonical(session: Session) -> Session:
+def _canonical(session: NeuralSession) -> NeuralSession:
     """The same trials in an order that depends on their values alone."""
     order = np.lexsort((*session.rates.T, session.stimulus))
-    return Session(session.animal, session.name, session.rates[order], session.stimulus[order])
+    return NeuralSession(
+        session.animal, session.name, session.rates[order], session.stimulus[order]
+    )
 
 
-def _sha256(*sessions: Session) -> str:
+def _sha256(*sessions: NeuralSession) -> str:
     arrays = {f"{i} rates": s.rates for i, s in enumerate(sessions)}
     return rates_sha256(arrays | {f"{i} stimulus": s.stimulus for i, s in enumerate(sessions)})
 
 
-def _pools(sessions: Sequence[Session], bootstraps: int, seed: int) -> tuple[_Pool, _Pool]:
+def _pools(sessions: Sequence[NeuralSession], bootstraps: int, seed: int) -> tuple[_Pool, _Pool]:
     """All units, and the reliable ones, of an animal's sessions."""
     every, kept = [], []
     for session in sessions:
@@ -179,7 +181,7 @@ def _pools(sessions: Sequence[Session], bootstraps: int, seed: int) -> tuple[_Po
     return _sum(every), _sum(kept)
 
 
-def disjoint_trials(session: Session, rng: np.random.Generator) -> tuple[Trials, Trials]:
+def disjoint_trials(session: NeuralSession, rng: np.random.Generator) -> tuple[Trials, Trials]:
     """Trials to choose units on, and the others, to score on: rows of every stimulus."""
     choosing, scoring = [], []
     for stimulus in range(len(STIMULI)):

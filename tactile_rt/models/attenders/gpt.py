@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-__all__ = ["BLOCK", "GPT", "HEADS", "LAYERS", "MAX_STEPS", "TOKENS", "Block"]
+__all__ = ["BLOCK", "GPT", "HEADS", "LAYERS", "MAX_STEPS", "TOKENS", "TransformerBlock"]
 
 HEADS = 4
 LAYERS = 8
@@ -17,7 +17,7 @@ MAX_STEPS = BLOCK // 2
 TOKENS = 2  # a step's observation, then the action token
 
 
-class Block(nn.Module):
+class TransformerBlock(nn.Module):
     """Pre-norm transformer layer: x + attention(norm(x)), then x + MLP(norm(x))."""
 
     def __init__(self, width: int, dropout: float) -> None:
@@ -78,7 +78,7 @@ class GPT(nn.Module):
         self.action = nn.Parameter(torch.randn(inputs))
         self.project_in = nn.Linear(inputs, width)
         self.positions = nn.Parameter(torch.empty(BLOCK, width))
-        self.blocks = nn.ModuleList(Block(width, dropout) for _ in range(LAYERS))
+        self.blocks = nn.ModuleList(TransformerBlock(width, dropout) for _ in range(LAYERS))
         self.norm = nn.LayerNorm(width)
         self.project_out = nn.Linear(width, width, bias=False)
         nn.init.normal_(self.positions, std=0.02)
@@ -128,7 +128,7 @@ class GPT(nn.Module):
         x = self._embed(features) + positions[index]
         keys, values = [], []
         for layer, block in enumerate(self.blocks):
-            assert isinstance(block, Block)
+            assert isinstance(block, TransformerBlock)
             q, k, v = block.heads(x)
             keys.append(torch.where(here, k[:, :, None], state["gpt_k"][:, layer]))
             values.append(torch.where(here, v[:, :, None], state["gpt_v"][:, layer]))

@@ -85,7 +85,7 @@ class ConvNorm(nn.Module):
         return self.matrix() * gain.repeat(sites)[:, None], bias.repeat(sites)
 
 
-class Block(nn.Module):
+class ResidualBlock(nn.Module):
     """relu(x + norm(conv(relu(norm(conv(x)))))), with x projected where its shape changes."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, shape: Shape) -> None:
@@ -116,7 +116,7 @@ class ResNet18Encoder(nn.Module):
         inputs, blocks = channels[0], []
         for i, outputs in enumerate(channels):
             for stride in (1 if i == 0 else 2, 1):
-                blocks.append(Block(inputs, outputs, stride, shape))
+                blocks.append(ResidualBlock(inputs, outputs, stride, shape))
                 inputs, shape = outputs, blocks[-1].shape
         assert shape == (1, 1)  # so there is nothing left to average
         self.blocks = nn.ModuleList(blocks)
@@ -160,7 +160,7 @@ class FoldedResNet18(nn.Module):
         self._add("stem", encoder.stem)
         self.count = len(encoder.blocks)
         for i, block in enumerate(encoder.blocks):
-            assert isinstance(block, Block)
+            assert isinstance(block, ResidualBlock)
             self._add(f"{i}_first", block.first)
             self._add(f"{i}_second", block.second)
             if block.shortcut is not None:

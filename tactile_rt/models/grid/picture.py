@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from tactile_rt.models.grid.plan import SUPERVISED, SVM
-from tactile_rt.models.grid.results import Results, Row
+from tactile_rt.models.grid.results import GridResults, Row
 from tactile_rt.models.intervals import Interval
 
 __all__ = ["draw_grid"]
@@ -25,7 +25,7 @@ PALE = 0.3
 ROW_INCH, BAR = 0.34, 0.4
 
 
-def draw_grid(results: Results, path: Path) -> None:
+def draw_grid(results: GridResults, path: Path) -> None:
     """Draw top-1 of every cell and of its untrained network, with 95 % intervals, as a PNG."""
     svm = next((row.top1 for row in results.rows if row.name == SVM), None)
     networks = [row for row in results.rows if row.name != SVM]

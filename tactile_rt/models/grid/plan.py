@@ -17,13 +17,22 @@ from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.training import TrainingConfig
 from tactile_rt.stream import ConfigError
 
-__all__ = ["Cell", "Grid", "Pair", "Question", "Sweeps", "Task", "read_grid", "shipped_grids"]
+__all__ = [
+    "Candidate",
+    "Grid",
+    "Pair",
+    "Question",
+    "SweepCounts",
+    "Task",
+    "read_grid",
+    "shipped_grids",
+]
 
 SHIPPED = resources.files("tactile_rt.models.grid")
 SUPERVISED, RANDOM, SVM = "supervised", "random", "svm"
 
 
-class Cell(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One network and how it learns.
 
     Attributes:
@@ -62,7 +71,7 @@ class Cell(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.network + ("" if self.objective == SUPERVISED else f" {self.learning}")
 
 
-class Sweeps(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SweepCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """How many sweeps of each object are taken; 0: all."""
 
     train: int = 0
@@ -95,7 +104,7 @@ class Task(msgspec.Struct, frozen=True):
 
     name: str
     seed: int
-    cell: Cell | None
+    cell: Candidate | None
 
     @property
     def slug(self) -> str:
@@ -125,12 +134,12 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     data: str
-    cells: tuple[Cell, ...] = msgspec.field(name="cell")
+    cells: tuple[Candidate, ...] = msgspec.field(name="cell")
     width: float = 0.125
     updates: int = 600
     batch: int = 32
     seeds: int = 3
-    sweeps: Sweeps = Sweeps()
+    sweeps: SweepCounts = SweepCounts()
     supervised: dict[str, Any] = {}
     self_supervised: dict[str, Any] = {}
     probe: dict[str, Any] = {}
@@ -174,7 +183,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 tasks.append(Task(cell.name, seed, cell))
                 if cell.network not in seen:
                     seen.add(cell.network)
-                    bare = Cell(cell.encoder, cell.attender, width=cell.width)
+                    bare = Candidate(cell.encoder, cell.attender, width=cell.width)
                     tasks.append(Task(f"{RANDOM} {cell.network}", seed, bare))
         return tasks
 

@@ -16,7 +16,7 @@ from tactile_rt.models.grid.work import SUBSET, Outcome, read_outcome
 from tactile_rt.models.intervals import Interval, accuracy
 from tactile_rt.stream import ConfigError
 
-__all__ = ["Answer", "Results", "Row", "gather", "put_into", "table", "write_results"]
+__all__ = ["Answer", "GridResults", "Row", "gather", "put_into", "table", "write_results"]
 
 BEGIN, END = "<!-- grid: begin -->", "<!-- grid: end -->"
 
@@ -68,7 +68,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Results:
+class GridResults:
     """Everything that a grid has found so far."""
 
     rows: tuple[Row, ...]
@@ -78,7 +78,7 @@ class Results:
     classes: int
 
 
-def gather(grid: Grid, folder: Path) -> Results:
+def gather(grid: Grid, folder: Path) -> GridResults:
     """Read the outcomes that there are.
 
     Raises:
@@ -109,7 +109,7 @@ def gather(grid: Grid, folder: Path) -> Results:
             difference = _difference(found.get(pair.better), found.get(pair.than), objects)
             if difference is not None:
                 answers.append(Answer(question.text, pair.better, pair.than, difference))
-    return Results(
+    return GridResults(
         tuple(rows),
         tuple(answers),
         len(set(objects.tolist())),
@@ -159,7 +159,7 @@ def _difference(
     return accuracy(np.stack([mine[s].astype(np.float64) - theirs[s] for s in seeds]), objects)
 
 
-def table(results: Results) -> str:
+def table(results: GridResults) -> str:
     """Markdown: every cell, then every comparison."""
     lines = [
         f"Top-1 on {results.objects} objects that no network trained on ({results.sweeps} sweeps, "
@@ -204,7 +204,7 @@ def _percent(one: Interval | None) -> str:
     return f"{100 * one.value:.1f} [{100 * one.low:.1f}, {100 * one.high:.1f}]"
 
 
-def write_results(results: Results, folder: Path) -> None:
+def write_results(results: GridResults, folder: Path) -> None:
     """Write `results.json` and `results.csv` into a grid's folder."""
     text = msgspec.json.format(msgspec.json.encode(results), indent=1)
     write_whole(folder / "results.json", lambda file: file.write(text))

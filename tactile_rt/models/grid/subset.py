@@ -3,8 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-from tactile_rt.models.grid.plan import Sweeps
-from tactile_rt.recording import (
+from tactile_rt.models.grid.plan import SweepCounts
+from tactile_rt.sweep_set import (
     SET_VERSION,
     SPLITS,
     SweepManifest,
@@ -18,7 +18,7 @@ from tactile_rt.recording import (
 __all__ = ["write_subset"]
 
 
-def write_subset(source: Path, folder: Path, sweeps: Sweeps) -> None:
+def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
     """Write, or go on writing, the first sweeps of every object of a set.
 
     Args:

@@ -26,8 +26,8 @@ from tactile_rt.models.training import (
     run_on,
     train,
 )
-from tactile_rt.recording import SweepManifest
 from tactile_rt.stream import ConfigError, ModelError
+from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["Outcome", "Workbench", "outcome_path", "read_outcome", "settings_of"]
 

@@ -19,7 +19,7 @@ from torch import Generator, Tensor
 from tactile_rt.models.augmentation import Augmentation, Loads
 from tactile_rt.models.datasets import TrainingBatches
 
-__all__ = ["Batch", "Feed", "Share", "generator_of", "prefetched"]
+__all__ = ["Batch", "BatchFeed", "Share", "generator_of", "prefetched"]
 
 CPU = torch.device("cpu")
 AHEAD = 2  # batches that wait for the network: more only take memory
@@ -53,7 +53,7 @@ class Batch:
     index: int
 
 
-class Feed:
+class BatchFeed:
     """Epochs of batches, each view augmented afresh, on the device.
 
     Args:

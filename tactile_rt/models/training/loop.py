@@ -29,12 +29,12 @@ from tactile_rt.models.data_checks import check_sets, check_split
 from tactile_rt.models.datasets import SweepSet, TrainingBatches
 from tactile_rt.models.objectives import Autoencoder, Objective, SimCLR, SimSiam, Supervised
 from tactile_rt.models.training.config import Progress, TrainingConfig
-from tactile_rt.models.training.feeding import Feed, Share, generator_of
+from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
 from tactile_rt.models.training.logs import Board, log_epoch
 from tactile_rt.models.training.optimizers import build_optimizer, build_schedule
 from tactile_rt.models.training.validation import Validation
-from tactile_rt.recording import SweepManifest
 from tactile_rt.stream import ConfigError, ModelError
+from tactile_rt.sweep_set import SweepManifest
 
 if TYPE_CHECKING:
     from lightning.fabric import Fabric
@@ -82,7 +82,7 @@ def train(
     share = Share(fabric.global_rank, fabric.world_size)
     batches = TrainingBatches(training, config.batch, config.seed)
     augmentation = objective.augmentation
-    feed = Feed(batches, augmentation, objective.views, config.seed, share, fabric.device)
+    feed = BatchFeed(batches, augmentation, objective.views, config.seed, share, fabric.device)
     validate = Validation(config, validating, augmentation, share, fabric.device)
     optimizer = build_optimizer(objective, config)
     run = _Run(objective, optimizer, config, len(batches))

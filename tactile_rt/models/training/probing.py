@@ -19,8 +19,8 @@ from tactile_rt.models.ead import READOUTS
 from tactile_rt.models.evaluation import hits, predict
 from tactile_rt.models.training.config import Progress
 from tactile_rt.models.training.logs import log_epoch
-from tactile_rt.recording import SweepManifest
 from tactile_rt.stream import ConfigError
+from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["ProbeConfig", "linear_probe", "probe"]
 

@@ -13,10 +13,10 @@ from typing import Any
 import msgspec
 
 from tactile_rt.files import write_whole
-from tactile_rt.recording import SweepManifest
 from tactile_rt.sim_backend.datasets.card_survey import Card, survey
 from tactile_rt.sim_backend.datasets.separability import Separability
 from tactile_rt.stream import ArraySpec
+from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["write_card"]
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.recording import SweepManifest, has_object, read_object, read_skipped
 from tactile_rt.sim_backend.datasets.separability import (
     Features,
     Separability,
@@ -18,6 +17,7 @@ from tactile_rt.sim_backend.datasets.separability import (
     window_features,
 )
 from tactile_rt.stream import ArraySpec, RecordingError
+from tactile_rt.sweep_set import SweepManifest, has_object, read_object, read_skipped
 
 __all__ = ["Card", "survey"]
 

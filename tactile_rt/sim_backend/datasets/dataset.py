@@ -18,15 +18,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt import __version__
-from tactile_rt.recording import (
-    MANIFEST,
-    SweepManifest,
-    has_object,
-    read_skipped,
-    write_object,
-    write_skipped,
-)
+from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.sim_backend.arrays.whisker_array import load_animals
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, contact_distances
 from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
@@ -40,7 +32,15 @@ from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, world_spec
 from tactile_rt.stream import Chunk, ConfigError, SourceError, TactileError
-from tactile_rt.timebase import Resampler
+from tactile_rt.sweep_set import (
+    MANIFEST,
+    SweepManifest,
+    has_object,
+    read_skipped,
+    write_object,
+    write_skipped,
+)
+from tactile_rt.version import VERSION
 
 __all__ = ["describe_set", "fingerprint", "finished_objects", "make_sweeps", "simulate_sweep"]
 
@@ -75,7 +75,7 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
         withheld=objects.withheld,
         category_of=objects.category_of,
         versions={
-            "tactile_rt": __version__,
+            "tactile_rt": VERSION,
             **{p: version(p) for p in packages},
             "whiskers": hashlib.sha256(morphology.encode()).hexdigest()[:16],
         },

@@ -20,8 +20,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.recording import MANIFEST, SKIPPED
 from tactile_rt.sim_backend.datasets.sums import SUMS
+from tactile_rt.sweep_set import MANIFEST, SKIPPED
 
 __all__ = ["Journal", "SweepRecord", "remove_leftovers"]
 

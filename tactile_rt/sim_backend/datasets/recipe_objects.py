@@ -8,12 +8,12 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_rt.recording import SPLITS, WITHHELD, split_by_object
 from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
 from tactile_rt.sim_backend.datasets.recipes import SHAPES, ObjectChoice
 from tactile_rt.sim_backend.objects import catalogue as shapes
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
 from tactile_rt.stream import ConfigError
+from tactile_rt.sweep_set import SPLITS, WITHHELD, split_by_object
 
 if TYPE_CHECKING:
     from tactile_rt.sim_backend.objects.object_sets import ObjectSet

@@ -4,8 +4,8 @@ import hashlib
 from pathlib import Path
 
 from tactile_rt.files import write_whole
-from tactile_rt.recording import MANIFEST, SKIPPED, SweepManifest, has_object
 from tactile_rt.stream import RecordingError
+from tactile_rt.sweep_set import MANIFEST, SKIPPED, SweepManifest, has_object
 
 __all__ = ["SUMS", "check_sums", "write_sums", "written_sum"]
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_rt.recording import SKIPPED, has_object, object_path, read_skipped
 from tactile_rt.stream import RecordingError
+from tactile_rt.sweep_set import SKIPPED, has_object, object_path, read_skipped
 
 __all__ = ["Tally", "tally"]
 

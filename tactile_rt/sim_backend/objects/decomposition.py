@@ -28,7 +28,7 @@ from tactile_rt.sim_backend.objects.deviation import (
     FACES,
     TOUCHING,
     Deviation,
-    Surface,
+    TriangleSurface,
     deviation,
     shuffled,
     tiles,
@@ -123,7 +123,7 @@ class _Cutter:
     def __init__(self, solid: Manifold, tolerance: float) -> None:
         self.tolerance = tolerance
         self.solid = solid
-        self.surface = Surface(surface_of(solid).triangles)
+        self.surface = TriangleSurface(surface_of(solid).triangles)
         self.normals = np.cross(*np.diff(self.surface.tiles, axis=1).transpose(1, 0, 2))
         self.columns = self.surface.points.T.copy()
         self.work = 0

@@ -14,7 +14,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, cKDTree
 
-__all__ = ["Deviation", "Surface", "deviation", "gap", "shuffled", "tiles"]
+__all__ = ["Deviation", "TriangleSurface", "deviation", "gap", "shuffled", "tiles"]
 
 Floats = NDArray[np.float64]
 
@@ -65,7 +65,7 @@ def tiles(triangles: Floats, size: float = TILE) -> Floats:
     return np.concatenate(done) if done else triangles
 
 
-class Surface:
+class TriangleSurface:
     """A surface to measure distances from.
 
     Attributes:
@@ -111,7 +111,7 @@ class Surface:
             floor = max(floor, float(best[some].max()))
 
 
-def deviation(drawn: Surface, pieces: Sequence[trimesh.Trimesh]) -> Deviation:
+def deviation(drawn: TriangleSurface, pieces: Sequence[trimesh.Trimesh]) -> Deviation:
     """Distance between a surface and the outside of the union of convex pieces.
 
     Args:
@@ -123,13 +123,13 @@ def deviation(drawn: Surface, pieces: Sequence[trimesh.Trimesh]) -> Deviation:
     every = np.concatenate(parts)
     across = np.cross(every[:, 1] - every[:, 0], every[:, 2] - every[:, 0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    made = Surface(every[~_inside(every.mean(axis=1) + OUTWARD * across, pieces, owner)])
+    made = TriangleSurface(every[~_inside(every.mean(axis=1) + OUTWARD * across, pieces, owner)])
     missed, beyond = made.distance(drawn.points), drawn.distance(made.middles)
     # a tile is outside if its middle is; a point that lies in no piece may be nearest to any tile
     far = np.flatnonzero(missed > missed.max() / 2)
     far = far[~_inside(drawn.points[far], pieces)]
     if len(far):
-        missed[far] = np.minimum(missed[far], Surface(every).distance(drawn.points[far]))
+        missed[far] = np.minimum(missed[far], TriangleSurface(every).distance(drawn.points[far]))
     points = np.concatenate([drawn.points, made.middles])
     gaps = np.concatenate([missed, beyond])
     return Deviation(points, gaps, float(missed.max()), float(beyond.max()))

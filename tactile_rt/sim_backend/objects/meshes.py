@@ -23,7 +23,7 @@ import numpy as np
 import trimesh
 
 from tactile_rt.sim_backend.objects.decomposition import cut_solid
-from tactile_rt.sim_backend.objects.deviation import Surface, deviation
+from tactile_rt.sim_backend.objects.deviation import TriangleSurface, deviation
 from tactile_rt.sim_backend.objects.manifolds import (
     bodies_of,
     in_unit_box,
@@ -214,11 +214,11 @@ def _make_pieces(path: Path, detail: MeshDetail, turned: bool) -> Pieces:
     # and not how far it is from these.
     if detail.hull or detail.broken == "hull":
         pieces = normalised([mesh.convex_hull])
-        return Pieces(pieces, deviation(Surface(mesh.triangles), pieces).beyond, "hull")
+        return Pieces(pieces, deviation(TriangleSurface(mesh.triangles), pieces).beyond, "hull")
     tolerance = max(detail.max_error_mm / detail.size_mm, REMESH_TOLERANCE)
     parts, found = cut_solid(closed_round(mesh), tolerance, detail.max_pieces)
     pieces = normalised(parts)
-    error = max(deviation(Surface(mesh.triangles), pieces).beyond, found.missed)
+    error = max(deviation(TriangleSurface(mesh.triangles), pieces).beyond, found.missed)
     return Pieces(pieces, error, "remeshed")
 
 
@@ -237,7 +237,7 @@ def _closed_pieces(mesh: trimesh.Trimesh, path: Path, detail: MeshDetail) -> Pie
         )
     if detail.hull:
         pieces = normalised([mesh.convex_hull])
-        return Pieces(pieces, deviation(Surface(mesh.triangles), pieces).largest, "hull")
+        return Pieces(pieces, deviation(TriangleSurface(mesh.triangles), pieces).largest, "hull")
     surfaces = [surface_of(body) for body in bodies]
     if len(bodies) <= detail.max_pieces and all(surface.is_convex for surface in surfaces):
         return Pieces(normalised(surfaces), 0.0, "bodies")

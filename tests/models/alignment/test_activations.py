@@ -6,7 +6,7 @@ import pytest
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
-from tactile_rt.model_file import load_model, shipped_model  # noqa: E402
+from tactile_rt.classifier.model_file import load_model, shipped_model  # noqa: E402
 from tactile_rt.models.alignment.activations import (  # noqa: E402
     network_layers,
     reach,

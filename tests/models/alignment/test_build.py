@@ -5,11 +5,11 @@ import sys
 
 import numpy as np
 import pytest
-from brains import geometry, padded
 
 from tactile_rt.models.alignment import build
 from tactile_rt.models.alignment.published import read_published, write_published
 from tactile_rt.stream import ConfigError
+from tests.helpers.brains import geometry, padded
 
 
 @pytest.fixture

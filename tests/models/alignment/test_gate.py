@@ -3,7 +3,6 @@
 import hashlib
 import itertools
 
-import brains
 import msgspec
 import numpy as np
 import pytest
@@ -21,15 +20,14 @@ from tactile_rt.models.alignment.gate import (
 )
 from tactile_rt.models.alignment.scoring import score
 from tactile_rt.models.alignment.strict import freeze_strict
+from tests.helpers import brains
 
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
-from small_networks import stir  # noqa: E402
-
+from tactile_rt.classifier.model_file import METADATA_KEY, load_model, shipped_model  # noqa: E402
 from tactile_rt.export.onnx_step import export_step  # noqa: E402
 from tactile_rt.export.windows import window_graph  # noqa: E402
-from tactile_rt.model_file import METADATA_KEY, load_model, shipped_model  # noqa: E402
 from tactile_rt.models.alignment.activations import network_layers  # noqa: E402
 from tactile_rt.models.alignment.fidelity import (  # noqa: E402
     compare,
@@ -40,6 +38,7 @@ from tactile_rt.models.alignment.onnx_activations import onnx_layers  # noqa: E4
 from tactile_rt.models.alignment.stimuli_input import read_stimuli  # noqa: E402
 from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
 from tactile_rt.models.ead import EADConfig  # noqa: E402
+from tests.helpers.small_networks import stir  # noqa: E402
 
 FELT = read_stimuli()
 

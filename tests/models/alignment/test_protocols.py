@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from brains import animals, geometry, loop, padded, responses, session
 
-from tactile_rt.models.alignment.neural import Animal, Session, pad, published_layout
+from tactile_rt.models.alignment.neural import Animal, NeuralSession, pad, published_layout
 from tactile_rt.models.alignment.paper_code import freeze_paper_code
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.scoring import score, score_rdms
 from tactile_rt.models.alignment.strict import disjoint_trials, freeze_strict
 from tactile_rt.stream import ConfigError
+from tests.helpers.brains import animals, geometry, loop, padded, responses, session
 
 BOOTSTRAPS = 200
 
@@ -140,7 +140,7 @@ def test_a_session_that_lacks_a_stimulus_is_left_out_and_named():
     made = animals(rng, number=2)
     one = made[0].sessions[0]
     shown = one.stimulus != 4
-    poor = Session(one.animal, "poor", one.rates[shown], one.stimulus[shown])
+    poor = NeuralSession(one.animal, "poor", one.rates[shown], one.stimulus[shown])
     frozen = freeze_strict([Animal(made[0].name, (*made[0].sessions, poor)), made[1]], 20)
     assert frozen.notes == (
         "session poor left out: it has 0 of concave-medium, "
@@ -253,8 +253,8 @@ def test_paper_code_is_the_plain_loop_with_the_published_aggregates():
 
 def test_the_published_layout_has_the_published_mistakes():
     rates = np.arange(1.0, 15.0).reshape(7, 2)
-    first = Session("m", "first", rates, np.array([4, 0, 4, 1, 2, 3, 5]))
-    second = Session("m", "second", -rates[:6, :1], np.array([5, 4, 3, 2, 1, 0]))
+    first = NeuralSession("m", "first", rates, np.array([4, 0, 4, 1, 2, 3, 5]))
+    second = NeuralSession("m", "second", -rates[:6, :1], np.array([5, 4, 3, 2, 1, 0]))
     made = published_layout(Animal("m", (first, second)))
     assert made.shape == (7, 6, 3)
     # By first appearance: 4 is index 0 in one session, 1 in the other.
@@ -263,7 +263,7 @@ def test_the_published_layout_has_the_published_mistakes():
     assert made[2, :, 0].tolist() == [5, 0, 0, 0, 0, 0]
     assert made[1, :, 2].tolist() == [0, -3, 0, 0, 0, 0]
     assert np.isnan(made[6, :, 2]).all()  # padding
-    poor = Session("m", "poor", rates[:3], np.array([4, 0, 1]))
+    poor = NeuralSession("m", "poor", rates[:3], np.array([4, 0, 1]))
     with pytest.raises(ConfigError, match="poor has no correct trial of convex-far, concave-close"):
         published_layout(Animal("m", (poor,)))
 
@@ -279,7 +279,7 @@ def test_an_animal_without_an_rdm_is_named():
 
 def test_sessions_check_themselves():
     with pytest.raises(ConfigError, match="do not fit"):
-        Session("m", "s", np.zeros((3, 2)), np.zeros(4, dtype=np.int64))
+        NeuralSession("m", "s", np.zeros((3, 2)), np.zeros(4, dtype=np.int64))
     with pytest.raises(ConfigError, match="not finite"):
-        Session("m", "s", np.full((3, 2), np.nan), np.zeros(3, dtype=np.int64))
+        NeuralSession("m", "s", np.full((3, 2), np.nan), np.zeros(3, dtype=np.int64))
     assert len(STIMULI) == 6

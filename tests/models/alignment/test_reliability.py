@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from brains import geometry, loop, padded
 
 from tactile_rt.models.alignment.rdm import pearson, rdm
 from tactile_rt.models.alignment.reliability import (
@@ -17,6 +16,7 @@ from tactile_rt.models.alignment.reliability import (
     trial_mean,
 )
 from tactile_rt.stream import ConfigError
+from tests.helpers.brains import geometry, loop, padded
 
 PUBLISHED = Path(__file__).parent / "data" / "published_model_input.npz"
 BOOTSTRAPS = 120

@@ -4,7 +4,6 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
-import brains
 import msgspec
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from tactile_rt.models.alignment.results import (
 from tactile_rt.models.alignment.stimuli_input import read_stimuli
 from tactile_rt.models.alignment.strict import freeze_strict
 from tactile_rt.stream import ConfigError
+from tests.helpers import brains
 
 ALONE = {"meta", "line", "rect", "circle", "br"}
 

@@ -1,0 +1,1 @@
+"""Rigs for the brain benchmark: `tactile-rt bench align`."""

@@ -1,0 +1,1 @@
+"""Rigs for the daemon: `tactile-rt bench daemon`."""

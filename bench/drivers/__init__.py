@@ -1,0 +1,1 @@
+"""Rigs for the drivers: `tactile-rt bench drivers`."""

@@ -1,0 +1,188 @@
+"""What acquisition costs, what it adds, what it loses: serial and slcan, over ptys."""
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.drivers.metronome import Beat, Sent, play
+from bench.drivers.processes import Helper
+from bench.drivers.readers import Came, read_bare, read_sources
+from tactile_rt.drivers.opening import make_codec
+from tactile_rt.drivers.stamping import Stamper
+from tactile_rt.evidence.records import Record
+from tactile_rt.sources.synthetic import synthetic_spec
+from tactile_rt.stream import Chunk, SourceStats
+
+__all__ = ["can", "serial"]
+
+DEVICES_PPM = (0.0, 200.0, -200.0, 50.0)  # the clocks of the four devices
+SERIAL_QUICK_S, SERIAL_S = 8.0, 600.0
+CAN_QUICK_S, CAN_S, FAST_QUICK_S, FAST_S = 5.0, 600.0, 3.0, 20.0
+SETTLED_S = 30.0  # until the clock must be right
+WARM = 3000  # samples
+SATURATED_HZ = 145.0  # of 62 frames: 9,000 frames/s, as many as 1 Mbit/s carries
+
+
+class _Result(NamedTuple):
+    sent: list[Sent]
+    came: list[Came]
+    share: float  # of a core
+    bare: list[Came]
+    bare_share: float
+
+
+def _run(beat: Beat) -> _Result:
+    """Play a beat to our sources and, where it has twins, to a bare reader."""
+    with Helper(play, beat) as device:
+        addresses = device.hear()
+        query = "&".join(f"{k}={v}" for k, v in {"codec": "native", **beat.options}.items())
+        urls, paths = [f"{address}?{query}" for address, _ in addresses], [p for _, p in addresses]
+        if not beat.twins:
+            with Helper(read_sources, urls, beat.samples) as ours:
+                ours.hear()
+                sent = device.hear(60 + 10 * beat.seconds if beat.fast else beat.seconds)
+                came, share = ours.hear()
+            return _Result(sent, came, share, [], 0.0)
+        with Helper(read_bare, paths, beat.samples) as bare:
+            bare.hear()
+            with Helper(read_sources, urls, beat.samples) as ours:
+                ours.hear()
+                sent = device.hear(beat.seconds)
+                came, share = ours.hear()
+            bare_came, bare_share = bare.ask(sent[0].packet)
+        return _Result(sent, came, share, bare_came, bare_share)
+
+
+def serial(quick: bool) -> list[Record]:
+    """Four devices of 1 kHz x 869 B, and four twins read by `os.read` alone."""
+    seconds = SERIAL_QUICK_S if quick else SERIAL_S
+    beat = Beat("serial", DEVICES_PPM, 35, 1000.0, seconds, twins=True)
+    sent, came, share, bare, bare_share = _run(beat)
+    ours_us = np.concatenate([_late(c, s.at_ns) for c, s in zip(came, sent, strict=True)])
+    bare_us = np.concatenate([_late(c, s.twin_ns) for c, s in zip(bare, sent, strict=True)])
+    p50, p99 = np.percentile(ours_us, (50, 99)).tolist()
+    bare50, bare99 = np.percentile(bare_us, (50, 99)).tolist()
+    size, n = sent[0].packet, len(came)
+    what = f"{n} devices x {beat.rate_hz:g} Hz x {size} B over ptys, {seconds:g} s"
+    side = "a thread for each device; beside it, in a process of its own, os.read alone"
+    reads = sum(c.reads for c in came) / sum(len(c.seq) for c in came)
+    samples = n * beat.rate_hz
+    return [
+        Record("drivers.serial.lost", _lost(sent, came), "samples", "== 0", "", what),
+        Record(
+            "drivers.serial.cpu", 100 * share, "% of a core", "<= 15",
+            f"os.read alone: {100 * bare_share:.1f}",
+            f"{what}; process time of a thread for each, {1e6 * share / samples:.0f} us and "
+            f"{reads:.2f} reads a sample",
+        ),
+        Record(
+            "drivers.serial.added_p50", p50 - bare50, "us", "<= 100",
+            f"from the device's write to the caller: {p50:.0f}, os.read alone {bare50:.0f}", side,
+        ),
+        Record(
+            "drivers.serial.p99_over_bare", p99 / bare99, "x", "<= 2",
+            f"{p99:.0f} us, os.read alone {bare99:.0f}", side,
+        ),
+        Record(
+            "drivers.serial.warm", _warm_us(), "us/sample", "", "no cold caches",
+            "the same samples from memory, one after another: decoding, numbering, timing",
+        ),
+        *_clock(sent, came, seconds),
+    ]  # fmt: skip
+
+
+def _warm_us() -> float:
+    """CPU time of decoding, numbering and timing a sample when nothing comes between, us."""
+    encoder, decoder = (make_codec("serial", "native", {}) for _ in range(2))
+    spec = encoder.spec = decoder.spec = synthetic_spec(35, 6, 1000.0)
+    seq = np.arange(WARM, dtype=np.int64)
+    values = np.random.default_rng(0).normal(0, 1e-3, (WARM, *spec.shape)).astype(np.float32)
+    chunk = Chunk(seq, 1_000_000 * seq, values, np.ones(values.shape[:2], np.bool_))
+    packets = encoder.encode(chunk)
+    taken = []
+    for _ in range(5):
+        decoder.forget()
+        stamper = Stamper(decoder, spec, SourceStats())
+        began = time.thread_time()
+        for k, packet in enumerate(packets):
+            samples = decoder.feed(packet, 10**9 + 1_000_000 * k)
+            assert samples is not None
+            stamper.chunk(samples)
+        taken.append(1e6 * (time.thread_time() - began) / WARM)
+    return float(np.median(taken))
+
+
+def _clock(sent: list[Sent], came: list[Came], seconds: float) -> list[Record]:
+    """How well the drifting clocks of these devices were followed."""
+    after = SETTLED_S if seconds > 2 * SETTLED_S else seconds / 2
+    errors = []
+    for s, c in zip(sent, came, strict=True):
+        late = c.seq > after * len(s.due_ns) / seconds
+        errors.append(np.abs(c.told_ns - s.due_ns[c.seq])[late])
+    off = [
+        abs(c.drift_ppm - 1e6 * (1 / (1 + 1e-6 * ppm) - 1))
+        for c, ppm in zip(came, DEVICES_PPM, strict=True)
+    ]
+    how = f"clocks {', '.join(f'{p:+g}' for p in DEVICES_PPM)} ppm fast, over the ptys"
+    whole = seconds >= SERIAL_S
+    return [
+        Record(
+            "drivers.clock.live_error_p99", float(np.percentile(np.concatenate(errors), 99)) / 1e6,
+            "ms", "<= 1", f"after {after:g} s", how,
+        ),
+        Record(
+            "drivers.clock.live_drift_off", max(off), "ppm", "<= 2" if whole else "",
+            f"after {seconds:g} s; the bar is for ten minutes", f"{how}; worst of {len(off)}",
+        ),
+    ]  # fmt: skip
+
+
+def can(quick: bool) -> list[Record]:
+    """A saturated bus, and as many frames as come through, behind slcan."""
+    seconds = CAN_QUICK_S if quick else CAN_S
+    beat = Beat("slcan", (0.0,), 30, SATURATED_HZ, seconds)
+    sent, came, share, *_ = _run(beat)
+    frames = sent[0].packet
+    what = f"native int16, 30 x 6, {frames} frames a sample, slcan over a pty"
+    records = [
+        Record(
+            "drivers.can.saturated_lost", _lost(sent, came), "samples", "== 0",
+            "1 Mbit/s carries some 9,000 frames/s",
+            f"{what}; {frames * SATURATED_HZ:.0f} frames/s for {seconds:g} s",
+        ),
+        Record("drivers.can.saturated_cpu", 100 * share, "% of a core", how=what),
+    ]  # fmt: skip
+    most = FAST_QUICK_S if quick else FAST_S
+    beat = Beat("slcan", (0.0,), 30, 1000.0, most, fast=True)
+    sent, came, share, *_ = _run(beat)
+    at = came[0].at_ns
+    rate = frames * (len(at) - 1) / (at[-1] - at[0]) * 1e9
+    return [
+        *records,
+        Record(
+            "drivers.can.frames_per_s", rate, "frames/s", ">= 20000",
+            "python-can's slcan: 5,500", f"{what}; {frames * len(at)} frames as fast as they go",
+        ),
+        Record("drivers.can.fast_lost", _lost(sent, came), "samples", "== 0", "", what),
+        Record(
+            "drivers.can.frames_per_cpu_s", rate / share, "frames/s of CPU", how="process time",
+        ),
+    ]  # fmt: skip
+
+
+def _late(came: Came, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(n,) from the device's write to the caller, us; without the first half second."""
+    late = (came.at_ns - at_ns[came.seq]) / 1e3
+    kept: NDArray[np.float64] = late[min(500, len(late) // 4) :]
+    return kept
+
+
+def _lost(sent: list[Sent], came: list[Came]) -> int:
+    """Samples that were sent and did not come, or came wrongly numbered; refusals too."""
+    lost = 0
+    for s, c in zip(sent, came, strict=True):
+        lost += s.refused + len(np.setxor1d(np.arange(len(s.at_ns)), c.seq))
+        lost += c.stats.missing + c.stats.corrupt
+    return lost

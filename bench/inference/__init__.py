@@ -1,0 +1,1 @@
+"""Rigs for steps and windows of models: `tactile-rt bench inference`."""

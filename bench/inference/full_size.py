@@ -1,0 +1,74 @@
+"""The paper's largest networks at full size with random weights, to measure what a step costs."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import torch
+
+from tactile_rt import export
+from tactile_rt.classifier.contact import CHANNEL_FLOOR
+from tactile_rt.classifier.model_card import ModelCard
+from tactile_rt.classifier.model_file import read_model, shipped_model
+from tactile_rt.export.onnx_step import OPSET, step_graph, write_model
+from tactile_rt.export.precision import Precision
+from tactile_rt.models.datasets import STEPS, SUBSTEPS, channel_values
+from tactile_rt.models.ead import EADConfig
+from tactile_rt.models.training import TactileClassifier
+from tactile_rt.stream import ArraySpec
+from tactile_rt.version import VERSION
+
+__all__ = ["full_size_models", "random_model"]
+
+CLASSES = 117  # of the paper
+NETWORKS = (("intersection-ln", "none"), ("intersection-ln-gpt", "gpt"))
+FULL_PRECISIONS: tuple[Precision, ...] = ("fp32", "int8")
+PERIOD_NS = 9_000_000
+
+
+def full_size_models(folder: Path) -> list[tuple[str, Path]]:
+    """Intersection-LN without and with the GPT, each in fp32 and int8: (name, file).
+
+    A file that this release has written to the folder before is not written again.
+
+    Args:
+        folder: where they go, some 500 MB; made if it is not there.
+    """
+    spec = read_model(shipped_model())[0].array
+    sources = sorted(Path(export.__file__).parent.glob("*.py"))
+    digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:8]
+    files = []
+    for name, attender in NETWORKS:
+        for precision in FULL_PRECISIONS:
+            path = folder / f"{name}-{precision}-{VERSION}-{OPSET}-{digest}.onnx"
+            files.append((f"{name}-{precision}", path))
+            if path.exists():
+                continue
+            config = EADConfig(CLASSES, "zhuang-intersection-ln", attender)
+            model, card = random_model(spec, config, f"{name}-{precision}")
+            proto, state = step_graph(model, card, integer=precision == "int8")
+            write_model(proto, state, model, card, path, precision)
+    return files
+
+
+def random_model(
+    spec: ArraySpec, config: EADConfig, name: str, seed: int = 0
+) -> tuple[TactileClassifier, ModelCard]:
+    """An untrained network for an array, and the card of a file of it."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        model = TactileClassifier(spec, config).eval()
+    return model, ModelCard(
+        name=name,
+        spec=spec.to_json(),
+        period_ns=PERIOD_NS,
+        substeps=SUBSTEPS,
+        steps=STEPS,
+        labels=tuple(f"class {i}" for i in range(config.classes)),
+        state=(),
+        clip=tuple(model.inputs.clip.tolist()),
+        scale=tuple(model.inputs.scale.tolist()),
+        floor=tuple(channel_values(spec, CHANNEL_FLOOR).tolist()),
+        provenance={"weights": f"random, seed {seed}"},
+    )

@@ -1,0 +1,1 @@
+"""Rigs for accuracy and speed of training: `tactile-rt bench models`."""

@@ -1,0 +1,1 @@
+"""Rigs for the simulator: `tactile-rt bench sim`."""

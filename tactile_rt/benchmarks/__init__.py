@@ -1,1 +1,0 @@
-"""Where figures come from: `tactile-rt bench` and `tactile-rt eval`."""

@@ -1,1 +1,0 @@
-"""Benchmark area `daemon`: the real process between emulated arrays and live readers."""

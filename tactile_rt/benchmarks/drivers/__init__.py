@@ -1,1 +1,0 @@
-"""Benchmark area `drivers`: real drivers at one end of a line, emulated devices at the other."""

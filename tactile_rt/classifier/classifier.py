@@ -1,0 +1,224 @@
+"""The classifier: push chunks, get decisions. ONNX Runtime and numpy only.
+
+    Chunk -> Resampler -> ContactDetector -> model step (explicit state) -> Classification
+
+Contact onset starts an episode, and without contact there is no decision. There are two modes:
+
+- ``episode``: the recurrent state is zeroed at the onset, and every completed step gives a
+  decision, the last of them final. With `sure`, the first decision that is sure enough is final.
+- ``sliding``: as before until the first final decision; from there on, as long as the contact
+  lasts, one every few steps, each equal to that of an episode which began so many steps later.
+
+A silence too long for the resampler to bridge ends an episode early.
+"""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.classifier.bad_samples import without_bad_samples
+from tactile_rt.classifier.contact import ContactDetector
+from tactile_rt.classifier.deadline import Deadline, Policy
+from tactile_rt.classifier.decisions import Classification, ClassifierStats, fuse
+from tactile_rt.classifier.early_exit import IN_A_ROW, EarlyExit
+from tactile_rt.classifier.lanes import Lanes
+from tactile_rt.classifier.model_file import element_order, load_model
+from tactile_rt.classifier.providers import onnxruntime_names
+from tactile_rt.classifier.stepper import Stepper
+from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, SpecMismatch
+
+__all__ = ["Classification", "Classifier", "ClassifierStats", "fuse"]
+
+Mode = Literal["episode", "sliding"]
+EVERY = 4
+
+
+class Classifier:
+    """A model file, run on a stream. One thread at a time may use it.
+
+    The stream may have another rate, and its elements another order, than the model's array.
+
+    Args:
+        model: path of the ``.onnx`` file.
+        spec: the array that the stream comes from.
+        mode: ``episode`` or ``sliding``.
+        every: steps between the windows of ``sliding``, None for 4 (180 ms at 45 ms); the network
+            runs in ceil(steps / every) lanes, and takes up to as many times as long.
+        sure: probability of the best class at which an episode ends early, or None: accuracy
+            given for time, see `tactile_rt.classifier.early_exit`. Of ``episode`` only.
+        in_a_row: steps running in which the same class must be so sure.
+        deadline_s: work that may gather before a step is late, s; None is the step's length.
+        late: what becomes of a late decision, see `tactile_rt.classifier.deadline.Deadline`.
+        providers: execution providers, first choice first: cpu, cuda, tensorrt, openvino, coreml.
+        threads: that may share one operator of the network.
+
+    Attributes:
+        card: the model's metadata.
+        detector: contact state and tare of the stream.
+        tared: last resampled sample less the tare, (element, channel) SI; zeros before the tare.
+            The next `push` overwrites it.
+        stats: what has been counted.
+        providers: names of the execution providers in use, as onnxruntime has them.
+
+    Raises:
+        ModelError: the file cannot be used.
+        SpecMismatch: the model was made for another array; the message says where they differ.
+        ConfigError: an option that cannot be, or an execution provider that is not there.
+    """
+
+    def __init__(
+        self,
+        model: Path,
+        spec: ArraySpec,
+        *,
+        mode: Mode = "episode",
+        every: int | None = None,
+        sure: float | None = None,
+        in_a_row: int = IN_A_ROW,
+        deadline_s: float | None = None,
+        late: Policy = "count",
+        providers: Sequence[str] = ("cpu",),
+        threads: int = 1,
+    ) -> None:
+        if mode not in get_args(Mode):
+            raise ConfigError(f"mode: {mode!r}; it can be {', '.join(get_args(Mode))}")
+        if mode == "sliding" and sure is not None:
+            raise ConfigError("sure: windows that slide have no early end; decide by episodes")
+        self._exit = EarlyExit(sure, in_a_row)
+        session, self.card = load_model(model, onnxruntime_names(providers), threads)
+        try:
+            order = element_order(self.card.array, spec)
+        except SpecMismatch as error:
+            raise SpecMismatch(
+                f"{model} was made for another array than {spec.name!r}: {error}"
+            ) from None
+        self.detector = ContactDetector(spec.shape, np.array(self.card.floor, dtype=np.float32))
+        self.tared = np.zeros(spec.shape, dtype=np.float32)
+        self.stats = ClassifierStats()
+        self.providers: tuple[str, ...] = tuple(session.get_providers())
+        self._sliding = mode == "sliding"
+        steps = self.card.steps
+        every = min(EVERY, steps) if every is None else every
+        self._lanes = Lanes(steps, every if self._sliding else steps)
+        step_s = self.card.substeps * self.card.period_ns / NS_PER_S
+        self._deadline = Deadline(step_s if deadline_s is None else deadline_s, late)
+        self._stepper = Stepper(session, self.card, self._lanes.count)
+        self._resampler = Resampler(self.card.period_ns, spec.rate_hz)
+        self._order = order  # where the array has the model's elements
+        # Of the episode; the detector does not change them, it makes new ones.
+        self._offset = self.detector.offset
+        self._sigma = self.detector.sigma
+        self._filled = 0  # sub-steps of the step under way
+        self._step = 0  # steps done since the onset
+        self._onset_ns: int | None = None  # None when no episode is under way
+        self._decided = False  # the episode has had its final decision
+        self._next_seq = 0
+
+    def push(self, chunk: Chunk) -> list[Classification]:
+        """Take samples as they come from the array, return the decisions that they complete."""
+        chunk, bad = without_bad_samples(chunk)
+        self.stats.bad_samples += bad
+        resampled = self._resampler.push(chunk)
+        if resampled is None:
+            return []
+        decisions = []
+        for i in range(len(resampled)):
+            if resampled.seq[i] != self._next_seq:
+                self._onset_ns = None  # what is touched now need not be what was touched before
+            self._next_seq = int(resampled.seq[i]) + 1
+            decision = self._sample(int(resampled.t_ns[i]), resampled.values[i], resampled.valid[i])
+            if decision is not None:
+                decisions.append(decision)
+        return decisions
+
+    def _sample(
+        self, t_ns: int, sample: NDArray[np.float32], valid: NDArray[np.bool_]
+    ) -> Classification | None:
+        begins = self.detector.update(sample, valid)
+        # An element without a trustworthy value, or without a tare, reads as untouched.
+        untouched = ~(valid & self.detector.tared)
+        np.subtract(sample, self.detector.offset, out=self.tared)
+        self.tared[untouched] = 0
+        if begins and (self._onset_ns is None or self._decided):
+            self._begin(t_ns)
+        if self._onset_ns is None:
+            return None
+        if self._decided and not self.detector.contact:
+            self._onset_ns = None  # released: the next contact is a new episode
+            return None
+        if self._decided and not self._sliding:
+            return None
+        now = np.where(untouched[:, None], self._offset, sample)
+        self._stepper.samples[:, self._filled] = now[self._order]
+        self._filled += 1
+        if self._filled < self.card.substeps:
+            return None
+        return self._advance(t_ns, self._onset_ns)
+
+    def _begin(self, t_ns: int) -> None:
+        self._onset_ns = t_ns
+        self._filled = self._step = 0
+        self._decided = False
+        self._exit.begin()
+        self._offset = self.detector.offset
+        self._sigma = self.detector.sigma
+        self._stepper.begin(self._offset[self._order], self._sigma[self._order])
+        self._deadline.begin()
+
+    def _advance(self, t_ns: int, onset_ns: int) -> Classification | None:
+        """Take a step with the samples gathered; the decision that it gives, if any."""
+        began = time.perf_counter()
+        lane = self._lanes.beginning(self._step)
+        if lane is not None:
+            self._stepper.reset(lane)
+        logits = self._stepper.run()
+        latency = time.perf_counter() - began
+        asked = self._lanes.asked(self._step)
+        self._filled = 0
+        self._step += 1
+        self.stats.steps += 1
+        late = self._deadline.missed(t_ns, latency)
+        self.stats.late = self._deadline.late
+        if asked is None:
+            return None
+        lane, step = asked
+        probabilities = self._posterior(logits[lane])
+        if probabilities is None:
+            self._give_up()
+            return None
+        best = int(probabilities.argmax())
+        final = step == self.card.steps or self._exit.reached(best, float(probabilities[best]))
+        self._decided = self._decided or final
+        if late and self._deadline.policy == "skip":
+            self.stats.withheld += 1
+            return None
+        return Classification(
+            onset_ns=onset_ns,
+            t_ns=t_ns,
+            step=step,
+            final=final,
+            label=self.card.labels[best],
+            labels=self.card.labels,
+            probabilities=probabilities,
+            latency_s=latency,
+            late=late,
+        )
+
+    def _posterior(self, logits: NDArray[np.float32]) -> NDArray[np.float32] | None:
+        probabilities: NDArray[np.float32] = logits / self.card.temperature
+        probabilities -= probabilities.max()
+        np.exp(probabilities, out=probabilities)
+        probabilities /= probabilities.sum()
+        return probabilities if np.isfinite(probabilities).all() else None
+
+    def _give_up(self) -> None:
+        """The state is no number and would stay none: end the episode, or begin windows anew."""
+        self.stats.bad_steps += 1
+        self._step = 0
+        self._decided = True
+        self._stepper.begin(self._offset[self._order], self._sigma[self._order])

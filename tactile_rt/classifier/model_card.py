@@ -1,0 +1,206 @@
+"""What a model file says of itself: the array, the episode, the classes, what was measured.
+
+Versions: a release reads every version of the metadata that an older one wrote, and passes over
+fields that it does not know; a version is raised only when an older reader would misread a file.
+"""
+
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.classifier.onnx_check import MAX_ELEMENTS
+from tactile_rt.stream import ArraySpec, ConfigError, ModelError, SpecMismatch
+
+__all__ = ["Kind", "ModelCard", "StateTensor", "element_order", "one_line", "parse_card"]
+
+CARD_VERSION = 2
+CARD_VERSIONS = (1, 2)  # 1: without what `ModelCard` says is since 2
+STATE_TYPES = ("bool", "float16", "float32", "float64", "int32", "int64", "int8", "uint8")
+MAX_STEPS = 1_000_000
+MAX_PERIOD_NS = 10**12
+MAX_EPISODE = 2**24  # values: checks run one at once, and a robot's has some 20,000
+MAX_NAME = 200  # characters
+LISTS = ("commands", "unseen_objects")  # of the provenance, where they are there
+
+Kind = Literal["step", "window"]
+
+
+class StateTensor(msgspec.Struct, frozen=True):
+    """One recurrent state: its name, shape without the batch axis, and element type.
+
+    `in_place`: a step only writes some rows of it, so `<name>_next` may be the same memory.
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    dtype: str
+    in_place: bool = False
+
+
+class ModelCard(msgspec.Struct, frozen=True):
+    """The metadata of a model file, stored as JSON under ``tactile_rt``.
+
+    Attributes:
+        name: of the model.
+        spec: JSON of the `ArraySpec` that it was trained on.
+        period_ns: sub-step period, ns; the stream is resampled to it.
+        substeps: sub-steps per step.
+        steps: steps of one episode.
+        labels: class names in the order of the logits.
+        state: recurrent state tensors.
+        clip, scale: (channel,) limits and smallest scale of the input compression, SI.
+        floor: (channel,) smallest sigma that the contact detector assumes, SI.
+        temperature: divides the logits, fitted on validation sweeps so that probabilities mean
+            what they say.
+        provenance: what made the file: network, training, data set, hashes, commands.
+        figures: what was measured on it: parity, accuracy.
+        version: of this schema.
+
+    Since version 2:
+        kind: "step" or "window", see the module's docstring.
+        precision: how weights are stored and multiplied.
+        opset: version of ONNX's operators.
+        hashes: SHA-256, hex; "graph" is `onnx_reading.graph_sha256` of the file.
+        thresholds: posteriors from which a decision may be taken early, by what they promise.
+        decision: defaults of the decision modes.
+        probe: (step, class) logits of the built-in probe episode, by which `tactile-rt model
+            verify` tells whether another machine computes the same.
+    """
+
+    name: str
+    spec: str
+    period_ns: int
+    substeps: int
+    steps: int
+    labels: tuple[str, ...]
+    state: tuple[StateTensor, ...]
+    clip: tuple[float, ...]
+    scale: tuple[float, ...]
+    floor: tuple[float, ...]
+    temperature: float = 1.0
+    provenance: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
+    version: int = CARD_VERSION
+    kind: Kind = "step"
+    precision: Literal["fp32", "fp16", "bf16", "int8"] = "fp32"
+    opset: int | None = None
+    hashes: dict[str, str] = {}
+    thresholds: dict[str, float] = {}
+    decision: dict[str, Any] = {}
+    probe: tuple[tuple[float, ...], ...] = ()
+
+    @property
+    def array(self) -> ArraySpec:
+        """The array that the model was trained on."""
+        return ArraySpec.from_json(self.spec)
+
+
+def element_order(card_spec: ArraySpec, source_spec: ArraySpec) -> NDArray[np.intp]:
+    """Where the source has each element of the model: ``samples[..., order, :]`` feeds the model.
+
+    Name, rate and the order of elements may differ; nothing else may.
+
+    Returns:
+        (element,) indices into the source's elements, 0, 1, 2, ... when the order is the same.
+
+    Raises:
+        SpecMismatch: the two are different arrays; the message says exactly where.
+    """
+    mine, theirs = card_spec.elements, source_spec.elements
+    if set(mine) == set(theirs):
+        order = np.array([theirs.index(element) for element in mine], dtype=np.intp)
+        per_element = ("elements", "grid", "positions", "orientations")
+        fields = {f: getattr(source_spec, f) for f in source_spec.__dataclass_fields__}
+        fields |= {f: tuple(fields[f][i] for i in order) for f in per_element}
+        differences = card_spec.differences(ArraySpec(**fields), ignore=("name", "rate_hz"))
+    else:
+        lacking = [e for e in mine if e not in theirs]
+        foreign = [e for e in theirs if e not in mine]
+        differences = [f"elements: lacks {', '.join(lacking)}"] if lacking else []
+        differences += [f"elements: {', '.join(foreign)} unknown to the model"] if foreign else []
+        rest = ("name", "rate_hz", "elements", "grid", "positions", "orientations")
+        differences += card_spec.differences(source_spec, ignore=rest)
+    if differences:
+        raise SpecMismatch("; ".join(differences))
+    return order
+
+
+def parse_card(path: Path, text: str) -> ModelCard:
+    """Read a model's metadata.
+
+    Args:
+        path: the file that it comes from, for messages.
+        text: its JSON.
+
+    Raises:
+        ModelError: damaged, of another version, or describing what cannot be run.
+    """
+
+    def damaged(why: object) -> ModelError:
+        return ModelError(f"{path} has damaged metadata: {one_line(why)}")
+
+    try:
+        version = msgspec.json.decode(text, type=dict[str, Any]).get("version")
+        if version not in CARD_VERSIONS:
+            raise ModelError(
+                f"{path} has metadata of version {repr(version)[:40]}; this release reads "
+                f"{' and '.join(map(str, CARD_VERSIONS))}"
+            )
+        card = msgspec.json.decode(text, type=ModelCard)
+        elements, channels = card.array.shape
+    except (msgspec.MsgspecError, ConfigError) as error:
+        raise damaged(error) from None
+    except RecursionError:
+        raise damaged("nested too deeply") from None
+    for what in ("clip", "scale", "floor"):
+        if len(getattr(card, what)) != channels:
+            raise damaged(f"{len(getattr(card, what))} values of {what} for {channels} channels")
+    for what in ("period_ns", "substeps", "steps", "temperature", "clip", "scale", "floor"):
+        values = np.asarray(getattr(card, what), dtype=np.float64)
+        if not (np.all(values > 0) and np.all(np.isfinite(values))):
+            raise damaged(f"{what} must be positive")
+    if card.steps > MAX_STEPS or card.period_ns > MAX_PERIOD_NS:
+        raise damaged(f"{card.steps} steps of {card.substeps} sub-steps of {card.period_ns} ns")
+    if not card.labels or len(set(card.labels)) != len(card.labels):
+        raise damaged("labels are missing or repeat")
+    # Decisions carry them to terminals, pages and logs.
+    if not all(0 < len(label) <= MAX_NAME and label.isprintable() for label in card.labels):
+        raise damaged(f"labels must be 1 to {MAX_NAME} printable characters")
+    if len(card.name) > MAX_NAME:
+        raise damaged(f"a name of {len(card.name)} characters")
+    for what in LISTS:
+        if not isinstance(card.provenance.get(what, []), list):
+            raise damaged(f"{what} of the provenance must be a list")
+    names = ["samples", "offset", "sigma", *(s.name for s in card.state)]
+    if len(set(names)) != len(names):
+        raise damaged("names of the state repeat")
+    if card.kind == "window" and card.state:
+        raise damaged("a window has no state")
+    shapes = {s.name: s.shape for s in card.state}
+    window = (card.steps,) if card.kind == "window" else ()
+    shapes["samples"] = (*window, card.substeps, elements, channels)
+    for name, shape in shapes.items():
+        # Python's integers: a product of int64 may come round to something small.
+        if min(shape, default=1) < 1 or math.prod(shape) > MAX_ELEMENTS:
+            raise damaged(f"{name[:40]} of shape {'x'.join(map(str, shape))[:80]}")
+    episode = card.steps * card.substeps * elements * channels
+    if episode > MAX_EPISODE:
+        raise damaged(f"an episode of {episode} values")
+    if sum(math.prod(shape) for shape in shapes.values()) > MAX_ELEMENTS:
+        raise damaged("its state is larger than any robot's memory should hold")
+    for state in card.state:
+        if state.dtype not in STATE_TYPES:
+            raise damaged(f"{state.name[:40]} of type {state.dtype[:40]!r}")
+    if card.probe and [len(row) for row in card.probe] != [len(card.labels)] * card.steps:
+        raise damaged(f"the probe is not {card.steps} steps of {len(card.labels)} logits")
+    return card
+
+
+def one_line(reason: object) -> str:
+    """The first line of a reason, without what a terminal would obey."""
+    line = (str(reason).strip().splitlines() or [type(reason).__name__])[0]
+    return "".join(c if c.isprintable() else "?" for c in line)

@@ -1,0 +1,232 @@
+"""A classifier at rest: one ONNX file whose metadata says everything needed to run it.
+
+Inputs of the graph, one step of a stream, for a batch of independent streams:
+
+    samples  (batch, sub-step, element, channel) float32, SI, as the array delivers them
+    offset   (batch, element, channel) float32, SI: the tare
+    sigma    (batch, element, channel) float32, SI: noise per sample, measured with the tare
+    <state>  every tensor of `ModelCard.state`, all zeros when an episode begins
+
+Outputs: ``logits (batch, class)`` and for every state tensor ``<name>_next``, its next value.
+Units, clipping, scaling and the layout on the grid are inside the graph.
+
+A file of kind "window" takes a whole episode instead: ``samples (batch, step, sub-step, element,
+channel)``, no state, and gives ``logits (batch, step, class)``.
+"""
+
+import hashlib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import onnxruntime as ort
+
+from tactile_rt.classifier.denormals import FlushDenormals
+from tactile_rt.classifier.model_card import (
+    Kind,
+    ModelCard,
+    StateTensor,
+    element_order,
+    one_line,
+    parse_card,
+)
+from tactile_rt.classifier.onnx_check import (
+    MAX_BYTES,
+    BadModel,
+    Contents,
+    read_onnx,
+)
+from tactile_rt.stream import ConfigError, ModelError
+
+__all__ = [
+    "METADATA_KEY",
+    "ModelCard",
+    "StateTensor",
+    "element_order",
+    "hash_of",
+    "load_model",
+    "read_model",
+    "shipped_model",
+]
+
+METADATA_KEY = "tactile_rt"
+MESSAGE = 300  # characters of what a file, or onnxruntime, has us say
+SHIPPED = Path(__file__).parents[1] / "assets" / "mouse24.onnx"
+
+
+def shipped_model() -> Path:
+    """The model that comes with the package: 24 categories on the right mouse array."""
+    return SHIPPED
+
+
+def hash_of(model: Path) -> str:
+    """The sha256 of a model's file.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    try:
+        return hashlib.sha256(model.read_bytes()).hexdigest()
+    except OSError as error:
+        raise ConfigError(f"model {model} cannot be read: {error.strerror}") from None
+
+
+def read_model(path: Path) -> tuple[ModelCard, Contents, bytes]:
+    """Read a model file without running it: its card, what else it holds, its bytes.
+
+    Raises:
+        ModelError: not there, too large, not ONNX, reaching outside the file or past the limits
+            of `onnx_reading`, without our metadata, or with metadata that is damaged, of
+            another version, or names other inputs and outputs than the graph.
+    """
+    if not path.is_file():
+        raise ModelError(f"no model file {path}")
+    size = path.stat().st_size
+    if size > MAX_BYTES:
+        raise ModelError(f"{path} is not a readable ONNX model: {size} bytes is too large")
+    data = b""
+    try:
+        data = path.read_bytes()
+        contents = read_onnx(data)
+    except (BadModel, OSError) as error:
+        reason = error.strerror if isinstance(error, OSError) else _mistaken(data) or error
+        raise ModelError(f"{path} is not a readable ONNX model: {reason}") from None
+    text = contents.metadata.get(METADATA_KEY)
+    if text is None:
+        raise ModelError(
+            f"{path} is ONNX but not a tactile_rt model: no {METADATA_KEY!r} metadata "
+            "(export it with `tactile-rt export`)"
+        )
+    card = parse_card(path, text)
+    named = {"samples", "offset", "sigma", *(s.name for s in card.state)}
+    if wrong := sorted(named ^ set(contents.inputs)):
+        raise _disagree(path, wrong)
+    for name in ("logits", *(f"{s.name}_next" for s in card.state)):
+        if name not in contents.outputs:
+            raise ModelError(f"{path}: no output `{one_line(name)}`, which its metadata promises")
+    return card, contents, data
+
+
+def load_model(
+    path: Path,
+    providers: Sequence[str] = ("CPUExecutionProvider",),
+    threads: int = 1,
+    kind: Kind | None = "step",
+) -> tuple[ort.InferenceSession, ModelCard]:
+    """Open a model file for inference and read its card.
+
+    Args:
+        path: the ``.onnx`` file.
+        providers: onnxruntime's execution providers in the order of preference.
+        threads: of the CPU's provider. A 1 ms step gains nothing from more than one, and the
+            robot has other work for its cores.
+        kind: the kind of model that is needed; None takes any.
+
+    Raises:
+        ModelError: as `read_model`; or not of this kind, not run by onnxruntime, or the graph
+            disagrees with the card.
+        ConfigError: this onnxruntime lacks a provider, or cannot use it here.
+    """
+    available = ort.get_available_providers()
+    for provider in providers:
+        if provider not in available:
+            raise ConfigError(f"no {provider} in this onnxruntime: it has {', '.join(available)}")
+    card, _, data = read_model(path)
+    if kind is not None and card.kind != kind:
+        raise ModelError(f"{path} is a model of kind {card.kind!r}; this needs {kind!r}")
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.inter_op_num_threads = 1
+    # For helper threads; this one's mode onnxruntime may change for ever: `FlushDenormals`.
+    options.add_session_config_entry("session.set_denormal_as_zero", "1")
+    options.log_severity_level = 4  # failures come as exceptions; the log would repeat them
+    # What was read as ONNX is not to be taken for another format by its first bytes.
+    options.add_session_config_entry("session.load_model_format", "ONNX")
+    try:
+        # The bytes that were checked, not the file, which may be another by now.
+        with FlushDenormals():  # which in the end puts the thread's mode back
+            session = ort.InferenceSession(data, options, providers=list(providers))
+    except Exception as error:  # onnxruntime raises a dozen unrelated types for a bad file
+        raise ModelError(f"{path} is not a readable ONNX model: {_reason(error)}") from None
+    unused = [p for p in providers if p not in session.get_providers()]
+    if unused:
+        raise ConfigError(f"onnxruntime cannot use {', '.join(unused)} on this machine")
+    return session, _checked(card, session, path)
+
+
+def _checked(card: ModelCard, session: ort.InferenceSession, path: Path) -> ModelCard:
+    window = card.kind == "window"
+    # (shape without the batch axis, element type) of everything the classifier will feed
+    inputs = {i.name: (tuple(i.shape[1:]), i.type) for i in session.get_inputs()}
+    elements, channels = card.array.shape
+    sample = (card.substeps, elements, channels)
+    expected: dict[str, tuple[tuple[Any, ...], str]] = {
+        "samples": ((card.steps, *sample) if window else sample, _onnx_type("float32")),
+        "offset": ((elements, channels), _onnx_type("float32")),
+        "sigma": ((elements, channels), _onnx_type("float32")),
+        **{s.name: (s.shape, _onnx_type(s.dtype)) for s in card.state},
+    }
+    if window and "samples" in inputs and not isinstance((inputs["samples"][0] or (0,))[0], int):
+        # A window may be made for any number of steps.
+        expected["samples"] = ((inputs["samples"][0][0], *sample), _onnx_type("float32"))
+    if inputs != expected:
+        wrong = sorted(k for k in inputs | expected if inputs.get(k) != expected.get(k))
+        raise _disagree(path, wrong)
+    batches = {i.shape[0] for i in session.get_inputs()}
+    if any(isinstance(batch, int) and batch != 1 for batch in batches):
+        raise ModelError(f"{path}: the graph's batch size is fixed to another than 1")
+    outputs = {o.name: (tuple(o.shape[1:]), o.type) for o in session.get_outputs()}
+    shape, kind = outputs.get("logits", ((), ""))
+    if shape[-1:] != (len(card.labels),) or len(shape) != 1 + window or kind != "tensor(float)":
+        raise ModelError(f"{path}: no output `logits` of {len(card.labels)} classes")
+    for state in card.state:
+        shape, kind = outputs.get(f"{state.name}_next", ((), ""))
+        # onnxruntime may not know every size before it runs.
+        sizes = zip(shape, state.shape, strict=False)
+        same = all(a == b or not isinstance(a, int) for a, b in sizes)
+        if not same or len(shape) != len(state.shape) or kind != _onnx_type(state.dtype):
+            raise ModelError(f"{path}: no output `{state.name}_next` like `{state.name}`")
+    return card
+
+
+def _disagree(path: Path, wrong: Sequence[str]) -> ModelError:
+    names = one_line(", ".join(wrong))[:MESSAGE]
+    return ModelError(f"{path}: the graph's inputs disagree with its metadata at {names}")
+
+
+def _mistaken(data: bytes) -> str:
+    """What a file is that somebody took for a model, as far as its first bytes tell."""
+    if not data:
+        return "it is empty"
+    if data.startswith(b"version https://git-lfs"):
+        return "it is a Git LFS pointer; `git lfs pull` fetches the file"
+    if data.startswith(b"PK\x03\x04"):
+        return "it is a zip archive, as checkpoints are; `tactile-rt export` makes a model of one"
+    head = data[:100].decode("latin-1")
+    if head.isascii() and all(c.isprintable() or c in "\t\r\n" for c in head):
+        return "it is text"
+    return ""
+
+
+def _reason(error: Exception) -> str:
+    """What onnxruntime says, less where in its source that is."""
+    text = re.sub(r"^\[ONNXRuntimeError\] : \d+ : \w+ : ", "", one_line(error))
+    if newest := re.search(r"Opset (\d+) is .* is till opset (\d+)", text):
+        return (
+            f"it uses opset {newest[1]}, and onnxruntime {ort.__version__} reads {newest[2]} at "
+            "most: update onnxruntime"
+        )
+    if where := re.match(r"\S+\.(?:cc|h):\d+ [^(]*", text):  # then the function's arguments
+        depth = 0
+        for at in range(where.end(), len(text)):
+            depth += (text[at] == "(") - (text[at] == ")")
+            if depth == 0:
+                text = text[at + 1 :].strip() or text
+                break
+    return text[:MESSAGE]
+
+
+def _onnx_type(dtype: str) -> str:
+    name = {"float32": "float", "float64": "double"}.get(dtype, dtype)
+    return f"tensor({name})"

@@ -1,0 +1,126 @@
+"""One stream through one classifier: acquisition never waits for the network.
+
+    source --(thread)--> bounded queue --> classifier --> (chunk, decisions)
+
+Of a live source, a thread reads whatever arrives. When the consumer falls behind by more than the
+queue holds, the oldest chunks are dropped and counted, so that decisions stay recent. A source
+that waits for its reader (a recording, a simulation at full speed) is read in step, and nothing
+can be lost.
+"""
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Generator, Iterator
+from types import TracebackType
+from typing import Self
+
+from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.stream import Chunk, EndOfStream, Source
+
+__all__ = ["Session"]
+
+POLL_S = 0.1  # how soon a reader thread notices that it should stop
+
+
+class Session:
+    """Run a classifier on a source; iterate to get every chunk with the decisions it completed.
+
+    Args:
+        source: where samples come from; the session closes it.
+        classifier: made for `source.spec`.
+        queue_chunks: chunks that may wait for the classifier.
+
+    Attributes:
+        dropped: samples that a live source delivered and the classifier was too late for.
+    """
+
+    def __init__(self, source: Source, classifier: Classifier, queue_chunks: int = 256) -> None:
+        self.source = source
+        self.classifier = classifier
+        self.dropped = 0
+        self._limit = queue_chunks
+        self._queue: deque[Chunk] = deque()
+        self._arrived = threading.Condition()
+        self._stopping = False
+        self._ending: Exception | None = None
+        self._reader: threading.Thread | None = None
+
+    def __iter__(self) -> Iterator[tuple[Chunk, list[Classification]]]:
+        # Closing: an error of the classifier ends the reader now, not when its traceback is freed.
+        with contextlib.closing(self._queued() if self.source.live else self._in_step()) as chunks:
+            for chunk in chunks:
+                yield chunk, self.classifier.push(chunk)
+
+    def stop(self) -> None:
+        """End the iteration, which then closes the source; from any thread, safe to call twice."""
+        with self._arrived:
+            self._stopping = True
+            self._arrived.notify_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._close()
+
+    def _close(self) -> None:
+        """Close the source when nobody reads it any more."""
+        self.stop()
+        if self._reader is not None:
+            self._reader.join()
+        self.source.close()
+
+    def _in_step(self) -> Generator[Chunk, None, None]:
+        try:
+            while not self._stopping:
+                chunk = self.source.read()
+                if chunk is not None:
+                    yield chunk
+        except EndOfStream:
+            pass
+        finally:
+            self._close()
+
+    def _queued(self) -> Generator[Chunk, None, None]:
+        self._reader = threading.Thread(target=self._read, name="tactile-rt-reader", daemon=True)
+        self._reader.start()
+        try:
+            while (chunk := self._take()) is not None:
+                yield chunk
+        finally:
+            self._close()
+
+    def _take(self) -> Chunk | None:
+        with self._arrived:
+            self._arrived.wait_for(lambda: self._queue or self._ending or self._stopping)
+            if self._stopping:
+                return None
+            if self._queue:
+                return self._queue.popleft()
+            if isinstance(self._ending, EndOfStream):
+                return None
+            assert self._ending is not None
+            raise self._ending
+
+    def _read(self) -> None:
+        while not self._stopping:
+            try:
+                chunk = self.source.read(POLL_S)
+            except Exception as error:  # whatever it is, it belongs to the consumer's thread
+                with self._arrived:
+                    self._ending = error
+                    self._arrived.notify_all()
+                return
+            if chunk is None:
+                continue
+            with self._arrived:
+                self._queue.append(chunk)
+                while len(self._queue) > self._limit:
+                    self.dropped += len(self._queue.popleft())
+                self._arrived.notify_all()

@@ -1,0 +1,133 @@
+"""The network's step, bound once to buffers that are made once.
+
+The state lives in two sets of buffers; a step reads the one and writes the other, by turns. So a
+step allocates nothing, and with a GPU the state never leaves it. A cache of which a step writes a
+few rows is in both sets the same buffer: onnxruntime then copies nothing.
+"""
+
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import DTypeLike, NDArray
+
+from tactile_rt.classifier.denormals import FlushDenormals
+from tactile_rt.classifier.model_file import ModelCard
+from tactile_rt.classifier.providers import device_of
+from tactile_rt.stream import ConfigError
+
+__all__ = ["Stepper"]
+
+WARM_UP = 4  # runs, two of each binding: the first ones allocate, and may even compile
+
+
+class Stepper:
+    """A model file's graph, run step by step in so many lanes at once.
+
+    Args:
+        session: the opened graph.
+        card: its metadata.
+        lanes: independent streams, the batch axis.
+
+    Attributes:
+        samples: (lane, sub-step, element, channel) SI: write the step's input here.
+
+    Raises:
+        ConfigError: the graph's batch is fixed to another number than `lanes`.
+    """
+
+    def __init__(self, session: ort.InferenceSession, card: ModelCard, lanes: int = 1) -> None:
+        batch = session.get_inputs()[0].shape[0]
+        if isinstance(batch, int) and batch != lanes:
+            raise ConfigError(
+                f"model {card.name!r} has a batch fixed to {batch}, and {lanes} lanes are needed: "
+                "export it with a dynamic batch, or decide by episodes"
+            )
+        self._session = session
+        device = device_of(session)
+        elements, channels = card.array.shape
+        shape = (lanes, elements, channels)
+        self._samples = _Tensor((lanes, card.substeps, elements, channels), np.float32, device)
+        self._offset = _Tensor(shape, np.float32, device)
+        self._sigma = _Tensor(shape, np.float32, device)
+        self._logits = _Tensor((lanes, len(card.labels)), np.float32, "cpu")
+        first = {s.name: _Tensor((lanes, *s.shape), s.dtype, device) for s in card.state}
+        # How other providers than onnxruntime's own write rows is not known.
+        own = session.get_providers() == ["CPUExecutionProvider"]
+        second = {
+            s.name: first[s.name]
+            if s.in_place and own
+            else _Tensor((lanes, *s.shape), s.dtype, device)
+            for s in card.state
+        }
+        self._states = (first, second)
+        self.samples = self._samples.array
+        self._bindings = tuple(
+            self._bound(self._states[now], self._states[1 - now]) for now in range(2)
+        )
+        self._now = 0
+        self._flush = FlushDenormals()
+        self._sigma.array[:] = np.array(card.floor, dtype=np.float32)
+        self._sigma.send()
+        for _ in range(WARM_UP):
+            self.run()
+        self.begin(self._offset.array[0], self._sigma.array[0])
+
+    def begin(self, offset: NDArray[np.float32], sigma: NDArray[np.float32]) -> None:
+        """Zero the state of every lane, and take a tare (element, channel), SI."""
+        self._offset.array[:] = offset
+        self._sigma.array[:] = sigma
+        self._offset.send()
+        self._sigma.send()
+        for state in self._states[self._now].values():
+            state.zero()
+
+    def reset(self, lane: int) -> None:
+        """Zero the state of one lane."""
+        for state in self._states[self._now].values():
+            state.zero(lane)
+
+    def run(self) -> NDArray[np.float32]:
+        """Take a step; return (lane, class) logits, a buffer that the next step overwrites."""
+        self._samples.send()
+        with self._flush:
+            self._session.run_with_iobinding(self._bindings[self._now])
+        self._now = 1 - self._now
+        logits: NDArray[np.float32] = self._logits.array
+        return logits
+
+    def _bound(self, before: "dict[str, _Tensor]", after: "dict[str, _Tensor]") -> ort.IOBinding:
+        binding = self._session.io_binding()
+        inputs = {
+            "samples": self._samples, "offset": self._offset, "sigma": self._sigma, **before,
+        }  # fmt: skip
+        for name, tensor in inputs.items():
+            binding.bind_ortvalue_input(name, tensor.value)
+        outputs = {"logits": self._logits, **{f"{k}_next": v for k, v in after.items()}}
+        for name, tensor in outputs.items():
+            binding.bind_ortvalue_output(name, tensor.value)
+        return binding
+
+
+class _Tensor:
+    """An array, and what onnxruntime sees: the same memory on the CPU, else a copy on a device."""
+
+    def __init__(self, shape: tuple[int, ...], dtype: DTypeLike, device: str) -> None:
+        self.array: NDArray[Any] = np.zeros(shape, dtype=dtype)
+        self.value = ort.OrtValue.ortvalue_from_numpy(self.array, device, 0)
+        self._apart = device != "cpu"
+
+    def send(self) -> None:
+        """Let the device have what was written to the array."""
+        if self._apart:
+            self.value.update_inplace(self.array)
+
+    def zero(self, lane: int | None = None) -> None:
+        """Zero one lane, or all."""
+        if lane is None:
+            self.array.fill(0)
+        else:
+            if self._apart:
+                self.array[:] = self.value.numpy()
+            self.array[lane] = 0
+        self.send()

@@ -1,0 +1,140 @@
+"""Clocks and rates: one anti-aliased resampler, shared by data set and runtime.
+
+Training windows and the live stream pass through the same code, so that the network never meets
+at run time what it was not trained on.
+"""
+
+import itertools
+
+import numpy as np
+
+from tactile_rt.stream import NS_PER_S, Chunk, concatenate
+
+__all__ = ["Resampler"]
+
+# A silence beyond it (or two input periods) is skipped instead of filled with invalid rows.
+LONGEST_GAP_NS = NS_PER_S
+# Of the kernel's nominal weight. Half would blank a slow sensor whose samples jitter by a fifth of
+# their period; much less would take a neighbour's value for that of a lost sample.
+LEAST_WEIGHT = 0.25
+
+
+class Resampler:
+    """Resample a stream to a fixed period with a Hann kernel; push chunks, take chunks.
+
+    Each output is the mean of the valid inputs within one output period either side, weighted by
+    ``(1 + cos(pi dt / period)) / 2``. The weights are never negative, so a force never changes its
+    sign and a step never overshoots, and every input contributes equally to the outputs in sum, so
+    impulse is conserved. The price is gentle: -6 dB at the output's Nyquist frequency, a zero at
+    the output rate, and a delay of one output period. An input that already has the output's
+    period passes unchanged. The result does not depend on how the input was cut into chunks.
+
+    Args:
+        period_ns: output period, ns.
+        input_rate_hz: nominal input rate; below the output rate the kernel widens to the input's
+            period, which interpolates.
+        aligned: whether outputs are at whole periods of the clock, so that several streams' outputs
+            coincide; else the first is as early as it can be.
+
+    Attributes:
+        out_of_order: input samples not later than the one before, which are left out.
+    """
+
+    def __init__(self, period_ns: int, input_rate_hz: float, aligned: bool = False) -> None:
+        self.period_ns = period_ns
+        self.half_width_ns = max(period_ns, round(NS_PER_S / input_rate_hz))
+        self._least_weight = LEAST_WEIGHT * self.half_width_ns * input_rate_hz / NS_PER_S
+        self._longest_gap_ns = max(LONGEST_GAP_NS, 2 * self.half_width_ns)
+        self.out_of_order = 0
+        self._origin: int | None = 0 if aligned else None  # time of output 0
+        self._next: int | None = None if aligned else 0  # index of the next output
+        self._held: Chunk | None = None  # inputs that a later output may still need
+
+    def push(self, chunk: Chunk) -> Chunk | None:
+        """Take input samples, return the outputs that they complete, or None.
+
+        Args:
+            chunk: (n, element, channel) samples in time order.
+
+        Returns:
+            Outputs with `seq` counting output periods since the first (`aligned`: since time 0),
+            `t_ns` at the kernel's centre, and `valid` False (value 0) where less than a quarter of
+            the kernel's weight had a valid sample, be it lost or marked.
+        """
+        ordered = self._in_order(chunk)
+        if ordered is None:
+            return None
+        pieces = []
+        for run in self._runs(ordered):
+            if self._held is not None and run.t_ns[0] - self._held.t_ns[-1] > self._longest_gap_ns:
+                self._skip_to(int(run.t_ns[0]))
+            pieces += self._resample(run)
+        return concatenate(pieces) if pieces else None
+
+    def _runs(self, chunk: Chunk) -> list[Chunk]:
+        """Cut a chunk at its long silences."""
+        cuts = np.flatnonzero(np.diff(chunk.t_ns) > self._longest_gap_ns) + 1
+        edges = [0, *cuts.tolist(), len(chunk)]
+        return [_slice(chunk, a, b) for a, b in itertools.pairwise(edges)]
+
+    def _in_order(self, chunk: Chunk) -> Chunk | None:
+        last = np.iinfo(np.int64).min if self._held is None else self._held.t_ns[-1]
+        newest = np.maximum.accumulate(np.concatenate([[last], chunk.t_ns]))
+        keep = chunk.t_ns > newest[:-1]
+        self.out_of_order += int((~keep).sum())
+        if keep.all():
+            return chunk
+        if not keep.any():
+            return None
+        return Chunk(chunk.seq[keep], chunk.t_ns[keep], chunk.values[keep], chunk.valid[keep])
+
+    def _skip_to(self, t_ns: int) -> None:
+        assert self._origin is not None
+        self._held = None
+        self._next = -(-(t_ns + self.half_width_ns - self._origin) // self.period_ns)
+
+    def _resample(self, chunk: Chunk) -> list[Chunk]:
+        if self._origin is None:
+            # The first output is the first whose kernel is filled on both sides.
+            self._origin = int(chunk.t_ns[0]) + self.half_width_ns
+        if self._next is None:
+            self._next = -(-(int(chunk.t_ns[0]) + self.half_width_ns) // self.period_ns)
+        held = chunk if self._held is None else concatenate([self._held, chunk])
+        # An output is complete when its kernel's end has been reached (the weight there is zero).
+        ready = (int(held.t_ns[-1]) - self.half_width_ns - self._origin) // self.period_ns + 1
+        out = [self._output(held, k) for k in range(self._next, ready)]
+        self._next = max(self._next, ready)
+        oldest = self._origin + self._next * self.period_ns - self.half_width_ns
+        keep = min(int(np.searchsorted(held.t_ns, oldest)), len(held) - 1)
+        self._held = _slice(held, keep, None)
+        return out
+
+    def _output(self, held: Chunk, k: int) -> Chunk:
+        assert self._origin is not None
+        centre = self._origin + k * self.period_ns
+        lo = np.searchsorted(held.t_ns, centre - self.half_width_ns, side="right")
+        hi = np.searchsorted(held.t_ns, centre + self.half_width_ns, side="left")
+        phase = (held.t_ns[lo:hi] - centre) * (np.pi / self.half_width_ns)
+        weight = (0.5 + 0.5 * np.cos(phase)).astype(np.float32)  # (m,)
+        usable = held.valid[lo:hi] & np.isfinite(held.values[lo:hi]).all(axis=2)  # (m, element)
+        weights = weight[:, None] * usable
+        total = weights.sum(axis=0)  # (element,)
+        valid = total > self._least_weight
+        values = np.where(usable[..., None], held.values[lo:hi], 0.0)
+        mean = np.einsum("me,mec->ec", weights, values) / np.where(valid, total, 1.0)[:, None]
+        mean[~valid] = 0.0
+        return Chunk(
+            np.array([k], dtype=np.int64),
+            np.array([centre], dtype=np.int64),
+            mean[None].astype(np.float32),
+            valid[None],
+        )
+
+
+def _slice(chunk: Chunk, start: int, stop: int | None) -> Chunk:
+    return Chunk(
+        chunk.seq[start:stop],
+        chunk.t_ns[start:stop],
+        chunk.values[start:stop],
+        chunk.valid[start:stop],
+    )

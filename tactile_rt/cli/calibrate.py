@@ -1,0 +1,244 @@
+"""`tactile-rt tare` and `calibrate`: what a device needs to read in newtons, kept by its id."""
+
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tactile_rt.cli.app import app, check_output, starting
+from tactile_rt.cli.calibrate_view import show_fit, show_tare, show_uncalibrated
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError, Source, concatenate
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from tactile_rt.calibration import Calibration, Fit, LoadTable
+
+LOUDER = 3.0  # noise over that of the last tare that is worth a word
+
+Out = Annotated[
+    Path | None,
+    typer.Option(help="The .toml to write or bring up to date. Default: the device's own."),
+]
+Device = Annotated[str, typer.Option(help="Id of the device. Default: what it calls itself.")]
+
+
+@app.command()
+def tare(
+    source: Annotated[str, typer.Argument(help="URL of a device, e.g. serial:/dev/ttyACM0?...")],
+    seconds: Annotated[float, typer.Option(min=0.01, max=3600, help="How long to read.")] = 2.0,
+    device: Device = "",
+    out: Out = None,
+) -> None:
+    """Measure what an untouched array reads, and store it as the zero of its device.
+
+    Refused if an element is touched meanwhile, or drifts. What else the
+    device's file holds (matrices, mapping, mirror) stays.
+    """
+    from rich.console import Console
+
+    from tactile_rt.calibration import (
+        CalibratedSource,
+        Calibration,
+        calibration_path,
+        save_calibration,
+    )
+    from tactile_rt.calibration import tare as measure
+    from tactile_rt.sources.opening import open_source
+
+    check_output(out)
+    with starting():
+        opened = open_source(source)
+    with opened:
+        raw: Source = opened
+        before: Calibration | None = None
+        while isinstance(raw, CalibratedSource):
+            before = raw.calibration
+            raw = raw.source
+        name = device or (before.device if before else _own_id(raw))
+        path = out or calibration_path(name)
+        known = _existing(path, device) or before or Calibration.of(name, raw.spec)
+        known.output_spec(raw.spec)  # refuses another array now, not after the reading
+        with Console(stderr=True).status(f"do not touch {raw.spec.name}"):
+            measured = measure(raw, seconds)
+    untared = set(measured.untared)
+    tared = [i for i, e in enumerate(raw.spec.elements) if e not in untared]
+    new = {raw.spec.elements[i]: _digits(measured.offset[i]) for i in tared}
+    noise = {raw.spec.elements[i]: _digits(measured.noise[i]) for i in tared}
+    louder = [e for e in noise if _louder(noise[e], known.noise.get(e, ()))]
+    known = known.noted(
+        f"{_now()} tare: {measured.seconds:.3g} s, {measured.samples.max()} samples",
+        tare={**known.tare, **new},
+        noise={**known.noise, **noise},
+    )
+    save_calibration(known, path if out else None)
+    show_tare(measured, Console())
+    if untared:
+        typer.echo(f"not tared, for want of valid samples: {', '.join(measured.untared)}", err=True)
+    if louder:
+        typer.echo(
+            f"more than {LOUDER:g} times as noisy as when last tared: {', '.join(louder)}; did "
+            "the array shake? then tare again",
+            err=True,
+        )
+    show_uncalibrated(known)
+    typer.echo(f"tare of {known.device} written to {path}")
+
+
+@app.command()
+def calibrate(
+    table: Annotated[
+        Path, typer.Argument(help="A .csv: loads fx..mz, and raw_... or start_s,end_s.")
+    ],
+    element: Annotated[
+        str, typer.Option(help="Which the loads were on. Default: the only one.")
+    ] = "",
+    source: Annotated[
+        str, typer.Option(help="URL of the recording that start_s and end_s are times in.")
+    ] = "",
+    device: Device = "",
+    unit: Annotated[str, typer.Option(help="Of the readings, for a device not yet known.")] = "1",
+    out: Out = None,
+) -> None:
+    """Fit an element's matrix to known loads by least squares; show how well it fits.
+
+    Without --device and --out nothing is written.
+    """
+    from rich.console import Console
+
+    from tactile_rt.calibration import (
+        Calibration,
+        calibration_path,
+        raw_readings,
+        read_loads,
+        save_calibration,
+    )
+    from tactile_rt.calibration import calibrate as fit_loads
+
+    check_output(out)
+    loads = read_loads(table)
+    path = out or (calibration_path(device) if device else None)
+    known = _existing(path, device) if path else None
+    if len(loads.times):
+        recorded, spec = _recorded(table, loads, source)
+        fresh = Calibration.of(device or (path.stem if path else "unnamed"), spec)
+    elif source:
+        raise ConfigError(f"{table} has readings of its own: leave out --source")
+    else:
+        fresh = Calibration(
+            device or (path.stem if path else "unnamed"),
+            (element or "A0",),
+            loads.channels,
+            (unit,) * len(loads.channels),
+        )
+    target = known or fresh
+    if not element and len(target.elements) > 1:
+        raise ConfigError(f"--element: name the loaded one of {', '.join(target.elements)}")
+    element = element or target.elements[0]
+    try:
+        if len(loads.times):
+            raw = raw_readings(loads, recorded, spec, element)
+        else:
+            raw = loads.raw
+        raw = raw[:, _order(fresh.channels, target)]
+        fit = fit_loads(raw, loads.loads, loads.axes, target.channels)
+    except ConfigError as error:
+        raise ConfigError(f"{table}: {error}") from None
+    made = None
+    if path:
+        made = _with_fit(target, element, fit, loads, table)
+        save_calibration(made, path if out else None)
+    show_fit(fit, loads, Console())
+    if made:
+        show_uncalibrated(made)
+        typer.echo(f"matrix of {made.device}, element {element}, written to {path}")
+    else:
+        typer.echo("not written: name a --device or a file (--out)")
+
+
+def _own_id(source: Source) -> str:
+    """What a device calls itself; of one that has no id, what its array is called."""
+    own = str(getattr(source, "device_id", "") or source.spec.name)
+    return re.sub(r"[^\w.:+-]+", "-", own).lstrip(".")
+
+
+def _existing(path: Path, device: str) -> "Calibration | None":
+    from tactile_rt.calibration import load_calibration
+
+    if not path.exists():
+        return None
+    known = load_calibration(path)
+    if device not in ("", known.device):
+        raise ConfigError(f"{path} is of device {known.device}, not {device}: name another --out")
+    return known
+
+
+def _recorded(table: Path, loads: "LoadTable", url: str) -> tuple[Chunk, ArraySpec]:
+    """The raw samples that the times of a table are of."""
+    from tactile_rt.calibration import CalibratedSource
+    from tactile_rt.calibration.taring import record
+    from tactile_rt.sources.opening import open_source
+
+    if not url:
+        raise ConfigError(f"{table} has times: name the recording they are in with --source")
+    with starting():
+        opened = open_source(url)
+    with opened:
+        raw: Source = opened
+        while isinstance(raw, CalibratedSource):
+            raw = raw.source
+        return concatenate(record(raw, float(loads.times.max()))), raw.spec
+
+
+def _order(channels: tuple[str, ...], known: "Calibration") -> list[int]:
+    """Where each raw channel of a device is among those of the table."""
+    for channel in known.channels:
+        if channel not in channels:
+            raise ConfigError(
+                f"no reading raw_{channel}; {known.device} has channels {', '.join(known.channels)}"
+            )
+    for channel in channels:
+        if channel not in known.channels:
+            raise ConfigError(
+                f"raw_{channel} is of no channel of {known.device}, which has "
+                f"{', '.join(known.channels)}"
+            )
+    return [channels.index(c) for c in known.channels]
+
+
+def _with_fit(
+    known: "Calibration", element: str, fit: "Fit", loads: "LoadTable", table: Path
+) -> "Calibration":
+    if element not in known.elements:
+        raise ConfigError(
+            f"--element: {known.device} has no {element!r}; there are {', '.join(known.elements)}"
+        )
+    if known.matrices.keys() - {element} and known.output != (loads.axes, loads.units):
+        raise ConfigError(
+            f"{table} has loads {', '.join(loads.axes)}; the other elements of {known.device} are "
+            f"calibrated for {', '.join(known.output[0])}: give the same columns"
+        )
+    return known.noted(
+        f"{_now()} matrix of {element}: {len(loads.loads)} loads, condition {fit.condition:.3g}",
+        output_channels=loads.axes,
+        output_units=loads.units,
+        gain=known.gain if len(known.channels) == len(loads.axes) else (),
+        tare={**known.tare, element: _digits(fit.tare)},
+        matrices={**known.matrices, element: tuple(map(_digits, fit.matrix))},
+    )
+
+
+def _digits(row: "NDArray[np.float64]") -> tuple[float, ...]:
+    # as many as float32 holds and two more: people read the file
+    return tuple(float(f"{v:.9g}") for v in row)
+
+
+def _louder(noise: tuple[float, ...], before: tuple[float, ...]) -> bool:
+    return any(now > LOUDER * then > 0 for now, then in zip(noise, before, strict=False))
+
+
+def _now() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")

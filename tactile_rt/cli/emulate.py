@@ -1,0 +1,135 @@
+"""`tactile-rt emulate`: a device without hardware, on a real line."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import quote, urlencode
+
+import typer
+from rich.console import Console
+
+from tactile_rt.cli.app import app, starting
+from tactile_rt.cli.run import leaving
+from tactile_rt.stream import ConfigError
+
+if TYPE_CHECKING:
+    from tactile_rt.drivers.emulation.emulator import Emulator
+    from tactile_rt.drivers.emulation.endpoints import Endpoint
+
+LOOK_S = 0.25  # how often the count is renewed
+LINGER_S = 0.5  # for the host to read the last samples before the port disappears
+
+
+@app.command()
+def emulate(
+    codec: Annotated[str, typer.Argument(help="What it speaks: native, bota, xela, ...")],
+    source: Annotated[
+        str, typer.Option(help="What it measures: sim:mouse, replay:FILE, synthetic:35x6, ...")
+    ] = "synthetic:",
+    wire: Annotated[
+        str | None, typer.Option(help="serial, slcan or can. Default: serial, else slcan.")
+    ] = None,
+    link: Annotated[
+        Path | None, typer.Option(help="A name for the port, e.g. /tmp/whisker0.")
+    ] = None,
+    bus: Annotated[
+        str | None, typer.Option(help="For --wire can: INTERFACE:CHANNEL, e.g. socketcan:vcan0.")
+    ] = None,
+    faults: Annotated[Path | None, typer.Option(help="A .toml of what goes wrong.")] = None,
+    option: Annotated[
+        list[str] | None, typer.Option(help="Of the codec: NAME=VALUE; may be repeated.")
+    ] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="As fast as the host reads, not in real time.")
+    ] = False,
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.001, max=1e9, help="Send so many seconds of samples, then leave."),
+    ] = None,
+) -> None:
+    """Emulate a device: whoever opens the port that is printed meets it.
+
+    It sends once it is listened to and, if that is its protocol, asked to.
+    With --faults it misbehaves as scheduled. Each fault has a kind
+    (bit_flip, truncate, duplicate, burst, stall, drop, clock_drift,
+    clock_jump, sequence_reset, unplug, can_error), a rate per second or
+    at_s, and, where the kind has them, duration_s and amount.
+
+    Ctrl-C leaves.
+    """
+    from tactile_rt.drivers.codec import CODECS
+    from tactile_rt.drivers.emulation.emulator import Emulator
+    from tactile_rt.drivers.emulation.endpoints import BusEndpoint, SerialEndpoint, SlcanEndpoint
+    from tactile_rt.drivers.emulation.faults import read_faults
+    from tactile_rt.drivers.opening import make_codec
+    from tactile_rt.sources.opening import open_source
+
+    if wire is None:
+        only_can = ("can", codec) in CODECS and ("serial", codec) not in CODECS
+        wire = "can" if bus else "slcan" if only_can else "serial"
+    if wire not in ("serial", "slcan", "can"):
+        raise ConfigError(f"--wire must be serial, slcan or can, not {wire!r}")
+    if (wire == "can") != (bus is not None):
+        raise ConfigError("--wire can needs --bus INTERFACE:CHANNEL, and only it takes one")
+    if bus is not None and link is not None:
+        raise ConfigError("--link names a port; a --bus has none")
+    fields = codec_options(option or [])
+    spoken = make_codec("serial" if wire == "serial" else "can", codec, fields)
+    schedule = read_faults(faults) if faults else None
+    endpoint: Endpoint[Any]
+    if wire == "serial":
+        endpoint = SerialEndpoint(link)
+    elif bus is None:
+        endpoint = SlcanEndpoint(link)
+    else:
+        endpoint = BusEndpoint(bus, fields.get("fd", "").lower() in ("1", "true"))
+    with starting():
+        opened = open_source(source)
+    device = None
+    with leaving(None), opened:
+        device = Emulator(
+            spoken, opened, endpoint, schedule, log=False,
+            pace="fast" if fast else "realtime", seconds=seconds,
+        )  # fmt: skip
+        with device:
+            query = urlencode({"codec": codec, **fields})
+            typer.echo(f"connect to {quote(device.address, safe=':/')}?{query}")
+            if (bus or "").startswith("virtual:"):
+                typer.echo("a virtual bus is seen inside its own process only", err=True)
+            _watch(device)
+    if device is not None:
+        typer.echo(_count(device), err=True)
+
+
+def codec_options(given: list[str]) -> dict[str, str]:
+    """``NAME=VALUE`` options of a codec, as fields."""
+    fields = {}
+    for pair in given:
+        name, equals, value = pair.partition("=")
+        if not equals or not name:
+            raise ConfigError(f"--option is NAME=VALUE, not {pair!r}")
+        if name in fields:
+            raise ConfigError(f"--option {name} is given twice")
+        fields[name] = value
+    return fields
+
+
+def _watch(device: "Emulator") -> None:
+    """Show the count until it is done."""
+    console = Console(stderr=True)
+    if console.is_terminal:
+        with console.status("") as status:
+            while not device.wait(LOOK_S):
+                there = "" if device.endpoint.heard else ", nobody listens"
+                status.update(_count(device) + there)
+    else:
+        device.wait()
+    time.sleep(LINGER_S)
+
+
+def _count(device: "Emulator") -> str:
+    log = device.log
+    counts = {fate.name.lower(): n for fate, n in sorted(log.counts.items()) if n}
+    counts |= {"copies": log.duplicated} if log.duplicated else {}
+    rest = ", ".join(f"{n} {name}" for name, n in counts.items())
+    return f"{log.sent} samples{': ' + rest if rest else ''}"

@@ -1,0 +1,42 @@
+"""`tactile-rt eval`: what a model can do, measured on objects that it never saw."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from tactile_rt.cli.app import app, check_output, needs
+
+
+@app.command(name="eval")
+def evaluate(
+    model: Annotated[Path, typer.Argument(help="An .onnx model.")],
+    data: Annotated[Path, typer.Argument(help="A sweep set.")],
+    accurate: Annotated[
+        Path | None, typer.Option(help="The same sweeps at another profile, to compare with.")
+    ] = None,
+    svm: Annotated[bool, typer.Option(help="Fit an RBF SVM on the same windows too.")] = False,
+    pictures: Annotated[
+        Path | None, typer.Option(help="Folder for confusion, accuracy over time and robustness.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option(help="Two sweeps of each object: to compare by, not to quote.")
+    ] = False,
+    json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
+) -> None:
+    """Measure a model on the test objects of a sweep set: accuracy, fusion, calibration, noise
+    and what else goes wrong with a sensor."""
+    try:
+        from tactile_rt.evidence.classification import evaluate_model
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    from tactile_rt.evidence.records import show, write
+
+    check_output(json)
+    console = Console(stderr=True)
+    with console.status("evaluating"):
+        records = evaluate_model(model, data, accurate, svm, pictures, quick)
+    show(records, Console())
+    if json:
+        write(records, json)

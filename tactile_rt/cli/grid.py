@@ -1,0 +1,60 @@
+"""`tactile-rt grid`: many networks under one budget, beside their random initialisations."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from tactile_rt.cli.app import app, check_output, needs
+
+
+@app.command()
+def grid(
+    plan: Annotated[str, typer.Argument(help="A TOML file, or the shipped `mouse24`.")],
+    folder: Annotated[Path, typer.Argument(help="Where it goes; what is done is kept.")],
+    processes: Annotated[int, typer.Option(min=1, help="That train side by side.")] = 2,
+    report: Annotated[
+        Path | None,
+        typer.Option(help="Train nothing: write the table of what is done into this page."),
+    ] = None,
+) -> None:
+    """Train encoder x attender x objective under equal budgets and draw how well they do.
+
+    Killed at any time, it goes on where it was. FOLDER gets results.json, results.csv and
+    task_performance.png.
+    """
+    try:
+        from tactile_rt.models.grid.picture import draw_grid
+        from tactile_rt.models.grid.plan import read_grid
+        from tactile_rt.models.grid.pool import run_grid
+        from tactile_rt.models.grid.results import gather, put_into, table, write_results
+        from tactile_rt.models.grid.work import Outcome
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    check_output(report)
+    wanted = read_grid(plan)
+    console = Console(stderr=True)
+
+    def conclude() -> None:
+        results = gather(wanted, folder)
+        write_results(results, folder)
+        draw_grid(results, folder / "task_performance.png")
+        if report is not None:
+            put_into(report, table(results))
+
+    def show(found: Outcome, done: int, total: int) -> None:
+        right = found.right()
+        said = found.failed or f"top-1 {100 * right.mean():.1f} %"
+        console.print(
+            f"{done}/{total} {found.name}, seed {found.seed}: {said}, {found.seconds:.0f} CPU s",
+            highlight=False,
+        )
+        if done % per_seed == 0:
+            conclude()
+
+    per_seed = -(-len(wanted.tasks()) // wanted.seeds)
+    if report is None:
+        run_grid(wanted, folder, processes, show)
+    conclude()
+    console.print(f"{folder}: results.json, results.csv, task_performance.png")

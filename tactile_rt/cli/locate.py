@@ -1,0 +1,88 @@
+"""`tactile-rt locate`: which whiskers touch, and where along them, from their base loads."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import numpy as np
+import typer
+from rich.console import Console
+
+from tactile_rt.cli.app import app, check_output, needs
+
+if TYPE_CHECKING:
+    from tactile_rt.classifier.contact_point import WhiskerShapes
+    from tactile_rt.sweep_set import SweepManifest
+
+locate = typer.Typer(help="Find out where along each whisker it touches.", no_args_is_help=True)
+app.add_typer(locate, name="locate")
+
+
+@locate.command()
+def train(
+    data: Annotated[Path, typer.Argument(help="A sweep set made with --contacts.")],
+    checkpoint: Annotated[Path, typer.Argument(help="The file to write.")],
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the training split.")] = 12,
+    hidden: Annotated[int, typer.Option(min=1, help="Units of the recurrent layer.")] = 48,
+    seed: Annotated[int, typer.Option(help="Of weights and noise.")] = 0,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+) -> None:
+    """Train the contact network on the simulator's own contacts."""
+    try:
+        import torch
+
+        from tactile_rt.models import contact_regression as regression
+        from tactile_rt.models.datasets import SweepSet
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    check_output(checkpoint)
+    torch.set_num_threads(threads)
+    console = Console(stderr=True)
+    sets = [SweepSet.read(data, split) for split in ("train", "validation")]
+    regression.train_contacts(
+        sets[0],
+        sets[1],
+        _shapes(sets[0].manifest),
+        regression.ContactConfig(hidden=hidden, epochs=epochs, seed=seed),
+        checkpoint,
+        lambda epoch, loss, error: console.print(
+            f"epoch {epoch}/{epochs}: loss {loss:.4f}, validation {error:.4f}"
+        ),
+    )
+    console.print(f"best network: {checkpoint}")
+
+
+@locate.command(name="eval")
+def evaluate(
+    checkpoint: Annotated[Path, typer.Argument(help="What `locate train` wrote.")],
+    data: Annotated[Path, typer.Argument(help="A sweep set made with --contacts.")],
+    json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
+) -> None:
+    """Measure it on the test objects, beside the classical estimates from moment and force."""
+    try:
+        from tactile_rt.evidence.locating import contact_records
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    from tactile_rt.evidence.records import show, write
+
+    check_output(json)
+    with Console(stderr=True).status("evaluating"):
+        records = contact_records(checkpoint, data)
+    show(records, Console())
+    if json:
+        write(records, json)
+
+
+def _shapes(manifest: "SweepManifest") -> "WhiskerShapes":
+    """Of the whiskers that a set was made with, from mm to SI."""
+    from tactile_rt.classifier.contact_point import WhiskerShapes
+    from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+
+    animals = load_animals(str(manifest.recipe.get("array", "mouse")))
+    whiskers = [whisker for animal in animals for whisker in animal.whiskers]
+    return WhiskerShapes(
+        length=np.array([w.length for w in whiskers]) * 1e-3,
+        curvature=np.array([w.curvature for w in whiskers]) * 1e3,
+        base_radius=np.array([w.base_radius for w in whiskers]) * 1e-3,
+        tip_radius=np.array([w.tip_radius for w in whiskers]) * 1e-3,
+        young_modulus=np.array([w.young_modulus for w in whiskers]),
+    )

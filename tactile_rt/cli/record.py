@@ -1,0 +1,143 @@
+"""`tactile-rt record`, `recover` and `convert`: streams at rest."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tactile_rt.cli.app import app, check_output, starting
+from tactile_rt.cli.run import Seconds, leaving
+from tactile_rt.stream import ConfigError, EndOfStream, Source
+
+if TYPE_CHECKING:
+    from tactile_rt.recording import StreamWriter
+
+POLL_S = 0.1
+TELL_S = 1.0
+
+Force = Annotated[bool, typer.Option("--force", help="Replace a file that is there.")]
+
+
+@app.command()
+def record(
+    source: Annotated[str, typer.Argument(help="URL of a source, e.g. serial:PORT?codec=native.")],
+    output: Annotated[Path, typer.Argument(help="The recording, as a rule .mcap.")],
+    seconds: Seconds = None,
+    note: Annotated[
+        list[str] | None, typer.Option(help="To keep with it: NAME=VALUE; may be repeated.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Record a source's samples and, of a device, its raw packets and health.
+
+    A line a second goes to stderr. Ctrl-C ends it; what is in the file
+    then is whole. Of a recorder that was killed, `tactile-rt recover`
+    makes a whole file, too.
+    """
+    from tactile_rt.recording import StreamWriter
+    from tactile_rt.recording.layout import need_mcap
+    from tactile_rt.sources.opening import open_source
+
+    need_mcap()
+    check_output(output)
+    if output.exists() and not force:  # before a device is opened and started
+        raise ConfigError(f"{output} is there already: name another file, or give --force")
+    session = _notes(note or [])
+    with starting():
+        opened = open_source(source)
+    with (
+        opened,
+        StreamWriter(output, opened, url=source, session=session, force=force) as writer,
+        leaving(seconds),
+    ):
+        _copy(opened, writer)
+    typer.echo(f"{output}: {_told(opened, writer)}")
+
+
+def _copy(source: Source, writer: "StreamWriter") -> None:
+    """Record until the stream ends, and tell how it goes."""
+    tell_at = time.monotonic() + TELL_S
+    while True:
+        try:
+            chunk = source.read(POLL_S)
+        except EndOfStream:
+            return
+        if chunk is not None:
+            writer.push(chunk)
+        if time.monotonic() >= tell_at:
+            tell_at += TELL_S
+            typer.echo(_told(source, writer), err=True)
+
+
+def _told(source: Source, writer: "StreamWriter") -> str:
+    done, stats = writer.stats, source.stats
+    health = getattr(source, "health", None)
+    said = [f"{health.state}"] if health is not None else []
+    said.append(f"{done.samples} samples")
+    if writer.about.wire:
+        said.append(f"{done.packets} packets")
+    said.append(f"{done.bytes / 1e6:.1f} MB")
+    if stats.corrupt or stats.missing:
+        said.append(f"lost on the wire: {stats.corrupt} damaged, {stats.missing} missing")
+    if done.dropped_samples or done.dropped_packets:
+        said.append(
+            f"disk too slow: {done.dropped_samples} samples, {done.dropped_packets} packets dropped"
+        )
+    return ", ".join(said)
+
+
+def _notes(given: list[str]) -> dict[str, str]:
+    notes = {}
+    for pair in given:
+        name, equals, value = pair.partition("=")
+        if not equals or not name or name == "crc32":
+            raise ConfigError(f"--note is NAME=VALUE, not {pair!r}")
+        notes[name] = value
+    return notes
+
+
+@app.command()
+def recover(
+    recording: Annotated[Path, typer.Argument(help="One that was cut short, or is damaged.")],
+    output: Annotated[
+        Path | None, typer.Option(help="Where to; default: beside it, NAME.recovered.mcap.")
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Make a whole recording of what is left of one; the old file stays."""
+    from tactile_rt.recording import read_stream
+    from tactile_rt.recording import recover as recovered
+
+    check_output(output)
+    made = recovered(recording, output, force)
+    if made == recording:
+        typer.echo(f"{recording} is whole: nothing to do")
+        return
+    n, first, last = 0, 0, 0
+    for chunk in read_stream(made):
+        first = first if n else int(chunk.t_ns[0])
+        n, last = n + len(chunk), int(chunk.t_ns[-1])
+    typer.echo(f"{made}: {n} samples, {(last - first) / 1e9:.1f} s")
+
+
+@app.command()
+def convert(
+    recording: Annotated[Path, typer.Argument(help="A .mcap of tactile-rt, .npz, .csv or .h5.")],
+    output: Annotated[Path, typer.Argument(help="Another of these.")],
+    force: Force = False,
+) -> None:
+    """Write a recording as arrays (.npz, .h5) or text (.csv), or make it one again (.mcap).
+
+    Samples, description, decisions, events and health come back bit for
+    bit; raw packets are in the .mcap alone. A .csv has a .csv.json beside
+    it, with all that is no sample.
+    """
+    from tactile_rt.recording.conversion import convert as converted
+    from tactile_rt.recording.conversion import outputs_of
+
+    for file in outputs_of(output):
+        check_output(file)
+        if file.exists() and not force:
+            raise ConfigError(f"{file} is there already: name another file, or give --force")
+    typer.echo(f"{output}: {converted(recording, output)} samples")

@@ -1,0 +1,270 @@
+"""`tactile-rt replay`: what a model decides on a recording, and whether it did so live."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO
+from urllib.parse import parse_qsl
+
+import typer
+
+from tactile_rt.cli.app import app, check_output
+from tactile_rt.cli.run import leaving
+from tactile_rt.stream import ConfigError, RecordingError
+
+if TYPE_CHECKING:
+    from tactile_rt.classifier.classifier import Classification, Classifier
+    from tactile_rt.recording import Description
+
+DIFFERENT = 1
+TIMING = ("model_ms", "latency_ms", "late")  # of a decision's message: not the same twice
+
+
+@app.command()
+def replay(
+    files: Annotated[
+        list[Path], typer.Argument(help="A recording; or the rotated files of one source.")
+    ],
+    model: Annotated[
+        Path | None, typer.Option(help="An .onnx model; default: the one that decided live.")
+    ] = None,
+    name: Annotated[str, typer.Option(help="Which of several models that decided live.")] = "",
+    speed: Annotated[
+        str, typer.Option(help="Times the recorded pace, 1 for as it was; or max.")
+    ] = "max",
+    codec: Annotated[
+        str, typer.Option(help="Decode the raw packets by this codec: NAME, NAME?OPTION=VALUE.")
+    ] = "",
+    redecode: Annotated[
+        bool, typer.Option("--redecode", help="Decode the raw packets again, as recorded.")
+    ] = False,
+    check: Annotated[
+        bool, typer.Option("--check", help="Compare with the recorded decisions; 1: they differ.")
+    ] = False,
+    out: Annotated[Path | None, typer.Option(help="Where decisions go; default: stdout.")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+) -> None:
+    """Let a model decide on a recording, as it did or would have done live.
+
+    One line of JSON per decision, as the daemon's `decision` messages,
+    less the times that they took: the same bytes at every speed and in
+    every run. With --check they are compared with the recorded ones
+    instead of printed; exit code 1, and the first difference, if there is
+    one. With --codec or --redecode the samples are decoded anew, and how
+    they differ from the recorded ones is told.
+    """
+    fields = {"speed": _speed(speed)} | _decoding(codec, redecode)
+    check_output(out)
+    if out is not None and out.exists() and not force:
+        raise ConfigError(f"{out} is there already: name another file, or give --force")
+    told = _Replay(_in_order(files), model, name, check, fields)
+    if "from" in fields:
+        _compare(told.files, {k: v for k, v in fields.items() if k not in ("from", "speed")})
+    if out is not None:
+        from tactile_rt.files import write_whole
+
+        write_whole(out, told.write)
+    elif check:
+        told.write(None)
+    else:
+        finished = False
+        with leaving(None):
+            for line in told.lines():
+                typer.echo(line)  # which flushes
+            finished = True
+        if not finished:
+            typer.echo("stopped before the end", err=True)
+    typer.echo(f"{told.samples} samples, {len(told.decided)} decisions", err=True)
+    if check:
+        told.compare()
+
+
+class _Replay:
+    """Files through a classifier."""
+
+    def __init__(
+        self,
+        files: "list[tuple[Path, Description]]",
+        model: Path | None,
+        name: str,
+        check: bool,
+        fields: dict[str, str],
+    ) -> None:
+        from tactile_rt.classifier.model_file import hash_of
+        from tactile_rt.recording.checking import file_of_model, live_model
+
+        self.files, self._fields = files, fields
+        self.samples = 0
+        self.decided: list[dict[str, Any]] = []
+        self._first = self._last = 0  # stream time, ns
+        self._begins_at = 0
+        about = files[0][1]
+        self._live = live_model(str(files[0][0]), about, name, model, check)
+        self._model = file_of_model(model, self._live)
+        sha256 = hash_of(self._model)
+        known = self._live.sha256 if self._live else ""
+        if check and known and known != sha256:
+            raise ConfigError(
+                f"--check needs the model that decided, sha256 {known[:16]}...; "
+                f"{self._model} is {sha256[:16]}..."
+            )
+
+    def write(self, file: BinaryIO | None) -> None:
+        """All lines into a file; None: nowhere."""
+        for line in self.lines():
+            if file is not None:
+                file.write(line + b"\n")
+
+    def lines(self) -> Iterator[bytes]:
+        """A line for each decision, as soon as it is due."""
+        import msgspec
+
+        from tactile_rt.recording.replay import open_replay
+
+        classifier: Classifier | None = None
+        after = 0
+        for path, about in self.files:
+            with open_replay(str(path), dict(self._fields)) as source:
+                for chunk in source:
+                    # Numbers that begin anew are another stream: what was touched is not known.
+                    if classifier is None or chunk.seq[0] < after:
+                        classifier = self._classifier(source.spec)
+                    if not self.samples:
+                        self._first, self._begins_at = int(chunk.t_ns[0]), int(chunk.seq[0])
+                    after, self._last = int(chunk.seq[-1]) + 1, int(chunk.t_ns[-1])
+                    self.samples += len(chunk)
+                    for decision in classifier.push(chunk):
+                        message = self._message(decision, about)
+                        self.decided.append(message)
+                        yield msgspec.json.encode(message)
+
+    def compare(self) -> None:
+        """Tell whether the decisions are the recorded ones; leave with `DIFFERENT` if not."""
+        from tactile_rt.recording import read_decisions
+        from tactile_rt.recording.checking import check_decisions
+
+        assert self._live is not None
+        recorded = [
+            decision
+            for path, _ in self.files
+            for decision in read_decisions(path)
+            if decision["model"] == self._live.name
+        ]
+        table = self._live.table
+        checked = check_decisions(
+            recorded, self.decided, (self._first, self._last),
+            final_only=table.get("decisions") == "final",
+            may_withhold=table.get("late") == "skip",
+        )  # fmt: skip
+        said = [f"{checked.same} decisions of {self._live.name} are as recorded"]
+        if checked.before:
+            said.append(f"{checked.before} recorded ones are about samples before the first")
+        if checked.withheld:
+            said.append(f"{checked.withheld} were withheld live as late")
+        if checked.late:
+            said.append(f"{checked.late} at the end came too late for the recording")
+        if not self._live.sha256:
+            said.append("the recording does not tell the model's hash")
+        typer.echo("; ".join(said))
+        if checked.difference:
+            typer.secho(checked.difference, err=True, fg="red")
+            if self._begins_at:
+                typer.echo(
+                    f"the recording begins in the middle of its stream (sample {self._begins_at}); "
+                    "what came before decides, too: give the files before it as well",
+                    err=True,
+                )
+            raise typer.Exit(DIFFERENT)
+
+    def _classifier(self, spec: Any) -> "Classifier":
+        from tactile_rt.classifier.classifier import Classifier
+
+        table = self._live.table if self._live else {}
+        return Classifier(
+            self._model, spec, mode=table.get("mode", "episode"), every=table.get("every") or None,
+            sure=table.get("sure") or None, in_a_row=table.get("in_a_row", 2),
+            providers=tuple(table.get("providers", ("cpu",))),
+        )  # fmt: skip
+
+    def _message(self, decision: "Classification", about: "Description") -> dict[str, Any]:
+        import msgspec
+
+        from tactile_rt.daemon.items import Decision
+        from tactile_rt.daemon.messages import message_of
+
+        item = Decision(
+            about.session.get("daemon_source", about.spec.name),
+            self._live.name if self._live else self._model.stem,
+            about.spec.frame, decision, 0, 0, about.utc_offset_ns,
+        )  # fmt: skip
+        fields: dict[str, Any] = msgspec.to_builtins(message_of(item))
+        return {key: value for key, value in fields.items() if key not in TIMING}
+
+
+def _in_order(files: list[Path]) -> "list[tuple[Path, Description]]":
+    """The files of one source by time, and what each is of."""
+    from tactile_rt.recording import read_description, read_stream
+
+    folders = [path for path in files if path.is_dir()]
+    if folders:
+        raise ConfigError(f"{folders[0]} is a folder: {_sources_in(folders[0])}")
+    found = [(path, read_description(path)) for path in files]
+    names = dict.fromkeys(about.session.get("daemon_source", about.source) for _, about in found)
+    if len(names) > 1:
+        raise ConfigError(
+            f"recordings of several sources: {', '.join(names)}; replay one at a time"
+        )
+    if len(found) == 1:
+        return found
+    begins = []
+    for path, about in found:
+        if differing := found[0][1].spec.differences(about.spec):
+            raise ConfigError(f"{path} is of another array than {files[0]}: {differing[0]}")
+        first = next(read_stream(path), None)
+        begins.append(0 if first is None else int(first.t_ns[0]) + about.utc_offset_ns)
+    return [found[k] for k in sorted(range(len(found)), key=begins.__getitem__)]
+
+
+def _sources_in(folder: Path) -> str:
+    from tactile_rt.recording import read_description
+
+    names: dict[str, str] = {}
+    for path in sorted(folder.glob("*.mcap")):
+        try:
+            about = read_description(path)
+        except RecordingError:
+            continue
+        names.setdefault(about.session.get("daemon_source", about.source), path.name)
+    if not names:
+        return "name a recording"
+    said = ", ".join(f"{name} ({file} ...)" for name, file in names.items())
+    return f"name the files of one source; it has recordings of {said}"
+
+
+def _compare(files: "list[tuple[Path, Description]]", options: dict[str, str]) -> None:
+    from tactile_rt.recording.redecoding import compare_decoding
+
+    if len(files) > 1:
+        raise ConfigError("packets are decoded again from one file at a time")
+    for line in compare_decoding(files[0][0], options).lines():
+        typer.echo(line, err=True)
+
+
+def _speed(text: str) -> str:
+    try:
+        speed = 0.0 if text == "max" else float(text)
+    except ValueError:
+        speed = -1.0
+    if not (0 < speed < float("inf") or text == "max"):
+        raise ConfigError(f"--speed is max, or times the recorded pace, not {text!r}")
+    return repr(speed)
+
+
+def _decoding(codec: str, redecode: bool) -> dict[str, str]:
+    """Options of `replay:` for raw packets; none to replay samples."""
+    if not codec:
+        return {"from": "wire"} if redecode else {}
+    chosen, _, query = codec.partition("?")
+    own = dict(parse_qsl(query.replace("+", "%2B"), keep_blank_values=True))
+    if set(own) & {"from", "speed", "codec"}:
+        raise ConfigError(f"--codec {codec}: from, speed and codec are not options of a codec")
+    return {"from": "wire", "codec": chosen, **own}

@@ -1,0 +1,235 @@
+"""`tactile-rt train`, `recipes`, `probe` and `export`: from a sweep set to a model file."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from tactile_rt.cli.app import app, needs
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.stream import ConfigError
+
+if TYPE_CHECKING:
+    from tactile_rt.models.training import Progress
+
+WAITING = 0.1  # share of an epoch: less says nothing that one could do something about
+
+
+@app.command()
+def train(
+    data: Annotated[Path, typer.Argument(help="A sweep set.")],
+    folder: Annotated[Path, typer.Argument(help="The run; an interrupted one goes on.")],
+    recipe: Annotated[
+        str, typer.Option(help="See `tactile-rt recipes`; or a TOML file. Options override it.")
+    ] = "default",
+    encoder: Annotated[str | None, typer.Option(help="zhuang-CELL, resnet18, s4, ...")] = None,
+    graph: Annotated[
+        Path | None, typer.Option(help="TOML file of nodes and edges, for --encoder graph.")
+    ] = None,
+    attender: Annotated[str | None, typer.Option(help="gpt, mamba or none.")] = None,
+    decoder: Annotated[str | None, typer.Option(help="linear, mlp or mlp-all.")] = None,
+    width: Annotated[
+        float | None, typer.Option(help="Scales every channel count; a multiple of 1/32.")
+    ] = None,
+    objective: Annotated[
+        str | None, typer.Option(help="supervised, simclr, simsiam or autoencoder.")
+    ] = None,
+    augmentation: Annotated[
+        str | None, typer.Option(help="none, tactile, tactile-paper or image.")
+    ] = None,
+    masking: Annotated[float | None, typer.Option(help="Share of steps to blank.")] = None,
+    optimizer: Annotated[
+        str | None, typer.Option(help="sgd, adam, adamw, lars or lars-paper.")
+    ] = None,
+    schedule: Annotated[
+        str | None, typer.Option(help="step, constant, cosine, cosine-annealing or one-cycle.")
+    ] = None,
+    epochs: Annotated[
+        int | None, typer.Option(min=1, help="Passes over the training split.")
+    ] = None,
+    updates: Annotated[
+        int | None, typer.Option(min=0, help="Stop after so many updates instead; 0: epochs.")
+    ] = None,
+    batch: Annotated[int | None, typer.Option(min=1, help="Sweeps per update.")] = None,
+    learning_rate: Annotated[float | None, typer.Option(help="The peak.")] = None,
+    precision: Annotated[str | None, typer.Option(help="bf16 or fp32.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Of weights, windows and noise.")] = None,
+    device: Annotated[str, typer.Option(help="auto, cpu, cuda ...")] = "auto",
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Write logs for TensorBoard, too.")
+    ] = False,
+    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+) -> None:
+    """Train an Encoder-Attender-Decoder network on a sweep set."""
+    try:
+        import torch
+
+        from tactile_rt.models import training
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    torch.set_num_threads(threads)
+    asked = {
+        "encoder": encoder,
+        "graph": None if graph is None else _text(graph),
+        "attender": attender,
+        "decoder": decoder,
+        "width": width,
+        "objective": objective,
+        "augmentation": augmentation,
+        "masking": masking,
+        "optimizer": optimizer,
+        "schedule": schedule,
+        "epochs": epochs,
+        "updates": updates,
+        "batch": batch,
+        "learning_rate": learning_rate,
+        "precision": precision,
+        "seed": seed,
+    }
+    given = {name: value for name, value in asked.items() if value is not None}
+    config = training.read_recipe(recipe, str(data), **given)
+    # Under torchrun every process has the same to say.
+    console = Console(stderr=True, quiet=os.environ.get("RANK", "0") != "0")
+    with progress_bar(console, "finding onsets") as update:
+
+        def show(at: "training.Progress") -> None:
+            update(
+                total=at.updates,
+                completed=at.update,
+                description=f"epoch {at.epoch}/{at.epochs} loss {at.loss:.3f}",
+            )
+            if at.metrics:
+                console.print(_in_words(at))
+
+        try:
+            best = training.train(config, folder, show, tensorboard=tensorboard, device=device)
+        except ModuleNotFoundError as error:
+            raise needs("train", error) from None
+    console.print(f"best network: {best}")
+
+
+def _in_words(at: "Progress") -> str:
+    """What came of an epoch."""
+    m = at.metrics
+    if "validation_top1" in m:
+        found = (
+            f"validation top-1 {100 * m['validation_top1']:.1f} % clean, "
+            f"{100 * m['validation_top1_noisy']:.1f} % at rated noise"
+        )
+    else:
+        found = f"validation loss {m['validation_loss']:.3f}"
+    waited = f" ({100 * m['waiting']:.0f} % of the time waiting for data)"
+    return f"epoch {at.epoch}: loss {m['loss']:.3f}, {found}" + waited * (m["waiting"] >= WAITING)
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path} is no text file") from None
+
+
+@app.command()
+def recipes() -> None:
+    """List the training recipes that ship."""
+    try:
+        from tactile_rt.models.training.recipes import load_recipe, shipped_recipes
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    table = Table(box=None, pad_edge=False)
+    for column in ("recipe", "what", "tried"):
+        table.add_column(column, no_wrap=column == "recipe")
+    for name in shipped_recipes():
+        recipe = load_recipe(name)
+        tried = (f"{key} {', '.join(map(str, v))}" for key, v in recipe.search.items())
+        table.add_row(name, recipe.about, "; ".join(tried))
+    Console().print(table)
+
+
+@app.command()
+def probe(
+    checkpoint: Annotated[Path, typer.Argument(help="best.pt of a training run.")],
+    folder: Annotated[Path, typer.Argument(help="Where the probed network goes.")],
+    data: Annotated[
+        Path | None, typer.Option(help="Sweep set; default: the one it was trained on.")
+    ] = None,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the features.")] = 100,
+    learning_rate: Annotated[float, typer.Option(help="Of SGD.")] = 0.1,
+    standardise: Annotated[
+        bool, typer.Option(help="Fit on standardised features; the paper did not.")
+    ] = True,
+    seed: Annotated[int, typer.Option(help="Of the layer and the windows.")] = 0,
+) -> None:
+    """Fit a linear layer on a frozen network's features: how much of the category do they hold?"""
+    try:
+        from tactile_rt.models import training
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    config = training.ProbeConfig(
+        data=str(data or ""),
+        epochs=epochs,
+        learning_rate=learning_rate,
+        standardise=standardise,
+        seed=seed,
+    )
+    console = Console(stderr=True)
+    with console.status("probing"):
+        shown: list[training.Progress] = []
+        best = training.probe(checkpoint, folder, config, shown.append)
+    m = shown[-1].metrics
+    console.print(
+        f"{best}: validation top-1 {100 * m['validation_top1']:.1f} % clean, "
+        f"{100 * m['validation_top1_noisy']:.1f} % at rated noise"
+    )
+
+
+@app.command()
+def export(
+    checkpoint: Annotated[Path, typer.Argument(help="best.pt of a training run.")],
+    model: Annotated[Path, typer.Argument(help="The .onnx file to write.")],
+    name: Annotated[str, typer.Option(help="Of the model; default: the file's name.")] = "",
+    precision: Annotated[
+        str, typer.Option(help="fp32, fp16 or bf16 (smaller files), int8 (also faster).")
+    ] = "fp32",
+    kind: Annotated[
+        str, typer.Option(help="step: one step of a stream; window: a whole episode at once.")
+    ] = "step",
+    data: Annotated[
+        Path | None,
+        typer.Option(help="Where the sweep set it was trained on lies now; default: where it lay."),
+    ] = None,
+) -> None:
+    """Export a trained network as a streaming ONNX step, with everything needed to run it."""
+    try:
+        from tactile_rt.export.precision import PRECISIONS
+        from tactile_rt.export.release import release
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    if model.is_dir():
+        raise ConfigError(f"{model} is a folder: name a file to write")
+    if precision not in PRECISIONS:
+        raise ConfigError(f"--precision is {precision!r}, not one of {', '.join(PRECISIONS)}")
+    if kind not in ("step", "window"):
+        raise ConfigError(f"--kind is {kind!r}, not one of step, window")
+    console = Console(stderr=True)
+    with console.status("calibrating, exporting and checking parity"):
+        card = release(
+            checkpoint,
+            model,
+            name or model.stem,
+            precision,
+            "window" if kind == "window" else "step",
+            data,
+        )
+    console.print(
+        f"{model}: {model.stat().st_size / 1e6:.1f} MB, parity {card.figures['parity']:.1e}, "
+        f"temperature {card.temperature:.2f}"
+    )
+    if precision != "fp32":
+        console.print(
+            "{quantisation_agreement:.1f} % of {quantisation_sweeps} validation decisions as in "
+            "fp32, top-1 {quantisation_top1_drop:.1f} points lower".format(**card.figures)
+        )

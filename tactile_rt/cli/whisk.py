@@ -1,0 +1,162 @@
+"""`tactile-rt whisk`: the array whisks against an object, or the stimuli of a recording."""
+
+import hashlib
+import math
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.stream import ConfigError
+
+
+@app.command()
+def whisk(
+    out: Annotated[Path, typer.Argument(help="The .npz to write; a .json goes beside it.")],
+    stimulus: Annotated[
+        str | None,
+        typer.Option(help="convex-close, concave-far, ..., comma-separated. Default: all six."),
+    ] = None,
+    target: Annotated[
+        str | None, typer.Option("--object", help="Instead of a stimulus: mug-3, or a mesh file.")
+    ] = None,
+    position: Annotated[
+        str,
+        typer.Option(
+            help="Of the object's centre: x lateral (away from the head), y rostral, z up, mm."
+        ),
+    ] = "25,5,0",
+    size: Annotated[float, typer.Option(help="Of the object: its largest extent, mm.")] = 20.0,
+    yaw: Annotated[float, typer.Option(help="Of the object, degrees.")] = 0.0,
+    radius: Annotated[float, typer.Option(help="Of the stimuli's arc, mm.")] = 63.6,
+    step: Annotated[
+        str, typer.Option(help="From a stimulus to the next further one: x,y,z, mm.")
+    ] = "1,1,0",
+    array: Annotated[str, typer.Option(help="mouse, rat, mouse-left, ..., or a file.")] = "mouse",
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(help="A .csv of time_s and theta_deg, instead of regular whisking."),
+    ] = None,
+    frequency: Annotated[float, typer.Option(help="Cycles per second.")] = 8.0,
+    protraction: Annotated[float, typer.Option(help="Furthest forward of rest, degrees.")] = 35.0,
+    retraction: Annotated[float, typer.Option(help="Furthest backward of rest, degrees.")] = 10.0,
+    asymmetry: Annotated[float, typer.Option(help="Fraction of a cycle spent protracting.")] = 0.5,
+    phase: Annotated[float, typer.Option(help="At the start, degrees; 0: fully retracted.")] = 0.0,
+    duration: Annotated[float, typer.Option(help="Seconds.")] = 1.5,
+    profile: Annotated[
+        str, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
+    ] = "dataset",
+) -> None:
+    """Whisk against surfaces and write what the array feels from first contact on."""
+    if out.suffix != ".npz":
+        raise ConfigError(f"{out}: name a file that ends in .npz")
+    if target is not None and stimulus is not None:
+        raise ConfigError("--object and --stimulus exclude each other: name one of them")
+    for file in (out, out.with_suffix(".json")):
+        check_output(file)
+    try:
+        with starting():
+            import numpy as np
+
+            from tactile_rt.sim_backend.arrays.whisker_array import load_array
+            from tactile_rt.sim_backend.arrays.whiskers import rotation
+            from tactile_rt.sim_backend.objects.catalogue import load_object
+            from tactile_rt.sim_backend.stimuli import STIMULI, Surface, whisk_against, write_input
+            from tactile_rt.sim_backend.trajectories import Whisk, base_angles, read_trajectory
+            from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
+            from tactile_rt.sim_backend.world import PROFILES, array_spec
+    except ModuleNotFoundError as error:
+        raise needs("sim", error) from None
+    if profile not in PROFILES:
+        raise ConfigError(f"no profile {profile!r}: there are {', '.join(PROFILES)}")
+    animal = load_array(array)
+    moves = (
+        read_trajectory(trajectory, animal.whiskers)
+        if trajectory
+        else Whisk(
+            frequency_hz=frequency,
+            protraction_deg=protraction,
+            retraction_deg=retraction,
+            asymmetry=asymmetry,
+            phase_deg=phase,
+            duration_s=duration,
+        )
+    )
+    pieces, described = {}, {}
+    # The stimuli stand on the right of the head, those of an array of the left on its left.
+    left = all(w.base[0] < 0 for w in animal.whiskers)
+    head, mirror = (HEAD.mirrored(), (-1.0, 1.0, 1.0)) if left else (HEAD, (1.0, 1.0, 1.0))
+    if target is not None:
+        if not 0 < size < 1e3:
+            raise ConfigError(f"--size must be above 0 and below 1000 mm, not {size:g}")
+        if not math.isfinite(yaw):
+            raise ConfigError(f"--yaw must be a number of degrees, not {yaw}")
+        thing = load_object(target)
+        at = np.array(_three(position, "--position")) * mirror
+        turn = rotation("z", np.radians(yaw))
+        pieces[thing.name] = tuple(p.vertices * size @ turn.T + at for p in thing.pieces)
+        described[thing.name] = {"position_mm": at.tolist(), "size_mm": size, "yaw_deg": yaw}
+    else:
+        names = STIMULI if stimulus in (None, "all") else stimulus.split(",")
+        for name in dict.fromkeys(n.strip() for n in names):
+            surface = Surface.named(name, _three(step, "--step"), radius)
+            pieces[name] = tuple(corners * mirror for corners in surface.pieces())
+            described[name] = {
+                **asdict(surface),
+                "mirrored": left,
+                "facet_error_mm": surface.largest_gap_mm,
+            }
+
+    console = Console(stderr=True)
+    felt = {}
+    with progress_bar(console, "whisking") as update:
+        for name, corners in pieces.items():
+            try:
+                simulation = WhiskSimulation(
+                    animal.whiskers, moves, PROFILES[profile], corners, head
+                )
+            except ConfigError as error:
+                raise ConfigError(f"{name}: {error}") from None
+            update(total=simulation.samples * len(pieces), description=name)
+            felt[name] = whisk_against(simulation, lambda n: update(advance=n))
+    times = np.arange(simulation.samples, dtype=np.float64) * 1e-3
+    parameters: dict[str, Any] = {
+        "parameters": described,
+        "approximate": target is None,
+        "trajectory": _described(trajectory) if trajectory else asdict(moves),
+        "head": asdict(head),
+        "profile": {"name": profile, **asdict(PROFILES[profile])},
+    }
+    write_input(
+        out,
+        felt,
+        array_spec(animal.whiskers, animal.name),
+        base_angles(moves, times, animal.whiskers),
+        parameters,
+    )
+    for name, what in felt.items():
+        touched = int(what.touch.any(axis=0).sum())
+        console.print(
+            f"{name}: first contact at {what.first_ms} ms, {touched} of "
+            f"{len(animal.whiskers)} whiskers touch it"
+        )
+    console.print(f"{out} and {out.with_suffix('.json')}: {len(felt)} stimuli")
+
+
+def _three(text: str, option: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+        if not all(map(math.isfinite, (x, y, z))):
+            raise ValueError
+    except ValueError:
+        raise ConfigError(f"{option} is three numbers, x,y,z, in mm; not {text!r}") from None
+    return x, y, z
+
+
+def _described(trajectory: Path) -> dict[str, str]:
+    sha256 = hashlib.sha256(trajectory.read_bytes()).hexdigest()
+    return {"file": trajectory.name, "sha256": sha256}

@@ -1,0 +1,295 @@
+"""What a model file can do on objects that it never saw: the figures of `tactile-rt eval`.
+
+The model runs as on a robot: the ONNX file itself, step by step, from where the contact detector
+finds its onset.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.classifier.model_file import load_model
+from tactile_rt.evidence.records import Record
+from tactile_rt.evidence.robustness import RATED, measure_robustness, robustness_records
+from tactile_rt.models import evaluation
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.stream import ConfigError, SpecMismatch
+from tactile_rt.sweep_set import WITHHELD, Sweeps
+
+__all__ = ["evaluate_model"]
+
+# By the number of classes: of the shipped recipes `mouse12` and `default24`.
+BARS = {
+    12: {"top-1": ">= 91", "top-5": ">= 99", "fused": ">= 97"},
+    24: {"top-1": ">= 82", "top-5": ">= 97", "fused": ">= 96", "noise": "<= 4"},
+}
+ECE_BAR = "<= 5"
+# The same sweeps under every condition of a long list: this many of each object are enough.
+ROBUSTNESS_SWEEPS, QUICK_SWEEPS = 4, 2
+
+
+def evaluate_model(
+    model: Path,
+    data: Path,
+    accurate: Path | None = None,
+    svm: bool = False,
+    pictures: Path | None = None,
+    quick: bool = False,
+) -> list[Record]:
+    """Measure a model on the test split of a sweep set.
+
+    Args:
+        model: the ``.onnx`` file.
+        data: a sweep set.
+        accurate: a set with the same test sweeps simulated at another profile.
+        svm: fit an RBF support vector machine on the same windows to compare with.
+        pictures: folder for ``confusion.png``, ``accuracy_over_time.png``, ``robustness.png``.
+        quick: take two sweeps of each object: enough to compare by, not to quote.
+
+    Raises:
+        ConfigError: the model was trained on some of the test objects, or on other categories
+            or another sample period; or `accurate` tests on other objects.
+        SpecMismatch: the model was made for another array than the set's.
+        ModelError, RecordingError: a file cannot be read.
+    """
+    run, card = _runner(model)
+    test = SweepSet.read(data, "test")
+    if test.manifest.categories != card.labels:
+        raise ConfigError(f"{model} knows other categories than {data}")
+    differences = card.array.differences(test.manifest.spec, ignore=("name", "rate_hz"))
+    if differences:
+        raise SpecMismatch(f"{model} was made for another array: " + "; ".join(differences))
+    if test.manifest.period_ns != card.period_ns:
+        raise ConfigError(
+            f"{model} takes a sample every {card.period_ns} ns, {data} has one every "
+            f"{test.manifest.period_ns} ns"
+        )
+    if quick:
+        test = _first_of_each(test, QUICK_SWEEPS)
+    labels, objects = test.sweeps.labels, test.sweeps.objects
+    unseen = card.provenance.get("unseen_objects")
+    if unseen is not None and not set(objects.tolist()) <= set(unseen):
+        raise ConfigError(f"{model} may have been trained on objects that {data} tests on")
+    # What may fail comes first, lest it fail after minutes.
+    other = SweepSet.read(accurate, "test") if accurate is not None else None
+    if other and not set(other.sweeps.objects.tolist()) <= set(objects.tolist()):
+        raise ConfigError(f"{accurate} tests on other objects than {data}")
+    if pictures is not None:
+        pictures.mkdir(parents=True, exist_ok=True)
+    sample = f"{len(set(objects.tolist()))} unseen objects, {len(labels)} sweeps"
+
+    clean = evaluation.predict(test, run)
+    over_time = evaluation.accuracy_over_time(clean, labels)
+    bars = BARS.get(len(card.labels), {})
+    records = [
+        _accuracy("top-1", clean[:, -1], labels, objects, bars.get("top-1", ""), sample),
+        _accuracy("top-5", clean[:, -1], labels, objects, bars.get("top-5", ""), sample, top=5),
+        _accuracy("top-1 at step 14 of 22", clean[:, 13], labels, objects, "", sample),
+    ]
+    for sweeps, count, bar in ((2, "two", bars.get("fused", "")), (4, "four", "")):
+        if np.unique(objects, return_counts=True)[1].max() >= sweeps:  # enough of one object
+            fused = evaluation.fused_accuracy(clean[:, -1], labels, objects, sweeps)
+            records.append(_record(f"{count} sweeps fused", fused, bar, sample))
+    settled = evaluation.deciding_step(clean, labels)
+    step_ms = card.period_ns * card.substeps * 1e-6
+    if settled.any():
+        records.append(
+            Record(
+                "models.time to the final decision",
+                float(np.median(settled[settled > 0])) * step_ms,
+                "ms",
+                "",
+                "median",
+                f"from contact onset, where it is right in the end; {sample}",
+            )
+        )
+    noisy = evaluation.predict(test, run, 1.0)
+    how = f"{sample}; white noise {RATED} added to every 9 ms sample, undetected sweeps count as "
+    records.append(
+        _accuracy("top-1 at rated noise", noisy[:, -1], labels, objects, "", how + "wrong")
+    )
+    lost = records[0].value - records[-1].value
+    records.append(
+        Record(
+            "models.points lost at rated noise",
+            lost,
+            "points",
+            bars.get("noise", ""),
+            "",
+            how + "wrong",
+        )
+    )
+    # The same noise on the sensor's own 1 kHz samples: the resampler's Hann kernel leaves 0.29.
+    raw = evaluation.predict(test, run, float(np.sqrt(1.5 / 18)))
+    how = f"{sample}; white noise {RATED} on every 1 kHz sample, through the resampler"
+    records.append(
+        _accuracy("top-1 at rated noise of 1 kHz samples", raw[:, -1], labels, objects, "", how)
+    )
+    few = _first_of_each(test, ROBUSTNESS_SWEEPS)
+    robustness = measure_robustness(few, run, clean[_firsts(objects, ROBUSTNESS_SWEEPS), -1])
+    records += robustness_records(robustness, f"{len(few.sweeps)} of the sweeps")
+    records += _calibration(clean[:, -1], noisy[:, -1], labels, objects, card.temperature, sample)
+    undetected = 100 * float(np.isnan(clean[:, 0, 0]).mean())
+    records.append(Record("models.undetected sweeps", undetected, "%", "", "", sample))
+    if test.manifest.split.get(WITHHELD):
+        unknown = SweepSet.read(data, WITHHELD)
+        if quick:
+            unknown = _first_of_each(unknown, QUICK_SWEEPS)
+        records.append(_open_set(run, unknown, clean[:, -1], objects))
+    if other:
+        records += _compare_profiles(run, other, test, clean)
+    if svm:
+        from tactile_rt.evidence.svm import compare_svm
+
+        records += compare_svm(data, test, evaluation.hits(clean[:, -1], labels))
+    if pictures is not None:
+        from tactile_rt.evidence.pictures import (
+            draw_accuracy_over_time,
+            draw_confusion,
+            draw_robustness,
+        )
+
+        table = evaluation.confusion(clean[:, -1], labels, len(card.labels))
+        draw_confusion(table, card.labels, pictures / "confusion.png")
+        curves = {
+            "no sensor noise": over_time,
+            f"rated noise ({RATED} per sample)": evaluation.accuracy_over_time(noisy, labels),
+        }
+        draw_accuracy_over_time(curves, 1e-3 * step_ms, pictures / "accuracy_over_time.png")
+        draw_robustness(
+            {r.name: r.accuracy for r in robustness},
+            100 / len(card.labels),
+            f"{len(few.sweeps)} sweeps of objects never seen in training",
+            pictures / "robustness.png",
+        )
+    return records
+
+
+def _runner(model: Path) -> tuple[evaluation.Step, Any]:
+    """The model file as a function of windows, stepped as on a robot."""
+    session, card = load_model(model)
+    names = [o.name for o in session.get_outputs()]
+
+    def run(
+        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        feed: dict[str, NDArray[Any]] = {"offset": offset, "sigma": sigma}
+        feed |= {s.name: np.zeros((len(samples), *s.shape), dtype=s.dtype) for s in card.state}
+        logits = []
+        for t in range(samples.shape[1]):
+            feed["samples"] = samples[:, t]
+            out = dict(zip(names, session.run(None, feed), strict=True))
+            feed |= {s.name: out[f"{s.name}_next"] for s in card.state}
+            logits.append(out["logits"] / np.float32(card.temperature))
+        return np.stack(logits, axis=1)
+
+    return run, card
+
+
+def _accuracy(
+    name: str,
+    posteriors: NDArray[np.float32],
+    labels: NDArray[np.int64],
+    objects: NDArray[np.str_],
+    bar: str,
+    how: str,
+    top: int = 1,
+) -> Record:
+    correct = evaluation.hits(posteriors, labels, top)
+    return _record(name, evaluation.accuracy(correct, objects), bar, how)
+
+
+def _record(name: str, estimate: evaluation.Interval, bar: str, how: str) -> Record:
+    interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
+    return Record(f"models.{name}", 100 * estimate.value, "%", bar, interval, how)
+
+
+def _calibration(
+    clean: NDArray[np.float32],
+    noisy: NDArray[np.float32],
+    labels: NDArray[np.int64],
+    objects: NDArray[np.str_],
+    temperature: float,
+    sample: str,
+) -> list[Record]:
+    """ECE as shipped, of the logits as they were trained, and at rated noise."""
+    cases = (
+        ("calibration error", clean, ECE_BAR, f"at temperature {temperature:.3g}"),
+        (
+            "calibration error without temperature scaling",
+            evaluation.at_temperature(clean, 1 / temperature),
+            "",
+            "logits as they were trained",
+        ),
+        ("calibration error at rated noise", noisy, "", f"at temperature {temperature:.3g}"),
+    )
+    records = []
+    for name, posteriors, bar, how in cases:
+
+        def ece(at: NDArray[np.int64], p: NDArray[np.float32] = posteriors) -> float:
+            return evaluation.expected_calibration_error(p[at], labels[at])
+
+        estimate = evaluation.bootstrap(ece, objects)
+        records.append(_record(name, estimate, bar, f"15 bins, {how}; {sample}"))
+    return records
+
+
+def _open_set(
+    run: evaluation.Step, unknown: SweepSet, known: NDArray[np.float32], objects: NDArray[np.str_]
+) -> Record:
+    """How well the largest posterior tells categories that training never saw from those it did."""
+    there = evaluation.predict(unknown, run)[:, -1].max(axis=1)
+    scores = np.concatenate([known.max(axis=1), there])
+
+    def area(at: NDArray[np.int64]) -> float:
+        mine = at < len(known)
+        return evaluation.auroc(scores[at[mine]], scores[at[~mine]])
+
+    estimate = evaluation.bootstrap(area, np.concatenate([objects, unknown.sweeps.objects]))
+    return Record(
+        "models.known against withheld categories",
+        100 * estimate.value,
+        "% AUROC",
+        "",
+        f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object; "
+        "50: chance",
+        f"largest posterior, {len(known)} sweeps of known and {len(there)} of withheld kinds",
+    )
+
+
+def _firsts(objects: NDArray[np.str_], sweeps: int) -> NDArray[np.int64]:
+    """Indices of the first sweeps of every object."""
+    mine = [np.flatnonzero(objects == name)[:sweeps] for name in dict.fromkeys(objects.tolist())]
+    return np.concatenate(mine)
+
+
+def _first_of_each(data: SweepSet, sweeps: int) -> SweepSet:
+    at = _firsts(data.sweeps.objects, sweeps)
+    values, labels, objects = data.sweeps.values, data.sweeps.labels, data.sweeps.objects
+    return replace(data, sweeps=Sweeps(values[at], labels[at], objects[at]))
+
+
+def _compare_profiles(
+    run: evaluation.Step, other: SweepSet, test: SweepSet, clean: NDArray[np.float32]
+) -> list[Record]:
+    # The same object's first sweeps are the same draws: compare on those that both sets have.
+    mine = np.concatenate(
+        [
+            np.flatnonzero(test.sweeps.objects == name)[: (other.sweeps.objects == name).sum()]
+            for name in dict.fromkeys(other.sweeps.objects.tolist())
+        ]
+    )
+    labels = other.sweeps.labels
+    there = evaluation.predict(other, run)[:, -1]
+    at_profile = evaluation.accuracy(evaluation.hits(there, labels), other.sweeps.objects)
+    here = evaluation.hits(clean[mine, -1], labels).mean()
+    profile = other.manifest.recipe.get("profile", "other")
+    how = f"{len(labels)} sweeps of {len(set(other.sweeps.objects.tolist()))} unseen objects"
+    lost = 100 * (float(here) - at_profile.value)
+    return [
+        _record(f"top-1 at the {profile} profile", at_profile, "", how),
+        Record(f"models.points lost at the {profile} profile", lost, "points", "<= 4", "", how),
+    ]

@@ -1,0 +1,327 @@
+"""Hardware in the loop, without hardware: does a driver change what is decided?
+
+source --> emulated device --> pty, slcan or CAN bus --> the real driver --> classifier
+   |                                                                            | compared
+   +--(the same samples, stamped by the device's clock)-----------> classifier --+
+
+A decision depends on the times of its samples, as they are resampled. So the driver is asked for
+the device's own time (`clock=device`), and the direct path's samples have the time that the
+device's clock showed: what is compared is what the wire and the driver did, and nothing else. With
+the host's time, as a robot has it, decisions may differ in their last bits from run to run.
+"""
+
+import os
+import time
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.drivers.codec import codec_class
+from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
+from tactile_rt.drivers.opening import make_codec
+from tactile_rt.sources.opening import open_source
+from tactile_rt.stream import Chunk, ConfigError, Source, SourceError, SourceStats
+
+if TYPE_CHECKING:
+    from tactile_rt.drivers.emulation.faults import FaultSchedule
+    from tactile_rt.drivers.health import Health
+
+__all__ = ["CLOCKS", "RANGES", "SAME_LABEL", "WIRES", "Loop", "LoopReport", "check_line", "pair"]
+
+WIRES: Final = ("serial", "slcan", "virtual")
+CLOCKS: Final = ("device", "host")
+SAME_LABEL: Final = 0.99  # of the decisions, where the format rounds
+START_S: Final = 30.0  # for a simulation to build its world before the first sample
+WAIT_S: Final = 0.1
+# Of an emulated native device whose values are rounded, N and N m: a count is then finer than the
+# least noise that the models assume, 2 uN and 10 nN m. A mouse's whiskers bear a fiftieth of it.
+RANGES: Final = {"range_n": "0.01", "range_nm": "0.0001"}
+SAME_EPISODE_NS: Final = 100_000_000  # onsets of the same touch differ by less
+
+
+@dataclass(frozen=True)
+class LoopReport:
+    """What came out of a loop, and whether it is as it must be.
+
+    Attributes:
+        samples: that the source delivered.
+        identical_samples: of these, that came out of the driver with the same bits.
+        direct, wire: decisions of the two paths.
+        identical: decisions that are the same in every bit, latency apart.
+        same_label: decisions of the same touch and step with the same label.
+        finals, finals_same: likewise, of the last decision of each touch.
+        exact: whether all decisions must be identical; else 99 % must have the same label.
+        faulty: whether faults were on the way; then only the account of losses must be right.
+        stats: the driver's account.
+        sent: packets of the device, copies included.
+        latency_s: (n,) from the source's delivery of a chunk's last sample to the driver's; None
+            where the source does not keep to real time.
+        stamp_error_s: (n,) by how much the driver's times are late; None with the device's time.
+        health: of the driver, at the end.
+    """
+
+    samples: int
+    identical_samples: int
+    direct: int
+    wire: int
+    identical: int
+    same_label: int
+    finals: int
+    finals_same: int
+    exact: bool
+    faulty: bool
+    stats: SourceStats
+    sent: int
+    latency_s: "np.ndarray | None"
+    stamp_error_s: "np.ndarray | None"
+    health: "Health"
+
+    @property
+    def accounted(self) -> bool:
+        """Whether each packet is delivered or counted as lost."""
+        s = self.stats
+        return self.sent == s.delivered + s.corrupt + s.missing + s.dropped + s.duplicates
+
+    @property
+    def failure(self) -> str:
+        """What is not as it must be; empty: all is well."""
+        decisions = max(self.direct, self.wire)
+        if not self.accounted:
+            return f"{self.sent} packets were sent, and the driver's account does not add up"
+        if self.faulty:
+            return ""
+        if not decisions:
+            return "nothing was touched, so there is nothing to compare: more sweeps or seconds"
+        if self.exact and not (
+            self.identical_samples == self.samples and self.identical == decisions
+        ):
+            return "the driver's path is not bit-equal to the direct one"
+        if self.same_label < SAME_LABEL * decisions:
+            return f"less than {SAME_LABEL:.0%} of the decisions have the same label"
+        return ""
+
+
+@dataclass(eq=False)
+class _Tee(Source):
+    """A source whose chunks are also kept, with the host time of their delivery."""
+
+    inner: Source
+    kept: "deque[tuple[Chunk, int]]" = field(default_factory=deque)
+
+    def __init__(self, inner: Source) -> None:
+        super().__init__(inner.spec)
+        self.inner, self.kept, self.live = inner, deque(), inner.live
+        self.stats = inner.stats
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        chunk = self.inner.read(timeout)
+        if chunk is not None:
+            self.kept.append((chunk, time.monotonic_ns()))
+        return chunk
+
+    def close(self) -> None:
+        self.inner.close()
+
+
+class Loop:
+    """One source, through an emulated device and its driver, and beside them.
+
+    Args:
+        source: what the device measures; the loop closes it.
+        model: an ``.onnx`` file made for the source's array.
+        wire: one of `WIRES`.
+        codec: what the device speaks.
+        options: of the codec, as in a URL; a native device's ranges are `RANGES` unless given.
+        faults: what goes wrong on the way; the schedule is used up.
+        seconds: how much of the source's stream to send; None: to its end.
+        clock: times of the driver's samples: ``device``, or ``host``, in real time only.
+
+    Attributes:
+        complete: whether it has run to the end; a report is only judged then.
+
+    Raises:
+        ConfigError: an unknown wire, clock, codec or option, or ones that do not go together.
+        SpecMismatch: the model is for another array.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        model: Path,
+        wire: str = "serial",
+        codec: str = "native",
+        options: dict[str, str] | None = None,
+        faults: "FaultSchedule | None" = None,
+        seconds: float | None = None,
+        clock: str = "device",
+    ) -> None:
+        check_line(wire, codec, options or {}, clock)
+        if clock == "host" and not source.live:
+            raise ConfigError("the host's clock means nothing of a source that is not in real time")
+        self._options = {**(RANGES if codec == "native" else {}), **(options or {})}
+        self._model, self._clock, self._faulty = model, clock, faults is not None
+        self._direct = Classifier(model, source.spec)
+        self._tee = _Tee(source)
+        further: dict[str, Any] = {
+            "options": self._options,
+            "faults": faults,
+            "pace": "realtime" if source.live else "fast",
+            "seconds": seconds,
+            "log": False,
+        }
+        if wire == "virtual":
+            further["bus"] = f"virtual:hil-{os.getpid()}-{id(self)}"
+            further["fd"] = self._options.get("fd", "").lower() in ("1", "true")
+        make = EmulatedSerial if wire == "serial" else EmulatedCan
+        self._device = make(self._tee, codec, **further)
+        own = codec_class(make.wire, codec).Options
+        form = self._options.get("format", getattr(own, "format", ""))
+        self._exact = codec == "native" and form == "float32" and clock == "device" and not faults
+        self._first_ns: int | None = None
+        self._pending: deque[tuple[int, Chunk, int]] = deque()  # first number, samples, when
+        self._samples = self._identical = 0
+        self._decided: tuple[list[Classification], list[Classification]] = ([], [])
+        self._latency: list[int] = []
+        self._late: list[int] = []
+        self._driver: Source | None = None
+        self.complete = False
+
+    @property
+    def samples(self) -> int:
+        """Samples that the source has delivered so far."""
+        return self._samples
+
+    @property
+    def decisions(self) -> int:
+        """Decisions of the driver's path so far."""
+        return len(self._decided[1])
+
+    def run(self) -> LoopReport:
+        """Run to the source's end, or to an interrupt, after which `report` tells the rest.
+
+        Raises:
+            SourceError: the source, the device or the driver broke.
+        """
+        with self._tee, self._device:
+            url = f"{self._device.url}&clock={self._clock}&start_s={START_S:g}"
+            try:
+                driver = open_source(url)
+            except SourceError:
+                self._device.wait(0)  # if the source broke, that is why
+                raise
+            with driver:
+                self._driver = driver
+                classifier = Classifier(self._model, driver.spec)
+                while True:
+                    chunk = driver.read(WAIT_S)
+                    came_ns = time.monotonic_ns()
+                    self._push_direct()
+                    if chunk is not None:
+                        self._decided[1].extend(classifier.push(chunk))
+                        self._compare(chunk, came_ns)
+                    elif self._device.wait(0):
+                        break
+        self.complete = True
+        return self.report()
+
+    def report(self) -> LoopReport:
+        """What there is to say of it so far."""
+        driver: Any = self._driver
+        if driver is None:
+            raise SourceError("the loop has not been closed: there is nothing to report")
+        direct, wire = self._decided
+        pairs = pair(direct, wire)
+        finals = [(a, b) for a, b in pairs if a.final]
+        live, log = self._tee.live, self._device.emulator.log
+        return LoopReport(
+            samples=self._samples,
+            identical_samples=self._identical,
+            direct=len(direct),
+            wire=len(wire),
+            identical=sum(_identical(a, b) for a, b in pairs),
+            same_label=sum(a.label == b.label for a, b in pairs),
+            finals=sum(d.final for d in direct),
+            finals_same=sum(a.label == b.label for a, b in finals),
+            exact=self._exact,
+            faulty=self._faulty,
+            stats=driver.stats,
+            sent=log.sent + log.duplicated,
+            latency_s=np.array(self._latency) * 1e-9 if live and self._latency else None,
+            stamp_error_s=np.array(self._late) * 1e-9 if self._late else None,
+            health=driver.health,
+        )
+
+    def _push_direct(self) -> None:
+        """The samples that have gone into the device since, straight into the classifier."""
+        while self._tee.kept:
+            chunk, went_ns = self._tee.kept.popleft()
+            if self._first_ns is None:
+                self._first_ns = int(chunk.t_ns[0])
+            if self._clock == "device":
+                tick = self._device.codec.tick_ns or 1.0
+                ticks = np.floor_divide(chunk.t_ns - self._first_ns, tick)
+                t_ns = np.round(ticks * tick).astype(np.int64)
+                chunk = Chunk(chunk.seq, t_ns, chunk.values, chunk.valid)
+            self._pending.append((self._samples, chunk, went_ns))
+            self._samples += len(chunk)
+            self._decided[0].extend(self._direct.push(chunk))
+
+    def _compare(self, chunk: Chunk, came_ns: int) -> None:
+        """Compare what came with what went, sample by sample, by their numbers."""
+        for i, number in enumerate(chunk.seq.tolist()):
+            while self._pending and self._pending[0][0] + len(self._pending[0][1]) <= number:
+                self._pending.popleft()
+            if not self._pending or number < self._pending[0][0]:
+                continue
+            first, went, went_ns = self._pending[0]
+            at = number - first
+            if went.values.shape[1:] == chunk.values.shape[1:]:
+                same = went.values[at].tobytes() == chunk.values[i].tobytes()
+                same = same and bool((went.valid[at] == chunk.valid[i]).all())
+                same = same and (self._clock == "host" or went.t_ns[at] == chunk.t_ns[i])
+                self._identical += bool(same)
+            if self._clock == "host":
+                self._late.append(int(chunk.t_ns[i] - went.t_ns[at]))
+            if at == len(went) - 1:
+                self._latency.append(came_ns - went_ns)
+
+
+def check_line(wire: str, codec: str, options: dict[str, str], clock: str) -> None:
+    """Refuse what no source could go through, before one is opened; see `Loop`.
+
+    Raises:
+        ConfigError: an unknown wire, clock, codec or option.
+    """
+    for given, name, known in ((wire, "wire", WIRES), (clock, "clock", CLOCKS)):
+        if given not in known:
+            raise ConfigError(f"{name} must be one of {', '.join(known)}, not {given!r}")
+    make_codec("serial" if wire == "serial" else "can", codec, options)
+
+
+def pair(
+    direct: Sequence[Classification], wire: Sequence[Classification]
+) -> list[tuple[Classification, Classification]]:
+    """Decisions of the two paths that are about the same step of the same touch."""
+    by_step: dict[int, list[Classification]] = {}
+    for decision in wire:
+        by_step.setdefault(decision.step, []).append(decision)
+    pairs = []
+    for decision in direct:
+        others = by_step.get(decision.step, [])
+        if not others:
+            continue
+        at = min(range(len(others)), key=lambda i: abs(others[i].onset_ns - decision.onset_ns))
+        if abs(others[at].onset_ns - decision.onset_ns) <= SAME_EPISODE_NS:
+            pairs.append((decision, others.pop(at)))
+    return pairs
+
+
+def _identical(a: Classification, b: Classification) -> bool:
+    """Whether two decisions are the same in every bit, but for the time that they took."""
+    plain = all(getattr(a, n) == getattr(b, n) for n in ("onset_ns", "t_ns", "step", "final"))
+    return plain and a.label == b.label and a.probabilities.tobytes() == b.probabilities.tobytes()

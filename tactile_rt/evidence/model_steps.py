@@ -1,0 +1,168 @@
+"""Steps of model files beside the roofline, and the published networks at full size to measure.
+
+The latter are made here, with random weights, and need the `train` extra.
+"""
+
+import gc
+import importlib
+import os
+import resource
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from tactile_rt.classifier.model_file import ModelCard, load_model
+from tactile_rt.classifier.stepper import Stepper
+from tactile_rt.evidence.records import Record
+from tactile_rt.evidence.roofline import measure_machine, products, roofline_s
+
+__all__ = ["FULL_SIZE", "Subject", "full_size", "measure_model", "step_times"]
+
+TURNS = 5
+TAIL = "<= 1.3"  # p99 over p50 of every step
+LOAD_INT8_MS = "<= 1000"
+# p50 over the roofline, of fp32 and of int8: without the GPT, with it
+FULL_SIZE = {False: ("<= 1.25", "<= 1.6"), True: ("<= 1.4", "<= 1.7")}
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A model file to measure, and the bars that it must meet; without one it is only reported."""
+
+    name: str
+    path: Path
+    over_roofline: str = ""
+    step_ms: str = ""
+    load_ms: str = ""
+
+
+def measure_model(subject: Subject, steps: int, repetitions: int = 10) -> list[Record]:
+    """Measure one file of kind "step": size, loading, memory, steps, and these over the roofline.
+
+    Steps and the machine are measured in turns, and each turn's steps are compared with its own
+    roofline: what else a shared host does changes from minute to minute.
+
+    Args:
+        steps: to time, in all.
+        repetitions: of each product that measures the machine.
+
+    Raises:
+        ModelError: the file cannot be used.
+    """
+    name, path = f"inference.{subject.name}", subject.path
+    path.read_bytes()  # so that the file is cached
+    gc.collect()
+    before, began = _resident(), time.process_time()
+    session, card = load_model(path)
+    load = time.process_time() - began
+    turns, machines, interruptions, grown = [], [], [], 0
+    for _ in range(TURNS):
+        seconds, interrupted = step_times(session, card, -(-steps // TURNS))
+        grown = grown or _resident() - before
+        turns.append(1e3 * seconds)
+        interruptions.append(interrupted)
+        machines.append(measure_machine(repetitions))
+    work = products(path)
+    least = np.array([1e3 * roofline_s(machine, work) for machine in machines])
+    ratios = np.median(turns, axis=1) / least
+    p50, p99 = np.percentile(turns, 50), np.percentile(turns, 99)
+    how = f"network alone, {np.size(turns)} steps, one thread"
+    operations = sum(p.operations for p in work) / 1e6
+    weights = sum(p.weights for p in work) / 1e6
+    return [
+        Record(f"{name}.size", path.stat().st_size / 1e6, "MB", how=card.precision),
+        Record(f"{name}.load", 1e3 * load, "ms CPU", subject.load_ms, how="file cached"),
+        Record(f"{name}.memory", grown / 1e6, "MB", how="resident, after the steps"),
+        Record(f"{name}.step_p50", float(p50), "ms CPU", subject.step_ms, "45 ms budget", how),
+        Record(
+            f"{name}.step_tail",
+            float(p99 / p50),
+            "x p50",
+            TAIL,
+            _tail(np.ravel(turns), np.ravel(interruptions)),
+            how,
+        ),
+        Record(
+            f"{name}.over_roofline",
+            float(np.median(ratios)),
+            "x",
+            subject.over_roofline,
+            f"roofline {np.median(least):.3g} ms; p50 over it, median of {TURNS} turns of both, "
+            f"{ratios.min():.3g} to {ratios.max():.3g}",
+            f"{len(work)} products, {operations:.3g} M operations, {weights:.3g} MB of weights",
+        ),
+    ]
+
+
+def _tail(taken: NDArray[np.float64], interrupted: NDArray[np.bool_]) -> str:
+    """The 99th percentile in words, also without the steps that gave their core away."""
+    said = f"p99 {np.percentile(taken, 99):.3g} ms CPU"
+    if interrupted.any() and not interrupted.all():
+        alone = np.percentile(taken[~interrupted], 99) / np.percentile(taken, 50)
+        share = 100 * interrupted.mean()
+        said += f"; {share:.2g} % of them gave way to other processes, the others' is {alone:.3g} x"
+    return said
+
+
+def step_times(
+    session: ort.InferenceSession, card: ModelCard, steps: int
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """CPU time of each step of episodes of noise, run as the classifier runs them, s.
+
+    And whether the system took the core away during it: such a step finds its weights gone from
+    the caches, and takes more CPU time itself.
+    """
+    rng = np.random.default_rng(0)
+    scale = np.array(card.scale, dtype=np.float32)
+    offset = np.zeros(card.array.shape, dtype=np.float32)
+    sigma = np.broadcast_to(np.array(card.floor, dtype=np.float32), card.array.shape)
+    shape = (card.steps, card.substeps, *card.array.shape)
+    noise = rng.standard_normal(shape, dtype=np.float32) * scale
+    stepper = Stepper(session, card)
+    taken, interrupted = np.empty(steps), np.zeros(steps, dtype=np.bool_)
+    for step in range(-card.steps, steps):  # an episode to warm up
+        if step % card.steps == 0:
+            stepper.begin(offset, sigma)
+        stepper.samples[0] = noise[step % card.steps]
+        before = _preemptions()
+        began = time.thread_time()
+        stepper.run()
+        if step >= 0:
+            taken[step] = time.thread_time() - began
+            interrupted[step] = _preemptions() > before
+    return taken, interrupted
+
+
+def full_size(folder: Path, lacking: list[str]) -> Iterator[Subject]:
+    """Make the published networks with random weights; what cannot be made is told to `lacking`."""
+    try:
+        making: Any = importlib.import_module("bench.inference.full_size")
+    except ModuleNotFoundError as error:
+        lacking.append(f"full size: needs {error.name} (pip install 'tactile-rt[train]')")
+        return
+    for name, path in making.full_size_models(folder):
+        gc.collect()
+        fp32_bar, int8_bar = FULL_SIZE["gpt" in name]
+        integer = name.endswith("int8")
+        yield Subject(
+            name.replace("-", "_"), path, over_roofline=int8_bar if integer else fp32_bar,
+            load_ms=LOAD_INT8_MS if integer else "",
+        )  # fmt: skip
+
+
+def _preemptions() -> int:
+    """How often this thread had to give its core away; 0 where the system does not tell."""
+    which = getattr(resource, "RUSAGE_THREAD", None)
+    return 0 if which is None else resource.getrusage(which).ru_nivcsw
+
+
+def _resident() -> int:
+    """Bytes of memory that this process holds."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")

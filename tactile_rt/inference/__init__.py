@@ -1,1 +1,0 @@
-"""The parts of the classifier: network step, execution providers, lanes, deadline, early exit."""

@@ -1,0 +1,197 @@
+"""Which model decided while it was recorded, and are these its decisions?
+
+A decision is what it says (`FACTS`); how long it took, and what the wall clock then was, are not
+part of it. A model's step does not depend on how its stream was cut or paced, so the same model on
+the same samples decides the same, digit for digit.
+"""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tactile_rt.classifier.model_file import hash_of, shipped_model
+from tactile_rt.recording.description import Description
+from tactile_rt.stream import NS_PER_S, ConfigError
+
+__all__ = [
+    "FACTS",
+    "Checked",
+    "RecordedModel",
+    "check_decisions",
+    "file_of_model",
+    "live_model",
+    "recorded_models",
+]
+
+FACTS = ("onset_ns", "step", "t_ns", "final", "label", "probabilities")
+# A recording ends with its source; what was being decided just then came too late for it.
+END_NS = NS_PER_S
+
+Fields = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class RecordedModel:
+    """A model of the daemon that decided on the recorded source.
+
+    Attributes:
+        name: in the configuration, and in its decisions.
+        file: where it was.
+        sha256: of the file; empty: the recording does not tell.
+        table: its table ``[[model]]`` in the configuration.
+    """
+
+    name: str
+    file: Path
+    sha256: str
+    table: Fields = field(default_factory=dict)
+
+
+def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
+    """The models that decided on the source while it was recorded; none without a daemon."""
+    session = about.session
+    try:
+        config = tomllib.loads(session.get("config", ""))
+    except tomllib.TOMLDecodeError:
+        config = {}
+    tables = {t["name"]: t for t in config.get("model", ()) if "name" in t}
+    found = []
+    for key, value in session.items():
+        if not key.startswith("model."):
+            continue
+        name = key.removeprefix("model.").removeprefix("model.")
+        table = tables.get(name, {})
+        if table.get("source", session.get("daemon_source")) == session.get("daemon_source"):
+            file, _, sha256 = value.rpartition(" sha256:")
+            found.append(RecordedModel(name, Path(file), sha256, table))
+    return tuple(found)
+
+
+def live_model(
+    what: str, about: Description, name: str, model: Path | None, check: bool
+) -> RecordedModel | None:
+    """The model that decided live; None: none did.
+
+    Args:
+        what: the recording, for messages.
+        about: what it is of.
+        name: of the model; empty: the only one, or the one that `model` is.
+        model: a file that is to decide now.
+        check: whether there must be one.
+
+    Raises:
+        ConfigError: there is none of that name, or there are several.
+    """
+    models = recorded_models(about)
+    names = ", ".join(m.name for m in models)
+    if not models:
+        if name or check:
+            why = f"no model {name!r}" if name else "nothing to check"
+            raise ConfigError(f"{what}: {why}: no model decided while it was recorded")
+        return None
+    named = [m for m in models if m.name == name] if name else list(models)
+    if not named:
+        raise ConfigError(f"{what}: no model {name!r} decided live; there are {names}")
+    if len(named) > 1 and model is not None:
+        same = hash_of(model)
+        named = [m for m in named if m.sha256 == same] or named
+    if len(named) > 1:
+        raise ConfigError(f"{what}: several models decided live: choose by --name {names}")
+    return named[0]
+
+
+def file_of_model(model: Path | None, live: RecordedModel | None) -> Path:
+    """The file of the model that is to decide: `model`, or the one that did live.
+
+    Raises:
+        ConfigError: it is not there any more.
+    """
+    if model is not None:
+        return model
+    if live is None:
+        return shipped_model()
+    if live.file.is_file() and live.sha256 in ("", hash_of(live.file)):
+        return live.file
+    if live.sha256 == hash_of(shipped_model()):  # of another installation
+        return shipped_model()
+    raise ConfigError(
+        f"the model that decided, {live.file} (sha256 {live.sha256[:16] or 'unknown'}), is not "
+        "there any more: name one by --model"
+    )
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What became of the comparison.
+
+    Attributes:
+        same: decisions that are as recorded.
+        before: recorded ones about samples before the first.
+        late: replayed ones of the last second, which the recording ended too early for.
+        withheld: replayed ones that were not recorded because they were late (``late = "skip"``).
+        difference: the first one, in words; empty: none.
+    """
+
+    same: int
+    before: int = 0
+    late: int = 0
+    withheld: int = 0
+    difference: str = ""
+
+
+def check_decisions(
+    recorded: Sequence[Fields],
+    replayed: Sequence[Fields],
+    span_ns: tuple[int, int],
+    *,
+    final_only: bool = False,
+    may_withhold: bool = False,
+) -> Checked:
+    """Compare decisions of one model, in their order.
+
+    Args:
+        recorded: as `read_decisions` gives them.
+        replayed: with `FACTS`, of every step.
+        span_ns: stream time of the first and the last sample.
+        final_only: whether only final ones were recorded.
+        may_withhold: whether late ones were not recorded.
+    """
+    kept = [d for d in recorded if d["t_ns"] >= span_ns[0]]
+    mine = [d for d in replayed if d["final"] or not final_only]
+    same = withheld = at = 0
+    before = len(recorded) - len(kept)
+    for k, theirs in enumerate(kept, 1):
+        while may_withhold and at < len(mine) and mine[at]["t_ns"] < theirs["t_ns"]:
+            at, withheld = at + 1, withheld + 1
+        if at == len(mine):
+            return Checked(
+                same, before, 0, withheld, f"decision {k} ({_of(theirs)}) is not decided again"
+            )
+        difference = _difference(theirs, mine[at])
+        if difference:
+            return Checked(same, before, 0, withheld, f"decision {k} ({_of(theirs)}): {difference}")
+        at, same = at + 1, same + 1
+    left = mine[at:]
+    if left and not may_withhold and left[0]["t_ns"] < span_ns[1] - END_NS:
+        return Checked(same, before, 0, withheld, f"a decision ({_of(left[0])}) was not recorded")
+    return Checked(same, before, len(left), withheld)
+
+
+def _of(decision: Fields) -> str:
+    return f"step {decision['step']} of the contact at {decision['onset_ns']} ns"
+
+
+def _difference(recorded: Fields, replayed: Fields) -> str:
+    for name in FACTS:
+        was, now = recorded[name], replayed[name]
+        if was == now:
+            continue
+        if name != "probabilities":
+            return f"{name} was {was!r}, is {now!r}"
+        if list(was) != list(now):
+            return f"classes were {', '.join(was)}, are {', '.join(now)}"
+        label = next(label for label in was if was[label] != now[label])
+        return f"the probability of {label} was {was[label]}, is {now[label]}"
+    return ""

@@ -1,0 +1,91 @@
+"""A recording as plain arrays or text, and these as a recording again: bit for bit."""
+
+from collections.abc import Generator, Iterable
+from contextlib import closing
+from pathlib import Path
+from typing import BinaryIO
+
+from tactile_rt.files import write_whole
+from tactile_rt.recording.as_csv import beside, read_csv, write_csv
+from tactile_rt.recording.as_hdf5 import need_h5py, read_hdf5, write_hdf5
+from tactile_rt.recording.as_npz import read_npz, write_npz
+from tactile_rt.recording.description import RECOVERED, Description
+from tactile_rt.recording.flat import TEXTS
+from tactile_rt.recording.layout import SAMPLES, decode_samples, need_mcap
+from tactile_rt.recording.mcap_file import McapFile
+from tactile_rt.recording.reader import Raw, read_description, read_raw
+from tactile_rt.stream import ConfigError
+
+__all__ = ["convert", "outputs_of"]
+
+MCAP, HDF5 = ".mcap", (".h5", ".hdf5")
+READERS = {".npz": read_npz, ".csv": read_csv, **dict.fromkeys(HDF5, read_hdf5)}
+
+
+def outputs_of(output: str | Path) -> list[Path]:
+    """The files that `convert` makes for this name."""
+    path = Path(output)
+    return [path, beside(path)] if path.suffix == ".csv" else [path]
+
+
+def convert(path: str | Path, output: str | Path) -> int:
+    """Write a recording as ``.npz``, ``.csv`` or ``.h5``, or any of these as a recording again.
+
+    All forms hold samples, description, decisions, events and health, and the chunks in which the
+    samples came; raw packets stay behind. They are laid out in docs/recording.md. What is written
+    appears whole or not at all.
+
+    Returns:
+        Number of samples.
+
+    Raises:
+        ConfigError: a file of another kind, or an extra is not installed.
+        RecordingError: what is read is damaged, or has no samples.
+    """
+    path, output = Path(path), Path(output)
+    for file in (path, output):
+        if file.suffix not in (MCAP, *READERS):
+            raise ConfigError(f"{file} is neither .mcap nor {', '.join(READERS)}")
+    if path.suffix == output.suffix == MCAP:
+        raise ConfigError(f"{path} is a recording already: {output} would be no other")
+    if {path.suffix, output.suffix} & set(HDF5):
+        need_h5py()
+    if MCAP in (path.suffix, output.suffix):
+        need_mcap()
+    about, raws = _read(path)
+    n = 0
+
+    def fill(file: BinaryIO) -> None:
+        nonlocal n
+        n = _write(str(path), about, raws, file, output)
+
+    with closing(raws):
+        write_whole(output, fill)
+    return n
+
+
+def _read(path: Path) -> tuple[Description, Generator[Raw, None, None]]:
+    if path.suffix == MCAP:
+        raws = (raw for _, raw in read_raw(path, SAMPLES, *TEXTS))
+        return read_description(path), raws
+    if not path.is_file():
+        raise ConfigError(f"no file {path}")
+    return READERS[path.suffix](path)
+
+
+def _write(what: str, about: Description, raws: Iterable[Raw], file: BinaryIO, output: Path) -> int:
+    if output.suffix == ".csv":
+        return write_csv(what, about, raws, file, output)
+    if output.suffix == ".npz":
+        return write_npz(what, about, raws, file)
+    if output.suffix in HDF5:
+        return write_hdf5(what, about, raws, file)
+    made, n = McapFile(file, about), 0
+    if about.recovered:
+        made.note(RECOVERED, {"by": "tactile_rt"})
+    for raw in raws:
+        made.add(raw.topic, raw.data, raw.t_ns)
+        if raw.topic == SAMPLES:
+            n += len(decode_samples(raw.data, about.spec.shape))
+    made.finish()
+    return n

@@ -1,0 +1,231 @@
+"""What is in a recording, byte by byte.
+
+Samples and packets are ROS 2 messages in CDR (little-endian), which MCAP tools decode by the schema
+that stands in the file; health is JSON. A message's log time is UTC: the host's monotonic time and
+the offset that the metadata gives.
+"""
+
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from tactile_rt.drivers.codec import CanFrame
+from tactile_rt.stream import Chunk, ConfigError
+
+__all__ = [
+    "CHANNELS",
+    "DECISIONS",
+    "EVENTS",
+    "HEALTH",
+    "SAMPLES",
+    "WIRE",
+    "Packet",
+    "Schema",
+    "decode_packet",
+    "decode_samples",
+    "encode_packet",
+    "encode_samples",
+    "need_mcap",
+]
+
+SAMPLES, WIRE, HEALTH = "samples", "wire", "health"
+DECISIONS, EVENTS = "decisions", "events"  # of the daemon, in its messages
+
+Packet = bytes | Sequence[CanFrame] | None  # None: the line was opened here
+
+_CDR = b"\x00\x01\x00\x00"  # little-endian, no options
+_FRAME = struct.Struct("<I???xI")  # and its data, padded to 4
+
+SAMPLES_MSG = """\
+# n consecutive samples of an array; its elements, channels and units are in the file's metadata
+int64[] seq          # (n,) sequence number of each sample; a gap means lost samples
+int64[] t_ns         # (n,) host monotonic time at which each was taken, ns
+uint32 elements
+uint32 channels
+float32[] values     # (n, element, channel), C order, SI units
+bool[] valid         # (n, element); false: no trustworthy value
+"""
+SERIAL_MSG = """\
+# bytes as they came from a serial line
+bool opened          # the line was opened here; no bytes
+uint8[] data
+"""
+CAN_MSG = f"""\
+# frames as they came from a CAN bus
+bool opened          # the bus was opened here; no frames
+tactile_rt/CanFrame[] frames
+{"=" * 80}
+MSG: tactile_rt/CanFrame
+uint32 id
+bool extended        # whether the identifier is of 29 bits
+bool fd
+bool remote
+uint8[] data
+"""
+HEALTH_SCHEMA: dict[str, Any] = {
+    "title": "tactile_rt health",
+    "type": "object",
+    "properties": {
+        "t_ns": {"type": "integer", "description": "host monotonic time, ns"},
+        "utc_offset_ns": {"type": "integer", "description": "UTC less monotonic time, now"},
+        "state": {"type": "string", "description": "connecting, streaming, stale, lost or closed"},
+        "reason": {"type": "string"},
+        "device": {"type": "object", "description": "as tactile_rt.drivers.health.Health"},
+        "stats": {"type": "object", "description": "samples, as tactile_rt.stream.SourceStats"},
+        "recorder": {"type": "object", "description": "what was recorded, and dropped"},
+    },
+}
+EVENT_SCHEMA: dict[str, Any] = {
+    "title": "tactile_rt decision, contact or health message",
+    "type": "object",
+    "properties": {
+        "type": {"type": "string", "description": "decision, contact or health"},
+        "version": {"type": "integer", "description": "of the messages, see docs/messages.md"},
+        "t_ns": {"type": "integer", "description": "host monotonic time, ns"},
+        "utc_ns": {"type": "integer", "description": "UTC, ns"},
+    },
+}
+
+
+@dataclass(frozen=True)
+class Schema:
+    """How a channel's messages are written."""
+
+    name: str
+    encoding: str
+    text: str
+    message_encoding: str
+
+
+CHANNELS = {
+    (SAMPLES, ""): Schema("tactile_rt/msg/Samples", "ros2msg", SAMPLES_MSG, "cdr"),
+    (WIRE, "serial"): Schema("tactile_rt/msg/SerialPacket", "ros2msg", SERIAL_MSG, "cdr"),
+    (WIRE, "can"): Schema("tactile_rt/msg/CanPacket", "ros2msg", CAN_MSG, "cdr"),
+    (HEALTH, ""): Schema(
+        "tactile_rt.Health", "jsonschema", msgspec.json.encode(HEALTH_SCHEMA).decode(), "json"
+    ),
+    # At the end: a recording whose first piece is damaged is recovered by the order of these.
+    (DECISIONS, ""): Schema(
+        "tactile_rt.Decision", "jsonschema", msgspec.json.encode(EVENT_SCHEMA).decode(), "json"
+    ),
+    (EVENTS, ""): Schema(
+        "tactile_rt.Event", "jsonschema", msgspec.json.encode(EVENT_SCHEMA).decode(), "json"
+    ),
+}
+
+
+def need_mcap() -> None:
+    """Make sure that MCAP files can be written and read.
+
+    Raises:
+        ConfigError: the extra is not installed.
+    """
+    try:
+        import mcap.writer  # noqa: F401
+    except ModuleNotFoundError as error:
+        missing = (error.name or "mcap").partition(".")[0]
+        raise ConfigError(
+            f"recordings need {missing}, which is not installed: pip install 'tactile-rt[record]'"
+        ) from None
+
+
+def encode_samples(chunk: Chunk) -> bytes:
+    """A chunk as a message of `SAMPLES_MSG`."""
+    n, elements, channels = chunk.values.shape
+    return b"".join(
+        (
+            _CDR,
+            struct.pack("<II", n, 0),  # 8-byte numbers begin at multiples of 8
+            chunk.seq.astype("<i8", copy=False).tobytes(),
+            struct.pack("<II", n, 0),
+            chunk.t_ns.astype("<i8", copy=False).tobytes(),
+            struct.pack("<III", elements, channels, n * elements * channels),
+            chunk.values.astype("<f4", copy=False).tobytes(),
+            struct.pack("<I", n * elements),
+            chunk.valid.tobytes(),
+        )
+    )
+
+
+def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
+    """The chunk in a message.
+
+    Args:
+        data: the message.
+        shape: (element, channel) of the array.
+
+    Raises:
+        ValueError: it is not such a message.
+    """
+    elements, channels = shape
+    (n,) = struct.unpack_from("<I", data, 4)
+    values_at = 4 + 16 + 16 * n + 12
+    valid_at = values_at + 4 * n * elements * channels + 4
+    if n == 0 or data[:4] != _CDR or len(data) != valid_at + n * elements:
+        raise ValueError(f"{len(data)} bytes are not samples of {elements} x {channels}")
+    counts = struct.unpack_from("<III", data, values_at - 12)
+    again = struct.unpack_from("<I", data, 12 + 8 * n) + struct.unpack_from(
+        "<I", data, valid_at - 4
+    )
+    if (*counts, *again) != (elements, channels, n * elements * channels, n, n * elements):
+        raise ValueError(f"samples of {counts[0]} x {counts[1]}, not {elements} x {channels}")
+    # Copied, so that what is read is as its owner's as what a device delivers.
+    return Chunk(
+        np.frombuffer(data, "<i8", n, 12).astype(np.int64),
+        np.frombuffer(data, "<i8", n, 20 + 8 * n).astype(np.int64),
+        np.frombuffer(data, "<f4", n * elements * channels, values_at)
+        .astype(np.float32)
+        .reshape(n, elements, channels),
+        np.frombuffer(data, np.uint8, n * elements, valid_at).astype(np.bool_).reshape(n, elements),
+    )
+
+
+def encode_packet(packet: Packet, wire: str) -> bytes:
+    """A raw packet as a message of `SERIAL_MSG` or `CAN_MSG`."""
+    opened, things = packet is None, packet or b""
+    parts = [_CDR, struct.pack("<?3xI", opened, len(things))]
+    if wire == "serial":
+        assert isinstance(things, bytes)
+        return b"".join((*parts, things))
+    for frame in things:
+        assert isinstance(frame, CanFrame)
+        pad = -len(parts[-1]) % 4
+        parts += [
+            bytes(pad),
+            _FRAME.pack(frame.id, frame.extended, frame.fd, frame.remote, len(frame.data)),
+            frame.data,
+        ]
+    return b"".join(parts)
+
+
+def decode_packet(data: bytes, wire: str) -> Packet:
+    """The raw packet in a message.
+
+    Raises:
+        ValueError: it is not such a message.
+    """
+    if len(data) < 12 or data[:4] != _CDR:
+        raise ValueError(f"{len(data)} bytes are not a packet")
+    opened, n = struct.unpack_from("<?3xI", data, 4)
+    if opened:
+        return None
+    if wire == "serial":
+        if len(data) != 12 + n:
+            raise ValueError(f"a packet of {len(data) - 12} bytes, not {n}")
+        return data[12:]
+    frames, at = [], 12
+    for _ in range(n):
+        at += -at % 4
+        if at + _FRAME.size > len(data):
+            raise ValueError("a packet with too few frames")
+        identifier, extended, fd, remote, length = _FRAME.unpack_from(data, at)
+        at += _FRAME.size
+        frames.append(CanFrame(identifier, data[at : at + length], extended, fd, remote))
+        at += length
+    if at != len(data):
+        raise ValueError("a packet of another length")
+    return frames

@@ -1,0 +1,129 @@
+"""Make a whole recording of one that was cut short or damaged."""
+
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, BinaryIO
+
+from tactile_rt.files import write_whole
+from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
+from tactile_rt.recording.layout import (
+    CHANNELS,
+    need_mcap,
+)
+from tactile_rt.recording.mcap_file import McapFile
+from tactile_rt.recording.reader import MAGIC, read_raw
+from tactile_rt.stream import ConfigError, RecordingError
+
+if TYPE_CHECKING:
+    from mcap.records import McapRecord, Message
+
+__all__ = ["recover"]
+
+
+def recover(path: str | Path, output: str | Path | None = None, force: bool = False) -> Path:
+    """Write all that is whole in a recording into a new one; the old one stays.
+
+    Args:
+        path: of a recording that was cut short (a killed process, a full disk) or damaged.
+        output: where to; None: beside it, as ``NAME.recovered.mcap``.
+        force: whether to replace a file that is there.
+
+    Returns:
+        The new file; `path` itself if it is whole.
+
+    Raises:
+        ConfigError: there is no such file, the output is there already, or the extra is not
+            installed.
+        RecordingError: it is no recording, or nothing in it is whole.
+    """
+    need_mcap()
+    path = Path(path)
+    whole = _is_whole(path)
+    if whole and output is None:
+        return path
+    output = path.with_name(f"{path.stem}.recovered.mcap") if output is None else Path(output)
+    if output.exists() and not force:
+        raise ConfigError(f"{output} is there already: name another file, or force it")
+    if output.resolve() == path.resolve():
+        raise ConfigError(f"{output} is the damaged file itself: name another")
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            raise RecordingError(f"{path} is not an MCAP file, or was cut before it began")
+        file.seek(0)
+        about, records = _begun(path, _whole_records(file))
+        write_whole(output, lambda new: _copy(records, new, about))
+    return output
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        for _ in read_raw(path):
+            pass
+    except RecordingError:
+        return False
+    return True
+
+
+def _begun(
+    path: Path, records: "Iterator[McapRecord]"
+) -> "tuple[Description, Iterator[McapRecord]]":
+    """What the recording is of, and what follows."""
+    from mcap.records import Metadata
+
+    found: dict[str, dict[str, str]] = {}
+    for record in records:
+        if isinstance(record, Metadata):
+            found.setdefault(record.name, record.metadata)
+        elif found:
+            records = chain((record,), records)
+            break
+    if METADATA not in found:
+        raise RecordingError(f"{path}: nothing in it is whole, or it is no recording of tactile-rt")
+    return (
+        Description.from_metadata(str(path), found[METADATA], found.get(SESSION, {}), True),
+        records,
+    )
+
+
+def _whole_records(file: BinaryIO) -> "Iterator[McapRecord]":
+    """Records outside chunks and within, until one is cut; damaged chunks are left out."""
+    from mcap.records import Chunk, DataEnd
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    records = StreamReader(file, emit_chunks=True, record_size_limit=1 << 30).records
+    while True:
+        try:
+            record = next(records, None)
+        except Exception:  # cut off here; a damaged length reads as anything
+            return
+        if record is None or isinstance(record, DataEnd):
+            return
+        if not isinstance(record, Chunk):
+            yield record
+            continue
+        try:
+            inside = breakup_chunk(record, validate_crc=True)
+        except Exception:  # damaged: what follows may be whole
+            continue
+        yield from inside
+
+
+def _copy(records: "Iterator[McapRecord]", new: BinaryIO, about: Description) -> None:
+    from mcap.records import Channel, Message
+
+    file = McapFile(new, about)
+    file.note(RECOVERED, {"by": "tactile_rt"})
+    # A damaged first chunk takes the names of the channels with it, but we number them alike.
+    numbered = (topic for topic, wire in CHANNELS if wire in ("", about.wire))
+    names = dict(enumerate(numbered, 1))
+    for record in records:
+        if isinstance(record, Channel):
+            names[record.id] = record.topic
+        elif isinstance(record, Message) and record.channel_id in names:
+            file.add(names[record.channel_id], record.data, _host_ns(record, about))
+    file.finish()
+
+
+def _host_ns(message: "Message", about: Description) -> int:
+    return message.log_time - about.utc_offset_ns

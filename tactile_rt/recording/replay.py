@@ -1,0 +1,232 @@
+"""`replay:` URLs: what was recorded, as a stream again.
+
+replay:run.mcap                                   the recorded chunks, as fast as they came
+replay:run.mcap?speed=10                          ten times as fast; 0: as fast as they are read
+replay:run.mcap?from=wire                         raw packets, decoded again
+replay:run.mcap?from=wire&codec=native            by another codec than the recorded one
+replay:data/mouse24/mug-1.npz?sweep=3&rest_s=1    one object's sweeps out of a sweep set
+"""
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tactile_rt.calibration import CalibratedSource
+from tactile_rt.drivers.codec import Codec, Command, Samples
+from tactile_rt.drivers.device_time import DeviceTime
+from tactile_rt.drivers.opening import make_codec
+from tactile_rt.drivers.stamping import Stamper
+from tactile_rt.recording.layout import SAMPLES, WIRE, Packet
+from tactile_rt.recording.reader import read_description, read_packets, read_stream
+from tactile_rt.recording.sweep_replay import SweepOptions, sweep_chunks, sweep_spec
+from tactile_rt.settings import take_options
+from tactile_rt.stream import (
+    NS_PER_S,
+    ArraySpec,
+    Chunk,
+    ConfigError,
+    EndOfStream,
+    RecordingError,
+    Source,
+    SourceStats,
+)
+
+__all__ = ["ReplayOptions", "ReplaySource", "open_replay"]
+
+SLICE_S = 0.1  # how soon a waiting read notices that the source was closed
+
+# Chunks and when each is due: ns on any clock, from 0 or not.
+Timed = Iterator[tuple[int, Chunk]]
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Options of ``replay:`` of a recording, besides those of its codec.
+
+    Attributes:
+        speed: times the recorded pace; 0: as fast as it is read.
+        codec: what decodes raw packets; empty: the recorded one.
+    """
+
+    speed: float = 1.0
+    codec: str = ""
+
+
+def open_replay(target: str, fields: dict[str, str]) -> Source:
+    """A recording, or one object of a sweep set, as a stream.
+
+    Raises:
+        ConfigError: no such file, a wrong option, or the extra is not installed.
+        RecordingError: the file is damaged.
+    """
+    path, what = Path(target), f"source replay:{target}"
+    if path.suffix == ".npz":
+        (options,) = take_options(what, fields, SweepOptions)
+        _check_speed(what, options.speed)
+        spec, manifest = sweep_spec(path)
+        return ReplaySource(spec, lambda _: sweep_chunks(path, manifest, options), options.speed)
+    if not target:
+        raise ConfigError("replay: needs a file, e.g. replay:run.mcap, replay:data/SET/mug-1.npz")
+    fields = dict(fields)
+    channel = fields.pop("from", SAMPLES)
+    about = read_description(path)
+    if channel == SAMPLES:
+        (options,) = take_options(what, fields, ReplayOptions)
+        _check_speed(what, options.speed)
+        if options.codec:
+            raise ConfigError(f"{what}: codec= is for from=wire; samples are decoded already")
+        return ReplaySource(about.spec, lambda stats: _recorded(path, stats), options.speed)
+    if channel != WIRE:
+        raise ConfigError(f"{what}: from must be samples or wire, not {channel!r}")
+    if not about.wire:
+        raise ConfigError(f"{what} has no raw packets: {about.source or 'its source'} is no device")
+    (options,) = take_options(
+        what, {k: v for k, v in fields.items() if k in ReplayOptions.__dataclass_fields__},
+        ReplayOptions,
+    )  # fmt: skip
+    _check_speed(what, options.speed)
+    own = {k: v for k, v in fields.items() if k not in ReplayOptions.__dataclass_fields__}
+    if options.codec in ("", about.codec):
+        own = {**about.codec_options, **own}
+    codec = make_codec(about.wire, options.codec or about.codec, own)
+    decoding = _Decoding(str(path), codec, read_packets(path), about.clock)
+    source = ReplaySource(decoding.spec, decoding.chunks, options.speed)
+    return source if about.calibration is None else CalibratedSource(source, about.calibration)
+
+
+def _check_speed(what: str, speed: float) -> None:
+    if not 0 <= speed < math.inf:
+        raise ConfigError(f"{what}: speed must be 0 (as fast as it is read) or more, not {speed:g}")
+
+
+class ReplaySource(Source):
+    """Chunks again, each when it is due.
+
+    The chunks, their times and all that is decided by them do not depend on the speed. A recording
+    is not live at any speed: it waits for its reader, who then falls behind the pace but loses
+    nothing.
+
+    Args:
+        spec: what the samples are.
+        timed: makes the chunks and when they are due, ns; what is lost is counted in its argument.
+        speed: times the recorded pace; 0: at once.
+    """
+
+    live = False
+
+    def __init__(
+        self, spec: ArraySpec, timed: Callable[[SourceStats], Timed], speed: float = 1.0
+    ) -> None:
+        super().__init__(spec)
+        self._speed = speed
+        self._timed = timed(self.stats)
+        self._next: tuple[int, Chunk] | None = None
+        self._begin: tuple[int, int] | None = None  # due time and host time of the first chunk
+        self._closed = False
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        end = None if timeout is None else time.monotonic() + timeout
+        while not self._closed:
+            if self._next is None:
+                self._next = next(self._timed, None)
+                if self._next is None:
+                    self.close()
+                    break
+            due, chunk = self._next
+            wait = self._wait_s(due)
+            if wait <= 0:
+                self._next = None
+                self.stats.delivered += len(chunk)
+                return chunk
+            left = math.inf if end is None else end - time.monotonic()
+            if left <= 0:
+                return None
+            time.sleep(min(wait, left, SLICE_S))
+        raise EndOfStream
+
+    def close(self) -> None:
+        self._closed = True
+        try:
+            self._timed.close()  # type: ignore[attr-defined]  # which closes the file
+        except ValueError:
+            pass  # being read in another thread, whose next read ends
+
+    def _wait_s(self, due: int) -> float:
+        if not self._speed:
+            return 0.0
+        now = time.monotonic_ns()
+        if self._begin is None:
+            self._begin = due, now
+        since = (due - self._begin[0]) / self._speed
+        return (since - (now - self._begin[1])) / NS_PER_S
+
+
+def _recorded(path: Path, stats: SourceStats) -> Timed:
+    """The chunks as recorded; what their numbers leave out was lost."""
+    after: int | None = None
+    for chunk in read_stream(path):
+        first, last = int(chunk.seq[0]), int(chunk.seq[-1])
+        before = first if after is None else after
+        stats.missing += max(0, last + 1 - before - len(chunk))
+        after = last + 1
+        yield int(chunk.t_ns[-1]), chunk
+
+
+class _Decoding:
+    """Raw packets through a codec and a stamper, as `DeviceSource` does it.
+
+    Raises:
+        RecordingError: the codec finds no sample in them.
+    """
+
+    def __init__(
+        self, path: str, codec: Codec[Any], packets: Iterator[tuple[Packet, int]], clock: str
+    ) -> None:
+        self._codec, self._packets, self._clock = codec, packets, clock
+        self._early: deque[tuple[Samples | None, int]] = deque()
+        # What the codec finds before the device has described itself waits, as in a live start.
+        while codec.spec is None:
+            found = next(packets, None)
+            if found is None:
+                break
+            self._early += self._feed(*found)
+        if codec.spec is None:
+            raise RecordingError(
+                f"{path}: codec {type(codec).__name__} finds no description of an array in its "
+                f"packets ({codec.stats.corrupt} damaged, {codec.stats.intact} intact frames)"
+            )
+        self.spec = codec.spec
+
+    def chunks(self, stats: SourceStats) -> Timed:
+        """The chunks and the arrival of the packets that completed them."""
+        stamper, codec = Stamper(self._codec, self.spec, stats), self._codec
+        if self._clock == "device" and codec.tick_ns is not None:
+            stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
+        connected = False
+        for samples, t_ns in self._found():
+            if samples is None:
+                if connected:
+                    stamper.resume()
+                connected = True
+                continue
+            chunk = stamper.chunk(samples)
+            if chunk is not None:
+                yield t_ns, chunk
+
+    def _found(self) -> Iterator[tuple[Samples | None, int]]:
+        while self._early:
+            yield self._early.popleft()
+        for packet, t_ns in self._packets:
+            yield from self._feed(packet, t_ns)
+
+    def _feed(self, packet: Packet, t_ns: int) -> list[tuple[Samples | None, int]]:
+        if packet is None:
+            self._codec.forget()
+            self._codec.commands(Command.START)  # some note what they have asked for
+            return [(None, t_ns)]
+        samples = self._codec.feed(packet, t_ns)
+        return [] if samples is None else [(samples, t_ns)]

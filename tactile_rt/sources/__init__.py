@@ -1,0 +1,1 @@
+"""Where samples come from: a URL opens a device, a simulation, a recording or several of them."""

@@ -1,0 +1,273 @@
+"""Several arrays as one: what each feels, on one clock, in one spec.
+
+combined:robot_head.toml, which reads
+
+    name = "head"
+    rate_hz = 1000               # of the combined stream
+    [[source]]
+    name = "left"
+    url = "serial:///dev/ttyACM0?codec=native"
+    [[source]]
+    name = "right"
+    url = "serial:///dev/ttyACM1?codec=native"
+    position = [0.0, -0.04, 0.0]            # of its mount frame in this one's, m
+    orientation = [1.0, 0.0, 0.0, 0.0]      # unit quaternion, w x y z
+"""
+
+import contextlib
+import time
+import tomllib
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.stream import (
+    NS_PER_S,
+    ArraySpec,
+    Chunk,
+    ConfigError,
+    EndOfStream,
+    Source,
+    SourceError,
+)
+
+__all__ = ["CombinedSource", "MemberArray", "combine_specs", "open_combined"]
+
+LATEST_NS = NS_PER_S // 5  # an array that lags so far is left out: its elements are invalid
+SLICE_S = 0.005
+
+
+class MemberArray(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One array among several.
+
+    Attributes:
+        name: put before the names of its elements.
+        url: of its source.
+        position: of its mount frame in the combined one, m.
+        orientation: of its mount frame, unit quaternion (w, x, y, z).
+    """
+
+    name: str
+    url: str
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+
+
+class _File(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    rate_hz: float
+    source: list[MemberArray]
+
+
+def open_combined(path: str, fields: dict[str, str]) -> Source:
+    """The arrays that a TOML file lists.
+
+    Raises:
+        ConfigError: the file cannot be read, or is not of the layout above.
+        SourceError: one of the devices cannot be opened.
+    """
+    from tactile_rt.sources.opening import open_source
+
+    if fields:
+        raise ConfigError(f"combined:{path} takes no options: they are in the file")
+    try:
+        wanted = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), _File)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
+        raise ConfigError(f"{path}: {error}") from None
+    if not wanted.source:
+        raise ConfigError(f"{path}: no [[source]] to combine")
+    with contextlib.ExitStack() as opened:
+        sources = [opened.enter_context(open_source(part.url)) for part in wanted.source]
+        made = CombinedSource(sources, wanted.source, wanted.name, wanted.rate_hz)
+        opened.pop_all()
+        return made
+
+
+def combine_specs(
+    specs: list[ArraySpec], parts: list[MemberArray], name: str, rate_hz: float
+) -> ArraySpec:
+    """One spec of all elements, each array's rows below those of the one before.
+
+    Raises:
+        ConfigError: the arrays do not measure the same channels, or two have one name.
+    """
+    for spec, part in zip(specs, parts, strict=True):
+        if (spec.channels, spec.units) != (specs[0].channels, specs[0].units):
+            raise ConfigError(
+                f"{part.name} measures {', '.join(spec.channels)} ({', '.join(spec.units)}), "
+                f"{parts[0].name} {', '.join(specs[0].channels)} ({', '.join(specs[0].units)}): "
+                "arrays that are combined measure the same"
+            )
+    grid, rows = [], 0
+    positions, orientations = [], []
+    for spec, part in zip(specs, parts, strict=True):
+        grid += [(rows + r, c) for r, c in spec.grid]
+        rows += spec.grid_shape[0]
+        turn = np.array(part.orientation)
+        if abs(np.linalg.norm(turn) - 1) > 1e-6:
+            raise ConfigError(f"{part.name}: orientation {part.orientation} is no unit quaternion")
+        positions += [tuple(_turned(turn, p) + part.position) for p in spec.positions]
+        orientations += [tuple(_product(turn, q)) for q in spec.orientations]
+    return replace(
+        specs[0],
+        name=name,
+        elements=tuple(
+            f"{part.name}.{e}" for s, part in zip(specs, parts, strict=True) for e in s.elements
+        ),
+        grid=tuple(grid),
+        positions=tuple((float(x), float(y), float(z)) for x, y, z in positions),
+        orientations=tuple((float(w), float(x), float(y), float(z)) for w, x, y, z in orientations),
+        rate_hz=rate_hz,
+        frame=name,
+    )
+
+
+@dataclass
+class _Feed:
+    """One of the sources, on the common time grid."""
+
+    source: Source
+    resampler: Resampler
+    begin: int  # of its elements among all
+    rows: dict[int, tuple[NDArray[np.float32], NDArray[np.bool_]]]
+    newest: int | None = None  # grid point
+    ended: bool = False
+
+
+class CombinedSource(Source):
+    """Samples of several sources, resampled to common times.
+
+    An array that is more than 0.2 s behind, lost or at its end is left out: its elements are
+    invalid until it comes again. The stream ends when all have.
+
+    Args:
+        sources: what to combine; closed with this one.
+        parts: name and pose of each.
+        name: of the combined array and its frame.
+        rate_hz: of the combined stream, Hz.
+
+    Raises:
+        ConfigError: they cannot be combined, see `combine_specs`.
+    """
+
+    def __init__(
+        self, sources: list[Source], parts: list[MemberArray], name: str, rate_hz: float
+    ) -> None:
+        super().__init__(combine_specs([s.spec for s in sources], parts, name, rate_hz))
+        self.live = any(s.live for s in sources)
+        self.sources = sources
+        period = round(NS_PER_S / rate_hz)
+        begins = np.cumsum([0, *(len(s.spec.elements) for s in sources)]).tolist()
+        self._feeds = [
+            _Feed(s, Resampler(period, s.spec.rate_hz, aligned=True), begin, {})
+            for s, begin in zip(sources, begins, strict=False)
+        ]
+        self._period_ns = period
+        self._next: int | None = None  # grid point
+        self._first = 0
+        self._closed = False
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        end = None if timeout is None else time.monotonic() + timeout
+        while not self._closed:
+            chunk = self._ready()
+            if chunk is not None:
+                self.stats.delivered += len(chunk)
+                return chunk
+            if all(feed.ended for feed in self._feeds):
+                break
+            left = SLICE_S if end is None else min(SLICE_S, max(0.0, end - time.monotonic()))
+            self._read_on(left)
+            if end is not None and time.monotonic() >= end:
+                chunk = self._ready()
+                if chunk is not None:
+                    self.stats.delivered += len(chunk)
+                return chunk
+        raise EndOfStream
+
+    def close(self) -> None:
+        self._closed = True
+        for source in self.sources:
+            source.close()
+
+    def _read_on(self, patience_s: float) -> None:
+        """Read the source that is furthest behind; if it has nothing, the others too."""
+        running = [feed for feed in self._feeds if not feed.ended]
+        running.sort(key=lambda feed: -1 if feed.newest is None else feed.newest)
+        for feed in running:
+            if self._take(feed, patience_s):
+                return
+            patience_s = 0.0
+
+    def _take(self, feed: _Feed, patience_s: float) -> bool:
+        try:
+            chunk = feed.source.read(patience_s)
+        except EndOfStream:
+            feed.ended = True
+            return True
+        except SourceError:
+            feed.ended = True
+            if all(f.ended for f in self._feeds):
+                raise
+            return True
+        if chunk is None:
+            return False
+        out = feed.resampler.push(chunk)
+        if out is not None:
+            for k, values, valid in zip(out.seq.tolist(), out.values, out.valid, strict=True):
+                feed.rows[k] = values, valid
+            feed.newest = int(out.seq[-1])
+        return True
+
+    def _ready(self) -> Chunk | None:
+        """The grid points that every source has passed, or been given up on."""
+        begun = [feed.newest for feed in self._feeds if feed.newest is not None]
+        if not begun:
+            return None
+        if self._next is None:
+            waiting = any(f.newest is None and not f.ended for f in self._feeds)
+            span = max(begun) - min(min(f.rows) for f in self._feeds if f.rows)
+            if waiting and span * self._period_ns < LATEST_NS:
+                return None
+            self._next = self._first = max(min(f.rows) for f in self._feeds if f.rows)
+        newest = max(begun)
+        behind = LATEST_NS // self._period_ns
+        ready = min(
+            newest if f.ended else max(newest - behind, -1 if f.newest is None else f.newest)
+            for f in self._feeds
+        )
+        n = ready + 1 - self._next
+        if n <= 0:
+            return None
+        values = np.zeros((n, *self.spec.shape), np.float32)
+        valid = np.zeros(values.shape[:2], np.bool_)
+        for feed in self._feeds:
+            stop = feed.begin + len(feed.source.spec.elements)
+            for k in [k for k in feed.rows if k <= ready]:
+                row, good = feed.rows.pop(k)
+                if k >= self._next:
+                    values[k - self._next, feed.begin : stop] = row
+                    valid[k - self._next, feed.begin : stop] = good
+        points = np.arange(self._next, ready + 1, dtype=np.int64)
+        self._next = ready + 1
+        return Chunk(points - self._first, points * self._period_ns, values, valid)
+
+
+def _product(a: NDArray[Any], b: tuple[float, ...]) -> NDArray[Any]:
+    """Hamilton product of two quaternions (w, x, y, z)."""
+    w, x, y, z = a
+    return np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]) @ b
+
+
+def _turned(turn: NDArray[Any], point: tuple[float, float, float]) -> NDArray[Any]:
+    """A vector turned by a unit quaternion."""
+    conjugate = turn * (1, -1, -1, -1)
+    return _product(_product(turn, tuple(chain((0.0,), point))), tuple(conjugate))[1:]

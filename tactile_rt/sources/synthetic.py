@@ -1,0 +1,126 @@
+"""A made-up array that feels bumps go by: a source that needs neither device nor simulator.
+
+synthetic:                                    5 whiskers x 6 channels at 1 kHz, without end
+synthetic:35x6?rate_hz=1000&seconds=10&pace=fast&seed=3
+"""
+
+import re
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStream, Source
+
+__all__ = ["SyntheticOptions", "SyntheticSource", "synthetic_spec"]
+
+COLUMNS = 7  # of the grid that the whiskers stand on
+PITCH_M = 0.002
+CHUNK_S = 0.009
+BUMP_S, EVERY_S = 0.3, 1.5  # a bump's length, and from one to the next
+PEAK = {"N": 2e-3, "N m": 2e-5}
+NOISE = 0.005  # of the peak, RMS
+NAMES = ("fx", "fy", "fz", "mx", "my", "mz")
+
+
+@dataclass(frozen=True)
+class SyntheticOptions:
+    """How fast, how long.
+
+    Attributes:
+        rate_hz: sample rate, Hz.
+        seconds: length of the stream, s; 0: endless.
+        seed: of its noise; the same seed gives the same stream.
+        pace: ``realtime`` delivers samples when they are due, ``fast`` at once.
+    """
+
+    rate_hz: float = 1000.0
+    seconds: float = 0.0
+    seed: int = 0
+    pace: str = "realtime"
+
+    def __post_init__(self) -> None:
+        if self.pace not in ("realtime", "fast"):
+            raise ConfigError(f"pace must be realtime or fast, not {self.pace!r}")
+        if not 0 < self.rate_hz <= 1e6 or self.seconds < 0 or self.seed < 0:
+            raise ConfigError("rate_hz must be above 0, seconds and seed 0 or more")
+
+
+def synthetic_spec(elements: int, channels: int, rate_hz: float) -> ArraySpec:
+    """Whiskers in rows of seven, 2 mm apart, that measure up to three forces and three moments."""
+    grid = tuple(divmod(i, COLUMNS) for i in range(elements))
+    return ArraySpec(
+        name="synthetic",
+        elements=tuple(f"{chr(65 + r) if r < 26 else f'R{r}'}{c}" for r, c in grid),
+        grid=grid,
+        positions=tuple((0.0, PITCH_M * c, -PITCH_M * r) for r, c in grid),
+        orientations=((1.0, 0.0, 0.0, 0.0),) * elements,
+        channels=NAMES[:channels],
+        units=("N", "N", "N", "N m", "N m", "N m")[:channels],
+        rate_hz=rate_hz,
+        frame="mount",
+    )
+
+
+class SyntheticSource(Source):
+    """Half-sine bumps that pass over the array from row to row, with a little noise.
+
+    Args:
+        size: ``ELEMENTSxCHANNELS``, e.g. ``35x6``; empty: ``5x6``.
+        options: how fast, how long.
+
+    Raises:
+        ConfigError: not such a size.
+    """
+
+    Options = SyntheticOptions
+
+    def __init__(self, size: str, options: SyntheticOptions) -> None:
+        found = re.fullmatch(r"(\d{1,4})x([1-6])", size or "5x6")
+        if not found or int(found[1]) == 0:
+            raise ConfigError(
+                f"synthetic:{size} is not a size: ELEMENTSxCHANNELS, e.g. 35x6; at most 9999x6"
+            )
+        super().__init__(synthetic_spec(int(found[1]), int(found[2]), options.rate_hz))
+        self.live = options.pace == "realtime"
+        self._rng = np.random.default_rng(options.seed)
+        self._left = round(options.seconds * options.rate_hz) if options.seconds else None
+        self._peak = np.array([PEAK[unit] for unit in self.spec.units])
+        self._at = np.array([r + c / 10 for r, c in self.spec.grid]) * 0.05  # s; bumps arrive
+        self._sent, self._start_ns, self._closed = 0, -1, False
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        n = max(1, round(CHUNK_S * self.spec.rate_hz))
+        n = n if self._left is None else min(n, self._left)
+        if self._closed or n == 0:
+            raise EndOfStream
+        if self._start_ns < 0:
+            self._start_ns = time.monotonic_ns() if self.live else 0
+        seq = self._sent + np.arange(n, dtype=np.int64)
+        due = np.round(seq * (NS_PER_S / self.spec.rate_hz)).astype(np.int64)
+        if self.live:
+            wait = (self._start_ns + int(due[-1]) - time.monotonic_ns()) / NS_PER_S
+            if timeout is not None and wait > timeout:
+                time.sleep(max(timeout, 0))
+                return None
+            time.sleep(max(wait, 0))
+        self._sent += n
+        if self._left is not None:
+            self._left -= n
+        self.stats.delivered += n
+        valid = np.ones((n, len(self.spec.elements)), np.bool_)
+        return Chunk(seq, self._start_ns + due, self._values(due / NS_PER_S), valid)
+
+    def close(self) -> None:
+        self._closed = True
+
+    def _values(self, t_s: NDArray[np.float64]) -> NDArray[np.float32]:
+        """(n, element, channel) at these times since the start."""
+        phase = (t_s[:, None] - self._at) % EVERY_S / BUMP_S  # (n, element)
+        bump = np.where(phase < 1, np.sin(np.pi * np.minimum(phase, 1)), 0.0)
+        share = np.cos(np.arange(len(self._peak)) * 1.1)  # channels differ in size and sign
+        clean = bump[..., None] * (share * self._peak)
+        noise = self._rng.normal(size=clean.shape) * (NOISE * self._peak)
+        values: NDArray[np.float32] = (clean + noise).astype(np.float32)
+        return values

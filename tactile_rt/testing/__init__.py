@@ -1,0 +1,153 @@
+"""For your own tests: a small array, chunks of any signal, a source that needs no device, and
+devices on real lines that need no hardware.
+
+spec = small_spec()
+source = ArraySource(spec, cut(signal, spec.rate_hz))
+
+with FakeSerial(signal, "native", spec=spec) as device, open_source(device.url) as source:
+    chunk = source.read(timeout=1.0)
+    device.unplug()
+
+`tactile_rt.testing.fixtures` has them as fixtures.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
+from tactile_rt.drivers.opening import make_codec
+from tactile_rt.sources.synthetic import synthetic_spec
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStream, Source
+
+__all__ = ["ArraySource", "FakeCan", "FakeSerial", "cut", "small_spec"]
+
+
+def small_spec(elements: int = 3, rate_hz: float = 1000.0) -> ArraySpec:
+    """A row of elements 2 mm apart that measure one force and one moment."""
+    return ArraySpec(
+        name="small",
+        elements=tuple(f"A{i}" for i in range(elements)),
+        grid=tuple((0, i) for i in range(elements)),
+        positions=tuple((0.0, 0.002 * i, 0.0) for i in range(elements)),
+        orientations=((1.0, 0.0, 0.0, 0.0),) * elements,
+        channels=("fy", "mz"),
+        units=("N", "N m"),
+        rate_hz=rate_hz,
+        frame="mount",
+    )
+
+
+def cut(values: ArrayLike, rate_hz: float, samples: int = 9, start_ns: int = 0) -> list[Chunk]:
+    """Cut a signal into chunks of evenly spaced, wholly valid samples.
+
+    Args:
+        values: (n, element, channel) SI.
+        rate_hz: sample rate.
+        samples: of each chunk; the last one may be shorter.
+        start_ns: time of the first sample.
+    """
+    signal = np.asarray(values, dtype=np.float32)
+    seq = np.arange(len(signal), dtype=np.int64)
+    t_ns = start_ns + np.round(seq * (NS_PER_S / rate_hz)).astype(np.int64)
+    return [
+        Chunk(
+            seq[i : i + samples],
+            t_ns[i : i + samples],
+            signal[i : i + samples],
+            np.ones(signal[i : i + samples].shape[:2], dtype=np.bool_),
+        )
+        for i in range(0, len(signal), samples)
+    ]
+
+
+class ArraySource(Source):
+    """Chunks in memory as a source: one per read, at once, then the end.
+
+    Args:
+        spec: what the samples are.
+        chunks: what to deliver.
+        live: claim to be a device, so that a `Session` reads in a thread of its own.
+
+    Raises:
+        ValueError: a chunk is not of `spec.shape`.
+    """
+
+    def __init__(self, spec: ArraySpec, chunks: Sequence[Chunk], live: bool = False) -> None:
+        super().__init__(spec)
+        self.live = live
+        for chunk in chunks:
+            if chunk.values.shape[1:] != spec.shape:
+                raise ValueError(f"chunk of shape {chunk.values.shape}, not (n, *{spec.shape})")
+        self._left = list(chunks)[::-1]  # the next one last
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        if not self._left:
+            raise EndOfStream
+        chunk = self._left.pop()
+        self.stats.delivered += len(chunk)
+        return chunk
+
+    def close(self) -> None:
+        self._left.clear()
+
+
+class FakeSerial(EmulatedSerial):
+    """A device on a serial port, plugged in while entered: see `EmulatedSerial`.
+
+    Args:
+        signal: What the device measures: (n, element, channel) in SI units, or a source.
+        codec: Name of the codec that it speaks.
+        spec: The array, where neither the codec nor a source tells.
+        further: Options of `EmulatedSerial`.
+
+    Raises:
+        ConfigError: The codec or an option is unknown, or the signal has another shape.
+    """
+
+    def __init__(
+        self,
+        signal: ArrayLike | Source,
+        codec: str = "native",
+        *,
+        spec: ArraySpec | None = None,
+        **further: Any,
+    ) -> None:
+        super().__init__(_source_of(signal, self.wire, codec, spec, further), codec, **further)
+
+
+class FakeCan(EmulatedCan):
+    """A device on a CAN bus, plugged in while entered: see `EmulatedCan`.
+
+    The arguments are those of `FakeSerial`, and `EmulatedCan` has further options.
+    """
+
+    def __init__(
+        self,
+        signal: ArrayLike | Source,
+        codec: str = "native",
+        *,
+        spec: ArraySpec | None = None,
+        **further: Any,
+    ) -> None:
+        super().__init__(_source_of(signal, self.wire, codec, spec, further), codec, **further)
+
+
+def _source_of(
+    signal: ArrayLike | Source,
+    wire: str,
+    codec: str,
+    spec: ArraySpec | None,
+    further: dict[str, Any],
+) -> Source:
+    if isinstance(signal, Source):
+        return signal
+    values = np.asarray(signal, np.float32)
+    if values.ndim != 3:
+        raise ConfigError(f"a signal is (n, element, channel), not {values.shape}")
+    elements, channels = values.shape[1:]
+    spec = spec or make_codec(wire, codec, dict(further.get("options") or {})).spec
+    spec = spec or synthetic_spec(elements, channels, 1000.0)
+    return ArraySource(spec, cut(values, spec.rate_hz))

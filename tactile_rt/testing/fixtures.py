@@ -1,0 +1,43 @@
+"""Fixtures for tests with emulated devices. In your conftest.py:
+
+    from tactile_rt.testing.fixtures import fake_can, fake_serial
+
+    def test_it_feels(fake_serial):
+        device = fake_serial(signal, "bota")
+        with open_source(device.url) as source:
+            ...
+
+Nothing else of tactile_rt imports it, so that pytest is needed for tests only.
+"""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import pytest
+
+from tactile_rt.testing import FakeCan, FakeSerial
+
+__all__ = ["fake_can", "fake_serial"]
+
+
+@pytest.fixture
+def fake_serial() -> Iterator[Callable[..., FakeSerial]]:
+    """Makes devices on serial ports, plugged in; unplugged when the test ends."""
+    with ExitStack() as devices:
+
+        def make(*arguments: Any, **options: Any) -> FakeSerial:
+            return devices.enter_context(FakeSerial(*arguments, **options))
+
+        yield make
+
+
+@pytest.fixture
+def fake_can() -> Iterator[Callable[..., FakeCan]]:
+    """Makes devices on CAN buses, plugged in; unplugged when the test ends."""
+    with ExitStack() as devices:
+
+        def make(*arguments: Any, **options: Any) -> FakeCan:
+            return devices.enter_context(FakeCan(*arguments, **options))
+
+        yield make

@@ -1,0 +1,5 @@
+"""The version of this release, which recordings, sweep sets and model files carry."""
+
+__all__ = ["VERSION"]
+
+VERSION = "0.1.0"

@@ -1,0 +1,379 @@
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx")
+
+from tactile_rt.classifier.classifier import Classifier
+from tactile_rt.classifier.model_check import probe_logits
+from tactile_rt.classifier.model_file import (
+    StateTensor,
+    element_order,
+    load_model,
+    read_model,
+    shipped_model,
+)
+from tactile_rt.stream import ConfigError, ModelError, SpecMismatch
+from tactile_rt.testing import small_spec
+from tests.helpers.tiny_model import CARD, GRAPH, LABELS, WINDOW, write_model
+
+
+def test_the_card_comes_back_as_it_was_written(tmp_path: Path) -> None:
+    provenance = {"commands": ["tactile-rt train"], "seed": 3}
+    path = write_model(tmp_path / "m.onnx", temperature=1.5, provenance=provenance)
+    session, card = load_model(path)
+    assert card == msgspec.structs.replace(CARD, temperature=1.5, provenance=provenance)
+    assert card.array == small_spec()
+    assert {i.name for i in session.get_inputs()} == {
+        "samples", "offset", "sigma", "steps", "total"
+    }  # fmt: skip
+
+
+def test_a_batch_is_a_batch_of_independent_streams(tmp_path: Path) -> None:
+    session, _ = load_model(write_model(tmp_path / "m.onnx"))
+    rng = np.random.default_rng(0)
+    feed = {
+        "samples": rng.normal(size=(4, 3, 3, 2)).astype(np.float32),
+        "offset": rng.normal(size=(4, 3, 2)).astype(np.float32),
+        "sigma": np.ones((4, 3, 2), dtype=np.float32),
+        "steps": np.arange(4),
+        "total": rng.normal(size=(4, 1)).astype(np.float32),
+    }
+    together = session.run(["logits"], feed)[0]
+    for i in range(4):
+        alone = session.run(["logits"], {k: v[i : i + 1] for k, v in feed.items()})[0]
+        assert np.array_equal(alone[0], together[i])
+
+
+def test_a_batch_frozen_into_the_graph_is_refused_unless_it_is_one(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="batch size is fixed"):
+        load_model(write_model(tmp_path / "m.onnx", GRAPH.replace("[B", "[2")))
+
+
+@pytest.mark.parametrize("content", [b"", b"garbage" * 100, b"\x08\x08", b"PK\x03\x04"])
+def test_a_file_that_is_not_onnx_is_named_in_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "m.onnx"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match=f"^{path} is not a readable ONNX model: .+") as caught:
+        load_model(path)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "it is empty"),
+        (b"garbage" * 100, "it is text"),
+        (b'{\n\t"version": 2}', "it is text"),
+        (
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n",
+            "`git lfs pull` fetches",
+        ),
+        (b"PK\x03\x04\x00\x00", "it is a zip archive, as checkpoints are; `tactile-rt export`"),
+    ],
+)
+def test_what_is_often_taken_for_a_model_is_named(
+    tmp_path: Path, content: bytes, said: str
+) -> None:
+    path = tmp_path / "m.onnx"
+    path.write_bytes(content)
+    with pytest.raises(ModelError, match=f"^{path} is not a readable ONNX model: .*{said}"):
+        read_model(path)
+
+
+@pytest.mark.parametrize(
+    ("graph", "said"),
+    [
+        (GRAPH.replace("18]", "99]"), "it uses opset 99, and onnxruntime .* reads .* at most"),
+        (GRAPH.replace("ir_version: 9", "ir_version: 99"), "Unsupported model IR version: 99"),
+        (GRAPH.replace("Sub(last, last)", "Sub(last, gone)"), "Invalid model. Node input 'gone'"),
+        (GRAPH.replace("Sub(last, last)", "Explode(last, last)"), "This is an invalid model."),
+    ],
+)
+def test_onnxruntime_s_reasons_are_said_without_its_source(
+    tmp_path: Path, graph: str, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("onnx.checker.check_model", lambda *a, **k: None)
+    path = write_model(tmp_path / "m.onnx", graph)
+    with pytest.raises(ModelError, match=f"^{path} is not a readable ONNX model: {said}") as caught:
+        load_model(path)
+    assert "\n" not in str(caught.value)
+    assert "onnxruntime_src" not in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 350
+
+
+def test_other_names_are_found_without_running_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("onnxruntime.InferenceSession", None)  # would be a TypeError
+    for old, said in (("sigma", "disagree with its metadata at S, sigma"), ("logits", "`logits`")):
+        path = write_model(tmp_path / "m.onnx", GRAPH.replace(old, "S"))
+        with pytest.raises(ModelError, match=f"^{path}: .*{said}"):
+            read_model(path)
+    stored = GRAPH.replace("float[B,3,2] sigma,", "float[B,3,2] sigma, int64[1] one,")
+    assert read_model(write_model(tmp_path / "m.onnx", stored))[0] == CARD
+
+
+def test_a_model_cut_short_is_named(tmp_path: Path) -> None:
+    path = write_model(tmp_path / "m.onnx")
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ModelError, match=f"^{path} "):
+        load_model(path)
+
+
+def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+    for path in (tmp_path / "none.onnx", tmp_path):
+        with pytest.raises(ModelError, match=f"^no model file {path}$"):
+            load_model(path)
+
+
+def test_onnx_without_our_metadata_is_told_apart_from_damage(tmp_path: Path) -> None:
+    path = write_model(tmp_path / "m.onnx", metadata="")
+    with pytest.raises(
+        ModelError, match=r"is ONNX but not a tactile_rt model: .*tactile-rt export"
+    ):
+        load_model(path)
+
+
+# The sum of two elements for a state of one.
+SWAPPED = (
+    GRAPH.replace("float[B,1] total_next)", "float[B,2] total_next)")
+    .replace(
+        "total_next = Add(total, sum)",
+        "total_wide = Add(total, sum)\n  total_next = Concat<axis = 1>(total_wide, total_wide)",
+    )
+    .replace("steps_column, total_next, last", "steps_column, total_wide, last")
+)
+
+
+def card_with(**fields: object) -> str:
+    return json.dumps({**msgspec.to_builtins(CARD), **fields})
+
+
+@pytest.mark.parametrize(
+    ("metadata", "complaint"),
+    [
+        ("{", "has damaged metadata"),
+        ("[1]", "has damaged metadata"),
+        ("{}", "has metadata of version None; this release reads 1 and 2"),
+        (card_with(version=3), "has metadata of version 3; this release reads 1 and 2"),
+        ('{"version": 1}', "has damaged metadata: .*missing required field"),
+        ('{"version": 1, "name": ' + "[" * 100_000, "has damaged metadata: "),
+        (card_with(clip=[1e-3, float("1e308")]).replace("1e+308", "1e999"), "has damaged metadata"),
+        (card_with(steps="many"), r"has damaged metadata: .*\$.steps"),
+        (card_with(spec="{}"), "has damaged metadata: array spec of version None"),
+        (card_with(spec="mouse"), "has damaged metadata: not an array spec"),
+    ],
+)
+def test_metadata_that_cannot_be_read_says_why(
+    tmp_path: Path, metadata: str, complaint: str
+) -> None:
+    path = write_model(tmp_path / "m.onnx", metadata=metadata)
+    with pytest.raises(ModelError, match=f"^{path} {complaint}"):
+        load_model(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "where"),
+    [
+        ({"substeps": 5}, "at samples$"),
+        ({"spec": small_spec(elements=4).to_json()}, "at offset, samples, sigma$"),
+        ({"state": CARD.state[:1]}, "at total$"),
+        ({"state": (*CARD.state, StateTensor("more", (2,), "float32"))}, "at more$"),
+        ({"state": (StateTensor("steps", (), "int64"), StateTensor("total", (2,), "float32"))},
+         "at total$"),
+        ({"state": (StateTensor("steps", (), "int32"), CARD.state[1])}, "at steps$"),
+    ],
+)  # fmt: skip
+def test_a_graph_that_disagrees_with_its_card_is_refused(
+    tmp_path: Path, changes: dict, where: str
+) -> None:
+    path = write_model(tmp_path / "m.onnx", **changes)
+    with pytest.raises(
+        ModelError, match=f"^{path}: the graph's inputs disagree with its metadata {where}"
+    ):
+        load_model(path)
+
+
+@pytest.mark.parametrize(
+    ("graph", "changes", "complaint"),
+    [
+        (GRAPH, {"labels": LABELS[:4]}, "no output `logits` of 4 classes"),
+        (GRAPH.replace("logits", "scores"), {}, "no output `logits`, which its metadata promises"),
+        (GRAPH.replace("total_next", "summed"), {}, "no output `total_next`"),
+        (SWAPPED, {}, "no output `total_next` like `total`"),
+    ],
+)
+def test_outputs_that_the_card_promises_must_be_there(
+    tmp_path: Path, graph: str, changes: dict, complaint: str
+) -> None:
+    path = write_model(tmp_path / "m.onnx", graph, **changes)
+    with pytest.raises(ModelError, match=f"^{path}: {complaint}"):
+        load_model(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"period_ns": 0}, "period_ns must be positive"),
+        ({"steps": 0}, "steps must be positive"),
+        ({"temperature": 0.0}, "temperature must be positive"),
+        ({"temperature": -1.0}, "temperature must be positive"),
+        ({"floor": (1e-3,)}, "1 values of floor for 2 channels"),
+        ({"clip": (1.0, 1.0, 1.0)}, "3 values of clip for 2 channels"),
+        ({"scale": ()}, "0 values of scale for 2 channels"),
+        ({"floor": (1e-3, 0.0)}, "floor must be positive"),
+        ({"steps": 10**9}, "1000000000 steps"),
+        ({"period_ns": 10**13}, "4 steps of 3 sub-steps of 10000000000000 ns"),
+        ({"substeps": 10**12}, "samples of shape 1000000000000x3x2"),
+        ({"labels": ("a", "a", "b", "c", "d")}, "labels are missing or repeat"),
+        ({"labels": ()}, "labels are missing or repeat"),
+        ({"labels": ("a", "b", "c", "d", "\x1b[2J")}, "labels must be 1 to 200 printable"),
+        ({"labels": ("a", "b", "c", "d", "")}, "labels must be 1 to 200 printable characters"),
+        ({"labels": ("a", "b", "c", "d", "e" * 201)}, "labels must be 1 to 200 printable"),
+        ({"name": "x" * 3_000_000}, "a name of 3000000 characters"),
+        ({"steps": 1_000_000}, "an episode of 18000000 values"),
+        ({"provenance": {"commands": 5}}, "commands of the provenance must be a list"),
+        ({"provenance": {"unseen_objects": "mug"}}, "unseen_objects of the provenance"),
+        ({"state": (*CARD.state, StateTensor("samples", (1,), "float32"))}, "names of the state"),
+        ({"state": (CARD.state[0], StateTensor("total", (2**40, 2**40), "float32"))},
+         "total of shape 1099511627776x1099511627776"),
+        ({"state": (CARD.state[0], StateTensor("total", (-1,), "float32"))}, "total of shape -1"),
+        ({"state": tuple(StateTensor(f"s{i}", (2**28,), "int8") for i in range(9))}, "its state"),
+        ({"state": (CARD.state[0], StateTensor("total", (1,), "object"))}, "total of type"),
+        ({"probe": ((0.0,) * 5,) * 3}, "the probe is not 4 steps of 5 logits"),
+        ({"kind": "window"}, "a window has no state"),
+        ({"kind": "film"}, r"Invalid enum value 'film'.*kind"),
+    ],
+)  # fmt: skip
+def test_a_card_that_cannot_be_run_is_refused_before_it_is_run(
+    tmp_path: Path, changes: dict, complaint: str
+) -> None:
+    path = write_model(tmp_path / "m.onnx", **changes)
+    with pytest.raises(ModelError, match=f"^{path} has damaged metadata: {complaint}"):
+        Classifier(path, small_spec())
+
+
+def test_running_a_model_writes_nothing_to_the_terminal(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """onnxruntime logs its failures to stderr unless told not to."""
+    load_model(write_model(tmp_path / "m.onnx"))
+    (tmp_path / "bad.onnx").write_bytes(b"garbage")
+    with pytest.raises(ModelError):
+        load_model(tmp_path / "bad.onnx")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_one_thread_runs_the_model(tmp_path: Path) -> None:
+    session, _ = load_model(write_model(tmp_path / "m.onnx"))
+    options = session.get_session_options()
+    assert (options.intra_op_num_threads, options.inter_op_num_threads) == (1, 1)
+
+
+def test_loading_a_model_leaves_the_process_s_arithmetic_alone(tmp_path: Path) -> None:
+    """A runtime may flush subnormal numbers to zero, for itself; not in the user's simulation."""
+    path = write_model(tmp_path / "m.onnx")
+    code = f"""
+import sys
+from dataclasses import replace
+from pathlib import Path
+from tactile_rt.classifier.model_file import load_model
+load_model(Path({str(path)!r}))
+assert sys.float_info.min / 2 > 0
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_shipped_model_can_be_run() -> None:
+    _, card = load_model(shipped_model())
+    assert len(card.labels) == len(set(card.labels)) >= 12
+    assert card.figures["parity"] <= 1e-5
+    Classifier(shipped_model(), card.array)
+
+
+# ---- what may differ between a model and a source
+
+
+def reordered(spec, order):
+    fields = ("elements", "grid", "positions", "orientations")
+    return replace(spec, **{f: tuple(getattr(spec, f)[i] for i in order) for f in fields})
+
+
+def test_a_source_with_the_elements_in_another_order_is_permuted() -> None:
+    spec = small_spec(elements=4)
+    assert element_order(spec, spec).tolist() == [0, 1, 2, 3]
+    source = reordered(spec, (2, 0, 3, 1))
+    order = element_order(spec, replace(source, name="other", rate_hz=17.0))
+    values = np.array([ord(e[-1]) for e in source.elements])
+    assert [source.elements[i] for i in order] == list(spec.elements)
+    assert values[order].tolist() == [ord(e[-1]) for e in spec.elements]
+
+
+def test_anything_else_that_differs_is_said_exactly() -> None:
+    spec = small_spec(elements=4)
+    source = reordered(spec, (2, 0, 3, 1))
+    moved = replace(source, positions=((9.0, 9.0, 9.0), *source.positions[1:]))
+    for other, said in [
+        (small_spec(elements=3), f"elements: lacks {spec.elements[3]}"),
+        (replace(source, elements=("new", *source.elements[1:])),
+         f"elements: lacks {source.elements[0]}; elements: new unknown to the model"),
+        (moved, r"positions\[2\] is \(9.0, 9.0, 9.0\), not"),
+        (replace(source, channels=source.channels[::-1]), r"channels\[0\] is"),
+        (replace(source, frame="elsewhere"), "frame is 'elsewhere', not"),
+    ]:  # fmt: skip
+        with pytest.raises(SpecMismatch, match=said):
+            element_order(spec, other)
+
+
+# ---- versions, kinds, providers
+
+
+def test_metadata_of_version_1_is_read(tmp_path: Path) -> None:
+    added = ("kind", "precision", "opset", "hashes", "thresholds", "decision", "probe")
+    old = {k: v for k, v in json.loads(card_with(version=1)).items() if k not in added}
+    _, card = load_model(write_model(tmp_path / "m.onnx", metadata=json.dumps(old)))
+    assert card == msgspec.structs.replace(CARD, version=1)
+    assert read_model(shipped_model())[0].version in (1, 2)
+
+
+def test_fields_that_a_later_release_adds_are_passed_over(tmp_path: Path) -> None:
+    path = write_model(tmp_path / "m.onnx", metadata=card_with(colour="red"))
+    assert load_model(path)[1] == CARD
+
+
+def test_a_window_is_loaded_only_where_one_is_wanted(tmp_path: Path) -> None:
+    path = write_model(tmp_path / "m.onnx", WINDOW, kind="window", state=())
+    with pytest.raises(ModelError, match=f"^{path} is a model of kind 'window'; this needs 'step'"):
+        load_model(path)
+    session, card = load_model(path, kind="window")
+    assert probe_logits(session, card).shape == (4, 5)
+    fixed = WINDOW.replace("B,T", "B,7")
+    write_model(path, fixed, kind="window", state=())
+    with pytest.raises(ModelError, match=r"disagree with its metadata at samples$"):
+        load_model(path, kind=None)
+
+
+def test_a_provider_that_is_not_there_is_refused_not_replaced(tmp_path: Path) -> None:
+    path = write_model(tmp_path / "m.onnx")
+    with pytest.raises(ConfigError, match=r"^no NoSuchProvider in this onnxruntime: it has .*CPU"):
+        load_model(path, providers=("NoSuchProvider", "CPUExecutionProvider"))
+
+
+GOLDEN = [0.0, 4.0, 0.00201300555, -1.13864025e-05, 0.00100000005]
+
+
+def test_the_probe_is_one_episode_of_the_same_input_everywhere(tmp_path: Path) -> None:
+    session, card = load_model(write_model(tmp_path / "m.onnx"))
+    logits = probe_logits(session, card)
+    assert logits[:, 1].tolist() == [1, 2, 3, 4]  # steps since the reset
+    # Golden: the input must never change, or stored probes would all miss.
+    assert np.array_equal(logits, probe_logits(session, card))
+    assert logits[-1].tolist() == pytest.approx(GOLDEN, rel=1e-6)

@@ -1,0 +1,141 @@
+"""`tactile-rt record`, `recover` and `convert`: what they write, say and refuse."""
+
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from tactile_rt.recording import read_description, read_packets, read_stream
+from tactile_rt.testing import FakeSerial
+
+pytest.importorskip("mcap")
+
+SOURCE = "synthetic:2x3?pace=fast&seconds=0.3"
+PROGRAM = "import sys; from tactile_rt.cli import main; sys.argv[0] = 'tactile-rt'; main()"
+
+
+def start(*arguments):
+    """Run the command line in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "run.mcap"
+
+
+def samples(path):
+    return sum(map(len, read_stream(path)))
+
+
+def test_a_source_is_recorded_to_its_end(call, path):
+    code, out, err = call("record", SOURCE, path, "--note", "who=Ada", "--note", "why=a=b")
+    assert (code, err) == (0, "")
+    assert out.startswith(f"{path}: 300 samples, ")
+    assert samples(path) == 300
+    about = read_description(path)
+    assert about.source == SOURCE
+    assert about.session == {"who": "Ada", "why": "a=b"}
+
+
+def test_a_device_s_packets_are_recorded_and_it_tells_how_it_goes(call, path):
+    with FakeSerial(np.zeros((5000, 2, 3))) as fake:
+        code, out, err = call("record", fake.url, path, "--seconds", "1.3")
+    assert code == 0
+    assert err.count("\n") == 1
+    assert err.startswith("streaming, ")
+    assert " packets, " in err
+    assert " packets, " in out
+    assert samples(path) > 500
+    assert sum(1 for _ in read_packets(path)) > 100
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_with_a_whole_file(end, path):
+    with start("record", "synthetic:2x3", path) as process:
+        assert process.stderr.readline().split()[1] == "samples,"
+        process.send_signal(end)
+        out, _ = process.communicate(timeout=10)
+    assert process.returncode == 0
+    assert out.startswith(f"{path}: ")
+    assert samples(path) == int(out.split()[1]) > 500
+
+
+def test_what_is_left_of_a_killed_one_is_recovered(call, path):
+    with start("record", "synthetic:2x3", path) as process:
+        told = int(process.stderr.readline().split()[0])
+        process.kill()
+        process.communicate(timeout=10)
+    code, _, err = call("convert", path, path.with_name("out.npz"))
+    assert code == 2
+    assert "`tactile-rt recover" in err
+    assert not path.with_name("out.npz").exists()
+    code, out, err = call("recover", path)
+    made = path.with_name("run.recovered.mcap")
+    assert (code, err) == (0, "")
+    assert out.startswith(f"{made}: {samples(made)} samples, ")
+    assert samples(made) >= told - 1000  # at 1 kHz
+    assert call("recover", path)[0] == 2  # which would write over it
+    assert call("recover", path, "--force")[:2] == (0, out)
+    assert call("recover", made)[1] == f"{made} is whole: nothing to do\n"
+
+
+@pytest.mark.parametrize("name", ["out.npz", "out.csv", "out.h5"])
+def test_a_recording_is_converted_and_made_one_again(name, call, path):
+    if name == "out.h5":
+        pytest.importorskip("h5py")
+    call("record", SOURCE, path)
+    output = path.with_name(name)
+    code, out, err = call("convert", path, output)
+    assert (code, out, err) == (0, f"{output}: 300 samples\n", "")
+    before = output.read_bytes()
+    assert call("convert", path, output)[0] == 2
+    assert call("convert", path, output, "--force")[0] == 0
+    assert len(output.read_bytes()) == len(before)
+    again = path.with_name("again.mcap")
+    assert call("convert", output, again) == (0, f"{again}: 300 samples\n", "")
+    assert samples(again) == 300
+
+
+def test_a_file_that_is_there_is_not_written_over(call, path):
+    path.write_bytes(b"precious")
+    code, out, err = call("record", SOURCE, path)
+    assert (code, out) == (2, "")
+    assert err == f"tactile-rt: {path} is there already: name another file, or give --force\n"
+    assert path.read_bytes() == b"precious"
+    assert call("record", SOURCE, path, "--force")[0] == 0
+    assert samples(path) == 300
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("record", SOURCE, "none/x.mcap"), "no folder none to write x.mcap in"),
+        (("record", SOURCE, "."), "is a folder: name a file"),
+        (("record", "syntetic:", "x.mcap"), "did you mean synthetic:?"),
+        (("record", SOURCE, "x.mcap", "--note", "who"), "--note is NAME=VALUE, not 'who'"),
+        (("recover", "none.mcap"), "no recording none.mcap"),
+        (("convert", "none.mcap", "x.npz"), "no recording none.mcap"),
+        (("convert", "none.mcap", "x.txt"), "neither .mcap nor .npz, .csv, .h5"),
+        (("convert", "text.mcap", "x.csv"), "text.mcap is not an MCAP file"),
+        (("convert", "text.mcap", "x.mcap"), "text.mcap is a recording already"),
+        (("convert", "none.npz", "x.mcap"), "no file none.npz"),
+        (("run", "--source", "replay:text.mcap"), "text.mcap is not an MCAP file"),
+        (("run", "--source", "replay:"), "replay: needs a file"),
+    ],
+)
+def test_a_mistake_is_one_line(arguments, said, call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "text.mcap").write_text("no recording at all\n")
+    code, out, err = call(*arguments)
+    assert (code, out) == (2, "")
+    assert said in err
+    assert err.count("\n") == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["text.mcap"]  # nothing half-written

@@ -1,0 +1,260 @@
+"""`tactile-rt replay`: the daemon's decisions again at every speed, and the first that differs."""
+
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tactile_rt.daemon.config_check import check_config
+from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.daemon import Daemon
+from tactile_rt.recording import read_decisions, read_description, read_stream
+from tactile_rt.recording.mcap_file import McapFile
+from tactile_rt.recording.reader import read_raw
+from tactile_rt.testing import FakeSerial, small_spec
+
+pytest.importorskip("mcap")
+tiny_model = pytest.importorskip("tests.helpers.tiny_model")
+
+SPEC = small_spec()
+PATIENCE_S = 30.0
+TOPICS = ("samples", "wire", "health", "decisions", "events")
+
+
+def touching(n, seed=0):
+    """(n, 3, 2): rest for half a second, then touches of different force."""
+    t = np.arange(n) / 1000.0
+    noise = np.random.default_rng(seed).normal(scale=1e-3, size=(n, 3, 2))
+    on = (t > 0.5) & (t % 0.7 < 0.3)
+    size = 0.05 * (1 + np.floor(t / 0.7))
+    return (noise + (size * on)[:, None, None]).astype(np.float32)
+
+
+def daemon_records(folder, text, n=1800):
+    """The files that a daemon records of an emulated device, in their order."""
+    model = tiny_model.write_model(folder / "tiny.onnx")
+    with FakeSerial(touching(n), spec=SPEC) as fake:
+        (folder / "robot.toml").write_text(
+            f'version = 1\n[[source]]\nname = "left"\nurl = "{fake.url}"\n[log]\nfile = "log"\n'
+            + text.format(model=model)
+        )
+        loaded = load_config(folder / "robot.toml")
+        check_config(loaded)
+        daemon = Daemon(loaded)
+        daemon.start()
+        end = time.monotonic() + PATIENCE_S
+        while not fake.wait(0.01) or any(
+            m.queue.taken["samples"] < n for m in daemon.snapshot().models
+        ):
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        assert daemon.stop() == []
+    return sorted((folder / "rec").glob("*.mcap"), key=lambda p: p.stat().st_mtime_ns)
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory):
+    """(recording, model) of a daemon with two models on one source."""
+    folder = tmp_path_factory.mktemp("live")
+    (path,) = daemon_records(
+        folder,
+        '[[model]]\nfile = "{model}"\n'
+        '[[model]]\nname = "last"\nfile = "{model}"\ndecisions = "final"\nmode = "sliding"\n'
+        '[recorder]\nfolder = "rec"\nmin_free_mb = 0\n',
+    )
+    return path, folder / "tiny.onnx"
+
+
+def again(path, to, change=lambda raw: raw, **session):
+    """The recording once more, with other messages or notes; a note of None is left out."""
+    about = read_description(path)
+    notes = {k: v for k, v in {**about.session, **session}.items() if v is not None}
+    with to.open("wb") as file:
+        made = McapFile(file, replace(about, session=notes))
+        for _, raw in read_raw(path, *TOPICS):
+            for changed in [change(raw)]:
+                if changed is not None:
+                    made.add(changed.topic, changed.data, changed.t_ns)
+        made.finish()
+    return to
+
+
+def spoil(nth, **fields):
+    """Change the nth decision of the model "left", from 0."""
+    seen = []
+
+    def change(raw):
+        if raw.topic != "decisions" or b'"model":"left"' not in raw.data:
+            return raw
+        seen.append(raw)
+        if len(seen) != nth + 1:
+            return raw
+        if not fields:
+            return None
+        return replace(raw, data=json.dumps({**json.loads(raw.data), **fields}).encode())
+
+    return change
+
+
+def test_it_decides_as_the_daemon_did_at_every_speed(call, live, tmp_path):
+    path, _ = live
+    recorded = [d for d in read_decisions(path) if d["model"] == "left"]
+    assert len(recorded) >= 8
+    timing = {"model_ms", "latency_ms", "late", "utc_ns"}
+    printed = set()
+    for speed in ("max", "max", "4"):
+        code, out, err = call("replay", path, "--name", "left", "--speed", speed)
+        assert code == 0
+        assert err.startswith("1800 samples, ")
+        printed.add(out)
+    assert len(printed) == 1
+    lines = [json.loads(line) for line in out.splitlines()]
+    for mine, theirs in zip(lines, recorded, strict=False):
+        assert {k: v for k, v in mine.items() if k != "utc_ns"} == {
+            k: v for k, v in theirs.items() if k not in timing
+        }
+        assert abs(mine["utc_ns"] - theirs["utc_ns"]) < 1e8
+    assert len(lines) - len(recorded) in range(3)  # what was decided as the stream ended
+    to = tmp_path / "decisions.jsonl"
+    assert call("replay", path, "--name", "left", "--out", to)[:2] == (0, "")
+    assert to.read_text() == out
+    assert call("replay", path, "--name", "left", "--out", to)[0] == 2
+
+
+@pytest.mark.parametrize("name", ["left", "last"])
+@pytest.mark.parametrize("further", [(), ("--redecode",)])
+def test_a_check_passes(name, further, call, live):
+    path, model = live
+    n = sum(d["model"] == name for d in read_decisions(path))
+    code, out, _ = call("replay", path, "--check", "--name", name, *further)
+    assert code == 0
+    assert out.startswith(f"{n} decisions of {name} are as recorded")
+    assert call("replay", path, "--check", "--name", name, "--model", model)[0] == 0
+
+
+def test_a_recording_made_of_arrays_is_checked_as_the_first(call, live, tmp_path):
+    assert call("convert", live[0], tmp_path / "x.npz")[0] == 0
+    assert call("convert", tmp_path / "x.npz", tmp_path / "back.mcap")[0] == 0
+    asked = ("--check", "--name", "left")
+    assert call("replay", tmp_path / "back.mcap", *asked) == call("replay", live[0], *asked)
+
+
+@pytest.mark.parametrize(
+    ("nth", "fields", "said"),
+    [
+        (4, {"label": "other"}, "label was 'other', is '"),
+        (0, {"step": 3}, "step was 3, is 1"),
+        (2, {}, r"decision 3 "),
+        (5, {"probabilities": {"a": 1.0}}, "classes were a, are nothing, steps"),
+    ],
+)
+def test_a_check_names_the_first_difference(nth, fields, said, call, live, tmp_path):
+    path = again(live[0], tmp_path / "x.mcap", spoil(nth, **fields))
+    code, out, err = call("replay", path, "--check", "--name", "left")
+    assert code == 1
+    assert out.startswith(f"{nth} decisions of left are as recorded")
+    assert said in err
+    assert f"decision {nth + 1} " in err
+
+
+def test_a_check_needs_the_model_that_decided(call, live, tmp_path):
+    path, model = live
+    other = tiny_model.write_model(tmp_path / "other.onnx", temperature=2.0)
+    (key,) = (k for k in read_description(path).session if k.endswith(".left"))
+    known = again(path, tmp_path / "known.mcap", **{key: f"{model} sha256:{'0' * 64}"})
+    for arguments in (("--model", model), ("--model", other)):
+        code, _, err = call("replay", known, "--check", "--name", "left", *arguments)
+        assert code == 2
+        assert "needs the model that decided, sha256 0000000000000000" in err
+    code, _, err = call("replay", known, "--name", "left")
+    assert code == 2 and "is not there any more: name one by --model" in err
+    moved = again(path, tmp_path / "moved.mcap", **{key: "/gone/tiny.onnx sha256:"})
+    code, _, err = call("replay", moved, "--name", "left")
+    assert code == 2 and "/gone/tiny.onnx (sha256 unknown), is not there any more" in err
+    # another model is what a replay is for, as long as it is not to be the same
+    mine = call("replay", path, "--name", "left")
+    others = call("replay", path, "--name", "left", "--model", other)
+    assert mine[0] == others[0] == 0
+    assert mine[1] != others[1]
+    assert mine[1].count("\n") == others[1].count("\n")
+
+
+def test_rotated_files_are_one_stream(call, tmp_path):
+    paths = daemon_records(
+        tmp_path,
+        '[[model]]\nfile = "{model}"\n[recorder]\nfolder = "rec"\nmin_free_mb = 0\nrotate_s = 1\n',
+        n=2400,
+    )
+    assert len(paths) > 1
+    code, out, _ = call("replay", *paths[::-1], "--check")
+    assert code == 0
+    n = sum(1 for path in paths for _ in read_decisions(path))
+    assert out.startswith(f"{n} decisions of left are as recorded")
+    code, _, err = call("replay", paths[1], "--check")
+    assert code == 1
+    assert "begins in the middle of its stream (sample " in err
+    assert call("replay", *paths, "--redecode")[0] == 2
+
+
+def test_a_folder_and_several_sources_are_named(call, live, tmp_path):
+    again(live[0], tmp_path / "left.mcap")
+    again(live[0], tmp_path / "right.mcap", daemon_source="right")
+    code, _, err = call("replay", tmp_path)
+    assert code == 2
+    assert "recordings of left (left.mcap ...), right (right.mcap ...)" in err
+    code, _, err = call("replay", tmp_path / "left.mcap", tmp_path / "right.mcap")
+    assert code == 2
+    assert "recordings of several sources: left, right" in err
+
+
+def test_what_another_codec_makes_of_the_packets_is_told(call, tmp_path):
+    path = tmp_path / "ascii.mcap"
+    values = np.arange(1, 81, dtype=np.float32).reshape(40, 1, 2) / 64
+    columns = "A0.fx:N,A0.fy:N"
+    with FakeSerial(values, "ascii_line", options={"columns": columns}) as fake:
+        call("record", f"{fake.url}", path, "--seconds", "1.5")
+    n = sum(map(len, read_stream(path)))
+    assert n == 40
+    model = tiny_model.write_model(tmp_path / "tiny.onnx")
+
+    def told(*arguments):
+        return call("replay", path, "--model", model, *arguments)[2]
+
+    same = told("--redecode")
+    assert f"{n} samples recorded, {n} decoded: {n} are the same, bit for bit, 0 differ" in same
+    twice = told("--codec", "ascii_line?columns=A0.fx*2:N,A0.fy:N")
+    assert "0 are the same, bit for bit, 40 differ, 0 were recorded alone" in twice
+    assert "they differ by at most fx 1.23 N" in twice  # 79 / 64
+    assert "fy" not in twice.splitlines()[1]
+    assert "another array: " in told("--codec", "ascii_line?columns=B0.fx:N,B0.fy:N")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("{path}",), "several models decided live: choose by --name left, last"),
+        (("{path}", "--name", "best"), "no model 'best' decided live; there are left, last"),
+        (("{path}", "--speed", "fast"), "--speed is max, or times the recorded pace, not 'fast'"),
+        (("{path}", "--speed", "0"), "--speed is max"),
+        (("{path}", "--name", "left", "--model", "x.onnx"), "model x.onnx cannot be read"),
+        (("none.mcap",), "no recording none.mcap"),
+        (("{path}", "--out", "none/x"), "no folder none to write x in"),
+        (("{path}", "--name", "left", "--codec", "natve"), "did you mean native?"),
+        (("{path}", "--codec", "native?speed=3"), "are not options of a codec"),
+    ],
+)
+def test_a_mistake_is_one_line(arguments, said, call, live):
+    code, out, err = call("replay", *(a.format(path=live[0]) for a in arguments))
+    assert (code, out) == (2, "")
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def test_without_a_daemon_there_is_nothing_to_check(call, tmp_path):
+    path = tmp_path / "run.mcap"
+    call("record", "synthetic:2x3?pace=fast&seconds=0.3", path)
+    code, _, err = call("replay", path, "--check")
+    assert code == 2
+    assert "nothing to check: no model decided while it was recorded" in err

@@ -1,0 +1,282 @@
+"""Hardware in the loop: the comparison can fail, and does not where it must not."""
+
+import dataclasses
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx")
+
+from tactile_rt.classifier.classifier import Classification
+from tactile_rt.drivers.codecs.native import NativeSerial
+from tactile_rt.drivers.device_time import DeviceTime
+from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
+from tactile_rt.drivers.health import Health, State
+from tactile_rt.evidence.hil import Loop, LoopReport, pair
+from tactile_rt.stream import ConfigError, SourceError, SourceStats, SpecMismatch
+from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
+from tests.helpers.tiny_model import write_model
+
+SPEC = small_spec()
+needs_sim = pytest.mark.skipif(find_spec("mujoco") is None, reason="mujoco is not installed")
+pytestmark = pytest.mark.usefixtures("no_thread_left")
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_model(tmp_path_factory.mktemp("model") / "tiny.onnx")
+
+
+def touches(n: int = 3000, start_ns: int = 12_345_678, **source) -> ArraySource:
+    """Two touches; times begin anywhere, and not at a whole microsecond."""
+    values = np.random.default_rng(0).normal(size=(n, *SPEC.shape)) * 2e-3
+    values[1600:1900, 0] += 0.05
+    values[2400:2700, 1] += 0.08
+    return ArraySource(SPEC, cut(values, SPEC.rate_hz, 9, start_ns), **source)
+
+
+@pytest.mark.parametrize("wire", ["serial", "slcan", "virtual"])
+def test_float32_is_bit_equal_over_every_wire(model: Path, wire: str) -> None:
+    loop = Loop(touches(), model, wire, options={"format": "float32"})
+    report = loop.run()
+    assert report.failure == "" and report.exact and not report.faulty
+    assert report.identical_samples == report.samples == report.stats.delivered == 3000
+    assert report.identical == report.same_label == report.direct == report.wire == 8
+    assert report.finals == report.finals_same == 2
+    assert report.latency_s is None and report.stamp_error_s is None
+    assert loop.samples == 3000 and loop.decisions == 8
+
+
+def test_what_a_format_rounds_is_not_bit_equal_and_need_not_be(model: Path) -> None:
+    report = Loop(touches(), model, options={"format": "int16", "range_n": "0.2"}).run()
+    assert not report.exact and report.direct == report.wire == 8
+    assert report.identical_samples < 100 and report.identical < 8
+
+
+@pytest.mark.parametrize("by", [None, 1e-3])
+def test_a_driver_that_alters_one_value_is_found_out(
+    model: Path, monkeypatch: pytest.MonkeyPatch, by: float | None
+) -> None:
+    """In one sample of a touch: by one unit in the last place, or so that decisions differ."""
+    honest, seen = NativeSerial.feed, []
+
+    def lying(self, packet, t_ns):
+        samples = honest(self, packet, t_ns)
+        if samples is not None:
+            seen.append(len(samples))
+            at = 1650 - (sum(seen) - len(samples))
+            if 0 <= at < len(samples):
+                one = samples.values[at, 0, 0]
+                samples.values[at, 0, 0] = one + by if by else np.nextafter(one, np.float32(1))
+        return samples
+
+    monkeypatch.setattr(NativeSerial, "feed", lying)
+    report = Loop(touches(), model).run()
+    assert report.identical_samples == 2999
+    assert report.direct == report.wire == 8 and (report.identical < 8) == bool(by)
+    assert report.failure == "the driver's path is not bit-equal to the direct one"
+
+
+def test_losses_are_accounted_for(model: Path) -> None:
+    faults = FaultSchedule((Fault("drop", at_s=1.0, amount=7), Fault("bit_flip", at_s=1.2)), 1)
+    report = Loop(touches(), model, faults=faults).run()
+    assert report.faulty and not report.exact and report.accounted and report.failure == ""
+    assert report.stats == SourceStats(delivered=2992, corrupt=1, missing=7)
+    assert report.samples == 3000 and report.identical_samples == 2992
+
+
+def test_the_hosts_clock_is_compared_with_the_source_s(model: Path) -> None:
+    """Times of a source in real time are the host's: the driver learns them with some delay."""
+    source = Synthetic()
+    report = Loop(source, model, clock="host").run()
+    assert report.stamp_error_s is not None and len(report.stamp_error_s) == 900
+    assert report.latency_s is not None and report.latency_s.min() > 0
+    assert not report.exact
+
+
+class Synthetic(ArraySource):
+    """A second of noise in real time."""
+
+    def __init__(self) -> None:
+        import time
+
+        values = np.random.default_rng(0).normal(size=(900, *SPEC.shape)) * 2e-3
+        super().__init__(SPEC, cut(values, SPEC.rate_hz), live=True)
+        self._began: int | None = None
+        self._clock = time
+
+    def read(self, timeout=None):
+        chunk = super().read(timeout)
+        if self._began is None:
+            self._began = self._clock.monotonic_ns()
+        chunk = dataclasses.replace(chunk, t_ns=chunk.t_ns + self._began)
+        self._clock.sleep(max(0, (int(chunk.t_ns[-1]) - self._clock.monotonic_ns()) * 1e-9))
+        return chunk
+
+
+def test_a_source_that_breaks_is_told(model: Path) -> None:
+    class Broken(ArraySource):
+        def read(self, timeout=None):
+            if len(self._left) < 100:
+                raise SourceError("the finger is off")
+            return super().read(timeout)
+
+    with pytest.raises(SourceError, match="the finger is off"):
+        Loop(Broken(SPEC, cut(np.zeros((3000, *SPEC.shape)), SPEC.rate_hz)), model).run()
+
+
+@pytest.mark.parametrize(
+    ("further", "said"),
+    [
+        ({"wire": "usb"}, "wire must be one of serial, slcan, virtual, not 'usb'"),
+        ({"clock": "wall"}, "clock must be one of device, host, not 'wall'"),
+        ({"clock": "host"}, "not in real time"),
+        ({"codec": "nativ"}, "no serial codec 'nativ'"),
+        ({"options": {"range_n": "0"}}, "range_n and range_nm must be above 0"),
+    ],
+)
+def test_what_cannot_be_is_refused(model: Path, further: dict, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        Loop(touches(), model, **further)
+
+
+def test_a_model_of_another_array_is_refused(model: Path) -> None:
+    other = ArraySource(small_spec(4), [])
+    with pytest.raises(SpecMismatch):
+        Loop(other, model)
+
+
+# ---- the verdict
+
+
+def decision(onset: int, step: int, label: str = "a", final: bool = False) -> Classification:
+    shares = np.array([0.6, 0.4], np.float32)
+    return Classification(onset, onset + step, step, final, label, ("a", "b"), shares, 0.0)
+
+
+def test_decisions_are_paired_by_touch_and_step() -> None:
+    ms = 1_000_000
+    direct = [decision(0, 1), decision(0, 2), decision(500 * ms, 1), decision(900 * ms, 1)]
+    wire = [decision(9 * ms, 1), decision(500 * ms, 1), decision(500 * ms, 2)]
+    assert pair(direct, wire) == [(direct[0], wire[0]), (direct[2], wire[1])]
+
+
+GOOD = LoopReport(
+    samples=1000, identical_samples=1000, direct=100, wire=100, identical=100, same_label=100,
+    finals=5, finals_same=5, exact=True, faulty=False, stats=SourceStats(delivered=1000), sent=1000,
+    latency_s=None, stamp_error_s=None, health=Health(State.STREAMING, 0),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, ""),
+        ({"identical": 99}, "not bit-equal"),
+        ({"identical_samples": 999}, "not bit-equal"),
+        ({"wire": 101}, "not bit-equal"),
+        ({"identical": 0, "identical_samples": 0, "exact": False, "same_label": 99}, ""),
+        ({"exact": False, "same_label": 98}, "less than 99%"),
+        ({"exact": False, "same_label": 99, "wire": 101}, "less than 99%"),
+        ({"direct": 0, "wire": 0, "identical": 0, "same_label": 0}, "nothing was touched"),
+        ({"sent": 1001}, "does not add up"),
+        ({"sent": 1001, "faulty": True, "exact": False}, "does not add up"),
+        ({"faulty": True, "exact": False, "same_label": 0}, ""),
+        ({"sent": 1003, "stats": SourceStats(1000, 1, 1, 0, 1), "faulty": True}, ""),
+    ],
+)
+def test_the_verdict(changes: dict, said: str) -> None:
+    failure = dataclasses.replace(GOOD, **changes).failure
+    assert said in failure and bool(said) == bool(failure)
+
+
+# ---- the device's own time
+
+
+def test_device_time_unwraps_and_never_goes_back() -> None:
+    clock = DeviceTime(1000.0, 32)
+    first, arrived = 2**32 - 3000, np.arange(6) * 1_000_000
+    ticks = (first + 1000 * np.arange(6)) % 2**32
+    told = clock.to_host(ticks, arrived)
+    assert told.tolist() == [(first + 1000 * i) * 1000 for i in range(6)]
+    clock.resume()
+    assert clock.to_host(ticks[-1:] + 1000, arrived[-1:] + 1).tolist() == [told[-1] + 1_000_000]
+    # it begins anew two milliseconds later, by the host's clock
+    anew = clock.to_host(np.array([0, 1000]), arrived[-1:].repeat(2) + 2_000_001)
+    assert anew.tolist() == [told[-1] + 3_000_000, told[-1] + 4_000_000] and clock.steps == 1
+    same = clock.to_host(np.array([1000]), arrived[-1:] + 3_000_000)
+    assert same[0] == anew[-1] + 1
+
+
+def test_a_short_clock_only_goes_forward() -> None:
+    clock = DeviceTime(100_000.0, 16)
+    told = clock.to_host(np.array([65_000, 60_000]), np.array([0, 1]))
+    assert np.diff(told).tolist() == [(65_536 - 5_000) * 100_000] and clock.steps == 0
+
+
+def test_a_codec_without_time_has_no_device_clock() -> None:
+    from tactile_rt.sources.opening import open_source
+
+    with (
+        FakeSerial(np.zeros((100, 1, 6)), "bota") as fake,
+        pytest.raises(ConfigError, match="clock must be host or device, not 'none'"),
+    ):
+        open_source(fake.url + "&clock=none")
+    with (
+        FakeSerial(np.zeros((100, 1, 3)), "optoforce") as fake,
+        pytest.raises(ConfigError, match="codec optoforce sends no time: it needs clock=host"),
+    ):
+        open_source(fake.url + "&clock=device")
+
+
+# ---- the command
+
+
+@needs_sim
+def test_the_command_compares_a_sweep(call) -> None:
+    code, out, err = call("hil", "--sweeps", 1, "--seed", 2)
+    assert (code, err) == (0, "")
+    cells = [line.strip("│").split("│") for line in out.splitlines() if line[0] == "│"]
+    rows = {key.strip(): value.strip() for key, value in cells}
+    n = rows["samples"].split(",")[0]
+    assert int(n) > 1500 and rows["identical samples"] == f"{n} of {n} (100.00 %)"
+    assert rows["decisions"] == "22 direct, 22 through the driver"
+    assert rows["identical decisions"] == rows["same labels"] == "22 of 22 (100.00 %)"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--wire", "usb"], "wire must be one of serial, slcan, virtual"),
+        (["--option", "form=int16"], "no option 'form'; did you mean format?"),
+        (["--source", "synthetic:", "--sweeps", 3], "--sweeps is of a sim: source"),
+        (["--source", "synthetic:3x6?seconds=1"], "was made for another array"),
+        (["--faults", "none.toml"], "none.toml: cannot be read"),
+        (["--source", "sintetic:"], "did you mean synthetic:?"),
+    ],
+)
+@needs_sim
+def test_a_mistake_is_one_line(call, arguments, said) -> None:
+    code, out, err = call("hil", *arguments)
+    assert (code, out) == (2, "")
+    assert said in err and len(err.strip().splitlines()) == 1
+
+
+def test_a_difference_is_exit_code_1(call, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tactile_rt.sources.opening.open_source", lambda url: touches(1000))
+    code, out, err = call("hil", "--source", "synthetic:3x2", "--model", model)
+    assert code == 1 and "0 direct, 0 through the driver" in out
+    assert "nothing was touched" in err and len(err.strip().splitlines()) == 1
+
+
+@needs_sim
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "arguments", [(), ("--option", "format=int16"), ("--wire", "slcan")], ids=" ".join
+)
+def test_24_sweeps(call, arguments: tuple[str, ...]) -> None:
+    """Bit-equal in float32; else 99 % of all decisions have the same label."""
+    code, out, err = call("hil", "--sweeps", 24, *arguments)
+    assert (code, err) == (0, "") and "528 direct, 528 through the driver" in out

@@ -1,0 +1,92 @@
+"""A model file whose logits say what the runtime fed it, so that every feed can be checked.
+
+    logits = [0, steps so far, sum of all windows, last sample, sigma]
+
+of the first channel of the first element, sample and sum less the offset. Needs onnx, not torch.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import onnx
+import onnx.parser
+
+from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, StateTensor
+from tactile_rt.testing import small_spec
+
+PERIOD_NS = 9_000_000
+SUBSTEPS, STEPS = 3, 4
+LABELS = ("nothing", "steps", "sum", "last", "sigma")
+
+GRAPH = """
+<ir_version: 9, opset_import: ["" : 18]>
+tiny (float[B,3,3,2] samples, float[B,3,2] offset, float[B,3,2] sigma,
+      int64[B] steps, float[B,1] total)
+  => (float[B,5] logits, int64[B] steps_next, float[B,1] total_next)
+<int64[1] one = {1}, int64 first = {0}, int64[1] head = {0}, int64[1] tail = {2}>
+{
+  offset_k = Unsqueeze(offset, one)
+  tared = Sub(samples, offset_k)
+  element = Gather<axis = 2>(tared, first)
+  channel = Gather<axis = 2>(element, first)
+  sum = ReduceSum<keepdims = 1>(channel, one)
+  total_next = Add(total, sum)
+  last = Gather<axis = 1>(channel, tail)
+  steps_next = Add(steps, one)
+  steps_float = Cast<to = 1>(steps_next)
+  steps_column = Unsqueeze(steps_float, one)
+  noise = Gather<axis = 1>(sigma, first)
+  noise_column = Gather<axis = 1>(noise, head)
+  zero = Sub(last, last)
+  logits = Concat<axis = 1>(zero, steps_column, total_next, last, noise_column)
+}
+"""
+
+# An episode at once, of any number of steps; its logits say nothing.
+WINDOW = """
+<ir_version: 9, opset_import: ["" : 18]>
+tiny (float[B,T,3,3,2] samples, float[B,3,2] offset, float[B,3,2] sigma)
+  => (float[B,T,5] logits)
+<int64[2] axes = {3, 4}, int64[1] width = {2}, int64[3] same = {1, 1, 5}>
+{
+  spread = ReduceSum<keepdims = 0>(samples, axes)
+  first = ReduceSum<keepdims = 1>(spread, width)
+  logits = Tile(first, same)
+}
+"""
+
+CARD = ModelCard(
+    name="tiny",
+    spec=small_spec().to_json(),
+    period_ns=PERIOD_NS,
+    substeps=SUBSTEPS,
+    steps=STEPS,
+    labels=LABELS,
+    state=(StateTensor("steps", (), "int64"), StateTensor("total", (1,), "float32")),
+    clip=(1.0, 1.0),
+    scale=(1e-3, 1e-3),
+    floor=(1e-3, 1e-3),
+)
+
+
+def write_model(
+    path: Path, graph: str = GRAPH, metadata: str | None = None, **changes: Any
+) -> Path:
+    """Write the model with some fields of its card changed, or with other metadata altogether."""
+    model = onnx.parser.parse_model(graph)
+    onnx.checker.check_model(model, full_check=True)
+    if metadata is None:
+        metadata = msgspec.json.encode(msgspec.structs.replace(CARD, **changes)).decode()
+    if metadata:
+        onnx.helper.set_model_props(model, {METADATA_KEY: metadata})
+    onnx.save(model, path)
+    return path
+
+
+def logits_of(probabilities: np.ndarray, temperature: float = 1.0) -> np.ndarray:
+    """The logits behind a posterior of this model, whose first one is zero."""
+    evidence = np.log(probabilities.astype(np.float64)) * temperature
+    logits: np.ndarray = evidence - evidence[0]
+    return logits

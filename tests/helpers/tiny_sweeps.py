@@ -1,0 +1,48 @@
+"""A sweep set that is quickly made, of an array like the mouse's, and needs no simulator."""
+
+from pathlib import Path
+
+import numpy as np
+
+from tactile_rt.stream import ArraySpec
+from tactile_rt.sweep_set import SweepManifest, split_by_object, write_object
+
+COLUMNS = (5, 5, 7, 7, 6)  # of rows A to E
+LEAD, SAMPLES = 24, 136
+CATEGORIES = ("ball", "cube", "cone")
+
+
+def tiny_array(seed: int = 0) -> ArraySpec:
+    """30 whiskers on a ragged 5 x 7 grid, each turned in its own way."""
+    rng = np.random.default_rng(seed)
+    grid = tuple((r, c) for r, n in enumerate(COLUMNS) for c in range(n))
+    turns = rng.normal(size=(len(grid), 4))
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    return ArraySpec(
+        name="tiny",
+        elements=tuple(f"{'ABCDE'[r]}{c}" for r, c in grid),
+        grid=grid,
+        positions=tuple((4e-3, 1e-3 * c + 1e-4 * r, -1e-3 * r) for r, c in grid),
+        orientations=tuple(tuple(map(float, q)) for q in turns),
+        channels=("fx", "fy", "fz", "mx", "my", "mz"),
+        units=("N", "N", "N", "N m", "N m", "N m"),
+        rate_hz=1000.0,
+        frame="head",
+    )
+
+
+def write_tiny_set(folder: Path, objects: int = 6, sweeps: int = 1) -> SweepManifest:
+    """Objects of three categories, every sweep a touch that noise and a category's mean make."""
+    spec, rng = tiny_array(), np.random.default_rng(1)
+    split = split_by_object(CATEGORIES, objects, 1, 1)
+    manifest = SweepManifest(spec, 9_000_000, LEAD, CATEGORIES, split)
+    manifest.write(folder)
+    unit = np.array([1e-4] * 3 + [1e-6] * 3)
+    means = np.random.default_rng(2).normal(size=(len(CATEGORIES), *spec.shape)) * unit
+    for name in manifest.names():
+        values = (
+            means[manifest.label(name)] + rng.normal(size=(sweeps, SAMPLES, *spec.shape)) * unit
+        )
+        values[:, :LEAD] = 0
+        write_object(folder, name, values.astype(np.float32), {})
+    return manifest

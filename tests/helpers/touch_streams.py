@@ -1,0 +1,43 @@
+"""Streams of touches for the tiny model, and what it must say of them."""
+
+import numpy as np
+
+from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.stream import NS_PER_S, Chunk
+from tactile_rt.testing import cut, small_spec
+from tests.helpers.tiny_model import CARD, PERIOD_NS, SUBSTEPS
+
+SPEC = small_spec()
+SAME_RATE = small_spec(rate_hz=NS_PER_S / PERIOD_NS)
+QUIET = 130  # samples before the first touch: more than a baseline holds
+SIGMA = 2e-3
+
+
+def signal(touches: list[tuple[int, int, float]], n: int, seed: int = 0) -> np.ndarray:
+    """(n, element, channel): noise on an offset, with touches (from, to, size) on element 0."""
+    values = np.random.default_rng(seed).normal(size=(n, *SPEC.shape)) * SIGMA + 0.25
+    for start, stop, size in touches:
+        values[start:stop, 0] += size
+    return values.astype(np.float32)
+
+
+def stream(values: np.ndarray, samples: int = 7) -> list[Chunk]:
+    """Chunks at the model's own rate: they pass the resampler unchanged, but for the first."""
+    return cut(values, SAME_RATE.rate_hz, samples)
+
+
+def push_all(classifier: Classifier, chunks: list[Chunk]) -> list[Classification]:
+    return [decision for chunk in chunks for decision in classifier.push(chunk)]
+
+
+def expected_logits(values: np.ndarray, onset: int, step: int) -> np.ndarray:
+    """What the tiny model says in a step (from 1) if it was fed right; onset indexes `values`.
+
+    The touch began one sample before the onset was certain. Nothing of it is in the baseline,
+    which also leaves out the five samples before it and reaches back a hundred more.
+    """
+    window = values[onset : onset + step * SUBSTEPS, 0, 0].astype(np.float64)
+    baseline = values[onset - 1 - 5 - 100 : onset - 1 - 5, 0, 0].astype(np.float64)
+    tared = window - baseline.mean()
+    sigma = max(baseline.std(ddof=1), CARD.floor[0])
+    return np.array([0, step, tared.sum(), tared[-1], sigma])

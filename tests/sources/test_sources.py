@@ -1,0 +1,169 @@
+from dataclasses import dataclass
+from importlib import metadata
+from importlib.util import find_spec
+
+import pytest
+
+from tactile_rt.sources.opening import open_source
+from tactile_rt.stream import ConfigError
+from tactile_rt.testing import ArraySource, small_spec
+
+
+@dataclass(frozen=True)
+class GloveOptions:
+    gain: float = 1.0
+    channels: int = 2
+    raw: bool = False
+    path: str = ""
+
+    def __post_init__(self) -> None:
+        if self.gain <= 0:
+            raise ConfigError(f"gain must be positive, not {self.gain}")
+
+
+class Glove(ArraySource):
+    """A source of another package."""
+
+    Options = GloveOptions
+
+    def __init__(self, target: str, options: GloveOptions) -> None:
+        super().__init__(small_spec(), [])
+        self.target, self.options = target, options
+
+
+@pytest.fixture
+def glove(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another package is installed that brings the scheme `glove`."""
+    point = metadata.EntryPoint("glove", f"{__name__}:Glove", "tactile_rt.sources")
+    monkeypatch.setattr(metadata.EntryPoint, "load", lambda self: Glove)
+    points = metadata.EntryPoints([point, metadata.EntryPoint("glove", "x:y", "other.group")])
+    monkeypatch.setattr(metadata, "entry_points", lambda **params: points.select(**params))
+
+
+def refused(url: str) -> str:
+    with pytest.raises(ConfigError) as caught:
+        open_source(url)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+# Third parties
+
+
+@pytest.mark.usefixtures("glove")
+def test_another_package_s_source_is_opened_with_its_own_options() -> None:
+    source = open_source("glove:/dev/ttyUSB0?gain=2.5&channels=6&raw=true")
+    assert isinstance(source, Glove)
+    assert source.target == "/dev/ttyUSB0"
+    assert source.options == GloveOptions(2.5, 6, True)
+
+
+@pytest.mark.usefixtures("glove")
+@pytest.mark.parametrize(
+    ("url", "target", "path"),
+    [
+        ("glove:", "", ""),
+        ("glove:left", "left", ""),
+        ("glove://host:5000/a", "host:5000/a", ""),
+        ("glove:a%20b?path=c%20d%26e", "a b", "c d&e"),
+        ("glove:?path=", "", ""),
+        ("glove:part#2?path=mesh#7.obj", "part#2", "mesh#7.obj"),
+        ("glove:?path=a=b", "", "a=b"),
+    ],
+)
+def test_what_the_url_says_arrives(url: str, target: str, path: str) -> None:
+    source = open_source(url)
+    assert (source.target, source.options.path) == (target, path)
+
+
+@pytest.mark.usefixtures("glove")
+@pytest.mark.parametrize(
+    ("url", "said"),
+    [
+        ("glove:a?gian=2", "source glove: has no option 'gian'; did you mean gain?"),
+        (
+            "glove:a?zzz=2",
+            "source glove: has no option 'zzz'; it takes gain, channels, raw, path",
+        ),
+        ("glove:a?channels=two", "Expected `int`, got `str` - at `$.channels`"),
+        ("glove:a?channels=2.5", "at `$.channels`"),
+        ("glove:a?raw=perhaps", "Expected `bool`, got `str` - at `$.raw`"),
+        ("glove:a?gain=", "at `$.gain`"),
+        ("glove:a?gain=-1", "gain must be positive, not -1.0"),
+        ("glove:a?gain=1&gain=2", "an option is given twice"),
+    ],
+)
+def test_a_wrong_option_is_named_with_what_would_be_right(url: str, said: str) -> None:
+    assert said in refused(url)
+
+
+@pytest.mark.usefixtures("glove")
+def test_third_parties_are_among_the_known_schemes() -> None:
+    said = refused("glvoe:left")
+    assert said == (
+        "unknown source 'glvoe:left': it begins with one of can:, combined:, glove:, replay:, "
+        "serial:, sim:, synthetic:, whisking: (did you mean glove:?)"
+    )
+
+
+# Ours
+
+
+@pytest.mark.parametrize("url", ["", "mouse", "xyz:mouse", "/dev/ttyUSB0", "?seed=1"])
+def test_an_unknown_source_is_told_what_there_is(url: str) -> None:
+    said = refused(url)
+    assert said.startswith(f"unknown source {url!r}: it begins with one of ")
+    assert "sim:" in said
+
+
+def test_a_near_miss_is_guessed() -> None:
+    assert refused("sum:mouse").endswith("(did you mean sim:?)")
+    assert refused("sim").endswith("(did you mean sim:?)")
+
+
+def test_a_url_that_cannot_be_taken_apart_is_a_config_error_too() -> None:
+    assert "sim://[mouse" in refused("sim://[mouse")
+
+
+def test_an_extra_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    from tactile_rt.sources import opening as sources
+
+    def without_mujoco(name: str) -> None:
+        raise ModuleNotFoundError("No module named 'mujoco'", name="mujoco")
+
+    monkeypatch.setattr(sources, "import_module", without_mujoco)
+    said = refused("sim:mouse")
+    assert said == "source sim: needs mujoco, which is not installed: pip install 'tactile-rt[sim]'"
+
+    def broken(name: str) -> None:
+        raise ModuleNotFoundError("no such module", name="tactile_rt.sim_backend.sauce")
+
+    # Our own mistake must not be taken for the user's.
+    monkeypatch.setattr(sources, "import_module", broken)
+    with pytest.raises(ModuleNotFoundError):
+        open_source("sim:mouse")
+
+
+@pytest.mark.skipif(find_spec("mujoco") is None, reason="mujoco is not installed")
+class TestSimulation:
+    def test_its_options_arrive(self) -> None:
+        with open_source("sim:mouse?objects=mug-3&pace=fast&seed=9") as source:
+            assert not source.live
+            assert source.spec.name == "mouse-right"
+
+    @pytest.mark.parametrize(
+        ("url", "said"),
+        [
+            ("sim:cat", "no simulated array 'cat'"),
+            ("sim:mouse?sede=1", "did you mean seed?"),
+            ("sim:mouse?seed=one", "at `$.seed`"),
+            ("sim:mouse?pace=slow", "no pace 'slow': there are realtime, fast"),
+            ("sim:mouse?profile=quick", "no profile 'quick': there are realtime"),
+            ("sim:mouse?sweeps=-1", "sweeps must be 0 or more"),
+            ("sim:mouse?repeat=0", "repeat 1 or more"),
+            ("sim:mouse?objects=mugg", "did you mean 'mug'?"),
+        ],
+    )
+    def test_what_it_cannot_do_is_named(self, url: str, said: str) -> None:
+        assert said in refused(url)
