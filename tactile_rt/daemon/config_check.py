@@ -23,9 +23,9 @@ from tactile_rt.daemon.config_shared import (
     check_host,
     check_listeners,
     check_outputs,
-    is_loopback,
 )
 from tactile_rt.daemon.config_tables import WORDS, nearest
+from tactile_rt.daemon.consumer import is_loopback
 from tactile_rt.daemon.consumers import wanted_consumers
 from tactile_rt.daemon.lock import lock_keys
 from tactile_rt.drivers.codec import codec_class

@@ -10,22 +10,12 @@ from pathlib import Path
 from tactile_rt.daemon.config_file import Loaded
 from tactile_rt.daemon.consumers import Wanted
 
-__all__ = ["check_folder", "check_host", "check_listeners", "check_outputs", "is_loopback"]
+__all__ = ["check_folder", "check_host", "check_listeners", "check_outputs"]
 
 HOST = re.compile(r"(?=.{1,253}\Z)([A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?\.?)+\Z")
 ANY = ("", "*", "0.0.0.0", "::")
 
 KeyPath = list[str | int]
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this computer can reach what listens there."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False
 
 
 def check_host(loaded: Loaded, path: KeyPath, host: str) -> None:

@@ -11,8 +11,8 @@ from tactile_rt.daemon.config import EXAMPLE, Config
 from tactile_rt.daemon.config_check import check_config
 from tactile_rt.daemon.config_file import load_config
 from tactile_rt.daemon.config_nodes import find_lines
-from tactile_rt.daemon.config_shared import is_loopback
 from tactile_rt.daemon.config_text import config_text
+from tactile_rt.daemon.consumer import is_loopback
 from tactile_rt.stream import ConfigError
 
 DATA = Path(__file__).parent / "data"

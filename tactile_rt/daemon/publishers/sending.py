@@ -6,8 +6,7 @@ from typing import Annotated
 
 import msgspec
 
-from tactile_rt.daemon.config_shared import is_loopback
-from tactile_rt.daemon.consumer import Consumer, View
+from tactile_rt.daemon.consumer import Consumer, View, is_loopback
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import Message, message_of, state_message
 
