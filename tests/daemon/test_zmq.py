@@ -30,10 +30,11 @@ pytestmark = pytest.mark.usefixtures("no_thread_left")
 @pytest.fixture
 def subscribe():
     """Connect subscribers; they are closed after, whatever becomes of the test."""
-    context = zmq.Context()
+    context, sockets = zmq.Context(), []
 
     def connect(publisher, topic=b"", **options):
         socket = context.socket(zmq.SUB)
+        sockets.append(socket)  # one that is let go of before it is closed warns
         socket.set(zmq.RCVTIMEO, round(1000 * PATIENCE_S))
         for name, value in options.items():
             socket.set(getattr(zmq, name), value)
@@ -42,7 +43,9 @@ def subscribe():
         return socket
 
     yield connect
-    context.destroy(linger=0)
+    for socket in sockets:
+        socket.close(linger=0)
+    context.term()
 
 
 def settle(publisher, *sockets):
