@@ -14,9 +14,9 @@ from typing import ClassVar
 import pytest
 
 from tactile_rt.cli import main
-from tactile_rt.daemon.config_check import check_config
-from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
+from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.runner import _serve
 from tactile_rt.daemon.snapshot import Snapshot
 from tactile_rt.daemon.systemd import Systemd, hanging, status_of
