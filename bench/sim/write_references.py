@@ -11,7 +11,7 @@ from bench.sim.pegs import PEG_RADIUS_MM
 from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
 from tests.helpers import beams as theory
 
-DATA = Path(__file__).parent / "sim" / "data"
+DATA = Path(__file__).parent / "data"
 BENDS = {"straight": 1, "convex": -1, "concave": 1}  # and the side that the peg comes from
 
 

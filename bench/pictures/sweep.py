@@ -2,7 +2,7 @@
 
 Above, the simulation at two moments, each whisker in the colour of the force on its base, beside
 the 5 x 7 map of the same forces. Below, the forces over the whole sweep.
-Run: python -m bench.plot_sweep [--out FILE]
+Run: python -m bench.pictures.sweep [--out FILE]
 """
 
 import argparse
