@@ -6,8 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from tactile_rt.classifier.model_check import probe_logits
-from tactile_rt.classifier.model_file import METADATA_KEY, load_model, read_model, shipped_model
+from tactile_rt.classifier.model_file import (
+    METADATA_KEY,
+    load_model,
+    probe_logits,
+    read_model,
+    shipped_model,
+)
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.evidence import model_steps, roofline
 
