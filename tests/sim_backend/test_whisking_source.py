@@ -15,7 +15,7 @@ from scipy.integrate import solve_ivp
 
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_common import IMPOSSIBLE, MessageType
-from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.trajectories import ELEVATION_SLOPES, Whisk
 from tactile_rt.sim_backend.whisking import ENDLESS, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import LAG_S, LARGEST_RAD, MOST, Drive, Whisking
