@@ -10,7 +10,7 @@ from rich.console import Console
 from tactile_rt.cli.app import app, check_output, needs
 
 if TYPE_CHECKING:
-    from tactile_rt.models.contact_point import WhiskerShapes
+    from tactile_rt.classifier.contact_point import WhiskerShapes
     from tactile_rt.sweep_set import SweepManifest
 
 locate = typer.Typer(help="Find out where along each whisker it touches.", no_args_is_help=True)
