@@ -12,7 +12,7 @@ from typing import Any
 
 from tactile_rt.calibration import load_calibration
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.classifier.providers import onnxruntime_names
+from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.daemon.config import Config, ModelConfig, is_loopback
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.loading import Loaded
