@@ -12,7 +12,7 @@ from tactile_rt.cli.app import app
 from tactile_rt.stream import ConfigError, SourceError
 
 if TYPE_CHECKING:
-    from tactile_rt.daemon.snapshot import Snapshot
+    from tactile_rt.daemon.health import Snapshot
 
 __all__ = ["read_snapshots", "snapshot_at"]
 

@@ -4,7 +4,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from tactile_rt.daemon.snapshot import Latency, PartState, QueueState, Snapshot
+from tactile_rt.daemon.health import Latency, PartState, QueueState, Snapshot
 
 __all__ = ["picture"]
 

@@ -26,7 +26,7 @@ PUBLISHERS = {
 }
 TABLES = {
     "recorder": (f"{_HERE}.recorder:Recorder", "record"),
-    "page": (f"{_HERE}.page:Page", "ui"),
+    "page": (f"{_HERE}.page:Page", ""),
     "metrics": (f"{_HERE}.metrics:Metrics", ""),
 }
 ENTRY_POINTS = "tactile_rt.publishers"
