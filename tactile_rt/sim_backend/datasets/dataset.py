@@ -63,7 +63,7 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
     morphology = repr(heads if len(heads) > 1 else heads[0])
     # Said in full: a later release may know more categories.
     chosen = replace(recipe.objects, categories=objects.categories, withheld=objects.withheld)
-    of_meshes = () if recipe.objects.source == SHAPES else ("coacd",)
+    of_meshes = () if recipe.objects.source == SHAPES else ("manifold3d",)
     packages = ("mujoco", "numpy", "scipy", "trimesh", *of_meshes)
     return SweepManifest(
         spec=world_spec(animals),
