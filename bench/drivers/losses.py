@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from bench.drivers.emulated import Log, Stage, emulate, signal
 from bench.drivers.processes import Helper
-from tactile_rt.drivers.emulation.damage import Fate
-from tactile_rt.drivers.emulation.faults import Fault
+from tactile_rt.drivers.emulation.faults import Fate, Fault
 from tactile_rt.evidence.records import Record
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import SourceStats, concatenate
