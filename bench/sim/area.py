@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bench.sim.mechanics import mechanics
 from bench.sim.reference_model import PROTOTYPE_CPU_S, reference_cost
 from tactile_rt.evidence.records import Record
-from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
 from tactile_rt.sim_backend.source import REST_SAMPLES
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation

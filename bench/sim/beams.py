@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays.whiskers import Whisker, mouse_whiskers
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
+from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.world import (
     Mount,
     Profile,

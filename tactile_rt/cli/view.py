@@ -66,7 +66,7 @@ def view(
     check_output(out)
     try:
         with starting():
-            from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+            from tactile_rt.sim_backend.arrays.files import load_animals
             from tactile_rt.sim_backend.objects.catalogue import load_object
             from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, usual_distance
             from tactile_rt.sim_backend.views.camera import VIEWS

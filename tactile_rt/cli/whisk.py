@@ -62,7 +62,7 @@ def whisk(
         with starting():
             import numpy as np
 
-            from tactile_rt.sim_backend.arrays.whisker_array import load_array
+            from tactile_rt.sim_backend.arrays.files import load_array
             from tactile_rt.sim_backend.arrays.whiskers import rotation
             from tactile_rt.sim_backend.objects.catalogue import load_object
             from tactile_rt.sim_backend.stimuli import STIMULI, Surface, whisk_against, write_input

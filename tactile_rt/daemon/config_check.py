@@ -15,7 +15,7 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 
 from tactile_rt.calibration import load_calibration
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.classifier.providers import onnxruntime_names
+from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.daemon.config import Config
 from tactile_rt.daemon.config_file import Loaded
 from tactile_rt.daemon.config_shared import (

@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, load_object
 from tactile_rt.sim_backend.pacing import CHUNK_SAMPLES, PacedSource, check_pace
 from tactile_rt.sim_backend.randomisation import Randomisation

@@ -21,8 +21,9 @@ from tactile_rt.sim_backend.approach import (
     way_to_contact,
     within_reach,
 )
+from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.head import add_head
-from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray, load_animals
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, ContactProbe
 from tactile_rt.sim_backend.objects.catalogue import TactileObject

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.objects.catalogue import load_object
 from tactile_rt.sim_backend.pacing import CHUNK_SAMPLES, PacedSource, check_pace

@@ -32,6 +32,7 @@ from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError, SourceError
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
 from tests.helpers.tiny_model import write_model
+from tests.helpers.waiting import until
 
 SPEC = small_spec()
 PATIENCE_S = 30.0
@@ -45,13 +46,6 @@ def touching(n=4000, seed=0):
     noise = np.random.default_rng(seed).normal(scale=1e-4, size=(n, 3, 2))
     on = (t > 0.5) & (t % 1.0 < 0.4)
     return (noise + 0.5 * on[:, None, None]).astype(np.float32)
-
-
-def until(condition):
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 class Spy(Consumer):

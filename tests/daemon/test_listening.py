@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.published import until
+from tests.helpers.waiting import until
 
 pytest.importorskip("uvicorn", reason="needs uvicorn: pip install 'tactile-rt[ui]'")
 pytest.importorskip("zmq", reason="needs pyzmq: pip install 'tactile-rt[publish]'")

@@ -23,7 +23,8 @@ from tactile_rt.daemon.systemd import Systemd, hanging, status_of
 from tactile_rt.daemon.unit import install_script, unit_text, written_folders
 from tactile_rt.stream import ConfigError, Source
 from tactile_rt.testing import small_spec
-from tests.helpers.published import PATIENCE_S, View, busy_snapshot, event, running, until
+from tests.helpers.published import PATIENCE_S, View, busy_snapshot, event, running
+from tests.helpers.waiting import until
 
 SMALL = 'version = 1\n[[source]]\nname = "a"\nurl = "synthetic:2x2"\n'
 pytestmark = pytest.mark.usefixtures("no_thread_left")

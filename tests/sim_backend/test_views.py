@@ -13,8 +13,8 @@ import mujoco
 from matplotlib.figure import Figure
 from PIL import Image
 
-from tactile_rt.sim_backend.arrays.whisker_array import load_array
-from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.arrays.files import load_array
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
 from tactile_rt.sim_backend.views.camera import VIEWS, Camera, framing

@@ -1,14 +1,12 @@
-"""Whiskers: the geometry and the material of one, and the animals' published measurements.
+"""Whiskers: the geometry and the material of one, and how a row of a table describes it.
 
 Lengths in mm and angles in rad here, as the field publishes them; `world.py` converts.
 """
 
-import csv
 import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +23,6 @@ __all__ = [
     "YOUNG_MODULUS_PA",
     "Whisker",
     "keratin_radii",
-    "mouse_whiskers",
-    "rat_whiskers",
     "rotation",
 ]
 
@@ -250,22 +246,6 @@ def keratin_radii(length: float, row: int, column: int) -> tuple[float, float]:
     base = (0.041 + 0.002 * length + 0.011 * (row + 1) - 0.0039 * column) / 2
     slope = 0.0012 + 0.00017 * (row + 1) - 0.000066 * column + 0.00011 * column**2
     return base, max((base - slope * length) / 2, THINNEST_TIP_MM)
-
-
-def mouse_whiskers() -> tuple[Whisker, ...]:
-    """The 30 right-side mystacial whiskers of the mouse (Bresee et al. 2023)."""
-    return _measured("mouse.csv")
-
-
-def rat_whiskers() -> tuple[Whisker, ...]:
-    """The 30 right-side mystacial whiskers of the rat (Belli et al. 2017, 2018)."""
-    return _measured("rat.csv")
-
-
-def _measured(file: str) -> tuple[Whisker, ...]:
-    text = resources.files(__package__).joinpath("data", file).read_text(encoding="utf-8")
-    lines = [line for line in text.splitlines() if not line.startswith("#")]
-    return tuple(Whisker.from_columns(row) for row in csv.DictReader(lines))
 
 
 def _number(values: Mapping[str, object], column: str) -> float:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, contact_distances
 from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
 from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove_leftovers

@@ -3,7 +3,7 @@
 Beside each, what CoACD (Wei et al. 2022) makes of the same mesh at its finest threshold, measured
 in the same way. Needs the package coacd.
 
-Run: python -m bench.measure_meshes
+Run: python -m bench.sim.measure_meshes
 """
 
 import tempfile

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from bench.sim.beams import GRAVITY, flat
 from bench.sim.pegs import PEG_RADIUS_MM
-from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tests.helpers import beams as theory
 
-DATA = Path(__file__).parent / "sim" / "data"
+DATA = Path(__file__).parent / "data"
 BENDS = {"straight": 1, "convex": -1, "concave": 1}  # and the side that the peg comes from
 
 

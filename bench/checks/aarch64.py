@@ -11,7 +11,7 @@ import tempfile
 import tomllib
 from pathlib import Path
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 PYTHONS = ("3.11", "3.12", "3.13")
 # Each takes wheels for an older glibc too; what is older than the first lacks onnxruntime.
 PLATFORMS = {

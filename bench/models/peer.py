@@ -1,6 +1,6 @@
 """Our networks beside the paper's published code: the same weights, parity and CPU time.
 
-Run: python -m bench.peer FOLDER_OF_TACTILE_NN FOLDER_OF_PYTORCHTNN [--network N] [--part P]
+Run: python -m bench.models.peer FOLDER_OF_TACTILE_NN FOLDER_OF_PYTORCHTNN [--network N] [--part P]
 
 The folders: `tactile-nn` of github.com/neuroagents-lab/2025-tactile-whisking (commit 3420db6) and
 github.com/neuroagents-lab/PyTorchTNN (commit 50713d9), which are imported, see `published`. Needs
@@ -28,8 +28,8 @@ import torch
 from rich.console import Console
 from torch import Tensor
 
+from bench.models.published import EPSILON, NETWORKS, NetworkPair, in_our_order, open_code
 from bench.models.training_speed import STEPS, training_step
-from bench.published import EPSILON, NETWORKS, Pair, in_our_order, open_code
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.evidence.records import Record, show
 from tactile_rt.export.onnx_step import file_logits, step_graph, write_model
@@ -39,7 +39,7 @@ from tactile_rt.stream import ConfigError
 PARTS = ("parity", "training", "window")
 
 
-class Comparison(Pair):
+class Comparison(NetworkPair):
     """What is measured of a pair."""
 
     def parity(self, _: int) -> list[Record]:

@@ -2,7 +2,7 @@
 
 Above, the simulation at two moments, each whisker in the colour of the force on its base, beside
 the 5 x 7 map of the same forces. Below, the forces over the whole sweep.
-Run: python -m bench.plot_sweep [--out FILE]
+Run: python -m bench.pictures.sweep [--out FILE]
 """
 
 import argparse
@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
 from tactile_rt.sim_backend.views.camera import Camera

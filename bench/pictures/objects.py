@@ -1,7 +1,7 @@
 """Draw docs/objects.png: three instances of every category, to see that each is what it says.
 
 Orthographic view from above and to one side, z-buffered here because a painter's sort
-(matplotlib's) tears pieces that touch. Run: python -m bench.plot_objects [--out FILE]
+(matplotlib's) tears pieces that touch. Run: python -m bench.pictures.objects [--out FILE]
 """
 
 import argparse

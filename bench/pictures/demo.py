@@ -1,6 +1,6 @@
 """Draw docs/demo.svg: the demonstration's view in the middle of a real, seeded run.
 
-Run: python -m bench.draw_demo [--model FILE] [--out FILE]
+Run: python -m bench.pictures.demo [--model FILE] [--out FILE]
 """
 
 import argparse

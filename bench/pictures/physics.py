@@ -1,8 +1,8 @@
 """Measure the physics, draw its pictures and write the tables of docs/physics.md.
 
-python -m bench.plot_physics                # everything: some 3 minutes of CPU
-python -m bench.plot_physics --json FILE    # take the figures of `tactile-rt bench sim --json FILE`
-python -m bench.plot_physics --only peg     # one of bars, whiskers, peg, creep, cost
+python -m bench.pictures.physics              # everything: some 3 minutes of CPU
+python -m bench.pictures.physics --json FILE  # the figures of `tactile-rt bench sim --json FILE`
+python -m bench.pictures.physics --only peg   # one of bars, whiskers, peg, creep, cost
 """
 
 import argparse
@@ -26,7 +26,7 @@ from bench.sim.reference_model import reference_cost
 from tactile_rt.sim_backend.world import PROFILES
 from tests.helpers import beams as theory
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 INK, BLUE, ORANGE, GREY = "#20262e", "#1f6fb2", "#d95f0e", "#9aa3ad"
 BOTH = ("dataset", "realtime")
 
@@ -35,7 +35,7 @@ def write_table(name: str, lines: list[str]) -> None:
     """Replace what stands between the markers of a table in docs/physics.md."""
     path = DOCS / "physics.md"
     text = path.read_text(encoding="utf-8")
-    start, end = f"<!-- {name}: written by bench/plot_physics.py -->", f"<!-- end {name} -->"
+    start, end = f"<!-- {name}: written by bench/pictures/physics.py -->", f"<!-- end {name} -->"
     if text.count(start) != 1 or text.count(end) != 1:
         raise SystemExit(f"{path}: wants one {start} and one {end}")
     before, _, rest = text.partition(start)

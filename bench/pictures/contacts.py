@@ -1,6 +1,6 @@
 """Draw docs/contacts.png: error of contact distance against the force, clean and at rated noise.
 
-python -m bench.plot_contacts runs/locate/best.pt data/contacts
+python -m bench.pictures.contacts runs/locate/best.pt data/contacts
 """
 
 import sys
@@ -17,7 +17,7 @@ from tactile_rt.evidence.locating import LEVELS, distance_estimates, measure_con
 from tactile_rt.models.contact_regression import load_contacts
 from tactile_rt.models.datasets import SweepSet
 
-DOCS = Path(__file__).parents[1] / "docs"
+DOCS = Path(__file__).parents[2] / "docs"
 SHOWN = {
     "network": ("#d95f0e", "network"),
     "straight": ("#9aa3ad", "moment / force, straight"),

@@ -12,13 +12,13 @@ from typing import Any, Self
 
 import msgspec
 
-from bench.daemon.arrays import Played, Stage, play
 from bench.daemon.models import finger_array, whisker_array, write_wide_model
 from bench.daemon.process import DaemonProcess, free_port, until
 from bench.daemon.stepped import MAIN, PATH, WallClock
-from bench.drivers.processes import Helper
+from bench.emulated import ArrayScript, Played, play
+from bench.processes import Helper
 
-__all__ = ["Scene", "Told"]
+__all__ = ["DaemonEvent", "DisturbedDaemon"]
 
 LONGEST_S = 3600.0
 SETTLED_S, SETTLED_MOST_S = 1.0, 5.0  # nothing told for so long; but a busy machine tells much
@@ -56,7 +56,7 @@ stall_s = 0.5
 
 
 @dataclass(frozen=True)
-class Told:
+class DaemonEvent:
     """An event that the daemon told: of which part, which state, why, when (CLOCK_MONOTONIC)."""
 
     part: str
@@ -65,7 +65,7 @@ class Told:
     t_ns: int
 
 
-class Scene:
+class DisturbedDaemon:
     """A context manager; when it is left, all is over.
 
     Args:
@@ -83,7 +83,7 @@ class Scene:
     def __init__(self, before: Any = None) -> None:
         self._before = before
         self._stack = ExitStack()
-        self._told: list[Told] = []
+        self._told: list[DaemonEvent] = []
         self._over = threading.Event()
         self._reading = threading.Event()
         self._paused = threading.Event()
@@ -99,7 +99,7 @@ class Scene:
         write_wide_model(self.model, specs["whiskers"])
         self.arrays = {
             name: stack.enter_context(
-                Helper(play, Stage(
+                Helper(play, ArrayScript(
                     "serial" if name == "whiskers" else "slcan", spec,
                     round(LONGEST_S * spec.rate_hz), str(self.folder / name),
                 ))
@@ -146,15 +146,15 @@ class Scene:
         """Where what is told from now on begins."""
         return len(self._told)
 
-    def all_told(self, since: int) -> list[Told]:
+    def all_told(self, since: int) -> list[DaemonEvent]:
         """All events since then."""
         return self._told[since:]
 
-    def told(self, since: int, part: str, state: str) -> list[Told]:
+    def told(self, since: int, part: str, state: str) -> list[DaemonEvent]:
         """All such events since then."""
         return [t for t in self._told[since:] if (t.part, t.state) == (part, state)]
 
-    def await_told(self, since: int, part: str, state: str, seconds: float = 20.0) -> Told:
+    def await_told(self, since: int, part: str, state: str, seconds: float = 20.0) -> DaemonEvent:
         """The first such event.
 
         Raises:
@@ -206,7 +206,7 @@ class Scene:
                 self._connected = True
                 if topic.endswith(b"health"):
                     m = msgspec.json.decode(line)
-                    self._told.append(Told(m["part"], m["state"], m["reason"], m["t_ns"]))
+                    self._told.append(DaemonEvent(m["part"], m["state"], m["reason"], m["t_ns"]))
             socket.setsockopt(zmq.LINGER, 0)
 
     def _drain(self) -> None:

@@ -21,7 +21,7 @@ from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.encoders.cells import Cell
 from tactile_rt.stream import ConfigError
 
-__all__ = ["EPSILON", "NETWORKS", "Pair", "in_our_order", "open_code"]
+__all__ = ["EPSILON", "NETWORKS", "NetworkPair", "in_our_order", "open_code"]
 
 CODE = "tactile_model"
 EPSILON = 1e-5  # torch's own, as in pt_tnn/recurrent_cells/intersection_cell.py
@@ -102,7 +102,7 @@ class Published(nn.Module):
         return logits[:, None]
 
 
-class Pair:
+class NetworkPair:
     """A network of theirs, and ours with its weights and their layer norm's epsilon."""
 
     def __init__(self, name: str, code: Path) -> None:

@@ -1,6 +1,6 @@
 """The shipped model in the classifier for days: nothing grows, and the end is like the beginning.
 
-python -m bench.long_run [STEPS]      1,000,000 by default, some 20 minutes of CPU
+python -m bench.checks.long_run [STEPS]      1,000,000 by default, some 20 minutes of CPU
 
 Touches of every length and strength, rests, silences of the line, NaN and infinite samples, dead
 and stuck whiskers, denormals and values past the clip, in chunks of random sizes. Prints resident

@@ -37,8 +37,7 @@ from tactile_rt.export.onnx_step import PARITY_BAR, step_graph, write_model
 from tactile_rt.export.streaming import streaming
 from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, EADConfig
 from tactile_rt.models.training import TactileClassifier
-from tactile_rt.stream import Chunk
-from tactile_rt.testing import cut
+from tactile_rt.stream import NS_PER_S, Chunk
 
 STREAM_BAR, DOUBLE_BAR = 2e-6, 1e-9  # some constants are single
 # What is measured, and the most that it may be; bit by bit is 0.
@@ -200,7 +199,9 @@ def cut_at_random(path: Path) -> float:
         load = rng.normal(size=SPEC.shape) * np.array(card.scale) * 3
         values[first : first + 1100] += load
     values[500:540] = np.nan
-    (whole,) = cut(values.astype(np.float32), SPEC.rate_hz, n)
+    seq = np.arange(n, dtype=np.int64)
+    t_ns = np.round(seq * (NS_PER_S / SPEC.rate_hz)).astype(np.int64)
+    whole = Chunk(seq, t_ns, values.astype(np.float32), np.ones(values.shape[:2], np.bool_))
     edges = [0, *np.sort(rng.choice(np.arange(1, n), 300, replace=False)).tolist(), n]
     parts = [
         Chunk(*(getattr(whole, name)[a:b] for name in ("seq", "t_ns", "values", "valid")))
