@@ -44,8 +44,7 @@ def doctor(
     from rich.console import Console
     from rich.markup import escape
 
-    from tactile_rt.drivers.discovery import can_buses, serial_ports
-    from tactile_rt.drivers.doctor import diagnose, udev_rules
+    from tactile_rt.drivers.discovery import can_buses, diagnose, serial_ports, udev_rules
     from tactile_rt.files import write_whole
 
     check_output(udev)

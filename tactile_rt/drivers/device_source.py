@@ -11,11 +11,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, Step
-from tactile_rt.drivers.device_time import DeviceTime
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.drivers.links import Link
-from tactile_rt.drivers.stamping import Stamper
 from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, EndOfStream, Source, SourceError
 
 __all__ = ["DeviceOptions", "DeviceSource", "Tap"]

@@ -23,7 +23,7 @@ from tactile_rt.daemon.config import RecorderConfig
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Opened, SourceChunk
 from tactile_rt.daemon.recorder import Recorder
-from tactile_rt.drivers.emulation.damage import Fate
+from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.recording import read_stream, recover
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource

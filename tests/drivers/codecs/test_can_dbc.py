@@ -11,7 +11,7 @@ from tactile_rt.drivers.codecs.can_dbc import CanDbc, CanDbcOptions
 from tactile_rt.stream import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
-DOCS = Path(__file__).parents[2] / "docs" / "codecs"
+DOCS = Path(__file__).parents[3] / "docs" / "codecs"
 
 # A 4 x 4 patch of three-axis taxels, a message per taxel, no counter: see test_xela.py.
 PATCH_DBC = "".join(

@@ -6,8 +6,15 @@ from pathlib import Path
 import pytest
 
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.drivers.emulation.damage import DeviceLog, Fate, damaged
-from tactile_rt.drivers.emulation.faults import KINDS, Fault, FaultSchedule, read_faults
+from tactile_rt.drivers.emulation.faults import (
+    KINDS,
+    DeviceLog,
+    Fate,
+    Fault,
+    FaultSchedule,
+    damaged,
+    read_faults,
+)
 from tactile_rt.stream import ConfigError
 
 RATE = 1000

@@ -22,7 +22,7 @@ from tests.helpers.codec_contract import (
     stacked,
 )
 
-EXAMPLE = Path(__file__).parents[2] / "docs" / "codecs" / "ascii_line.toml"
+EXAMPLE = Path(__file__).parents[3] / "docs" / "codecs" / "ascii_line.toml"
 PLAIN = "A0.fx,A0.fy,B1.fx,B1.fy"
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from tactile_rt.drivers.codec import CanFrame, Command
-from tactile_rt.drivers.codecs.rounds import Rounds
 from tactile_rt.drivers.codecs.xela import Xela, XelaOptions
 from tactile_rt.stream import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
@@ -94,17 +93,3 @@ def test_mistakes_are_named() -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             xela(**wrong)
-
-
-def test_rounds() -> None:
-    rounds: Rounds[str] = Rounds(3)
-    assert [rounds.add(i, c) for i, c in ((1, "x"), (2, "y"))] == [[], []]  # entered in the middle
-    assert [rounds.add(i, c) for i, c in enumerate("abc")][2] == [["a", "b", "c"]]
-    assert rounds.add(2, "c") == []  # the same frame twice
-    assert rounds.add(0, "d") == [] and rounds.add(0, "d") == []
-    assert rounds.add(0, "e") == [["d", None, None]]
-    assert rounds.add(2, "f") == [["e", None, "f"]]
-    assert rounds.add(1, "g") == [] and rounds.add(1, "h") == [[None, "g", None]]
-    assert rounds.end() == [[None, "h", None]] and rounds.end() == []
-    single: Rounds[str] = Rounds(1)
-    assert single.add(0, "a") == single.add(0, "a") == [["a"]]

@@ -1,4 +1,4 @@
-"""Frames of one length in a stream of bytes."""
+"""Checksums, frames of one length in a stream of bytes, samples in several frames."""
 
 import itertools
 import random
@@ -9,12 +9,25 @@ import pytest
 
 from tactile_rt.drivers.codec import SerialCodec, WireStats
 from tactile_rt.drivers.codecs.bota import Bota
-from tactile_rt.drivers.codecs.frame_finder import FrameFinder
+from tactile_rt.drivers.codecs.framing import (
+    FrameFinder,
+    Rounds,
+    crc16_modbus,
+    crc16_x25,
+    crc16_xmodem,
+)
 from tactile_rt.drivers.codecs.ft300 import Ft300
 from tactile_rt.drivers.codecs.optoforce import OptoForceSerial
 from tests.helpers.codec_contract import chunk_of, decode, held
 
 SIZE = 6  # "<>", three bytes, their sum
+
+
+def test_the_checksums_are_the_catalogued_ones() -> None:
+    check = b"123456789"  # https://reveng.sourceforge.io/crc-catalogue/16.htm
+    assert crc16_xmodem(check) == 0x31C3
+    assert crc16_x25(check) == 0x906E
+    assert crc16_modbus(check) == 0x4B37
 
 
 def frame(k: int) -> bytes:
@@ -117,3 +130,17 @@ def test_what_is_kept_is_bounded_and_forgotten() -> None:
     found.find(frame(9)[:5])
     found.forget()
     assert found.find(frame(1))[1] == [0]
+
+
+def test_rounds() -> None:
+    rounds: Rounds[str] = Rounds(3)
+    assert [rounds.add(i, c) for i, c in ((1, "x"), (2, "y"))] == [[], []]  # entered in the middle
+    assert [rounds.add(i, c) for i, c in enumerate("abc")][2] == [["a", "b", "c"]]
+    assert rounds.add(2, "c") == []  # the same frame twice
+    assert rounds.add(0, "d") == [] and rounds.add(0, "d") == []
+    assert rounds.add(0, "e") == [["d", None, None]]
+    assert rounds.add(2, "f") == [["e", None, "f"]]
+    assert rounds.add(1, "g") == [] and rounds.add(1, "h") == [[None, "g", None]]
+    assert rounds.end() == [[None, "h", None]] and rounds.end() == []
+    single: Rounds[str] = Rounds(1)
+    assert single.add(0, "a") == single.add(0, "a") == [["a"]]

@@ -16,11 +16,10 @@ import serial
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial
 from tactile_rt.drivers.codecs.native_can import NativeCan, NativeCanOptions
-from tactile_rt.drivers.emulation.damage import Fate
 from tactile_rt.drivers.emulation.emulator import Emulator
 from tactile_rt.drivers.emulation.endpoints import BusEndpoint, SerialEndpoint, SlcanEndpoint
-from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
-from tactile_rt.drivers.emulation.fitting import fit
+from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule
+from tactile_rt.drivers.emulation.transmitter import fit
 from tactile_rt.drivers.slcan import SlcanDecoder, encode, opening
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec

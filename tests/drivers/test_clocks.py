@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tactile_rt.drivers.device_clock import DeviceClock, host_stamps
+from tactile_rt.drivers.clocks import DeviceClock, DeviceTime, host_stamps
 
 MS = 1_000_000
 
@@ -121,3 +121,24 @@ def test_samples_without_time_or_count_are_spread_before_their_arrival():
     assert squeezed.tolist() == [85 * MS, 90 * MS, 95 * MS, 100 * MS]
     late = host_stamps(arrived, 100 * MS, 10 * MS)  # something was dated after it already
     assert (np.diff(late) > 0).all() and late[0] > 100 * MS
+
+
+def test_device_time_unwraps_and_never_goes_back() -> None:
+    clock = DeviceTime(1000.0, 32)
+    first, arrived = 2**32 - 3000, np.arange(6) * 1_000_000
+    ticks = (first + 1000 * np.arange(6)) % 2**32
+    told = clock.to_host(ticks, arrived)
+    assert told.tolist() == [(first + 1000 * i) * 1000 for i in range(6)]
+    clock.resume()
+    assert clock.to_host(ticks[-1:] + 1000, arrived[-1:] + 1).tolist() == [told[-1] + 1_000_000]
+    # it begins anew two milliseconds later, by the host's clock
+    anew = clock.to_host(np.array([0, 1000]), arrived[-1:].repeat(2) + 2_000_001)
+    assert anew.tolist() == [told[-1] + 3_000_000, told[-1] + 4_000_000] and clock.steps == 1
+    same = clock.to_host(np.array([1000]), arrived[-1:] + 3_000_000)
+    assert same[0] == anew[-1] + 1
+
+
+def test_a_short_clock_only_goes_forward() -> None:
+    clock = DeviceTime(100_000.0, 16)
+    told = clock.to_host(np.array([65_000, 60_000]), np.array([0, 1]))
+    assert np.diff(told).tolist() == [(65_536 - 5_000) * 100_000] and clock.steps == 0

@@ -24,7 +24,7 @@ from tactile_rt.stream import ArraySpec, Chunk
 from tactile_rt.testing import small_spec
 from tests.helpers.codec_contract import T0, mutations
 
-FIRMWARE = Path(__file__).parents[2] / "docs" / "firmware"
+FIRMWARE = Path(__file__).parents[3] / "docs" / "firmware"
 SPEC = small_spec(5)
 BASE = 0x120
 STRICT = "-std=c99 -Wall -Wextra -Werror -pedantic -Wconversion -Wshadow".split()

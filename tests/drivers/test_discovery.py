@@ -6,8 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tactile_rt.drivers.discovery import CanBus, Port, can_buses, serial_ports
-from tactile_rt.drivers.doctor import diagnose, udev_rules
+from tactile_rt.drivers.discovery import CanBus, Port, can_buses, diagnose, serial_ports, udev_rules
 
 
 @pytest.fixture
