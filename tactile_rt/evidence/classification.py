@@ -142,9 +142,7 @@ def evaluate_model(
     if other:
         records += _compare_profiles(run, other, test, clean)
     if svm:
-        from tactile_rt.evidence.svm import compare_svm
-
-        records += compare_svm(data, test, evaluation.hits(clean[:, -1], labels))
+        records += _compare_svm(data, test, evaluation.hits(clean[:, -1], labels))
     if pictures is not None:
         from tactile_rt.evidence.pictures import (
             draw_accuracy_over_time,
@@ -293,3 +291,23 @@ def _compare_profiles(
         _record(f"top-1 at the {profile} profile", at_profile, "", how),
         Record(f"models.points lost at the {profile} profile", lost, "points", "<= 4", "", how),
     ]
+
+
+def _compare_svm(data: Path, test: SweepSet, network: NDArray[np.bool_]) -> list[Record]:
+    """A network, right or not (sweep,), beside a support vector machine on the same test sweeps."""
+    from tactile_rt.models.svm import fit_svm  # scikit-learn
+
+    svm = fit_svm(SweepSet.read(data, "train"), SweepSet.read(data, "validation"))
+    right, objects = svm.hits(test), test.sweeps.objects
+    above = evaluation.accuracy(network.astype(np.float64) - right, objects)
+    records = []
+    for name, found, unit, bar in (
+        ("RBF SVM top-1", evaluation.accuracy(right, objects), "%", ""),
+        ("points above the SVM", above, "points", ">= 3"),
+    ):
+        interval = (
+            f"95 % interval {100 * found.low:.1f} to {100 * found.high:.1f}, by object; "
+            "the same test sweeps"
+        )
+        records.append(Record(f"models.{name}", 100 * found.value, unit, bar, interval, svm.how))
+    return records
