@@ -98,9 +98,10 @@ def _write_card(folder: Path) -> None:
         import sklearn  # noqa: F401
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
+    from tactile_rt.models.svm import fit
     from tactile_rt.sim_backend.datasets.card import write_card
 
-    write_card(folder)
+    write_card(folder, fit)
 
 
 def _recipe(folder: Path, name: str | None) -> "SweepRecipe":

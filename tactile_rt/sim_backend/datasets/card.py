@@ -14,15 +14,19 @@ import msgspec
 
 from tactile_rt.files import write_whole
 from tactile_rt.sim_backend.datasets.card_survey import Card, survey
-from tactile_rt.sim_backend.datasets.separability import Separability
+from tactile_rt.sim_backend.datasets.separability import Fit, Separability
 from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["write_card"]
 
 
-def write_card(folder: Path) -> Card:
+def write_card(folder: Path, fit: Fit) -> Card:
     """Write the card of a set, or of what there is of it, into its folder.
+
+    Args:
+        folder: the set's.
+        fit: fits a support vector machine, as `models.svm.fit`.
 
     Raises:
         RecordingError: no such set, nothing in it, or an object is damaged.
@@ -30,7 +34,7 @@ def write_card(folder: Path) -> Card:
     from tactile_rt.sim_backend.datasets.card_pictures import draw_card, draw_examples  # matplotlib
 
     manifest = SweepManifest.read(folder)
-    card, examples = survey(folder)
+    card, examples = survey(folder, fit)
     spec, period_ms = manifest.spec, manifest.period_ns * 1e-6
     write_whole(folder / "card.png", lambda file: draw_card(card, spec, file))
     if examples:

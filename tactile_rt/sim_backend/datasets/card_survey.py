@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.datasets.separability import (
     Features,
+    Fit,
     Separability,
     check_separability,
     window_features,
@@ -86,8 +87,12 @@ class _Findings:
     examples: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # (sample, element) N
 
 
-def survey(folder: Path) -> tuple[Card, dict[str, NDArray[np.float32]]]:
+def survey(folder: Path, fit: Fit) -> tuple[Card, dict[str, NDArray[np.float32]]]:
     """Measure a set: the objects that are there.
+
+    Args:
+        folder: the set's.
+        fit: fits a support vector machine, as `models.svm.fit`.
 
     Returns:
         The card, and the force (sample, element), N, of one sweep of some categories.
@@ -109,7 +114,7 @@ def survey(folder: Path) -> tuple[Card, dict[str, NDArray[np.float32]]]:
         for s in ("train", "test")
     )
     if len(train.categories) and len(test.categories):
-        card.separability = check_separability(train, test)
+        card.separability = check_separability(train, test, fit)
     return card, found.examples
 
 
