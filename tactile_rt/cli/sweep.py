@@ -55,7 +55,7 @@ def sweep(
     """Sweep simulated objects past the whisker array and store what it feels."""
     console = Console(stderr=True, soft_wrap=True)
     if verify:
-        from tactile_rt.sim_backend.datasets.sums import check_sums
+        from tactile_rt.sim_backend.datasets.inventory import check_sums
 
         console.print(f"{folder}: {check_sums(folder)} files are as they were written")
         return
@@ -66,7 +66,7 @@ def sweep(
                 finished_objects,
                 make_sweeps,
             )
-            from tactile_rt.sim_backend.datasets.tally import tally
+            from tactile_rt.sim_backend.datasets.inventory import tally
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
     chosen = _override(

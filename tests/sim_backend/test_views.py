@@ -20,8 +20,8 @@ from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
 from tactile_rt.sim_backend.views.camera import VIEWS, Camera, framing
 from tactile_rt.sim_backend.views.film import Film, camera_of
 from tactile_rt.sim_backend.views.footage import Footage, record
-from tactile_rt.sim_backend.views.panels import ForceMap, rostral_sign
 from tactile_rt.sim_backend.views.scale import ForceScale, round_number
+from tactile_rt.sim_backend.views.sheet import ForceMap, rostral_sign
 from tactile_rt.sim_backend.views.stage import Stage
 from tactile_rt.sim_backend.views.window import _Player, check_display
 from tactile_rt.sim_backend.views.writing import check_suffix, write_image, write_video

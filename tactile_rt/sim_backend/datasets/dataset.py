@@ -22,11 +22,11 @@ from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, contact_distances
 from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
+from tactile_rt.sim_backend.datasets.inventory import write_sums, written_sum
 from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove_leftovers
 from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObjects, choose_objects
 from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
 from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
-from tactile_rt.sim_backend.datasets.sums import write_sums, written_sum
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import SweepSimulation

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.datasets.sums import SUMS
+from tactile_rt.sim_backend.datasets.inventory import SUMS
 from tactile_rt.sweep_set import MANIFEST, SKIPPED
 
 __all__ = ["Journal", "SweepRecord", "remove_leftovers"]
