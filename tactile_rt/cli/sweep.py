@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, needs, starting
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.app import app, needs, progress_bar, starting
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
