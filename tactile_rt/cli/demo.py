@@ -124,11 +124,11 @@ class Demonstration:
         fast: as fast as the simulation goes, instead of in real time.
 
     Attributes:
-        unseen: the objects are ones that the model has not been trained on.
-        classifier: what is run; holds the contact state and the forces.
-        target: the object that `decision` is about; None before the first touch.
-        decision: the latest one.
-        outcomes: of the objects done, in order.
+        unseen: Whether the objects are ones that the model has not been trained on.
+        classifier: The classifier that is run; holds the contact state and the forces.
+        target: The object that `decision` is about; None before the first touch.
+        decision: The latest decision of the model; None before the first one.
+        outcomes: The outcomes of the objects that have passed, in order.
 
     Raises:
         ModelError, SpecMismatch: the model cannot be used on the mouse array.

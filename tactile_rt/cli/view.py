@@ -138,9 +138,9 @@ def view(
             return
         with progress_bar(console, "drawing", total=len(footage)) as update:
 
-            def frames() -> Iterator["NDArray[np.uint8]"]:
+            def pictures() -> Iterator["NDArray[np.uint8]"]:
                 for picture in film:
                     yield picture
                     update(advance=1)
 
-            write_video(out, frames(), fps, film.picture(footage.strongest))
+            write_video(out, pictures(), fps, film.picture(footage.strongest))

@@ -1,4 +1,4 @@
-"""`tactile-rt whisk`: the array whisks against an object, or the stimuli of a recording."""
+"""`tactile-rt whisk`: the array whisks against an object, or the barrel-cortex stimuli."""
 
 import hashlib
 import math

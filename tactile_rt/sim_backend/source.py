@@ -45,7 +45,7 @@ class PacedSource(Source):
         pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
 
     Attributes:
-        live: whether samples wait for nobody (real-time pace).
+        live: Whether samples wait for nobody (real-time pace).
     """
 
     def __init__(self, spec: ArraySpec, pace: str) -> None:
@@ -97,13 +97,13 @@ class SimOptions(SensorModel, Randomisation):
     `Randomisation`, whose array is drawn afresh for every sweep.
 
     Attributes:
-        objects: comma-separated names (``mug-50``), categories (``mug``: its first instance) or
+        objects: Comma-separated names (``mug-50``), categories (``mug``: its first instance) or
             mesh files (.obj, .stl, .ply, .glb), drawn in random order; empty: all categories.
-        sweeps: how many objects pass before the stream ends; 0: endless.
-        repeat: sweeps of the same object in succession.
-        seed: of the drawn objects, sweep parameters, arrays and sensor imperfections; the same seed
-            gives the same stream, and the same objects and sweeps whatever the sensors.
-        profile: simulation profile, see `array.PROFILES`.
+        sweeps: The number of different objects that pass before the stream ends; 0: endless.
+        repeat: The number of sweeps of the same object in succession.
+        seed: The seed of the drawn objects, sweep parameters, arrays and sensor imperfections; the
+            same seed gives the same stream, and the same objects and sweeps whatever the sensors.
+        profile: The name of the simulation profile, one of `world.PROFILES`.
         pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
     """
 
@@ -147,12 +147,12 @@ class SimSource(PacedSource):
     Samples that the sensors drop count as missing.
 
     Args:
-        array: which array, see `arrays.load_animals`: ``mouse`` (also if empty), ``rat-left``, a
+        array: which array, see `files.load_animals`: ``mouse`` (also if empty), ``rat-left``, a
             .csv or .toml file.
         options: what it meets.
 
     Attributes:
-        passes: the objects that have come by so far, in order.
+        passes: The objects that have come by so far, in order.
     """
 
     Options = SimOptions

@@ -216,8 +216,8 @@ def fingerprint(target: TactileObject) -> str:
 def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> SweepRecord:
     """Make one sweep of a set, by itself.
 
-    A drawn sweep that misses the array or turns unstable is drawn again, up to 20 times; one of a
-    grid stays.
+    A drawn sweep that misses the array or turns unstable is drawn again, up to 20 times; one of
+    the combinations of given values stays.
 
     Args:
         recipe: the set.
@@ -236,7 +236,7 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
     spec = world_spec(ideal)
     draws = recipe.rng(target.name, index, RANDOMISATION)
     animals = tuple(recipe.randomisation.draw(draws, animal) for animal in ideal)
-    for _ in range(1 if recipe.sweeps.is_grid else DRAWS):
+    for _ in range(1 if recipe.sweeps.keeps_misses else DRAWS):
         sweep = recipe.sweeps.draw(rng, index)
         simulation = SweepSimulation(animals, target, sweep, profile)
         made = _with_lead(recipe, simulation) if simulation.touches else None

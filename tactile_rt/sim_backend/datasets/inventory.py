@@ -31,10 +31,11 @@ class Tally:
     """Counts of a set.
 
     Attributes:
-        sweeps: that are there.
-        misses: of these, pass beside the array.
-        unstable: of these, could not be simulated at the set's profile, and are empty.
-        skipped: objects that could not be made.
+        sweeps: The number of sweeps that are there.
+        misses: The number of these sweeps that pass beside the array.
+        unstable: The number of these sweeps that could not be simulated at the set's profile, and
+            are empty.
+        skipped: The number of objects that could not be made.
     """
 
     sweeps: int = 0

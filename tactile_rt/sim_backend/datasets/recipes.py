@@ -78,14 +78,16 @@ class ObjectChoice:
     """Which objects, and who is held out.
 
     Attributes:
-        source: "shapes" (the parametric ones) or a folder of meshes.
-        categories: class names; empty: all that there are.
-        withheld: categories of the extra split "withheld", which is for open-set tests: their
-            objects are in no other split. Empty: none, or `objects.WITHHELD` if `per_withheld`
+        source: The origin of the objects: "shapes" (the parametric ones) or a folder of meshes.
+        categories: The names of the classes; empty: all that there are.
+        withheld: The categories of the extra split "withheld", which is for open-set tests: their
+            objects are in no other split. Empty: none, or `catalogue.WITHHELD` if `per_withheld`
             asks for some.
-        per_category: objects of every category; 0: all that the folder has.
-        validation, test: how many of every category are held out; below 1 a fraction.
-        per_withheld: objects of every withheld category; 0: 12, or all that the folder has.
+        per_category: The number of objects of every category; 0: all that the folder has.
+        validation, test: The numbers of objects of every category that are held out; below 1 a
+            fraction.
+        per_withheld: The number of objects of every withheld category; 0: 12, or all that the
+            folder has.
     """
 
     source: str = SHAPES
@@ -118,8 +120,9 @@ class SweepChoice:
     """How every object is swept: see `sweep.Sweep` for the parameters.
 
     Attributes:
-        draws: sweeps of every combination of the `Each` values.
-        held_out_draws: as many more, marked by a `draw` of `draws` and above.
+        draws: The number of sweeps of every combination of the `Each` values.
+        held_out_draws: The number of further sweeps of each combination, marked by a `draw` of
+            `draws` and above.
     """
 
     size_mm: Choice = 40.0
@@ -162,8 +165,8 @@ class SweepChoice:
         return len(self.combinations()) * (self.draws + self.held_out_draws)
 
     @property
-    def is_grid(self) -> bool:
-        """Whether a sweep that misses the array stays: a grid is to have all its points."""
+    def keeps_misses(self) -> bool:
+        """Whether a sweep that misses the array stays: all combinations are to be there."""
         return any(isinstance(getattr(self, n), Each) for n in PARAMETERS)
 
     def draw_index(self, index: int) -> int:
@@ -201,19 +204,19 @@ class SweepRecipe:
     """How a sweep set is made.
 
     Attributes:
-        name: what the set is called.
-        array: which whiskers, see `whisker_array.load_animals`.
-        profile: simulation profile, see `array.PROFILES`.
-        seed: of the drawn parameters.
-        period_ms: of the stored samples, ms.
-        lead_ms: at rest, before the simulation starts, ms: enough for a tare.
-        length_ms: of one sweep, the lead included, ms.
-        contacts: store where along each whisker it touches, beside the loads.
-        objects: what is swept.
-        sweeps: how it is swept.
-        sensor: what the sensors make of the loads; perfect ones unless it says otherwise.
-        randomisation: how the array of each sweep differs from its description; not at all unless
-            it says so.
+        name: The name of the set.
+        array: The name or file of the array, see `files.load_animals`.
+        profile: The name of the simulation profile, one of `world.PROFILES`.
+        seed: The seed of the drawn parameters, 0 or more.
+        period_ms: The period of the stored samples, ms.
+        lead_ms: The time at rest before the simulation starts, ms: enough for a tare.
+        length_ms: The length of one sweep with its lead, ms.
+        contacts: Whether to store where along each whisker it touches, beside the loads.
+        objects: The choice of what is swept.
+        sweeps: The choice of how each object is swept.
+        sensor: What the sensors make of the loads; perfect ones unless it says otherwise.
+        randomisation: The way the array of each sweep differs from its description; not at all
+            unless it says so.
 
     Raises:
         ConfigError: values that cannot be, or contradict each other.

@@ -43,7 +43,7 @@ NAMED = 6  # strongest traces that get a colour and a name
 
 
 class Sheet:
-    """Pictures of a recorded simulation, one a frame. What stays is drawn once.
+    """Pictures of footage, one for each moment. What stays is drawn once.
 
     Args:
         footage: what to draw.
@@ -54,8 +54,8 @@ class Sheet:
         pixels: width of the pictures; their height is 9/16 of it.
 
     Attributes:
-        size: (width, height) of the pictures, both even.
-        scene_size: (width, height) of the scene in them.
+        size: The (width, height) of the pictures in pixels, both even.
+        scene_size: The (width, height) in pixels of the scene in the pictures.
     """
 
     def __init__(
@@ -105,16 +105,16 @@ class Sheet:
         self._still = self._canvas.copy_from_bbox(figure.bbox)
         self._figure = figure
 
-    def frame(self, frame: int, scene: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture of one frame: (height, width, 3) RGB.
+    def picture(self, moment: int, scene: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The picture of one moment: (height, width, 3) RGB.
 
         Args:
-            frame: of the footage.
+            moment: which of the footage.
             scene: its (height, width, 3) picture of `scene_size`.
         """
-        time = float(self._footage.times_ms[frame])
+        time = float(self._footage.times_ms[moment])
         self._scene.set_data(scene)
-        cells = self._map.show(self._footage.loads[frame])
+        cells = self._map.show(self._footage.loads[moment])
         self._cursor.set_xdata([time, time])
         self._clock.set_text(f"t = {time:5.0f} ms")
         self._canvas.restore_region(self._still)
