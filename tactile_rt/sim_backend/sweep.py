@@ -87,7 +87,8 @@ class SweepSimulation:
 
     Args:
         array: the whiskers; a tuple of arrays for several animals in one world
-            (`whisker_array.place`). The object passes on the side to which most of the whiskers reach.
+            (`whisker_array.place`). The object passes on the side to which most of the whiskers
+            reach.
         target: the object.
         sweep: how it moves.
         profile: how finely to simulate.

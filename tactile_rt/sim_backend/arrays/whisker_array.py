@@ -1,6 +1,6 @@
 """Whisker arrays: which whiskers stand where, on which heads.
 
-Lengths in mm and angles in rad, as in `whiskers.py`. The frame of a head is x lateral (to the
+Lengths in mm and angles in rad, as in `whiskers`. The frame of a head is x lateral (to the
 animal's right), y rostral, z dorsal; the left side of an animal is its right side mirrored in x.
 """
 

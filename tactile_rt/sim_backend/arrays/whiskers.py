@@ -1,6 +1,6 @@
 """Whiskers: the geometry and the material of one, and how a row of a table describes it.
 
-Lengths in mm and angles in rad here, as the field publishes them; `world.py` converts.
+Lengths in mm and angles in rad here, as the field publishes them; `world` converts.
 """
 
 import math

@@ -1,6 +1,6 @@
 """What there is of a sweep set: its sweeps counted, its files held against their checksums.
 
-Neither reads the loads. The checksums are in the format of `sha256sum`.
+Neither reads the loads. The checksums are written as the program sha256sum writes them.
 """
 
 import hashlib

@@ -1,6 +1,6 @@
 """Cameras: from where a simulation is seen.
 
-World frame as in `sweep.py`: x away from the head, y rostral, z up; mm. Azimuth and elevation are
+World frame as in `sweep`: x away from the head, y rostral, z up; mm. Azimuth and elevation are
 MuJoCo's: the direction of view is (cos e cos a, cos e sin a, sin e), so azimuth 0 looks along +x
 and a negative elevation looks down.
 """
