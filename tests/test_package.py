@@ -18,7 +18,7 @@ LINKS = ("drivers", "export", "models", "sim_backend")
 # What a robot has none of.
 HEAVY = ("torch", "mujoco", "trimesh", "scipy", "onnx", "onnxscript", "sklearn", "matplotlib")
 ONBOARD = (
-    "calibration", "classifier.classifier", "classifier.session", "cli", "daemon.runner",
+    "calibration", "classifier.classifier", "classifier.contact_point", "classifier.session", "cli", "daemon.runner",
     "drivers.opening", "recording", "settings", "sources.combined", "sources.opening", "stream",
     "sweep_set", "testing",
 )  # fmt: skip

@@ -12,8 +12,7 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from tactile_rt.daemon.config import MetricsConfig
-from tactile_rt.daemon.config_shared import is_loopback
+from tactile_rt.daemon.config import MetricsConfig, is_loopback
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import Item
 from tactile_rt.daemon.messages import encode, state_message

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from tactile_rt.sim_backend.arrays.files import load_animals
-from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, load_object
+from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, load_object
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation, usual_distance
@@ -161,8 +161,7 @@ class SimSource(PacedSource):
         self._animals = load_animals(array or "mouse")
         super().__init__(world_spec(self._animals), options.pace)
         self._options = options
-        names = [n for n in options.objects.split(",") if n] or list(CATEGORIES)
-        self._objects = [load_object(name) for name in names]
+        self._objects = _objects(options) or [load_object(name) for name in CATEGORIES]
         self._rng = np.random.default_rng(options.seed)
         # Of its own, so that the objects are the same with and without.
         self._array_rng = np.random.default_rng([options.seed, 1])
@@ -174,6 +173,12 @@ class SimSource(PacedSource):
         self._simulation: SweepSimulation | None = None
         self._left = 0  # samples of the sweep still to deliver
         self._order: list[int] = []
+
+    @staticmethod
+    def check(array: str, options: SimOptions) -> None:
+        """Raise the `ConfigError` that opening it would raise."""
+        load_animals(array or "mouse")
+        _objects(options)
 
     def close(self) -> None:
         super().close()
@@ -228,3 +233,8 @@ class SimSource(PacedSource):
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)
         now = start_ns + round(self._sent * SAMPLE_MS * 1e6)
         self.passes.append(Pass(now, target.name, target.category, sweep))
+
+
+def _objects(options: SimOptions) -> list[TactileObject]:
+    """The objects that the options name; none: all categories are meant."""
+    return [load_object(name) for name in options.objects.split(",") if name]

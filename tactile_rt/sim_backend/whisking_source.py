@@ -140,6 +140,11 @@ class WhiskingSource(PacedSource):
         self._wanted: Whisking | None = None
         self.commands: list[tuple[int, Whisking]] = [(0, options.whisking)]
 
+    @staticmethod
+    def check(array: str, options: WhiskingOptions) -> None:
+        """Raise the `ConfigError` that opening it would raise."""
+        WhiskingSource(array, options).close()
+
     def set_whisking(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> None:
         """Whisk like this from the next sample that is not yet simulated on; from any thread.
 

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 pytest.importorskip("onnx")
 
-from tactile_rt.classifier import denormals, stepper
+from tactile_rt.classifier import runtime, stepper
 from tactile_rt.classifier.classifier import Classification, Classifier
-from tactile_rt.classifier.deadline import Deadline
+from tactile_rt.classifier.exits import Deadline
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.stream import NS_PER_S, Chunk, concatenate
@@ -125,7 +125,7 @@ DECAY = GRAPH.replace("total_next = Add(total, sum)", "total_next = Mul(sum, tin
 )
 
 
-@pytest.mark.skipif(denormals.LIBRARY is None, reason="not on this system")
+@pytest.mark.skipif(runtime.LIBRARY is None, reason="not on this system")
 def test_denormals_are_zero_in_the_network_and_nowhere_else(tmp_path: Path) -> None:
     used = Stepper(*load_model(write_model(tmp_path / "m.onnx", DECAY)))
     smallest_normal, quarter = np.full(3, 1.2e-38, dtype=np.float32), np.float32(0.25)

@@ -26,6 +26,7 @@ from tactile_rt.daemon.page.server import MAX_CONNECTIONS, MAX_LINES, MAX_STREAM
 from tactile_rt.daemon.snapshot import Snapshot
 from tactile_rt.stream import ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec
+from tests.helpers.waiting import until
 
 SPEC = small_spec()
 TOKEN = "correct horse battery"
@@ -123,13 +124,6 @@ class Stream:
     def close(self):
         self.answer.close()
         self.line.close()
-
-
-def until(condition):
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def floats(text):

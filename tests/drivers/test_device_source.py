@@ -13,6 +13,7 @@ from tactile_rt.drivers.health import State
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError, EndOfStream, SourceError
 from tactile_rt.testing import FakeCan, FakeSerial
+from tests.helpers.waiting import until
 
 PATIENCE_S = 20.0
 
@@ -37,16 +38,6 @@ def take(source, n, over=lambda: False):
         elif over():
             break
     return chunks
-
-
-def until(condition, source=None):
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        if source is not None:
-            source.read(0.01)
-        else:
-            time.sleep(0.01)
 
 
 DEVICES = {
@@ -111,7 +102,7 @@ def test_a_device_that_is_unplugged_comes_again(tmp_path, no_thread_left):
         take(source, 50)
         for connections in range(2, 7):
             fake.unplug()
-            until(lambda: source.health.state == State.LOST, source)
+            until(lambda: source.health.state == State.LOST, meanwhile=lambda: source.read(0.01))
             assert source.health.reason
             assert source.read(0.0) is None  # nothing old is given out as new
             fake.replug()
@@ -149,7 +140,7 @@ def test_a_device_that_restarts_goes_on(tmp_path):
     with FakeSerial(signal(60_000), link=link) as fake, open_source(fake.url) as source:
         first = take(source, 50)
         fake.unplug()
-        until(lambda: source.health.state == State.LOST, source)
+        until(lambda: source.health.state == State.LOST, meanwhile=lambda: source.read(0.01))
         fake.replug(restart=True)
         again = take(source, 50)
         t = np.concatenate([c.t_ns for c in first + again])
@@ -162,7 +153,7 @@ def test_whisking_commands_reach_the_device():
     with FakeSerial(signal(5000)) as fake, open_source(fake.url) as source:
         take(source, 10)
         source.set_whisking(8.0, 0.6, -0.1)
-        until(lambda: fake.codec.whisking is not None, source)
+        until(lambda: fake.codec.whisking is not None, meanwhile=lambda: source.read(0.01))
         assert fake.codec.whisking == pytest.approx((8.0, 0.6, -0.1))
 
 

@@ -4,7 +4,7 @@ import os
 import select
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from tactile_rt.drivers.slcan import SlcanDecoder, encode, opening
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
 from tactile_rt.testing.fixtures import fake_can, fake_serial  # noqa: F401
+from tests.helpers.waiting import until
 
 SPEC = small_spec(4)
 PATIENCE_S = 20.0  # a test that waits so long has failed
@@ -47,13 +48,6 @@ def native(n: int = 0, values: np.ndarray | None = None, **options: Any) -> Emul
     source = options.pop("source", made)
     options = {"pace": "fast", "endpoint": SerialEndpoint(), **options}
     return Emulator(NativeSerial(NativeOptions()), source, **options)
-
-
-def eventually(true: Callable[[], Any]) -> None:
-    end = time.monotonic() + PATIENCE_S
-    while not true():
-        assert time.monotonic() < end, "it never happened"
-        time.sleep(0.002)
 
 
 class Host:
@@ -138,7 +132,7 @@ def test_it_waits_for_its_host_and_stops_when_told() -> None:
         while device.log.sent < 100:
             host.read(PATIENCE_S)
         os.write(host.fd, host.codec.commands(Command.STOP)[0].send)
-        eventually(lambda: not device.codec.streaming)
+        until(lambda: not device.codec.streaming)
         while host.read(0.2):
             pass
         sent = device.log.sent
@@ -216,7 +210,7 @@ def test_a_host_that_does_not_read_loses_what_does_not_fit_and_stops_nobody() ->
     source = ArraySource(SPEC, cut(signal(3000), 1000.0), live=True)
     with native(endpoint=endpoint, source=source) as device:
         host = Host(endpoint.pty.path)
-        eventually(lambda: device.log.sent == 3000)
+        until(lambda: device.log.sent == 3000)
         host.read_all(device)
     counts = device.log.counts
     assert counts[Fate.OVERFLOWED] > 0 and counts[Fate.SENT] + counts[Fate.OVERFLOWED] == 3000
@@ -229,9 +223,9 @@ def test_a_host_that_goes_is_noticed_and_the_next_finds_nothing_stale() -> None:
     endpoint = SerialEndpoint(fifo_bytes=30_000)
     with native(endpoint=endpoint, source=source) as device:
         first = Host(device.endpoint.pty.path)
-        eventually(lambda: device.log.counts[Fate.OVERFLOWED])
+        until(lambda: device.log.counts[Fate.OVERFLOWED])
         first.close()
-        eventually(lambda: device.log.counts[Fate.UNHEARD])
+        until(lambda: device.log.counts[Fate.UNHEARD])
         host = Host(device.endpoint.pty.path, first.codec, start=False)
         first.codec.forget()
         assert host.read(PATIENCE_S)
@@ -278,7 +272,7 @@ def test_a_schedule_unplugs_and_replugs(tmp_path: Path) -> None:
         end = time.monotonic() + PATIENCE_S
         while host.read(1.0):
             assert time.monotonic() < end
-        eventually(link.is_symlink)
+        until(link.is_symlink)
         again = Host(str(link), host.codec, start=False)
         again.read_all(device)
         host.close()
@@ -466,7 +460,7 @@ def test_a_commanded_array_moves() -> None:
     with Emulator(NativeSerial(NativeOptions()), source, SerialEndpoint()) as device:
         host = Host(device.endpoint.pty.path)
         os.write(host.fd, host.codec.whisk(8.0, 0.5, -0.25).send)
-        eventually(lambda: source.moved)
+        until(lambda: source.moved)
         assert source.moved == (8.0, 0.5, -0.25)
         host.close()
 

@@ -13,7 +13,7 @@ import time
 import msgspec
 import uvicorn
 
-from tactile_rt.daemon.config import PageConfig
+from tactile_rt.daemon.config import PageConfig, is_loopback
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import Contact, Control, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import encode, state_message
@@ -45,7 +45,7 @@ class Page(Consumer):
     tick_s = STATE_S
 
     def __init__(self, name: str, options: PageConfig) -> None:
-        if not _is_loopback(options.host) and len(options.token) < SHORTEST_TOKEN:
+        if not is_loopback(options.host) and len(options.token) < SHORTEST_TOKEN:
             raise ConfigError(
                 f"{name}: {options.host} can be reached by others: a token of at least "
                 f"{SHORTEST_TOKEN} characters is needed"
@@ -94,7 +94,7 @@ class Page(Consumer):
             if not self._thread.is_alive() or time.monotonic() > until:
                 raise TactileError("the page's server did not start")
             time.sleep(0.01)
-        if not _is_loopback(options.host):
+        if not is_loopback(options.host):
             view.report(
                 self._name, "exposed",
                 "the token and all data cross the network unencrypted: see docs/security.md",
@@ -179,13 +179,6 @@ class Page(Consumer):
     def _failed(self, reason: str) -> None:
         assert self._view is not None
         self._view.report(self._name, "request", reason, "error")
-
-
-def _is_loopback(host: str) -> bool:
-    # Late: the configuration's check imports all consumers.
-    from tactile_rt.daemon.config_shared import is_loopback
-
-    return is_loopback(host)
 
 
 def _listen(host: str, port: int) -> socket.socket:
