@@ -554,7 +554,7 @@ def test_a_file_by_hand(tmp_path) -> None:
     [
         ("version = 1", "version = 2", "is a calibration of version 2; this release reads 1"),
         ("version = 1", "", "is a calibration of version None"),
-        ("version = 1", "version = ", ":1: not TOML: Invalid value"),
+        ("version = 1", "version = ", ":2: not TOML: Invalid value"),
         ("[tare]", "[taré]", "not TOML: "),
         ("[tare]", "[tarre]", "the file has no key 'tarre'; did you mean tare?"),
         ("units =", "unit =", "raw has no key 'unit'; did you mean units?"),

@@ -244,7 +244,7 @@ def test_polling(folder: Path) -> None:
         ('"Taxel3.X"', '"X"', r"'X' must be written Message.Signal \(did you mean Taxel0.X\?\)"),
         ('x = "Taxel3.X", ', "", r"element T3: no signal for channel x; add one"),
         ('x = "Taxel3.X"', 'xx = "Taxel3.X"', r"element T3: no channel 'xx' \(did you mean x\?\)"),
-        ("patch.dbc", "patsch.dbc", r"dbc: .*patsch.dbc: no such file"),
+        ("patch.dbc", "patsch.dbc", r"dbc: .*patsch.dbc: No such file"),
         ("patch.dbc", "bad.dbc", r"bad.dbc: is not a DBC file that cantools reads: .*line 3"),
         ("rate_hz", "rate_hs", r":3: the file has no key 'rate_hs'; did you mean rate_hz\?"),
         ("100.0", "-1.0", r"array 'patch': rate_hz must be positive"),
