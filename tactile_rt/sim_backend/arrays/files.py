@@ -192,7 +192,7 @@ def _distinct(path: Path, whiskers: list[tuple[str, Whisker]]) -> tuple[Whisker,
         for key in (f"whisker {w.name}", cell):
             if key in first:
                 raise ConfigError(f"{where}: {key} is taken already ({first[key]}); change one")
-            first[key] = where.removeprefix(f"{path}:")
+            first[key] = f"line {where.removeprefix(f'{path}:')}"
     return tuple(w for _, w in whiskers)
 
 
