@@ -6,7 +6,6 @@ updates = 600
 encoder = "zhuang-gru"
 """
 
-import tomllib
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import msgspec
 
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.training import TrainingConfig
+from tactile_rt.settings import convert, make_node, parse_toml, read_toml
 from tactile_rt.stream import ConfigError
 
 __all__ = [
@@ -169,10 +169,9 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             **common,
             **cell.options,
         }
-        try:
-            return TrainingConfig(**options)
-        except TypeError as error:
-            raise ConfigError(f"cell {cell.name!r}: {error}") from None
+        convert(make_node(options, f"cell {cell.name!r}", 0, Path()), TrainingConfig)
+        # As it is written: whole numbers stay whole in what is stored of a run.
+        return TrainingConfig(**options)
 
     def tasks(self) -> list[Task]:
         """Everything to do, the first seed of all first."""
@@ -200,31 +199,27 @@ def read_grid(name: str | Path) -> Grid:
     Raises:
         ConfigError: there is none, or it is not such a file.
     """
-    path = Path(name)
-    try:
-        if str(name) in shipped_grids():
-            text = (SHIPPED / f"{name}.toml").read_text()
-        else:
-            text = path.read_text()
-    except FileNotFoundError:
+    if str(name) in shipped_grids():
+        nodes = parse_toml((SHIPPED / f"{name}.toml").read_text(), str(name))
+    elif Path(name).exists():
+        nodes = read_toml(Path(name))
+    else:
         raise ConfigError(
             f"no grid {name}: name a TOML file, or one of {', '.join(shipped_grids())}"
-        ) from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{name} is not a text file: {error}") from None
-    try:
-        grid = msgspec.convert(tomllib.loads(text), Grid)
-    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-        raise ConfigError(f"{name}: {error}") from None
+        )
+    grid: Grid = convert(nodes, Grid)
     names = [cell.name for cell in grid.cells]
     for cell in grid.cells:
         if names.count(cell.name) > 1:
             raise ConfigError(f"{name}: two cells are {cell.name!r}")
         try:
             config = grid.config(Task(cell.name, 0, cell), Path(grid.data))
-            EADConfig(2, cell.encoder, cell.attender, config.decoder, config.width)
+            try:
+                EADConfig(2, cell.encoder, cell.attender, config.decoder, config.width)
+            except ConfigError as error:
+                raise ConfigError(f"cell {cell.name!r}: {error}") from None
         except ConfigError as error:
-            raise ConfigError(f"{name}: cell {cell.name!r}: {error}") from None
+            raise ConfigError(f"{name}: {error}") from None
     known = {task.name for task in grid.tasks()}
     for question in grid.questions:
         for one in (name for pair in question.pairs for name in (pair.better, pair.than)):
