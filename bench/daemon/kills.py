@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bench.daemon.process import DaemonProcess, free_port
 from bench.emulated import ArrayScript, EmulatedArray
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.drivers.emulation.damage import Fate
+from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.evidence.records import Record
 from tactile_rt.recording import read_decisions, read_stream, recover
 from tactile_rt.recording.redecoding import compare_decoding
