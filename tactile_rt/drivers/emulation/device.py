@@ -59,7 +59,7 @@ class EmulatedDevice:
 
     @property
     def url(self) -> str:
-        """For `open_source`."""
+        """What `open_source` opens: the line, the codec and its options."""
         query = urlencode({"codec": self._name, **self._options})
         return f"{quote(self.emulator.address, safe=':/')}?{query}"
 
