@@ -10,7 +10,7 @@ over restarts of the device, and has a gap exactly where the stream has one.
 The plan. A device's counter is narrow, may begin anywhere and begins anew with the device. So only
 its steps count, modulo its width:
 - a step of one is the next sample; a step of g + 1 is a gap of g. If d damaged frames came within
-  the gap, min(d, g) of it count as corrupt and the rest as missing: noise can look like damage, too;
+  the gap, min(d, g) of it count as corrupt and the rest as missing: noise looks like damage, too;
 - a step of zero, or back, is a copy if a sample with this counter and this very content came
   lately; else the counter has begun anew;
 - a step forward though the device's clock hardly moved is a restart as well, not a gap of

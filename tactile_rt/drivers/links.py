@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any, Generic
 
 from tactile_rt.drivers.codec import CanFrame, Packet
+from tactile_rt.drivers.slcan import SlcanDecoder, closing, encode, opening
 from tactile_rt.stream import ConfigError, SourceError
 
 __all__ = ["CanLink", "Link", "SerialLink", "SlcanLink"]
@@ -224,9 +225,6 @@ class SlcanLink(Link[Sequence[CanFrame]]):
     """
 
     def __init__(self, port: str, bitrate: int, fd: bool = False) -> None:
-        from tactile_rt.drivers.slcan import SlcanDecoder, encode, opening
-
-        self._encode = encode
         self._decoder = SlcanDecoder()
         self._serial = SerialLink(port, 115200)
         self.name = f"slcan:{port}"
@@ -244,11 +242,11 @@ class SlcanLink(Link[Sequence[CanFrame]]):
                 return frames, found[1]
 
     def send(self, packet: Sequence[CanFrame]) -> None:
-        self._serial.send(self._encode(packet))
+        self._serial.send(encode(packet))
 
     def close(self) -> None:
         try:
-            self._serial.send(b"C\r")
+            self._serial.send(closing())
         except SourceError:
             pass  # it is gone, which is what we want
         self._serial.close()

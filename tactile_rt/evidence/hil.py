@@ -179,7 +179,6 @@ class Loop:
         }
         if wire == "virtual":
             further["bus"] = f"virtual:hil-{os.getpid()}-{id(self)}"
-            further["fd"] = self._options.get("fd", "").lower() in ("1", "true")
         make = EmulatedSerial if wire == "serial" else EmulatedCan
         self._device = make(self._tee, codec, **further)
         own = codec_class(make.wire, codec).Options
