@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from tactile_rt.cli.app import app, check_output, starting
-from tactile_rt.cli.run import Seconds, leaving
+from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
 
 Url = Annotated[str, typer.Argument(help="URL of a source, e.g. serial:///dev/ttyUSB0?codec=bota.")]
 WINDOW_S = 1.0

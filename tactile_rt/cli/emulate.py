@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, starting
-from tactile_rt.cli.run import leaving
+from tactile_rt.cli.app import app, leaving, starting
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:

@@ -53,8 +53,9 @@ class DeviceOptions:
     clock: str = "host"
 
     def __post_init__(self) -> None:
-        if self.start_s < 0 or self.stale_s < 0:
-            raise ConfigError("start_s and stale_s must not be negative")
+        for name in ("start_s", "stale_s"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name):g}")
         if self.clock not in ("host", "device"):
             raise ConfigError(f"clock must be host or device, not {self.clock!r}")
 

@@ -50,21 +50,21 @@ class LoopReport:
 
     Attributes:
         samples: Number of samples that the source delivered.
-        identical_samples: Number of these that came out of the driver with the same bits.
-        direct, wire: Number of decisions that each of the two paths made.
-        identical: Number of decisions that are the same in every bit, latency apart.
-        same_label: Number of decisions of the same touch and step with the same label.
-        finals, finals_same: Number of last decisions of a touch on the direct path, and of those
-            with the same label on both paths.
+        identical_samples: Number of samples that came out of the driver with the same bits.
+        direct: Number of decisions that the direct path made.
+        wire: Number of decisions that the driver's path made.
+        identical: Decisions that are the same in every bit on both paths, latency apart.
+        same_label: Decisions of the same touch and step that have the same label on both paths.
+        finals: Last decisions of a touch on the direct path.
+        finals_same: Last decisions of a touch that have the same label on both paths.
         exact: Whether all decisions must be identical; else 99 % must have the same label.
         faulty: Whether faults were on the way; then only the account of losses must be right.
-        stats: The account of losses that the driver keeps.
+        stats: The driver's account of what it delivered and what it lost.
         sent: Number of packets that the device sent, copies included.
-        latency_s: Time from the source's delivery of a chunk's last sample to the driver's, (n,),
-            s; None where the source does not keep to real time.
-        stamp_error_s: Delay of the driver's times against the source's, (n,), s; None with the
-            device's time.
-        health: Health of the driver at the end.
+        latency_s: (n,) time from the source's delivery of a chunk's last sample to the driver's, s;
+            None where the source does not keep to real time.
+        stamp_error_s: (n,) delay of each of the driver's times, s; None with the device's time.
+        health: The driver's state at the end.
     """
 
     samples: int

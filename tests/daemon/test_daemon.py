@@ -11,9 +11,8 @@ import pytest
 
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.daemon import consumers
+from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.clock import Clock
-from tactile_rt.daemon.config_check import check_config
-from tactile_rt.daemon.config_file import load_config
 from tactile_rt.daemon.consumer import Consumer
 from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.items import (
@@ -26,6 +25,7 @@ from tactile_rt.daemon.items import (
     Packet,
     SourceChunk,
 )
+from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.lock import AlreadyRunning, Locks
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.sources.opening import open_source

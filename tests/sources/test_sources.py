@@ -74,17 +74,15 @@ def test_what_the_url_says_arrives(url: str, target: str, path: str) -> None:
 @pytest.mark.parametrize(
     ("url", "said"),
     [
-        ("glove:a?gian=2", "source glove: has no option 'gian'; did you mean gain?"),
-        (
-            "glove:a?zzz=2",
-            "source glove: has no option 'zzz'; it takes gain, channels, raw, path",
-        ),
-        ("glove:a?channels=two", "Expected `int`, got `str` - at `$.channels`"),
-        ("glove:a?channels=2.5", "at `$.channels`"),
-        ("glove:a?raw=perhaps", "Expected `bool`, got `str` - at `$.raw`"),
-        ("glove:a?gain=", "at `$.gain`"),
+        ("glove:a?gian=2", "glove:a has no option 'gian'; did you mean gain?"),
+        ("glove:a?zzz=2", "glove:a has no option 'zzz'; there are gain, channels, raw, path"),
+        ("glove:a?channels=two", "glove:a: channels: expected a whole number, got 'two'"),
+        ("glove:a?channels=2.5", "glove:a: channels: expected a whole number, got '2.5'"),
+        ("glove:a?raw=perhaps", "glove:a: raw: expected true or false, got 'perhaps'"),
+        ("glove:a?gain=", "glove:a: gain: expected a number, got ''"),
+        ("glove:a?gain=1e999", "glove:a: gain: inf is no quantity"),
         ("glove:a?gain=-1", "gain must be positive, not -1.0"),
-        ("glove:a?gain=1&gain=2", "an option is given twice"),
+        ("glove:a?gain=1&gain=2", "option 'gain' is given twice"),
     ],
 )
 def test_a_wrong_option_is_named_with_what_would_be_right(url: str, said: str) -> None:
@@ -93,11 +91,8 @@ def test_a_wrong_option_is_named_with_what_would_be_right(url: str, said: str) -
 
 @pytest.mark.usefixtures("glove")
 def test_third_parties_are_among_the_known_schemes() -> None:
-    said = refusal(open_source, "glvoe:left")
-    assert said == (
-        "unknown source 'glvoe:left': it begins with one of can:, combined:, glove:, replay:, "
-        "serial:, sim:, synthetic:, whisking: (did you mean glove:?)"
-    )
+    assert refusal(open_source, "glvoe:left") == "'glvoe:left' is no source; did you mean glove:?"
+    assert "glove:" in refusal(open_source, "xyz:left")
 
 
 # Ours
@@ -106,13 +101,13 @@ def test_third_parties_are_among_the_known_schemes() -> None:
 @pytest.mark.parametrize("url", ["", "mouse", "xyz:mouse", "/dev/ttyUSB0", "?seed=1"])
 def test_an_unknown_source_is_told_what_there_is(url: str) -> None:
     said = refusal(open_source, url)
-    assert said.startswith(f"unknown source {url!r}: it begins with one of ")
+    assert said.startswith(f"{url!r} is no source; there are ")
     assert "sim:" in said
 
 
 def test_a_near_miss_is_guessed() -> None:
-    assert refusal(open_source, "sum:mouse").endswith("(did you mean sim:?)")
-    assert refusal(open_source, "sim").endswith("(did you mean sim:?)")
+    assert refusal(open_source, "sum:mouse").endswith("did you mean sim:?")
+    assert refusal(open_source, "sim").endswith("did you mean sim:?")
 
 
 def test_a_url_that_cannot_be_taken_apart_is_a_config_error_too() -> None:
@@ -150,7 +145,7 @@ class TestSimulation:
         [
             ("sim:cat", "no simulated array 'cat'"),
             ("sim:mouse?sede=1", "did you mean seed?"),
-            ("sim:mouse?seed=one", "at `$.seed`"),
+            ("sim:mouse?seed=one", "seed: expected a whole number, got 'one'"),
             ("sim:mouse?pace=slow", "no pace 'slow': there are realtime, fast"),
             ("sim:mouse?profile=quick", "no profile 'quick': there are realtime"),
             ("sim:mouse?sweeps=-1", "sweeps must be 0 or more"),

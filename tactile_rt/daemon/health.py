@@ -1,22 +1,36 @@
-"""All states, counts and latencies at one moment, frozen; `msgspec.json.encode` takes it as it is.
+"""How the daemon is: all states, counts and latencies at one moment, and what does not work.
 
-Counts only ever grow while the daemon runs, also over restarts of a part.
+A `Snapshot` is frozen, and `msgspec.json.encode` takes it as it is: the page, the metrics and the
+``state`` message all tell it. Its counts only ever grow while the daemon runs, also over restarts
+of a part. `degraded` says in words what does not work; `LatencyMeter` measures what takes time.
 """
 
+import bisect
+import threading
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from tactile_rt.drivers.health import Health
+from tactile_rt.drivers.health import Health, State
 from tactile_rt.stream import SourceStats
 
 __all__ = [
     "ConsumerState",
     "Latency",
+    "LatencyMeter",
     "ModelState",
     "PartState",
     "QueueState",
     "Snapshot",
     "SourceState",
+    "degraded",
 ]
+
+EDGES_S = (
+    0.0005, 0.001, 0.002, 0.003, 0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.045, 0.07, 0.1, 0.2,
+    0.5, 1.0, 5.0,
+)  # fmt: skip
+NEWEST = 1000  # measurements that percentiles are taken of
 
 
 @dataclass(frozen=True)
@@ -190,3 +204,80 @@ class Snapshot:
     sources: tuple[SourceState, ...] = ()
     models: tuple[ModelState, ...] = ()
     consumers: tuple[ConsumerState, ...] = ()
+
+
+class LatencyMeter:
+    """How long a thing takes: a histogram for ever, percentiles of the newest. Add seconds from any
+    thread; `state` is a frozen `Latency`."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._newest: deque[float] = deque(maxlen=NEWEST)
+        self._buckets = [0] * (len(EDGES_S) + 1)
+        self._count, self._sum = 0, 0.0
+
+    def add(self, seconds: float) -> None:
+        """One more."""
+        with self._lock:
+            self._newest.append(seconds)
+            self._buckets[bisect.bisect_left(EDGES_S, seconds)] += 1
+            self._count += 1
+            self._sum += seconds
+
+    @property
+    def state(self) -> Latency:
+        """What was measured."""
+        with self._lock:
+            ordered = sorted(self._newest)
+            count, total, buckets = self._count, self._sum, tuple(self._buckets)
+        if not ordered:
+            return Latency(edges_s=EDGES_S, buckets=buckets)
+        return Latency(
+            count, total, 1e3 * _rank(ordered, 0.5), 1e3 * _rank(ordered, 0.99), 1e3 * ordered[-1],
+            EDGES_S, buckets,
+        )  # fmt: skip
+
+
+def _rank(ordered: list[float], share: float) -> float:
+    """The smallest value that at least this share of all are not above."""
+    return ordered[max(0, -(-len(ordered) * round(1000 * share) // 1000) - 1)]
+
+
+def degraded(
+    sources: Sequence[SourceState],
+    models: Sequence[ModelState],
+    consumers: Sequence[ConsumerState],
+) -> tuple[str, ...]:
+    """One line for each part that does not work. Reasons that count on are left out, so that a
+    line stays the same as long as what it says."""
+    lines = []
+    recording = any(c.kind == "recorder" and c.part.state == "running" for c in consumers)
+    for source in sources:
+        device = source.device
+        if _broken(source.part):
+            lines.append(f"no samples: {_why(source.part)}")
+        elif device is not None and device.state in (State.STALE, State.LOST):
+            lines.append(f"no samples: {source.part.name}: the device is {device.state}")
+    for model in models:
+        if _broken(model.part):
+            goes_on = "recording goes on" if recording else "acquisition goes on"
+            lines.append(f"no decisions: {_why(model.part)}; {goes_on}")
+    for consumer in consumers:
+        if _broken(consumer.part):
+            lines.append(f"{_what(consumer)}: {_why(consumer.part)}; acquisition goes on")
+    return tuple(lines)
+
+
+def _broken(part: PartState) -> bool:
+    # While it is tried again it is not well yet.
+    return part.state in ("waiting", "stalled") or (part.state == "starting" and part.failures > 0)
+
+
+def _why(part: PartState) -> str:
+    return f"{part.name} {'stalls' if part.state == 'stalled' else 'fails: ' + part.reason}"
+
+
+def _what(consumer: ConsumerState) -> str:
+    return {"recorder": "no recording", "page": "no page", "log": "no log"}.get(
+        consumer.kind, "not published" if consumer.part.name.startswith("publisher.") else "missing"
+    )

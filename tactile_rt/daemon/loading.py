@@ -7,22 +7,21 @@ valid name.
 import hashlib
 import os
 import re
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import msgspec
 
 from tactile_rt.daemon.config import CONFIG_VERSION, Config
-from tactile_rt.daemon.config_nodes import TomlNode, make_node, merge, named, read_nodes
-from tactile_rt.daemon.config_tables import convert_table, is_list, is_text, nearest, refusal
+from tactile_rt.settings import SettingNode, convert, merge, read_toml, refusal, set_key
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Loaded", "load_config"]
 
 DEEPEST = 8  # files that extend files
+LARGEST = 1 << 20  # bytes of a configuration
 FILES_IN = ("replay", "combined")  # schemes of URLs whose target is a file
 
 
@@ -31,14 +30,14 @@ class Loaded:
     """A configuration, and where each value of it came from.
 
     Attributes:
-        config: of which all names are filled in and all paths absolute.
-        nodes: its tree.
-        path: of the file.
-        sets: of the command line.
+        config: The configuration, with all names filled in and all paths absolute.
+        nodes: The tree that the configuration was made of, which knows the lines.
+        path: The path of the file, as the user named it.
+        sets: The settings of the command line, ``KEY=VALUE`` each.
     """
 
     config: Config
-    nodes: TomlNode
+    nodes: SettingNode
     path: Path
     sets: tuple[str, ...] = ()
 
@@ -48,7 +47,7 @@ class Loaded:
 
     @property
     def sha256(self) -> str:
-        """Of what it says, however it is written."""
+        """Hash of what it says, however it is written."""
         return hashlib.sha256(msgspec.json.encode(self.config)).hexdigest()
 
 
@@ -64,10 +63,10 @@ def load_config(path: Path, sets: Sequence[str] = ()) -> Loaded:
     """
     nodes = _with_bases(path, [])
     for text in sets:
-        nodes = _set(nodes, text)
+        nodes = set_key(nodes, text, Config)
     _check_version(nodes)
     _absolute(nodes)
-    config = convert_table(nodes, nodes, [], Config)
+    config = convert(nodes, Config)
     loaded = Loaded(config, nodes, path, tuple(sets))
     return Loaded(_filled(loaded), nodes, path, tuple(sets))
 
@@ -75,8 +74,8 @@ def load_config(path: Path, sets: Sequence[str] = ()) -> Loaded:
 # reading
 
 
-def _with_bases(path: Path, above: list[Path]) -> TomlNode:
-    nodes = read_nodes(path)
+def _with_bases(path: Path, above: list[Path]) -> SettingNode:
+    nodes = read_toml(path, LARGEST)
     if "version" in nodes.value:
         _check_version(nodes)  # of a base, too: its keys may mean something else
     base = nodes.value.get("extends")
@@ -101,64 +100,7 @@ def _with_bases(path: Path, above: list[Path]) -> TomlNode:
     return merge(under, nodes)
 
 
-def _set(nodes: TomlNode, text: str) -> TomlNode:
-    key, equals, written = text.partition("=")
-    origin = f"--set {text}"
-    steps = key.split(".")
-    if not equals or not all(steps):
-        raise ConfigError(f"{origin}: a setting is KEY=VALUE, e.g. page.port=9000")
-    at: Any = nodes
-    path: list[str | int] = []
-    for i, step in enumerate(steps):
-        last = i == len(steps) - 1
-        if isinstance(at.value, list):
-            place = _item(at, step, origin, named(path))
-            path.append(place)
-            if last:
-                raise ConfigError(f"{origin}: {named(path)} is a table: say which key of it")
-            at = at.value[place]
-            continue
-        if not isinstance(at.value, dict):
-            raise ConfigError(f"{origin}: {named(path)} has a value, not keys")
-        path.append(step)
-        if last:
-            value = written if is_text(path) else _value(written)
-            at.value[step] = make_node(value, origin, 0, Path.cwd())
-        else:
-            if step not in at.value:
-                listed = is_list(path)
-                at.value[step] = make_node([] if listed else {}, origin, 0, Path.cwd())
-            at = at.value[step]
-    return nodes
-
-
-def _item(node: TomlNode, step: str, origin: str, where: str) -> int:
-    names = [
-        n.value[key].value
-        for n in node.value
-        for key in ("name", "kind")
-        if isinstance(n.value, dict) and key in n.value and isinstance(n.value[key].value, str)
-    ]
-    for i, n in enumerate(node.value):
-        if isinstance(n.value, dict) and step in (
-            getattr(n.value.get("name"), "value", None),
-            getattr(n.value.get("kind"), "value", None),
-        ):
-            return i
-    if step.isdecimal() and len(step) < 6 and int(step) < len(node.value):
-        return int(step)
-    raise ConfigError(f"{origin}: no {where} {step!r}; {nearest(step, list(dict.fromkeys(names)))}")
-
-
-def _value(written: str) -> Any:
-    """A TOML value, or else text, so that it need not be quoted twice."""
-    try:
-        return tomllib.loads(f"value = {written}")["value"]
-    except (tomllib.TOMLDecodeError, RecursionError, ValueError):
-        return written
-
-
-def _absolute(nodes: TomlNode) -> None:
+def _absolute(nodes: SettingNode) -> None:
     """Relative paths from the folder of the file that they stand in."""
     for path, node in nodes.walk():
         if not isinstance(node.value, str) or not node.value or "\0" in node.value:
@@ -180,7 +122,7 @@ def _absolute(nodes: TomlNode) -> None:
                 node.value = f"{scheme}:{_from(node, target)}{question}{options}"
 
 
-def _from(node: TomlNode, value: str) -> Path:
+def _from(node: SettingNode, value: str) -> Path:
     path = Path(value)
     if value.startswith("~"):
         try:
@@ -234,7 +176,7 @@ def _free(name: str, taken: set[str], given: bool, loaded: Loaded, path: list[st
     return made
 
 
-def _check_version(nodes: TomlNode) -> None:
+def _check_version(nodes: SettingNode) -> None:
     version = nodes.value.get("version")
     if version is None:
         raise ConfigError(

@@ -1,4 +1,9 @@
-"""A TOML file as a tree in which every value knows the file and the line that it came from."""
+"""What was written, as a tree in which every value knows the file and the line that it came from.
+
+`tomllib` tells values but not where they stand, so the lines are found beside it: `find_lines`
+reads the text a second time, line by line. It looks at no values, only at headers, keys, and
+whether a line ends within a string or within brackets; the document is known to be valid by then.
+"""
 
 import os
 import re
@@ -10,22 +15,32 @@ from typing import Any
 
 from tactile_rt.stream import ConfigError
 
-__all__ = ["TomlNode", "make_node", "merge", "named", "read_nodes"]
+__all__ = [
+    "SettingNode",
+    "find_lines",
+    "make_node",
+    "merge",
+    "named",
+    "parse_toml",
+    "plain_value",
+    "read_text",
+    "read_toml",
+]
 
-LARGEST = 1 << 20
+LARGEST = 1 << 26  # bytes of a file that people write, or have a program write for them
 BARE = re.compile(r"[A-Za-z0-9_-]+")
 INT64 = 2**63
 
 
 @dataclass
-class TomlNode:
-    """A value; of a table a dict of nodes, of a list a list of nodes.
+class SettingNode:
+    """A value, and where it was written.
 
     Attributes:
-        value: see above.
-        file: as the user named it, or ``--set ...``.
-        line: from 1; 0: there are none.
-        folder: what relative paths are meant from.
+        value: The value; of a table a dict of nodes, of a list a list of nodes.
+        file: The file as the user named it, ``--set ...``, or the URL whose options these are.
+        line: The line of the file, counted from 1; 0 where there are no lines.
+        folder: The folder that relative paths in the file are meant from.
     """
 
     value: Any
@@ -46,7 +61,7 @@ class TomlNode:
             return [node.plain() for node in self.value]
         return self.value
 
-    def at(self, path: list[str | int]) -> "TomlNode":
+    def at(self, path: Sequence[str | int]) -> "SettingNode":
         """The node at a path, or the last one there is on the way."""
         node = self
         for step in path:
@@ -72,48 +87,88 @@ def named(path: Sequence[str | int]) -> str:
     return "".join(f"[{p}]" if isinstance(p, int) else f".{p}" for p in path).lstrip(".")
 
 
-def make_node(value: Any, file: str, line: int, folder: Path) -> TomlNode:
+def make_node(value: Any, file: str, line: int, folder: Path) -> SettingNode:
     """Nodes of a plain value, all of one line."""
     return _build(value, (), {(): line}, file, folder, line)
 
 
-def read_nodes(path: Path) -> TomlNode:
-    """Read a TOML file.
+def read_text(path: Path, largest: int = LARGEST) -> str:
+    """The text of a file that a user names, without a byte order mark.
+
+    Args:
+        path: of the file.
+        largest: number of bytes that it may have.
 
     Raises:
-        ConfigError: not there, not readable, not TOML, or a number that no key can mean.
+        ConfigError: not there, not readable, too large, or not UTF-8; names file and line.
     """
     try:
         with path.open("rb") as file:
-            data = file.read(LARGEST + 1)
+            data = file.read(largest + 1)
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:  # a zero byte in the name
         raise ConfigError(f"{str(path)!r}: cannot be read: {error}") from None
-    if len(data) > LARGEST:
-        raise ConfigError(f"{path}: larger than {LARGEST >> 20} MB: not a configuration")
+    if len(data) > largest:
+        raise ConfigError(f"{path}: larger than {largest >> 20} MB: not such a file")
     try:
-        text = data.decode().removeprefix("\ufeff")  # which some editors write before the text
+        return data.decode().removeprefix("\ufeff")  # which some editors write before the text
     except UnicodeDecodeError as error:
         line = data[: error.start].count(b"\n") + 1
         raise ConfigError(f"{path}:{line}: not UTF-8 text") from None
+
+
+def read_toml(path: Path, largest: int = LARGEST) -> SettingNode:
+    """Read a TOML file.
+
+    Args:
+        path: of the file.
+        largest: number of bytes that it may have.
+
+    Raises:
+        ConfigError: as `read_text` and `parse_toml`.
+    """
+    folder = Path(os.path.abspath(path)).parent
+    return parse_toml(read_text(path, largest), str(path), folder)
+
+
+def parse_toml(text: str, where: str, folder: Path = Path()) -> SettingNode:
+    """A TOML document as a tree.
+
+    Args:
+        text: the document.
+        where: it comes from, for messages.
+        folder: what relative paths in it are meant from.
+
+    Raises:
+        ConfigError: not TOML, or a number that no key can mean; names the line.
+    """
     try:
         parsed = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(_syntax(path, str(error), text)) from None
+        raise ConfigError(_syntax(where, str(error), text)) from None
     except (RecursionError, ValueError):  # lists in lists in lists; a number of 10,000 digits
-        raise ConfigError(f"{path}: nested too deeply, or a number too long") from None
-    folder = Path(os.path.abspath(path)).parent
-    return _build(parsed, (), find_lines(text), str(path), folder, 0)
+        raise ConfigError(f"{where}: nested too deeply, or a number too long") from None
+    return _build(parsed, (), find_lines(text), where, folder, 0)
 
 
-def merge(base: TomlNode, over: TomlNode) -> TomlNode:
+def plain_value(written: str) -> Any:
+    """A TOML value, or else text, so that it need not be quoted twice."""
+    try:
+        return tomllib.loads(f"value = {written}")["value"]
+    except (tomllib.TOMLDecodeError, RecursionError, ValueError):
+        return written
+
+
+def merge(base: SettingNode, over: SettingNode) -> SettingNode:
     """`over` on top of `base`: tables by key, lists of tables by the items' name, else replaced."""
     if isinstance(base.value, dict) and isinstance(over.value, dict):
         both = dict(base.value)
         for key, node in over.value.items():
             both[key] = merge(both[key], node) if key in both else node
-        return TomlNode(both, over.file, over.line, over.folder)
+        return SettingNode(both, over.file, over.line, over.folder)
     if _tables(base) and _tables(over):
         items = list(base.value)
         places = {_name(item): i for i, item in enumerate(items) if _name(item)}
@@ -123,15 +178,15 @@ def merge(base: TomlNode, over: TomlNode) -> TomlNode:
                 items.append(item)
             else:
                 items[place] = merge(items[place], item)
-        return TomlNode(items, over.file, over.line, over.folder)
+        return SettingNode(items, over.file, over.line, over.folder)
     return over
 
 
-def _tables(node: TomlNode) -> bool:
+def _tables(node: SettingNode) -> bool:
     return isinstance(node.value, list) and all(isinstance(n.value, dict) for n in node.value)
 
 
-def _name(item: TomlNode) -> str:
+def _name(item: SettingNode) -> str:
     """What identifies an item of a list: its name, or of a publisher its kind."""
     for key in ("name", "kind"):
         named = item.value.get(key)
@@ -147,14 +202,14 @@ def _build(
     file: str,
     folder: Path,
     line: int,
-) -> TomlNode:
+) -> SettingNode:
     line = lines.get(path, line)
     made: Any = value
     if isinstance(value, dict):
         made = {k: _build(v, (*path, k), lines, file, folder, line) for k, v in value.items()}
     elif isinstance(value, list):
         made = [_build(v, (*path, i), lines, file, folder, line) for i, v in enumerate(value)]
-    node = TomlNode(made, file, line, folder)
+    node = SettingNode(made, file, line, folder)
     if isinstance(value, float) and (value != value or value in (float("inf"), -float("inf"))):
         raise ConfigError(f"{node.where}: {named(path)}: {value} is no quantity")
     if isinstance(value, int) and not -INT64 <= value < INT64:
@@ -162,7 +217,7 @@ def _build(
     return node
 
 
-def _syntax(path: Path, message: str, text: str) -> str:
+def _syntax(path: str, message: str, text: str) -> str:
     found = re.search(r" \(at line (\d+), column (\d+)\)$", message)
     if found:
         return f"{path}:{found[1]}: not TOML: {message[: found.start()]} (column {found[2]})"
