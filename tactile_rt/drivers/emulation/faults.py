@@ -80,12 +80,16 @@ class Fault:
     """One kind of fault, and when.
 
     Attributes:
-        kind: one of `KINDS`. ``stall``: nothing is sent for a while, then all at once.
-            ``sequence_reset``: the device's counter and clock start again, as after a restart.
-        rate: how often, per second in the mean, at random times; or
-        at_s: when, in seconds of the stream.
-        duration_s: how long, of ``stall``, ``unplug`` and ``clock_drift`` (0: to the end).
-        amount: how much, see `KINDS`; None: its default.
+        kind: Name of a kind in `KINDS`. With ``stall`` nothing is sent for a while, then all at
+            once; with ``sequence_reset`` the device's counter and clock start again, as after a
+            restart.
+        rate: Mean number of times per second that the fault happens, at random; 0 if `at_s` is
+            given.
+        at_s: Time at which the fault happens, once, in seconds of the stream; None if `rate` is
+            given.
+        duration_s: Length of the fault, s, for ``stall``, ``unplug`` and ``clock_drift`` (0: to the
+            end).
+        amount: Size of the fault, in the unit that `KINDS` tells; None for the default of its kind.
 
     Raises:
         ConfigError: which field, and what it can be.
@@ -134,12 +138,12 @@ class FaultSchedule:
     """Which fault hits which sample; the same seed and times give the same faults.
 
     Args:
-        faults: what may happen.
-        seed: of the random times and of `random`.
+        faults: The faults that may happen.
+        seed: Seed of the random times and of `random`.
 
     Attributes:
-        faults: what may happen.
-        random: for whoever carries the faults out.
+        faults: The faults that may happen.
+        random: Random numbers for whoever carries the faults out.
     """
 
     def __init__(self, faults: tuple[Fault, ...] | list[Fault], seed: int = 0) -> None:
@@ -162,8 +166,8 @@ class FaultSchedule:
         sample come one after the other. ``clock_drift`` is returned once, when it begins.
 
         Args:
-            t_s: seconds since the first sample.
-            quiet: whether the stream is about to end: nothing happens any more.
+            t_s: Time since the first sample, s.
+            quiet: Whether the stream is about to end, so that nothing happens any more.
         """
         if quiet or t_s < QUIET_S:
             return None
@@ -216,8 +220,8 @@ class DeviceLog:
     """What a device did with each of its samples.
 
     Attributes:
-        counts: samples by fate.
-        duplicated: packets sent beyond one per sample.
+        counts: Number of samples by fate.
+        duplicated: Number of packets that were sent beyond one per sample.
     """
 
     def __init__(self, kept: bool = True) -> None:
