@@ -100,7 +100,8 @@ class EAD(nn.Module):
     (batch, step, channel[, row, column]) for a window, without the step for one step.
 
     Attributes:
-        lag: the first `lag` steps of a window know of no frame, the last `lag` frames do not count.
+        lag: The number of steps that a frame takes to reach the logits: the first `lag` steps of a
+            window know of no frame, the last `lag` frames do not count.
     """
 
     def __init__(self, config: EADConfig) -> None:

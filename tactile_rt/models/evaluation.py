@@ -52,13 +52,13 @@ class Disturbance:
     """What is wrong with the sensor; each sweep is a draw of its own.
 
     Attributes:
-        noise: white, on every stored sample, in units of the rated noise.
-        gain: one standard deviation of every whisker's relative gain error.
-        dead: how many whiskers, drawn at random, read zero throughout.
-        offset: a constant that appears with the contact, after the tare, in units of `OFFSET`;
-            its sign is drawn for every whisker and channel.
-        rest: stored samples of silence before each sweep, for the tare; a robot has them, the
-            sweeps have only a short lead.
+        noise: The white noise on every stored sample, in units of the rated noise.
+        gain: The standard deviation of every whisker's relative gain error.
+        dead: The number of whiskers, drawn at random, that read zero throughout.
+        offset: The size of a constant that appears with the contact, after the tare, in units of
+            `OFFSET`; a sign is drawn for every whisker and channel.
+        rest: The number of stored samples of silence before each sweep, for the tare; a robot has
+            them, the sweeps have only a short lead.
 
     Raises:
         ConfigError: a negative amount.

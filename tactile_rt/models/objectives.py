@@ -49,9 +49,9 @@ class Objective(nn.Module):
     """A network and what it is trained for.
 
     Attributes:
-        model: the network.
-        augmentation: of the frames.
-        views: how many times an update sees each window, each time augmented afresh.
+        model: The network that is trained.
+        augmentation: The augmentation that is applied to the frames.
+        views: The number of times that an update sees each window, each time augmented afresh.
     """
 
     views = 1

@@ -49,8 +49,9 @@ class GraphEncoder(nn.Module):
         graph: what to build; its channel counts are final (see `Graph.scaled`).
 
     Attributes:
-        features: channels of the graph's readout.
-        lag: the first `lag` steps of a window cannot depend on any frame.
+        features: The number of channels of the graph's readout.
+        lag: The number of steps that a frame takes to reach the readout: the first `lag` steps of a
+            window cannot depend on any frame.
     """
 
     def __init__(self, graph: Graph) -> None:

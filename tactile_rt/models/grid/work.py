@@ -40,13 +40,13 @@ class Outcome(msgspec.Struct, frozen=True):
     """What a task found.
 
     Attributes:
-        name, seed: of the task.
-        key: of the settings that it depends on; another key is another experiment.
-        top1, top5, noisy: a 0 or 1 per test sweep: right, among the first five, right at the
-            rated noise.
-        parameters: of encoder, attender and decoder.
-        seconds: of CPU time, all included.
-        failed: why there is no figure; empty if there is one.
+        name, seed: Name and seed of the task.
+        key: The settings that the outcome depends on, as JSON; another key is another experiment.
+        top1, top5, noisy: Hits as text, a 0 or 1 per test sweep: right, among the first five, right
+            at the rated noise.
+        parameters: The number of parameters of encoder, attender and decoder.
+        seconds: The CPU time that the task took, all included, s.
+        failed: The reason why there is no figure; empty if there is one.
     """
 
     name: str

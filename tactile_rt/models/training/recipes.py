@@ -33,9 +33,9 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A recipe file.
 
     Attributes:
-        about: what it is, in a line.
-        train: fields of `TrainingConfig`.
-        search: for some of them, all values that are to be tried.
+        about: A line that says what the recipe is.
+        train: Fields of `TrainingConfig`, by name.
+        search: All values that are to be tried, for some of the fields.
     """
 
     about: str = ""
