@@ -40,7 +40,8 @@ class AlignmentControl(msgspec.Struct, frozen=True):
         name: The name of the control, as a report prints it.
         layers: The names of the layers that were scored.
         corrected: (layer, target) Correlations corrected for noise.
-        score, sem, p: Score, standard error and p value of the control, as `scoring.Score` has a model's.
+        score, sem, p: Score, standard error and p value of the control, as `scoring.Score` has a
+            model's.
     """
 
     name: str

@@ -25,6 +25,7 @@ class NoAttender(nn.Module):
     """Each step on its own."""
 
     def forward(self, features: Tensor) -> Tensor:
+        """features (batch, step, feature), as they are"""
         return features
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
@@ -33,4 +34,5 @@ class NoAttender(nn.Module):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
+        """features (batch, feature), as they are, {}"""
         return features, {}

@@ -63,14 +63,14 @@ class MambaBlock(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """All steps at once, from a zero state."""
-        x, gate = self.in_proj(features).chunk(2, dim=-1)
+        x, gate = self.in_proj(features).chunk(2, dim=-1)  # (batch, step, inner) each
         steps = x.shape[1]
         padded = F.pad(x, (0, 0, TAPS - 1, 0))
         conv = self.conv_bias + sum(
             padded[:, k : k + steps] * self.conv_weight[:, k] for k in range(TAPS)
         )
         x = F.silu(conv)
-        y = selective_scan(*self._select(x))
+        y = selective_scan(*self._select(x))  # (batch, step, inner)
         return self._out(y, x, gate)
 
     def step(self, features: Tensor, taps: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -79,15 +79,15 @@ class MambaBlock(nn.Module):
         features (batch, width), taps (batch, TAPS - 1, inner): the last x, oldest first,
         h (batch, inner, STATES) -> the output and the new taps and h
         """
-        x, gate = self.in_proj(features).chunk(2, dim=-1)
-        taps = torch.cat([taps, x[:, None]], dim=1)
-        x = F.silu(self.conv_bias + (taps * self.conv_weight.t()).sum(1))
-        dt, signal, a, b, c = self._select(x)
+        x, gate = self.in_proj(features).chunk(2, dim=-1)  # (batch, inner) each
+        taps = torch.cat([taps, x[:, None]], dim=1)  # (batch, TAPS, inner)
+        x = F.silu(self.conv_bias + (taps * self.conv_weight.t()).sum(1))  # (batch, inner)
+        dt, signal, a, b, c = self._select(x)  # a (inner, STATES); b, c (batch, STATES)
         h = torch.exp(dt[..., None] * a) * h + (dt * signal)[..., None] * b[:, None]
         return self._out((h * c[:, None]).sum(-1), x, gate), taps[:, 1:], h
 
     def _select(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What `selective_scan` takes, of x (..., inner)."""
+        """What `selective_scan` takes, of x (..., inner): dt, x, a, b and c."""
         dt, b, c = self.x_proj(x).split([self.rank, STATES, STATES], dim=-1)
         dt = F.softplus(self.dt_proj(dt))
         # In the parameters' type whatever autocast says: the state is a long product.
@@ -175,8 +175,8 @@ class _Scan(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, dt: Tensor, u: Tensor, b: Tensor, c: Tensor, a: Tensor) -> Tensor:
-        keep = torch.mul(dt[..., None], a).exp_()
-        h = u[..., None] * b[..., None, :]
+        keep = torch.mul(dt[..., None], a).exp_()  # (step, batch, channel, state)
+        h = u[..., None] * b[..., None, :]  # the same
         for t in range(1, len(h)):
             h[t].addcmul_(keep[t], h[t - 1])
         ctx.save_for_backward(dt, u, a, b, c, keep, h)

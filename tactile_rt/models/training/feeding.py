@@ -43,7 +43,8 @@ class Batch:
     """What an update needs.
 
     Attributes:
-        views: The loads, one or two batches of them, as `InputStage` takes them, each drawn by itself.
+        views: The loads, one or two batches of them, as `InputStage` takes them, each drawn by
+            itself.
         labels: (batch,) The index of the category of each window.
         index: The index of the batch among the epoch's, counted from 0.
     """
