@@ -31,6 +31,7 @@ class Fusion(nn.Module):
         self.gates = nn.ModuleList(nn.Linear(2 * base, 1) if g else nn.Identity() for g in gated)
 
     def forward(self, base: Tensor, maps: Sequence[Tensor]) -> Tensor:
+        """base (row, column, lane, channel), maps of other channels each -> as base"""
         out = base
         for project, gate, m in zip(self.projections, self.gates, maps, strict=True):
             added = project(m)

@@ -97,6 +97,7 @@ class ResidualBlock(nn.Module):
         self.shortcut = None if same else ConvNorm(inputs, outputs, 1, stride, shape)
 
     def forward(self, x: Tensor) -> Tensor:
+        """x (frame, site in * inputs) -> (frame, site out * outputs)"""
         short = x if self.shortcut is None else self.shortcut(x)
         out: Tensor = F.relu(short + self.second(F.relu(self.first(x))))
         return out
