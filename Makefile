@@ -17,16 +17,16 @@ check: $(VENV)/.dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -m "slow or not slow"
-	$(BIN)/python -m bench.check_wheel
+	$(BIN)/python -m bench.checks.wheel
 
 check-export: $(VENV)/.dev
-	$(BIN)/python -m bench.check_export
+	$(BIN)/python -m bench.checks.export
 
 bench: $(VENV)/.dev
 	$(BIN)/tactile-rt bench
 
 fuzz: $(VENV)/.dev
-	$(BIN)/python -m bench.fuzz_codecs
+	$(BIN)/python -m bench.drivers.fuzzing
 
 format: $(VENV)/.dev
 	$(BIN)/ruff format .

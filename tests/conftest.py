@@ -49,3 +49,17 @@ def call(capsys, monkeypatch):
         return left.value.code or 0, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture
+def refused(call):
+    """Call `tactile-rt` with these arguments, expect one line on stderr and no more, return it."""
+
+    def run(*arguments):
+        code, out, err = call(*arguments)
+        assert (code, out) == (2, "")
+        assert err.startswith("tactile-rt: ")
+        assert err.count("\n") == 1, err
+        return err
+
+    return run

@@ -8,8 +8,7 @@ from urllib.parse import quote, urlencode
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, starting
-from tactile_rt.cli.run import leaving
+from tactile_rt.cli.app import app, leaving, starting
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from rich.console import Console
 from tactile_rt.cli.app import app, check_output, needs
 
 if TYPE_CHECKING:
-    from tactile_rt.models.contact_point import WhiskerShapes
+    from tactile_rt.classifier.contact_point import WhiskerShapes
     from tactile_rt.sweep_set import SweepManifest
 
 locate = typer.Typer(help="Find out where along each whisker it touches.", no_args_is_help=True)
@@ -74,8 +74,8 @@ def evaluate(
 
 def _shapes(manifest: "SweepManifest") -> "WhiskerShapes":
     """Of the whiskers that a set was made with, from mm to SI."""
-    from tactile_rt.models.contact_point import WhiskerShapes
-    from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+    from tactile_rt.classifier.contact_point import WhiskerShapes
+    from tactile_rt.sim_backend.arrays.files import load_animals
 
     animals = load_animals(str(manifest.recipe.get("array", "mouse")))
     whiskers = [whisker for animal in animals for whisker in animal.whiskers]

@@ -10,9 +10,9 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from types import FrameType
 
-from tactile_rt.daemon.config_check import check_config
-from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
+from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.lock import Locks
 from tactile_rt.stream import TactileError
 

@@ -31,6 +31,7 @@ __all__ = [
     "Step",
     "WireStats",
     "codec_class",
+    "six_axis",
 ]
 
 ENTRY_POINTS = "tactile_rt.codecs"  # names "serial.NAME" and "can.NAME"
@@ -276,6 +277,21 @@ class SampleBatch:
         ]
         damaged = np.array(self.damaged or [0] * n, np.int64)
         return Samples(values, valid, np.full(n, t_ns, np.int64), damaged, *whole)
+
+
+def six_axis(name: str, rate_hz: float) -> ArraySpec:
+    """One element at the origin of the frame ``sensor``: fx, fy, fz in N, mx, my, mz in N m."""
+    return ArraySpec(
+        name=name,
+        elements=("sensor",),
+        grid=((0, 0),),
+        positions=((0.0, 0.0, 0.0),),  # loads are told at the frame's origin
+        orientations=((1.0, 0.0, 0.0, 0.0),),
+        channels=("fx", "fy", "fz", "mx", "my", "mz"),
+        units=("N",) * 3 + ("N m",) * 3,
+        rate_hz=rate_hz,
+        frame="sensor",
+    )
 
 
 def codec_class(wire: str, name: str) -> type[Codec[Any]]:

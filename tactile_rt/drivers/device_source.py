@@ -11,11 +11,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, Step
-from tactile_rt.drivers.device_time import DeviceTime
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.drivers.links import Link
-from tactile_rt.drivers.stamping import Stamper
 from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, EndOfStream, Source, SourceError
 
 __all__ = ["DeviceOptions", "DeviceSource", "Tap"]
@@ -51,8 +50,9 @@ class DeviceOptions:
     clock: str = "host"
 
     def __post_init__(self) -> None:
-        if self.start_s < 0 or self.stale_s < 0:
-            raise ConfigError("start_s and stale_s must not be negative")
+        for name in ("start_s", "stale_s"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name):g}")
         if self.clock not in ("host", "device"):
             raise ConfigError(f"clock must be host or device, not {self.clock!r}")
 

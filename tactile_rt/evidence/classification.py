@@ -294,20 +294,22 @@ def _compare_profiles(
 
 
 def _compare_svm(data: Path, test: SweepSet, network: NDArray[np.bool_]) -> list[Record]:
-    """A network, right or not (sweep,), beside a support vector machine on the same test sweeps."""
-    from tactile_rt.models.svm import fit_svm  # scikit-learn
+    """A network (sweep,), right or not, beside an RBF support vector machine on the same windows.
+
+    Raises:
+        RecordingError: the set's training or validation split cannot be read.
+    """
+    from tactile_rt.models.svm import fit_svm  # scikit-learn takes a second to import
 
     svm = fit_svm(SweepSet.read(data, "train"), SweepSet.read(data, "validation"))
     right, objects = svm.hits(test), test.sweeps.objects
+    own = evaluation.accuracy(right, objects)
     above = evaluation.accuracy(network.astype(np.float64) - right, objects)
     records = []
-    for name, found, unit, bar in (
-        ("RBF SVM top-1", evaluation.accuracy(right, objects), "%", ""),
-        ("points above the SVM", above, "points", ">= 3"),
-    ):
-        interval = (
-            f"95 % interval {100 * found.low:.1f} to {100 * found.high:.1f}, by object; "
-            "the same test sweeps"
-        )
-        records.append(Record(f"models.{name}", 100 * found.value, unit, bar, interval, svm.how))
+    for name, unit, estimate, bar in (
+        ("RBF SVM top-1", "%", own, ""), ("points above the SVM", "points", above, ">= 3"),
+    ):  # fmt: skip
+        interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
+        anchor = f"{interval}; the same test sweeps"
+        records.append(Record(f"models.{name}", 100 * estimate.value, unit, bar, anchor, svm.how))
     return records

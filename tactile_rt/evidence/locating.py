@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.classifier.contact_point import ESTIMATES
 from tactile_rt.evidence.records import Record
-from tactile_rt.models.contact_point import ESTIMATES
 from tactile_rt.models.contact_regression import (
     FLOOR,
     ContactNetwork,

@@ -307,7 +307,7 @@ def test_an_axis_flipped_in_both_frames_leaves_the_orientation() -> None:
 def test_a_simulated_left_array_becomes_the_right_one() -> None:
     pytest.importorskip("mujoco")
     pytest.importorskip("trimesh")
-    from tactile_rt.sim_backend.arrays.whisker_array import load_array
+    from tactile_rt.sim_backend.arrays.files import load_array
     from tactile_rt.sim_backend.world import array_spec
 
     left, right = (

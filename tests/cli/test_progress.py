@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.app import progress_bar
 
 
 @pytest.fixture

@@ -18,8 +18,7 @@ from tactile_rt.stream import Chunk
 
 pytest.importorskip("mujoco")
 
-from tactile_rt.cli.demo import Demonstration
-from tactile_rt.cli.demo_view import draw, watch
+from tactile_rt.cli.demo import Demonstration, draw, watch
 
 ONE_MUG = "sim:mouse?objects=mug-50&sweeps=1&pace=fast"
 ENDLESS = "sim:mouse?objects=mug-50"

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.daemon.digits import shortest
-from tactile_rt.daemon.messages import encode, message_of
+from tactile_rt.daemon.messages import encode, message_of, shortest
 from tactile_rt.testing import small_spec
 from tests.helpers.published import samples
 

@@ -11,8 +11,7 @@ import pytest
 from rich.console import Console
 
 from tactile_rt.cli import main
-from tactile_rt.cli.top import read_snapshots, snapshot_at
-from tactile_rt.cli.top_view import picture
+from tactile_rt.cli.top import picture, read_snapshots, snapshot_at
 from tactile_rt.daemon.config import MetricsConfig
 from tactile_rt.daemon.messages import encode, message_of, state_message
 from tactile_rt.daemon.metrics import Metrics

@@ -10,12 +10,12 @@ pytest.importorskip("torch")
 import torch
 from sklearn.metrics import f1_score, roc_auc_score
 
+from tactile_rt.classifier.contact_point import WhiskerShapes
 from tactile_rt.evidence.locating import (
     contact_records,
     weighted_auroc,
     weighted_quantile,
 )
-from tactile_rt.models.contact_point import WhiskerShapes
 from tactile_rt.models.contact_regression import (
     ContactConfig,
     ContactNetwork,

@@ -18,19 +18,18 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.arrays import head as head_module
-from tactile_rt.sim_backend.arrays.files import read_animals
+from tactile_rt.sim_backend.arrays.files import load_animals, load_array, read_animals
 from tactile_rt.sim_backend.arrays.head import HEAD_BIT, add_head
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers, rat_whiskers
 from tactile_rt.sim_backend.arrays.whisker_array import (
     MOUNT,
     Mount,
     WhiskerArray,
     both_sides,
-    load_animals,
-    load_array,
     mirrored,
     place,
 )
-from tactile_rt.sim_backend.arrays.whiskers import Whisker, mouse_whiskers, rat_whiskers
+from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.world import (
     CHANNELS,
     PROFILES,
@@ -418,7 +417,7 @@ def test_no_file_is_worse_than_a_config_error(
 
 def test_arrays_come_without_a_simulator() -> None:
     code = (
-        "import sys; from tactile_rt.sim_backend.arrays.whisker_array import load_array;"
+        "import sys; from tactile_rt.sim_backend.arrays.files import load_array;"
         f"load_array({str(EXAMPLES / 'robot.toml')!r}); load_array('rat-both');"
         "sys.exit(bool({'mujoco', 'trimesh', 'torch'} & set(sys.modules)))"
     )

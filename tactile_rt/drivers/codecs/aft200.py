@@ -7,9 +7,16 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
-from tactile_rt.drivers.codecs.rounds import Rounds
-from tactile_rt.drivers.codecs.six_axis import six_axis
+from tactile_rt.drivers.codec import (
+    CanCodec,
+    CanFrame,
+    Command,
+    SampleBatch,
+    Samples,
+    Step,
+    six_axis,
+)
+from tactile_rt.drivers.codecs.framing import Rounds
 from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = ["Aft200", "Aft200Options"]

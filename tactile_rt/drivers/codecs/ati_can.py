@@ -9,8 +9,15 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
-from tactile_rt.drivers.codecs.six_axis import six_axis
+from tactile_rt.drivers.codec import (
+    CanCodec,
+    CanFrame,
+    Command,
+    SampleBatch,
+    Samples,
+    Step,
+    six_axis,
+)
 from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = ["AtiCan", "AtiCanOptions"]

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
-from tactile_rt.drivers.codecs.frame_finder import FrameFinder
-from tactile_rt.drivers.codecs.framing import crc16_x25
+from tactile_rt.drivers.codecs.framing import FrameFinder, crc16_x25
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
 __all__ = ["Bota", "BotaOptions"]

@@ -12,7 +12,7 @@ import numpy as np
 from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
 from tactile_rt.drivers.codecs.dbc_layout import FramePart, Signal
 from tactile_rt.drivers.codecs.dbc_mapping import read_mapping
-from tactile_rt.drivers.codecs.rounds import Rounds
+from tactile_rt.drivers.codecs.framing import Rounds
 from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = ["CanDbc", "CanDbcOptions"]

@@ -14,10 +14,8 @@ from typing import Final
 
 import numpy as np
 
-from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
-from tactile_rt.drivers.codecs.frame_finder import FrameFinder
-from tactile_rt.drivers.codecs.framing import crc16_modbus
-from tactile_rt.drivers.codecs.six_axis import six_axis
+from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step, six_axis
+from tactile_rt.drivers.codecs.framing import FrameFinder, crc16_modbus
 from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = ["Ft300", "Ft300Options"]

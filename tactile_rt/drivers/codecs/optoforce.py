@@ -27,7 +27,7 @@ from tactile_rt.drivers.codec import (
     Step,
     WireStats,
 )
-from tactile_rt.drivers.codecs.frame_finder import FrameFinder
+from tactile_rt.drivers.codecs.framing import FrameFinder
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
 __all__ = ["OptoForceCan", "OptoForceCanOptions", "OptoForceOptions", "OptoForceSerial"]

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 
 from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
-from tactile_rt.drivers.codecs.rounds import Rounds
+from tactile_rt.drivers.codecs.framing import Rounds
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
 __all__ = ["Xela", "XelaOptions"]

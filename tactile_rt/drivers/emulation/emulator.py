@@ -13,11 +13,9 @@ from typing import Any, Final, Self
 import numpy as np
 
 from tactile_rt.drivers.codec import Codec
-from tactile_rt.drivers.emulation.damage import DeviceLog
 from tactile_rt.drivers.emulation.endpoints import Endpoint
-from tactile_rt.drivers.emulation.faults import QUIET_S, FaultSchedule
-from tactile_rt.drivers.emulation.fitting import fit
-from tactile_rt.drivers.emulation.transmitter import EmulatedClock, Transmitter
+from tactile_rt.drivers.emulation.faults import QUIET_S, DeviceLog, FaultSchedule
+from tactile_rt.drivers.emulation.transmitter import EmulatedClock, Transmitter, fit
 from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, EndOfStream, Source
 
 __all__ = ["PACES", "Emulator"]

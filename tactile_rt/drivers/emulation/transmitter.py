@@ -1,17 +1,24 @@
-"""How an emulated device numbers, times and encodes its samples, and what goes wrong with them."""
+"""An emulated device: how it fits, numbers, times and encodes samples, and what goes wrong."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Codec
-from tactile_rt.drivers.emulation.damage import DeviceLog, Fate, damaged
 from tactile_rt.drivers.emulation.endpoints import Endpoint
-from tactile_rt.drivers.emulation.faults import QUIET_S, Fault, FaultSchedule
-from tactile_rt.stream import NS_PER_S, Chunk
+from tactile_rt.drivers.emulation.faults import (
+    QUIET_S,
+    DeviceLog,
+    Fate,
+    Fault,
+    FaultSchedule,
+    damaged,
+)
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
-__all__ = ["EmulatedClock", "Transmitter"]
+__all__ = ["EmulatedClock", "Transmitter", "fit"]
 
 
 class Transmitter:
@@ -214,3 +221,29 @@ class EmulatedClock:
     def _anchor(self, t_ns: int) -> None:
         self._there = int(self.at(np.array([t_ns]))[0])
         self._here = t_ns
+
+
+def fit(source: ArraySpec, device: ArraySpec) -> Callable[[Chunk], Chunk]:
+    """Make a source's chunks those of a device's spec.
+
+    The device's elements are the source's first ones, in order; those beyond are invalid. Its
+    channels are those of the same name, or, if no name is the same, those in the same place;
+    others are 0. Values pass as they are, whatever the unit.
+    """
+    if source.shape == device.shape and source.channels == device.channels:
+        return lambda chunk: chunk
+    columns = [source.channels.index(c) if c in source.channels else -1 for c in device.channels]
+    if max(columns) < 0:
+        columns = [i if i < len(source.channels) else -1 for i in range(len(device.channels))]
+    into = [i for i, column in enumerate(columns) if column >= 0]
+    taken = [columns[i] for i in into]
+    n = min(len(source.elements), len(device.elements))
+
+    def fitted(chunk: Chunk) -> Chunk:
+        values = np.zeros((len(chunk), *device.shape), np.float32)
+        values[:, :n, into] = chunk.values[:, :n, taken]
+        valid = np.zeros(values.shape[:2], np.bool_)
+        valid[:, :n] = chunk.valid[:, :n]
+        return Chunk(chunk.seq, chunk.t_ns, values, valid)
+
+    return fitted

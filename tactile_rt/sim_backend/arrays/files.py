@@ -1,7 +1,7 @@
-"""Arrays from files: a table of whiskers in CSV, or in TOML with a mount, a head and defaults.
+"""Arrays by name: a species' or a file's, a table of whiskers in CSV or in TOML with more to it.
 
-Both have the columns of ``data/mouse.csv`` and may add those of `whiskers.OPTIONAL`; see
-``docs/arrays/robot.toml`` and ``robot.csv`` for one array in both. In TOML::
+Both kinds of file have the columns of ``data/mouse.csv`` and may add those of `whiskers.OPTIONAL`;
+see ``docs/arrays/robot.toml`` and ``robot.csv`` for one array in both. In TOML::
 
     name = "robot"             # the file's name if left out
     head = "head.stl"          # in the head's frame, mm; its path is relative to this file
@@ -29,22 +29,22 @@ from typing import Any
 
 import msgspec
 
+from tactile_rt.sim_backend.arrays.species import species_array
 from tactile_rt.sim_backend.arrays.whisker_array import (
-    ARRAY_FILES,
     HEAD_FILES,
     Mount,
     Point,
     WhiskerArray,
     both_sides,
     centred_mount,
-    load_array,
     place,
 )
 from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, REQUIRED, Whisker
 from tactile_rt.stream import ConfigError
 
-__all__ = ["read_animals"]
+__all__ = ["load_animals", "load_array", "read_animals"]
 
+ARRAY_FILES = (".csv", ".toml")
 COLUMNS = (*REQUIRED, *OPTIONAL)
 ORIGIN = (0.0, 0.0, 0.0)
 
@@ -67,6 +67,31 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     defaults: dict[str, Any] = {}
     whisker: list[dict[str, Any]] = []
     animal: list[_Animal] = []
+
+
+def load_array(name: str) -> WhiskerArray:
+    """The one array of a name.
+
+    Args:
+        name: of an animal and side, see `species_array`, or a path to a .csv or .toml file.
+
+    Raises:
+        ConfigError: no such array, several, or a file with a mistake.
+    """
+    arrays = load_animals(name)
+    if len(arrays) > 1:
+        raise ConfigError(f"{name}: holds {len(arrays)} animals where one array is wanted")
+    return arrays[0]
+
+
+def load_animals(name: str) -> tuple[WhiskerArray, ...]:
+    """The arrays that share one world: one by its name, or all that a .toml file places in it.
+
+    Raises:
+        ConfigError: no such array, or a file with a mistake.
+    """
+    path = Path(name)
+    return read_animals(path) if path.suffix.lower() in ARRAY_FILES else (species_array(name),)
 
 
 def read_animals(path: Path) -> tuple[WhiskerArray, ...]:

@@ -8,7 +8,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.datasets.recipe_tables import Table, misnamed
 from tactile_rt.sim_backend.datasets.recipes import (
     PARAMETERS,
