@@ -32,7 +32,8 @@ class Session:
         queue_chunks: chunks that may wait for the classifier.
 
     Attributes:
-        dropped: samples that a live source delivered and the classifier was too late for.
+        dropped: The number of samples that a live source delivered and that the classifier was
+            too late for.
     """
 
     def __init__(self, source: Source, classifier: Classifier, queue_chunks: int = 256) -> None:

@@ -23,6 +23,7 @@ def main() -> None:
         bench,
         calibrate,
         daemon,
+        demo,
         devices,
         emulate,
         evaluate,

@@ -37,8 +37,8 @@ def serve(file: Path, sets: list[str], seconds: float | None) -> None:
 @config.command()
 def check(file: File, sets: Settings = None) -> None:
     """Say whether a configuration can work; nothing is opened."""
-    from tactile_rt.daemon.config_check import check_config
-    from tactile_rt.daemon.config_file import load_config
+    from tactile_rt.daemon.checks import check_config
+    from tactile_rt.daemon.loading import load_config
 
     loaded = load_config(file, sets or [])
     check_config(loaded)
@@ -58,8 +58,8 @@ def check(file: File, sets: Settings = None) -> None:
 @config.command()
 def show(file: File, sets: Settings = None) -> None:
     """Print the configuration in force: with what it extends, overrides and defaults."""
-    from tactile_rt.daemon.config_file import load_config
-    from tactile_rt.daemon.config_text import config_text
+    from tactile_rt.daemon.config import config_text
+    from tactile_rt.daemon.loading import load_config
 
     typer.echo(config_text(load_config(file, sets or []).config), nl=False)
 

@@ -29,11 +29,10 @@ def install_service(
 
     Nothing is changed outside the folder: read the script, then run it as root.
     """
-    from tactile_rt.daemon.config_check import check_config
-    from tactile_rt.daemon.config_file import load_config
+    from tactile_rt.daemon.checks import check_config
+    from tactile_rt.daemon.loading import load_config
     from tactile_rt.daemon.systemd import install_script, unit_text
-    from tactile_rt.drivers.discovery import serial_ports
-    from tactile_rt.drivers.doctor import udev_rules
+    from tactile_rt.drivers.discovery import serial_ports, udev_rules
 
     loaded = load_config(file.absolute())
     check_config(loaded)

@@ -2,7 +2,6 @@
 run: in a thread of its own, fed from a mailbox."""
 
 import abc
-import ipaddress
 import time
 from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol
@@ -13,7 +12,7 @@ from tactile_rt.daemon.items import Closed, Contact, Control, Decision, Event, I
 from tactile_rt.daemon.mailbox import Mailbox
 from tactile_rt.daemon.part import Part, Report
 
-__all__ = ["Consumer", "ConsumerPart", "View", "is_loopback"]
+__all__ = ["Consumer", "ConsumerPart", "View"]
 
 
 class View(Protocol):
@@ -156,13 +155,3 @@ class ConsumerPart(Part):
             self.consumer.close()
         finally:
             self._busy_ns = 0
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this computer can reach what listens there."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host.strip("[]")).is_loopback
-    except ValueError:
-        return False

@@ -1,18 +1,16 @@
 """Which consumers a configuration asks for, and how each is made."""
 
-import difflib
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module, metadata
+from pathlib import Path
 from typing import Any
 
-import msgspec
-
-from tactile_rt.daemon.config import PublisherConfig
-from tactile_rt.daemon.config_file import Loaded
-from tactile_rt.daemon.config_tables import convert_table
+from tactile_rt.daemon.config import Config, PublisherConfig
 from tactile_rt.daemon.consumer import Consumer
+from tactile_rt.daemon.loading import Loaded
+from tactile_rt.settings import convert, make_node, no_such
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Wanted", "wanted_consumers"]
@@ -39,11 +37,12 @@ class Wanted:
     """A consumer that a configuration asks for.
 
     Attributes:
-        name: of the part.
-        kind: of consumer.
-        key: equal for two that are configured alike, which need not be restarted.
-        make: makes it; may raise `ConfigError`.
-        options: its table, or of a publisher that of its options.
+        name: The name of the part that runs the consumer, e.g. ``publisher.zmq``.
+        kind: The kind of consumer, e.g. ``zmq`` or ``recorder``.
+        key: A value that is equal for two consumers that are configured alike, of which the
+            running one need not be restarted.
+        make: A function that makes the consumer; may raise `ConfigError`.
+        options: The table of the configuration; of a publisher that of its ``options``.
     """
 
     name: str
@@ -95,17 +94,15 @@ def _publisher(loaded: Loaded, i: int, config: PublisherConfig) -> Wanted:
     path: list[str | int] = ["publisher", i, "options"]
     options: Any = None
     kind = getattr(cls, "Options", None)
-    node = loaded.nodes.at(path)
     if kind is None and config.options:
         loaded.refuse(path, f"publisher {config.kind} takes no options")
-    if kind is not None:
-        if config.options:
-            options = convert_table(loaded.nodes, node, path, kind)
-        else:
-            try:
-                options = msgspec.convert({}, kind)
-            except msgspec.ValidationError as error:
-                loaded.refuse(["publisher", i], f"options: {error}".replace("`", "'"))
+    if kind is not None and config.options:
+        options = convert(loaded.nodes, kind, path, top=Config)
+    elif kind is not None:
+        try:
+            options = convert(make_node({}, "options", 0, Path()), kind)
+        except ConfigError as error:  # it needs some
+            loaded.refuse(["publisher", i], str(error))
     key = (config.kind, config.name, options, loaded.config.limits)
     name = f"publisher.{config.name}"
     return Wanted(name, config.kind, key, _maker(cls, name, options), options)
@@ -122,10 +119,7 @@ def _publisher_class(kind: str) -> Any:
                 return point.load()
             except Exception as error:  # another package's code
                 raise ConfigError(f"publisher {kind} cannot be loaded: {error}") from None
-    known = sorted({*PUBLISHERS, *points.names})
-    near = difflib.get_close_matches(kind.lower(), known, 1, 0.5)
-    hint = f"did you mean {near[0]}?" if near else f"there is {', '.join(known)}"
-    raise ConfigError(f"no publisher {kind!r}; {hint}")
+    raise ConfigError(no_such("publisher", kind, sorted({*PUBLISHERS, *points.names})))
 
 
 def _class(where: str, what: str, extra: str) -> Any:

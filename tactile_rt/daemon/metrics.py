@@ -13,8 +13,8 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from tactile_rt.daemon.config import MetricsConfig
-from tactile_rt.daemon.consumer import Consumer, View, is_loopback
+from tactile_rt.daemon.config import MetricsConfig, is_loopback
+from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.health import Latency, PartState, QueueState, Snapshot
 from tactile_rt.daemon.http import HttpLimits, HttpServer, Refused, Request, Response, listen
 from tactile_rt.daemon.items import Item

@@ -71,9 +71,9 @@ def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = Non
         if _asked_to_end(_noted):
             return ExitCode.STOPPED
         # Late, as all this takes its time.
-        from tactile_rt.daemon.config_check import check_config
-        from tactile_rt.daemon.config_file import load_config
+        from tactile_rt.daemon.checks import check_config
         from tactile_rt.daemon.daemon import Daemon
+        from tactile_rt.daemon.loading import load_config
         from tactile_rt.daemon.lock import Locks
 
         loaded = load_config(path, sets)
@@ -108,8 +108,8 @@ def _asked_to_end(calls: Calls) -> bool:
 def _serve(
     daemon: "Daemon", path: Path, sets: Sequence[str], calls: Calls, seconds: float | None
 ) -> None:
-    from tactile_rt.daemon.config_check import check_config
-    from tactile_rt.daemon.config_file import load_config
+    from tactile_rt.daemon.checks import check_config
+    from tactile_rt.daemon.loading import load_config
     from tactile_rt.stream import TactileError
 
     end = None if seconds is None else time.monotonic() + seconds

@@ -8,6 +8,7 @@ import pytest
 from tactile_rt.classifier.session import Session
 from tactile_rt.stream import Chunk, EndOfStream, Source, SourceError
 from tactile_rt.testing import ArraySource, cut, small_spec
+from tests.helpers.waiting import until
 
 SPEC = small_spec()
 CHUNKS = cut(np.random.default_rng(0).normal(size=(400, *SPEC.shape)), SPEC.rate_hz, samples=4)
@@ -66,13 +67,6 @@ class Device(Source):
         self.closed_by.append(threading.current_thread().name)
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    give_up = time.monotonic() + SOON_S
-    while not condition():
-        assert time.monotonic() < give_up
-        time.sleep(0.002)
-
-
 def reading() -> bool:
     return any(t.name == "tactile-rt-reader" for t in threading.enumerate())
 
@@ -109,7 +103,7 @@ def test_a_slow_consumer_gets_the_newest_and_every_loss_is_counted() -> None:
     with Session(source, listener, queue_chunks=8) as session:
         chunks = iter(session)
         first, _ = next(chunks)
-        wait_for(lambda: not reading())  # all has arrived while we did something else
+        until(lambda: not reading())  # all has arrived while we did something else
         assert source.stats.delivered == 400
         rest = [chunk for chunk, _ in chunks]
     assert rest == [chunk for chunk in CHUNKS[-8:] if chunk is not first]
@@ -123,7 +117,7 @@ def test_acquisition_never_waits_for_the_consumer() -> None:
     with Session(device, Listener(), queue_chunks=2) as session:
         device.arriving += CHUNKS[:50]
         next(iter(session))
-        wait_for(lambda: not device.arriving)
+        until(lambda: not device.arriving)
     assert device.stats.delivered == 200
 
 

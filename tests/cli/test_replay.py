@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_rt.daemon.config_check import check_config
-from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
+from tactile_rt.daemon.loading import load_config
 from tactile_rt.recording import read_decisions, read_description, read_stream
 from tactile_rt.recording.mcap_file import McapFile
 from tactile_rt.recording.reader import read_raw

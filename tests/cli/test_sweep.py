@@ -8,7 +8,7 @@ pytest.importorskip("trimesh")
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 from tactile_rt.sweep_set import SweepManifest
 
-TINY = """
+RECIPE = """
 name = "tiny"
 lead_ms = 45
 length_ms = 180
@@ -27,7 +27,7 @@ gap_mm = 0.5
 @pytest.fixture
 def recipe(tmp_path):
     path = tmp_path / "tiny.toml"
-    path.write_text(TINY)
+    path.write_text(RECIPE)
     return path
 
 
@@ -96,7 +96,7 @@ def test_another_profile_of_a_set_goes_elsewhere(call, recipe, tmp_path):
 
 
 def test_sweeps_that_miss_are_told(call, recipe, tmp_path):
-    recipe.write_text(TINY + "height_mm = 200\n")
+    recipe.write_text(RECIPE + "height_mm = 200\n")
     code, _, err = call("sweep", tmp_path / "set", "--recipe", recipe, "--processes", 1)
     assert code == 0
     assert "6 sweeps at profile realtime; 6 miss the array" in err.replace("\n", " ")

@@ -13,8 +13,8 @@ from unittest import mock
 
 import pytest
 
-from tactile_rt.daemon.config_check import check_config
-from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.checks import check_config
+from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.metrics import exposition
 from tactile_rt.daemon.process import ExitCode

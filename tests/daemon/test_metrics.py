@@ -17,7 +17,8 @@ from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.messages import StateMessage
 from tactile_rt.daemon.metrics import Metrics, exposition
 from tactile_rt.stream import SourceError
-from tests.helpers.published import View, busy_snapshot, part, running, until
+from tests.helpers.published import View, busy_snapshot, part, running
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 

@@ -25,6 +25,7 @@ from tactile_rt.daemon.page.guard import Guard
 from tactile_rt.daemon.page.routes import LIMITS, MAX_LINES, MAX_STREAMS, STATIC, PageClient
 from tactile_rt.stream import ConfigError, SourceError
 from tactile_rt.testing import ArraySource, cut, small_spec
+from tests.helpers.waiting import until
 
 SPEC = small_spec()
 TOKEN = "correct horse battery"
@@ -122,13 +123,6 @@ class Stream:
     def close(self):
         self.answer.close()
         self.line.close()
-
-
-def until(condition):
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 def floats(text):

@@ -17,10 +17,10 @@ from playwright.sync_api import sync_playwright
 
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.config import PageConfig
-from tactile_rt.daemon.config_file import load_config
 from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.health import ModelState, PartState, Snapshot, SourceState
 from tactile_rt.daemon.items import Decision, Event, Opened, SourceChunk
+from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.page import Page
 from tactile_rt.testing import ArraySource, cut, small_spec
 

@@ -297,7 +297,7 @@ def test_config_commands(folder, monkeypatch, capsys):
 
 def test_the_daemon_reaches_nothing_that_a_robot_does_not_have():
     code = (
-        "import sys, tactile_rt.daemon.daemon, tactile_rt.daemon.config_check, "
+        "import sys, tactile_rt.daemon.daemon, tactile_rt.daemon.checks, "
         "tactile_rt.daemon.publishers.jsonl\n"
         "print({'torch', 'mujoco', 'trimesh', 'scipy', 'matplotlib'} & set(sys.modules))"
     )

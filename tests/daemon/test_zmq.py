@@ -20,8 +20,8 @@ from tests.helpers.published import (
     opened,
     running,
     samples,
-    until,
 )
+from tests.helpers.waiting import until
 
 FREE = "tcp://127.0.0.1:*"
 pytestmark = pytest.mark.usefixtures("no_thread_left")

@@ -7,12 +7,12 @@ import time
 import numpy as np
 import pytest
 
-from tactile_rt.drivers.emulation.damage import Fate
-from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
+from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule
 from tactile_rt.drivers.health import State
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError, EndOfStream, SourceError
 from tactile_rt.testing import FakeCan, FakeSerial
+from tests.helpers.waiting import until
 
 PATIENCE_S = 20.0
 
@@ -37,16 +37,6 @@ def take(source, n, over=lambda: False):
         elif over():
             break
     return chunks
-
-
-def until(condition, source=None):
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        if source is not None:
-            source.read(0.01)
-        else:
-            time.sleep(0.01)
 
 
 DEVICES = {
@@ -111,7 +101,7 @@ def test_a_device_that_is_unplugged_comes_again(tmp_path, no_thread_left):
         take(source, 50)
         for connections in range(2, 7):
             fake.unplug()
-            until(lambda: source.health.state == State.LOST, source)
+            until(lambda: source.health.state == State.LOST, meanwhile=lambda: source.read(0.01))
             assert source.health.reason
             assert source.read(0.0) is None  # nothing old is given out as new
             fake.replug()
@@ -149,7 +139,7 @@ def test_a_device_that_restarts_goes_on(tmp_path):
     with FakeSerial(signal(60_000), link=link) as fake, open_source(fake.url) as source:
         first = take(source, 50)
         fake.unplug()
-        until(lambda: source.health.state == State.LOST, source)
+        until(lambda: source.health.state == State.LOST, meanwhile=lambda: source.read(0.01))
         fake.replug(restart=True)
         again = take(source, 50)
         t = np.concatenate([c.t_ns for c in first + again])
@@ -162,7 +152,7 @@ def test_whisking_commands_reach_the_device():
     with FakeSerial(signal(5000)) as fake, open_source(fake.url) as source:
         take(source, 10)
         source.set_whisking(8.0, 0.6, -0.1)
-        until(lambda: fake.codec.whisking is not None, source)
+        until(lambda: fake.codec.whisking is not None, meanwhile=lambda: source.read(0.01))
         assert fake.codec.whisking == pytest.approx((8.0, 0.6, -0.1))
 
 
@@ -231,6 +221,19 @@ def test_a_silent_line():
 def test_a_wrong_url_is_explained(url, said):
     with pytest.raises(ConfigError, match=said):
         open_source(url)
+
+
+def test_a_codec_without_time_has_no_device_clock():
+    with (
+        FakeSerial(np.zeros((100, 1, 6)), "bota") as fake,
+        pytest.raises(ConfigError, match="clock must be host or device, not 'none'"),
+    ):
+        open_source(fake.url + "&clock=none")
+    with (
+        FakeSerial(np.zeros((100, 1, 3)), "optoforce") as fake,
+        pytest.raises(ConfigError, match="codec optoforce sends no time: it needs clock=host"),
+    ):
+        open_source(fake.url + "&clock=device")
 
 
 @pytest.mark.skipif(not os.path.isdir("/sys/class/net/vcan0"), reason="no kernel CAN (vcan0)")

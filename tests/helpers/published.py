@@ -1,7 +1,6 @@
 """Items, and a daemon as its consumers see it, for the tests of publishers."""
 
 import contextlib
-import time
 
 import numpy as np
 
@@ -124,13 +123,6 @@ def busy_snapshot(seconds=0, state="degraded"):
             ConsumerState(part("recorder", "waiting", "No space left on device", 9), "recorder"),
         ),
     )  # fmt: skip
-
-
-def until(condition, seconds=PATIENCE_S):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 @contextlib.contextmanager

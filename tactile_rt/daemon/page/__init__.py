@@ -8,8 +8,8 @@ import time
 
 import msgspec
 
-from tactile_rt.daemon.config import PageConfig
-from tactile_rt.daemon.consumer import Consumer, View, is_loopback
+from tactile_rt.daemon.config import PageConfig, is_loopback
+from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.http import HttpServer, listen
 from tactile_rt.daemon.items import Contact, Control, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import encode, state_message

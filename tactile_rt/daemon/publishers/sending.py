@@ -6,14 +6,19 @@ from typing import Annotated
 
 import msgspec
 
-from tactile_rt.daemon.consumer import Consumer, View, is_loopback
+from tactile_rt.daemon.config import is_loopback
+from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import Message, message_of, state_message
 
 __all__ = ["Repeated", "Sender", "SenderOptions", "is_port", "tell_exposed"]
 
 Prefix = Annotated[
-    str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64}){0,7}\Z")
+    str,
+    msgspec.Meta(
+        pattern=r"^[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64}){0,7}\Z",
+        description="prefix: one to eight words of letters, digits, ., - and _, with / between",
+    ),
 ]
 StateSeconds = Annotated[float, msgspec.Meta(ge=0, le=86400)]
 
