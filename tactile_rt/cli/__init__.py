@@ -28,7 +28,6 @@ def main() -> None:
         evaluate,
         grid,
         hil,
-        install_service,
         locate,
         model,
         record,

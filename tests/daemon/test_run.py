@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -186,7 +187,7 @@ def test_what_hangs_at_the_end_is_left_behind(folder, started):
         (["run"], "run needs a configuration (robot.toml, --set with it) or --source URL"),
         (["run", "--source", "synthetic:", "--set", "a=1"], "run needs a configuration"),
         (["run", "robot.toml", "--source", "synthetic:"], "robot.toml says what to run"),
-        (["run", "gone.toml"], "gone.toml: cannot be read: No such file"),
+        (["run", "gone.toml"], "gone.toml: no such file"),
         (["run", "robot.toml", "--set", "page.port=0"], "page.port: expected a whole number >= 1"),
         (["config", "check", "robot.toml", "--set", "sorce=1"], "did you mean source?"),
         (["config", "example", "robot.toml"], "robot.toml is there already"),
@@ -211,6 +212,9 @@ def test_config_commands(folder, monkeypatch, capsys):
     assert call(monkeypatch, capsys, "config", "example")[1] == EXAMPLE
     assert call(monkeypatch, capsys, "config", "example", "new.toml")[0] == 0
     assert call(monkeypatch, capsys, "config", "check", "new.toml")[0] == 0
+    _, said, _ = call(monkeypatch, capsys, "config", "example", "rö bot.toml")
+    assert said.endswith("run it with: tactile-rt run 'rö bot.toml'\n")
+    assert shlex.split(said.partition("with: ")[2]) == ["tactile-rt", "run", "rö bot.toml"]
 
 
 def test_the_daemon_reaches_nothing_that_a_robot_does_not_have():
