@@ -59,10 +59,10 @@ class ArrayScript:
     Attributes:
         wire: The line that the array is on: ``serial``, or ``slcan`` for a CAN bus behind slcan.
         spec: The description of the array, with its rate.
-        samples: How many samples the array measures before it falls silent.
+        samples: Number of samples that the array measures before it falls silent.
         link: A path that stays the port's name when the array is plugged in again; None: none.
         signal: What the array feels: ``bumps`` that go by, or ``noise``.
-        pace: When samples are sent: in ``realtime``, or as ``fast`` as the host takes them.
+        pace: The pace of the samples: ``realtime``, or as ``fast`` as the host takes them.
         faults: The faults that strike the array's line.
         seed: The seed of the noise and of the faults' times.
         options: Options of the native codec, as in a URL.
@@ -135,7 +135,7 @@ class LoopedSource(Source):
     Args:
         spec: What the samples are.
         signal: (n, element, channel) SI.
-        samples: How many samples there are; None: one round of the signal.
+        samples: Number of samples that there are; None: one round of the signal.
     """
 
     live = False

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.emulated import Played
-from tactile_rt.drivers.emulation.damage import Fate
+from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.recording.reader import read_stream
 
 __all__ = ["Account", "RecordedSamples", "account", "recorded"]

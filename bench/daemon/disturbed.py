@@ -72,12 +72,12 @@ class DisturbedDaemon:
         before: called in the daemon's process before it becomes the daemon.
 
     Attributes:
-        folder: of its files.
+        folder: The folder of the daemon's files.
         arrays: ``whiskers`` at 1 kHz on a serial line, ``finger`` at 110 Hz behind slcan.
-        daemon: the process.
-        clock: its wall clock.
-        ports: by name.
-        pipe: descriptor from which the lines of its jsonl publisher can be read, some 200 kB/s.
+        daemon: The process that the daemon runs in.
+        clock: The hand on the daemon's wall clock.
+        ports: TCP ports by what listens on them: ``zmq``, ``page``, ``metrics``.
+        pipe: Descriptor from which the lines of the jsonl publisher can be read, some 200 kB/s.
     """
 
     def __init__(self, before: Any = None) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from bench.daemon.process import DaemonProcess, free_port
 from bench.emulated import ArrayScript, EmulatedArray
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.drivers.emulation.damage import Fate
+from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.evidence.records import Record
 from tactile_rt.recording import read_decisions, read_stream, recover
 from tactile_rt.recording.redecoding import compare_decoding
@@ -48,13 +48,13 @@ class Killed:
     Attributes:
         after_s: Time from the first sample that the device sent to the kill, s.
         lost_s: Age at the kill of the first sample that is lost, s; 0: none is.
-        files: How many files the recording has.
-        cut: How many of these files had no end.
+        files: Number of files that the recording has.
+        cut: Number of files that had no end.
         unreadable: Files that, recovered, the MCAP library's own reader does not read to their end.
-        samples: How many samples were recovered.
+        samples: Number of samples that were recovered.
         missing: Samples that the device sent before the last that is there, and that are not there.
         wrong: Samples that are not as the device sent them, or not as their packets decode again.
-        decisions: How many of the model's decisions were recovered.
+        decisions: Number of the model's decisions that were recovered.
     """
 
     after_s: float

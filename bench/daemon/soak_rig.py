@@ -40,7 +40,7 @@ class Soak:
         played: What each array did, by the array's name.
         state: The daemon's last snapshot.
         recorded: The samples in the recordings of each array.
-        unfinished: How many recordings were not closed.
+        unfinished: Number of recordings that were not closed.
         heard: What each peer heard, by the peer's name.
         ping: The delay that the machine itself added meanwhile.
         usage: Processor time and memory of the daemon's process.

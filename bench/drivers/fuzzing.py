@@ -56,8 +56,8 @@ class Fuzzed:
 
     Attributes:
         codec: The codec's wire and name.
-        bytes: How many mutated bytes were fed.
-        exceptions: How many exceptions the codec raised.
+        bytes: Number of mutated bytes that were fed.
+        exceptions: Number of exceptions that the codec raised.
         held: Bytes that the codec kept at most.
         uneven: Whether another cut of the same input gave another result.
         seconds: Processor time of it all, s.

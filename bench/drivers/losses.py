@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from bench.emulated import ArrayScript, Played, noise, play
 from bench.processes import Helper
-from tactile_rt.drivers.emulation.damage import Fate
-from tactile_rt.drivers.emulation.faults import Fault
+from tactile_rt.drivers.emulation.faults import Fate, Fault
 from tactile_rt.evidence.records import Record
 from tactile_rt.sources.opening import open_source
 from tactile_rt.sources.synthetic import synthetic_spec

@@ -17,8 +17,8 @@ from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
 from tactile_rt.sim_backend.views.camera import Camera
 from tactile_rt.sim_backend.views.footage import record
-from tactile_rt.sim_backend.views.panels import INK, QUIET, ForceMap, draw_scale, draw_traces
 from tactile_rt.sim_backend.views.scale import ForceScale
+from tactile_rt.sim_backend.views.sheet import INK, QUIET, ForceMap, draw_scale, draw_traces
 from tactile_rt.sim_backend.views.stage import Stage
 from tactile_rt.sim_backend.world import PROFILES, array_spec
 

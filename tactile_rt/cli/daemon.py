@@ -32,7 +32,7 @@ app.add_typer(config, name="config")
 def serve(file: Path, sets: list[str], seconds: float | None) -> None:
     """Run the daemon; leaves the process with its exit code."""
     from tactile_rt.daemon.lock import AlreadyRunning
-    from tactile_rt.daemon.runner import ExitCode, leave, run_daemon
+    from tactile_rt.daemon.process import ExitCode, leave, run_daemon
 
     try:
         leave(run_daemon(file, sets, seconds))
@@ -102,9 +102,8 @@ def install_service(
     """
     from tactile_rt.daemon.checks import check_config
     from tactile_rt.daemon.loading import load_config
-    from tactile_rt.daemon.unit import install_script, unit_text
-    from tactile_rt.drivers.discovery import serial_ports
-    from tactile_rt.drivers.doctor import udev_rules
+    from tactile_rt.daemon.systemd import install_script, unit_text
+    from tactile_rt.drivers.discovery import serial_ports, udev_rules
 
     loaded = load_config(file.absolute())
     check_config(loaded)

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, starting
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.app import app, check_output, needs, progress_bar, starting
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -139,9 +138,9 @@ def view(
             return
         with progress_bar(console, "drawing", total=len(footage)) as update:
 
-            def frames() -> Iterator["NDArray[np.uint8]"]:
+            def pictures() -> Iterator["NDArray[np.uint8]"]:
                 for picture in film:
                     yield picture
                     update(advance=1)
 
-            write_video(out, frames(), fps, film.picture(footage.strongest))
+            write_video(out, pictures(), fps, film.picture(footage.strongest))

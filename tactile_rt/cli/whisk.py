@@ -1,4 +1,4 @@
-"""`tactile-rt whisk`: the array whisks against an object, or the stimuli of a recording."""
+"""`tactile-rt whisk`: the array whisks against an object, or the barrel-cortex stimuli."""
 
 import hashlib
 import math
@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, starting
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.app import app, check_output, needs, progress_bar, starting
 from tactile_rt.stream import ConfigError
 
 

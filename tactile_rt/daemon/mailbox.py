@@ -4,8 +4,8 @@ import threading
 from collections import deque
 from collections.abc import Iterable
 
+from tactile_rt.daemon.health import QueueState
 from tactile_rt.daemon.items import Decision, Item, Packet, SourceChunk
-from tactile_rt.daemon.snapshot import QueueState
 
 __all__ = ["Mailbox"]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from tactile_rt.daemon.config import LimitsConfig
-from tactile_rt.daemon.snapshot import PartState
+from tactile_rt.daemon.health import PartState
 from tactile_rt.stream import TactileError
 
 __all__ = ["Part", "Report", "reason_of"]

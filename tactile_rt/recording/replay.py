@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import Any
 
 from tactile_rt.calibration import CalibratedSource
+from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples
-from tactile_rt.drivers.device_time import DeviceTime
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.drivers.stamping import Stamper
 from tactile_rt.recording.layout import SAMPLES, WIRE, Packet
 from tactile_rt.recording.reader import MAGIC, read_description, read_packets, read_stream
 from tactile_rt.recording.sweep_replay import SweepOptions, sweep_chunks, sweep_spec

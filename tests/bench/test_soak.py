@@ -9,7 +9,6 @@ import pytest
 pytest.importorskip("onnx", reason="needs onnx: pip install 'tactile-rt[train]'")
 pytest.importorskip("mcap", reason="needs mcap: pip install 'tactile-rt[record]'")
 pytest.importorskip("zenoh", reason="needs zenoh: pip install 'tactile-rt[publish]'")
-pytest.importorskip("uvicorn", reason="needs uvicorn: pip install 'tactile-rt[ui]'")
 
 from bench.daemon.accounts import RecordedSamples, account
 from bench.daemon.disk import disk_full
@@ -21,10 +20,10 @@ from bench.emulated import KINDS, Played, fault_beat
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.daemon.config import RecorderConfig
+from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Opened, SourceChunk
 from tactile_rt.daemon.recorder import Recorder
-from tactile_rt.daemon.snapshot import Snapshot
-from tactile_rt.drivers.emulation.damage import Fate
+from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.recording import read_stream, recover
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource

@@ -11,7 +11,6 @@ import pytest
 
 from tests.helpers.waiting import until
 
-pytest.importorskip("uvicorn", reason="needs uvicorn: pip install 'tactile-rt[ui]'")
 pytest.importorskip("zmq", reason="needs pyzmq: pip install 'tactile-rt[publish]'")
 pytest.importorskip("zenoh", reason="needs zenoh: pip install 'tactile-rt[publish]'")
 

@@ -15,6 +15,7 @@ from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon import mailbox as mailbox_module
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, LogConfig
+from tactile_rt.daemon.health import EDGES_S, LatencyMeter
 from tactile_rt.daemon.hub import Hub
 from tactile_rt.daemon.items import (
     Closed,
@@ -26,7 +27,6 @@ from tactile_rt.daemon.items import (
     Packet,
     SourceChunk,
 )
-from tactile_rt.daemon.latency import EDGES_S, LatencyMeter
 from tactile_rt.daemon.lock import AlreadyRunning, Locks, lock_keys
 from tactile_rt.daemon.log import Log
 from tactile_rt.daemon.mailbox import Mailbox

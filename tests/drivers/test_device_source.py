@@ -7,8 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from tactile_rt.drivers.emulation.damage import Fate
-from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
+from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule
 from tactile_rt.drivers.health import State
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError, EndOfStream, SourceError
@@ -222,6 +221,19 @@ def test_a_silent_line():
 def test_a_wrong_url_is_explained(url, said):
     with pytest.raises(ConfigError, match=said):
         open_source(url)
+
+
+def test_a_codec_without_time_has_no_device_clock():
+    with (
+        FakeSerial(np.zeros((100, 1, 6)), "bota") as fake,
+        pytest.raises(ConfigError, match="clock must be host or device, not 'none'"),
+    ):
+        open_source(fake.url + "&clock=none")
+    with (
+        FakeSerial(np.zeros((100, 1, 3)), "optoforce") as fake,
+        pytest.raises(ConfigError, match="codec optoforce sends no time: it needs clock=host"),
+    ):
+        open_source(fake.url + "&clock=device")
 
 
 @pytest.mark.skipif(not os.path.isdir("/sys/class/net/vcan0"), reason="no kernel CAN (vcan0)")

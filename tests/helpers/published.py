@@ -5,8 +5,7 @@ import contextlib
 import numpy as np
 
 from tactile_rt.classifier.classifier import Classification
-from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Opened, SourceChunk
-from tactile_rt.daemon.snapshot import (
+from tactile_rt.daemon.health import (
     ConsumerState,
     Latency,
     ModelState,
@@ -15,6 +14,7 @@ from tactile_rt.daemon.snapshot import (
     Snapshot,
     SourceState,
 )
+from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Opened, SourceChunk
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.stream import ArraySpec, Chunk, SourceStats
 from tactile_rt.testing import small_spec

@@ -25,6 +25,7 @@ from tactile_rt.sim_backend.datasets.dataset import (
     make_sweeps,
     simulate_sweep,
 )
+from tactile_rt.sim_backend.datasets.inventory import check_sums
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe, recipe_of_set
 from tactile_rt.sim_backend.datasets.recipes import (
     Between,
@@ -33,7 +34,6 @@ from tactile_rt.sim_backend.datasets.recipes import (
     SweepChoice,
     SweepRecipe,
 )
-from tactile_rt.sim_backend.datasets.sums import check_sums
 from tactile_rt.sim_backend.objects.catalogue import load_object, make_object
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import SensorModel

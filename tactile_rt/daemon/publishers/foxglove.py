@@ -17,7 +17,6 @@ from foxglove.messages import Log, LogLevel, Timestamp
 from foxglove.websocket import WebSocketServer
 
 from tactile_rt.daemon.consumer import Consumer, View
-from tactile_rt.daemon.digits import shortest
 from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import (
     DecisionMessage,
@@ -25,6 +24,7 @@ from tactile_rt.daemon.messages import (
     Message,
     encode,
     message_of,
+    shortest,
     topic_of,
 )
 from tactile_rt.daemon.publishers.scene import Scene

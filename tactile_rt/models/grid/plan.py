@@ -36,12 +36,13 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One network and how it learns.
 
     Attributes:
-        encoder, attender: as in `EADConfig`.
-        objective: "supervised", or a self-supervised one, whose features a linear probe reads.
-        augmentation: of the views of a self-supervised objective.
-        masking: share of the steps of a view that is blanked.
-        width: of this network; 0: the grid's.
-        options: further fields of `TrainingConfig`, for this cell alone.
+        encoder, attender: Names of the encoder and the attender, as in `EADConfig`.
+        objective: The objective, "supervised", or a self-supervised one, whose features a linear
+            probe reads.
+        augmentation: The augmentation that makes the views of a self-supervised objective.
+        masking: The share of the steps of a view that is blanked, 0 to 1.
+        width: The width of this network; 0 takes the grid's.
+        options: Further fields of `TrainingConfig`, for this cell alone.
     """
 
     encoder: str
@@ -97,9 +98,9 @@ class Task(msgspec.Struct, frozen=True):
     """One thing to do: a cell with a seed, a network's random initialisation, or the SVM.
 
     Attributes:
-        name: of the cell, "random NETWORK" or "svm".
-        seed: of weights, windows and noise.
-        cell: None for the SVM.
+        name: The name of the cell, "random NETWORK" or "svm".
+        seed: The seed of the weights, the windows and the noise.
+        cell: The cell to train; None for the support vector machine.
     """
 
     name: str
@@ -121,16 +122,16 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole grid.
 
     Attributes:
-        data: the sweep set.
-        cells: in the order in which they are trained.
-        width: of every network that has none of its own.
-        updates, batch: the budget of every cell.
-        seeds: how many; all cells are trained with the first before any with the second.
-        sweeps: of each object that are used.
-        supervised, self_supervised: fields of `TrainingConfig` for cells of either kind.
-        probe: fields of `ProbeConfig`.
-        svm: fit a support vector machine too.
-        questions: what the report answers.
+        data: The folder of the sweep set.
+        cells: The cells, in the order in which they are trained.
+        width: The width of every network that has none of its own.
+        updates, batch: The budget of every cell: updates, and sweeps per update.
+        seeds: The number of seeds; all cells are trained with the first before any with the second.
+        sweeps: The number of sweeps of each object that are used, by split.
+        supervised, self_supervised: Fields of `TrainingConfig` for cells of either kind.
+        probe: Fields of `ProbeConfig` for cells whose features a probe reads.
+        svm: Whether a support vector machine is fitted too.
+        questions: The questions that the report answers.
     """
 
     data: str

@@ -1,6 +1,6 @@
 """Whisker arrays: which whiskers stand where, on which heads.
 
-Lengths in mm and angles in rad, as in `whiskers.py`. The frame of a head is x lateral (to the
+Lengths in mm and angles in rad, as in `whiskers`. The frame of a head is x lateral (to the
 animal's right), y rostral, z dorsal; the left side of an animal is its right side mirrored in x.
 """
 
@@ -64,10 +64,10 @@ class WhiskerArray:
     """Whiskers on one head.
 
     Attributes:
-        name: what the array is called, e.g. ``mouse-right``.
-        whiskers: in the frame of the head, mm and rad.
-        mount: pose of the head in the world.
-        head: mesh file of the head, in its frame and in mm; None: no head is drawn.
+        name: The name that the array is called by, e.g. ``mouse-right``.
+        whiskers: The array's whiskers in the frame of the head, in mm and rad.
+        mount: The pose of the head in the world.
+        head: The mesh file of the head, in the head's frame and in mm; None: no head is drawn.
 
     Raises:
         ConfigError: no whiskers, or two of one name or in one cell of the grid.
