@@ -12,13 +12,14 @@ SCALE is what a one on the wire stands for, in UNIT; what is stored is SI. Witho
 """
 
 import re
-import tomllib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import msgspec
 import numpy as np
 
+from tactile_rt.settings import convert, read_toml
 from tactile_rt.stream import ArraySpec, ConfigError
 
 __all__ = ["UNITS", "Column", "Element", "LineMapping", "array_of", "parse_column", "read_mapping"]
@@ -126,18 +127,7 @@ def read_mapping(path: str) -> LineMapping:
     Raises:
         ConfigError: it cannot be read or is none; names the file and the key or line.
     """
-    try:
-        with open(path, "rb") as file:
-            fields = tomllib.load(file)
-        mapping = msgspec.convert(fields, LineMapping)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: not a text file") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not TOML: {error}") from None
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {error}") from None
+    mapping: LineMapping = convert(read_toml(Path(path)), LineMapping)
     if mapping.version != VERSION:
         raise ConfigError(f"{path}: version {mapping.version}; this release reads {VERSION}")
     return mapping
