@@ -1,9 +1,8 @@
 """What one device's samples need to become SI loads of the array that a model knows."""
 
-import difflib
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -12,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.calibration.mirroring import Mirror
+from tactile_rt.settings import no_such
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError, SpecMismatch
 
-__all__ = ["Calibration", "check_device", "nearest"]
+__all__ = ["Calibration", "check_device"]
 
 Row = tuple[float, ...]
 
@@ -247,17 +247,9 @@ def check_device(device: str) -> None:
         raise ConfigError(f"device id {device!r}: use letters, digits, '_', '.', ':', '+' and '-'")
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """A phrase for an error's end: the name that was probably meant, or all there are."""
-    names = list(known)
-    plain = {n.casefold(): n for n in names}
-    near = difflib.get_close_matches(name.casefold(), plain, 1)
-    return f"did you mean {plain[near[0]]}?" if near else f"there are {_listed(names) or 'none'}"
-
-
 def _known(key: str, name: str, known: tuple[str, ...], what: str) -> None:
     if name not in known:
-        raise ConfigError(f"{key}: no {what} {name!r}; {nearest(name, known)}")
+        raise ConfigError(f"{key}: {no_such(what, name, known)}")
 
 
 def _sized(key: str, items: tuple[Any, ...], n: int, of: str, what: str = "values") -> None:

@@ -50,7 +50,7 @@ class FittedSVM:
 
     Attributes:
         predict: The machine's decisions, from (sweep, feature) values to (sweep,) labels.
-        how: How the machine was made, in words, for a report.
+        how: A sentence for reports that says how the machine was made.
     """
 
     predict: Predict

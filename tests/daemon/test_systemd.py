@@ -18,7 +18,7 @@ from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.loading import load_config
-from tactile_rt.daemon.runner import _serve
+from tactile_rt.daemon.process import _serve
 from tactile_rt.daemon.systemd import (
     Systemd,
     hanging,

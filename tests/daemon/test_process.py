@@ -14,9 +14,27 @@ import pytest
 
 from tactile_rt.cli import main
 from tactile_rt.daemon.config import EXAMPLE
+from tactile_rt.daemon.process import SIGNALS
 
 PATIENCE_S = 30.0
 RUN = [sys.executable, "-c", "from tactile_rt.cli import main; main()"]
+# Sends itself a signal when it imports for the nth time since it is the daemon; 0: at each time.
+SIGNALLED = """
+import os, signal, sys
+at, number, seen = int(sys.argv.pop(1)), int(sys.argv.pop(1)), 0
+def hook(event, arguments):
+    global seen
+    if event == "import" and signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        seen += 1
+        if at in (0, seen):
+            os.kill(os.getpid(), number)
+sys.addaudithook(hook)
+from tactile_rt.cli import main
+try:
+    main()
+finally:
+    print(seen)
+"""
 SMALL = """version = 1
 [[source]]
 name = "a"
@@ -32,6 +50,15 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     (tmp_path / "robot.toml").write_text(SMALL)
     return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def handlers_as_before():
+    """A process that is to be a daemon notes signals to its end; this one goes on."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
 
 
 @pytest.fixture
@@ -105,6 +132,61 @@ def test_signals_reload_and_stop_and_a_second_one_is_refused(folder, started, mo
     assert states.count(("source.a", "running")) == 1  # it went on undisturbed
     assert ("source.b", "stopped") in states
     assert "Traceback" not in log and "daemon stopping" in log
+
+
+def signalled(folder, at, number, seconds):
+    """A process that is signalled while it starts."""
+    return subprocess.Popen(
+        [sys.executable, "-c", SIGNALLED, str(at), str(int(number)), "run",
+         str(folder / "robot.toml"), "--seconds", str(seconds)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+
+
+def test_a_signal_at_any_moment_of_the_start_ends_it_in_order(folder):
+    """The moments are those at which something is imported: most of the first second."""
+    imports = int(signalled(folder, -1, signal.SIGTERM, 0.1).communicate(timeout=PATIENCE_S)[0])
+    assert imports > 200  # else they are noted too late
+    for number, moments in ((signal.SIGTERM, 6), (signal.SIGINT, 3)):
+        for at in (1 + imports * k // moments for k in range(moments)):
+            code, log = ended(signalled(folder, at, number, PATIENCE_S))
+            assert code == 0 and "Traceback" not in log, (number, at, code, log)
+
+
+def test_a_reload_asked_for_at_every_moment_of_the_start_ends_nothing(folder):
+    process = signalled(folder, 0, signal.SIGHUP, 1.0)
+    code, log = ended(process)
+    assert code == 0 and "Traceback" not in log and "source.a running" in log, (code, log)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_at_any_time_of_the_first_second_does_what_it_should(folder, number):
+    """By the clock, from the moment at which the process takes signals."""
+    for ms in range(0, 1000, 40):
+        with subprocess.Popen(
+            [*RUN, "run", str(folder / "robot.toml")], stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        ) as process:  # fmt: skip
+            end = time.monotonic() + PATIENCE_S
+            while not takes(process, signal.SIGTERM):
+                assert time.monotonic() < end
+            time.sleep(ms / 1000)
+            process.send_signal(number)
+            if number == signal.SIGHUP:
+                await_told(folder, "source.a", "running")
+                process.send_signal(signal.SIGTERM)
+            code, log = ended(process)
+            assert code == 0 and "Traceback" not in log, (ms, code, log)
+        (folder / "out.jsonl").unlink(missing_ok=True)
+
+
+def takes(process, number):
+    """Whether a process has a handler for a signal."""
+    with open(f"/proc/{process.pid}/status") as file:
+        (mask,) = (int(line.split()[1], 16) for line in file if line.startswith("SigCgt"))
+    return bool(mask >> (number - 1) & 1)
 
 
 def test_a_stream_that_is_over_and_a_time_that_is_up_end_it(folder, monkeypatch, capfd):
@@ -215,7 +297,7 @@ def test_config_commands(folder, monkeypatch, capsys):
 
 def test_the_daemon_reaches_nothing_that_a_robot_does_not_have():
     code = (
-        "import sys, tactile_rt.daemon.runner, tactile_rt.daemon.log, "
+        "import sys, tactile_rt.daemon.daemon, tactile_rt.daemon.checks, "
         "tactile_rt.daemon.publishers.jsonl\n"
         "print({'torch', 'mujoco', 'trimesh', 'scipy', 'matplotlib'} & set(sys.modules))"
     )
