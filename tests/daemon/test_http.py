@@ -19,7 +19,7 @@ from tactile_rt.daemon.http import (
     listen,
     parse_head,
 )
-from tests.helpers.published import PATIENCE_S, until
+from tests.helpers.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 LIMITS = HttpLimits(connections=8, head_bytes=1000, head_s=PATIENCE_S, send_s=PATIENCE_S)

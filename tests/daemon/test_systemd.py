@@ -29,8 +29,8 @@ from tactile_rt.daemon.systemd import (
 )
 from tactile_rt.stream import ConfigError, Source
 from tactile_rt.testing import small_spec
-from tests.helpers.published import PATIENCE_S, View, busy_snapshot, event, running
-from tests.helpers.waiting import until
+from tests.helpers.published import View, busy_snapshot, event, running
+from tests.helpers.waiting import PATIENCE_S, until
 
 SMALL = 'version = 1\n[[source]]\nname = "a"\nurl = "synthetic:2x2"\n'
 pytestmark = pytest.mark.usefixtures("no_thread_left")

@@ -134,15 +134,17 @@ class SourceContract:
 
     def test_a_read_without_patience_returns_at_once(self, case: Case) -> None:
         with case.open() as source:
+            took = []
             for _ in range(20):
                 began = time.monotonic()
                 chunk = source.read(timeout=0)
-                assert time.monotonic() - began < AT_ONCE_S
+                took.append(time.monotonic() - began)
                 assert chunk is None or isinstance(chunk, Chunk)
+            assert sorted(took)[10] < AT_ONCE_S  # a busy machine may hold up some of them
 
     def test_closing_ends_it_and_may_be_repeated(self, case: Case) -> None:
         with case.open() as source:
-            assert source.read(5.0) is not None
+            assert source.read(PATIENCE_S) is not None
             source.close()
             source.close()
             for _ in range(2):
