@@ -28,7 +28,7 @@ from bench.daemon.models import finger_array, whisker_array, write_wide_model
 from bench.daemon.peers import Heard, Listening, Ping, listen
 from bench.daemon.process import DaemonProcess, Usage, free_port, until
 from bench.drivers.processes import Helper
-from tactile_rt.recording.reader import is_finished, read_stream
+from tactile_rt.recording.reader import Recording, is_finished
 
 __all__ = ["EVERY_S", "QUICK_S", "WHOLE_S", "WIRES", "Soak", "configuration", "recorded", "soak"]
 
@@ -197,7 +197,7 @@ def _queued(state: dict[str, Any]) -> dict[str, int]:
 def recorded(files: list[Path], source: str) -> Recorded:
     """What is in the recordings of one array."""
     seq, t_ns = array("q"), array("q")  # an hour's chunks would not fit into memory
-    for chunk in (c for f in files if f.name.startswith(f"{source}-") for c in read_stream(f)):
+    for chunk in (c for f in files if f.name.startswith(f"{source}-") for c in Recording(f)):
         seq.frombytes(chunk.seq.tobytes())
         t_ns.frombytes(chunk.t_ns.tobytes())
     return Recorded(np.array(seq, np.int64), np.array(t_ns, np.int64))

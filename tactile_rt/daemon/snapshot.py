@@ -5,6 +5,7 @@ Counts only ever grow while the daemon runs, also over restarts of a part.
 
 from dataclasses import dataclass, field
 
+from tactile_rt.bounded_queue import QueueState
 from tactile_rt.drivers.health import Health
 from tactile_rt.stream import SourceStats
 
@@ -38,21 +39,6 @@ class Latency:
     max_ms: float = 0.0
     edges_s: tuple[float, ...] = ()
     buckets: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True)
-class QueueState:
-    """A mailbox. In each class of items: put = taken + dropped + waiting.
-
-    The classes are ``samples`` (counted by sample), ``packets``, ``decisions`` and ``events`` (all
-    else).
-    """
-
-    waiting: dict[str, int] = field(default_factory=dict)
-    put: dict[str, int] = field(default_factory=dict)
-    taken: dict[str, int] = field(default_factory=dict)
-    dropped: dict[str, int] = field(default_factory=dict)
-    waiting_bytes: int = 0
 
 
 @dataclass(frozen=True)

@@ -19,23 +19,14 @@ from hypothesis import strategies as st
 from tactile_rt.calibration import Calibration, save_calibration
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
-from tactile_rt.recording import (
-    Description,
-    StreamWriter,
-    read_description,
-    read_health,
-    read_packets,
-    read_stream,
-    recover,
-    writer,
-)
+from tactile_rt.recording import Description, Recording, StreamWriter, recover, writer
 from tactile_rt.recording.layout import (
     decode_packet,
     decode_samples,
     encode_packet,
     encode_samples,
 )
-from tactile_rt.recording.mcap_file import McapFile
+from tactile_rt.recording.writer import McapFile
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, RecordingError, concatenate
 from tactile_rt.sweep_set import SweepManifest, write_object
@@ -91,7 +82,7 @@ def path(tmp_path):
 def test_chunks_come_back_bit_for_bit(path, no_thread_left):
     chunks = odd_chunks()
     write(path, chunks)
-    back = list(read_stream(path))
+    back = list(Recording(path))
     assert all_parts(back) == all_parts(chunks)
     assert [c.values.dtype for c in back] == [np.float32] * len(chunks)
     assert back[0].values.flags.writeable  # its reader's own
@@ -100,7 +91,7 @@ def test_chunks_come_back_bit_for_bit(path, no_thread_left):
 def test_a_description_comes_back(path):
     before = time.time_ns() - time.monotonic_ns()
     write(path, odd_chunks(), session={"who": "Ada", "why": "a test"}, url="array:x")
-    about = read_description(path)
+    about = Recording(path).description
     assert about.spec == SPEC
     assert about.session == {"who": "Ada", "why": "a test"}
     assert (about.source, about.wire, about.codec) == ("array:x", "", "")
@@ -226,13 +217,13 @@ def test_any_mcap_reader_reads_it_by_the_schemas_in_the_file(path):
         values = np.array(fields["values"], np.float32)
         assert values.tobytes() == chunk.values.tobytes()
         assert fields["valid"] == chunk.valid.ravel().tolist()
-        assert message.log_time == chunk.t_ns[-1] + read_description(path).utc_offset_ns
+        assert message.log_time == chunk.t_ns[-1] + Recording(path).description.utc_offset_ns
 
 
 @pytest.mark.parametrize("make", [FakeSerial, FakeCan])
 def test_packets_are_read_by_their_schema(make, path):
     record_device(make(noise(50, (4, 6)), pace="fast"), path, 50)
-    packets = list(read_packets(path))
+    packets = list(Recording(path).packets())
     from mcap.reader import make_reader
 
     with path.open("rb") as file:
@@ -241,7 +232,7 @@ def test_packets_are_read_by_their_schema(make, path):
         ):
             fields = cdr(schema.data.decode(), message.data)
             assert fields["opened"] == (packet is None)
-            assert message.log_time - read_description(path).utc_offset_ns == t_ns
+            assert message.log_time - Recording(path).description.utc_offset_ns == t_ns
             if make is FakeSerial:
                 assert bytes(fields["data"]) == (packet or b"")
             else:
@@ -295,7 +286,7 @@ def test_packets_decode_again_as_they_did_live(device, path, no_thread_left):
     again, source = replayed(path)
     assert all_parts(again) == all_parts(chunks)
     assert source.stats == stats
-    assert all_parts(read_stream(path)) == all_parts(chunks)
+    assert all_parts(Recording(path)) == all_parts(chunks)
 
 
 def test_damage_and_a_reconnection_decode_again_as_they_did_live(path, tmp_path):
@@ -312,7 +303,7 @@ def test_damage_and_a_reconnection_decode_again_as_they_did_live(path, tmp_path)
 
     chunks, stats = record_device(fake, path, 600, during)
     assert len(unplugged) == 3 or len(unplugged) == 4
-    assert sum(packet is None for packet, _ in read_packets(path)) >= 3
+    assert sum(packet is None for packet, _ in Recording(path).packets()) >= 3
     assert min(stats.corrupt, stats.missing, stats.duplicates) > 0
     again, source = replayed(path)
     assert all_parts(again) == all_parts(chunks)
@@ -321,7 +312,7 @@ def test_damage_and_a_reconnection_decode_again_as_they_did_live(path, tmp_path)
 
 def test_a_device_s_own_clock_is_the_replay_s(path):
     chunks, _ = record_device(FakeSerial(noise(100, (4, 6))), path, 100, suffix="&clock=device")
-    assert read_description(path).clock == "device"
+    assert Recording(path).description.clock == "device"
     assert all_parts(replayed(path)[0]) == all_parts(chunks)
 
 
@@ -332,7 +323,7 @@ def test_a_calibration_is_applied_again(path, tmp_path):
     file = save_calibration(calibration, tmp_path / "it.toml")
     fake = FakeSerial(noise(100, (4, 6)))
     chunks, _ = record_device(fake, path, 100, suffix=f"&calibration={file}")
-    assert read_description(path).calibration == calibration
+    assert Recording(path).description.calibration == calibration
     assert all_parts(replayed(path)[0]) == all_parts(chunks)
     whole = concatenate(chunks)
     expected = 2 * (noise(100, (4, 6)) - np.array([0.5, 0, 0, 0], np.float32)[:, None])
@@ -343,7 +334,7 @@ def test_options_of_a_codec_are_recorded_and_may_be_replaced(path, tmp_path):
     columns = "A0.fx:N,A0.fy:N"
     fake = FakeSerial(noise(40, (1, 2)), "ascii_line", options={"columns": columns}, pace="fast")
     chunks, _ = record_device(fake, path, 40)
-    about = read_description(path)
+    about = Recording(path).description
     assert (about.wire, about.codec) == ("serial", "ascii_line")
     assert about.codec_options == {"columns": columns}
     assert all_parts(replayed(path)[0]) == all_parts(chunks)
@@ -368,7 +359,7 @@ def test_health_is_told_when_it_changes(path, tmp_path):
             away[0] = float("inf")
 
     record_device(fake, path, 400, during)
-    told = list(read_health(path))
+    told = list(Recording(path).health())
     states = [h["state"] for h in told]
     assert states[0] == "connecting"
     assert states[-1] == "closed"
@@ -416,7 +407,7 @@ def decisions_of(url, model):
             chunks.append(parts(chunk))
             decisions += [
                 msgspec.json.encode({**d.__dict__, "probabilities": d.probabilities.tolist(),
-                                     "latency_s": 0})
+                                     "latency_s": 0, "late": False})
                 for d in classifier.push(chunk)
             ]  # fmt: skip
     return chunks, decisions
@@ -572,11 +563,13 @@ def test_what_a_slow_disk_has_no_room_for_is_counted_and_told(path, disk, no_thr
         assert time.monotonic() - began < 5  # a stuck disk holds nobody up
         assert recorder.stats.dropped_samples > 2000
         disk[0].open.set()
-    stats, back = recorder.stats, list(read_stream(path))
+    stats, back = recorder.stats, list(Recording(path))
     assert sum(map(len, back)) == stats.samples
     assert stats.samples + stats.dropped_samples == 3000
     assert parts(back[-1]) == parts(chunks[-1])  # the oldest went
-    assert list(read_health(path))[-1]["recorder"]["dropped_samples"] == stats.dropped_samples
+    assert (
+        list(Recording(path).health())[-1]["recorder"]["dropped_samples"] == stats.dropped_samples
+    )
     kept = {parts(c) for c in chunks}
     assert all(parts(c) in kept for c in back)
 
@@ -587,7 +580,7 @@ def test_a_source_that_can_wait_waits_for_a_slow_disk(path, disk):
         for chunk in chunks:
             recorder.push(chunk)
     assert recorder.stats.dropped_samples == 0
-    assert all_parts(read_stream(path)) == all_parts(chunks)
+    assert all_parts(Recording(path)) == all_parts(chunks)
 
 
 def test_a_full_disk_is_told_and_what_is_written_can_be_recovered(path, disk, no_thread_left):
@@ -603,7 +596,7 @@ def test_a_full_disk_is_told_and_what_is_written_can_be_recovered(path, disk, no
     with pytest.raises(RecordingError, match="No space left"):
         recorder.close()
     recorder.close()
-    back = list(read_stream(recover(path)))
+    back = list(Recording(recover(path)))
     assert 0 < len(back)
     assert all_parts(back) == all_parts(chunks[: len(back)])
 
@@ -632,14 +625,14 @@ def test_of_a_killed_recorder_all_but_the_last_second_is_recovered(seconds, path
         process.kill()
         last = int((process.stdout.read().splitlines() or ["0"])[-1].split()[0])
     with pytest.raises(RecordingError, match="cut short"):
-        list(read_stream(path))
+        list(Recording(path))
     back = recover(path)
     assert back.name == "run.recovered.mcap"
-    chunks = list(read_stream(back))
+    chunks = list(Recording(back))
     seq = np.concatenate([[-1], *(c.seq for c in chunks)])
     assert np.array_equal(seq, np.arange(-1, len(seq) - 1))
     assert seq[-1] >= last - 1000  # at 1 kHz
-    assert read_description(back).recovered
+    assert Recording(back).description.recovered
 
 
 @pytest.fixture(scope="module")
@@ -668,7 +661,7 @@ def cut_short(whole, tmp_path, at):
     path = tmp_path / "cut.mcap"
     path.write_bytes(data[:at])
     with pytest.raises(RecordingError, match=re.escape(str(path))):
-        list(read_stream(path))
+        list(Recording(path))
     kept = 3 * sum(end <= at for end in ends)
     try:
         back = recover(path, tmp_path / "out.mcap", force=True)
@@ -677,9 +670,9 @@ def cut_short(whole, tmp_path, at):
         assert str(path) in str(error)
         assert list(tmp_path.iterdir()) == [path]  # nothing half-written
         return False
-    assert all_parts(read_stream(back)) == all_parts(chunks[:kept])
-    assert read_description(back).spec == SPEC
-    assert read_description(back).session == {"a": "b"}
+    assert all_parts(Recording(back)) == all_parts(chunks[:kept])
+    assert Recording(back).description.spec == SPEC
+    assert Recording(back).description.session == {"a": "b"}
     back.unlink()
     return True
 
@@ -702,7 +695,7 @@ def test_damaged_anywhere_nothing_is_misread(whole, tmp_path_factory, at, damage
     path.write_bytes(data[:begin] + damage + data[begin + len(damage) :])
     back = []
     try:
-        back += read_stream(path)
+        back += Recording(path)
     except RecordingError as error:
         assert str(path) in str(error)
     else:
@@ -714,7 +707,7 @@ def test_damaged_anywhere_nothing_is_misread(whole, tmp_path_factory, at, damage
         assert str(path) in str(error)
         return
     known = all_parts(chunks)
-    order = [known.index(p) for p in all_parts(read_stream(out))]
+    order = [known.index(p) for p in all_parts(Recording(out))]
     assert order == sorted(order)
 
 
@@ -726,8 +719,8 @@ def test_a_piece_damaged_in_the_middle_is_left_out(whole, tmp_path):
     path.write_bytes(spoilt)
     back = []
     with pytest.raises(RecordingError, match="is damaged"):
-        back += read_stream(path)
-    kept = all_parts(read_stream(recover(path)))
+        back += Recording(path)
+    kept = all_parts(Recording(recover(path)))
     assert kept == all_parts(chunks[:9] + chunks[12:])
 
 
@@ -772,7 +765,7 @@ def newer(path):
 )
 def test_what_is_no_recording_is_named(make, kind, said, path):
     make(path)
-    for read in (read_description, lambda p: list(read_stream(p)), recover):
+    for read in (Recording, lambda p: list(Recording(p)), recover):
         with pytest.raises(kind, match=said) as caught:
             read(path)
         assert "\n" not in str(caught.value)
@@ -785,7 +778,7 @@ def test_a_file_that_is_there_is_not_written_over(path):
         StreamWriter(path, ArraySource(SPEC, []))
     assert path.read_bytes() == b"precious"
     write(path, cut(noise(10), 1000.0), force=True)
-    assert len(list(read_stream(path))) == 2
+    assert len(list(Recording(path))) == 2
     with pytest.raises(ConfigError, match="no folder"):
         StreamWriter(path.parent / "none" / "x.mcap", ArraySource(SPEC, []))
 
@@ -797,8 +790,8 @@ def test_without_the_extra_it_says_what_to_install(path, monkeypatch):
     monkeypatch.setitem(sys.modules, "mcap", None)
     for use in (
         lambda: StreamWriter(path, ArraySource(SPEC, [])),
-        lambda: read_description(path),
-        lambda: list(read_stream(path)),
+        lambda: Recording(path).description,
+        lambda: list(Recording(path)),
         lambda: recover(path),
         lambda: open_source(f"replay:{path}"),
     ):
@@ -808,7 +801,7 @@ def test_without_the_extra_it_says_what_to_install(path, monkeypatch):
 
 def test_readers_may_stop_early(path):
     write(path, cut(noise(100), 1000.0))
-    with closing(read_stream(path)) as chunks:
+    with closing(Recording(path).chunks()) as chunks:
         next(chunks)
     with open_source(f"replay:{path}") as source:
         source.read()

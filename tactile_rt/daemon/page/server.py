@@ -10,7 +10,6 @@ cannot keep up loses the oldest lines and nobody waits for them.
 """
 
 import asyncio
-from collections import deque
 from collections.abc import Awaitable, Callable
 from importlib.resources import files
 from typing import Any
@@ -19,6 +18,7 @@ from urllib.parse import parse_qs
 import msgspec
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from tactile_rt.bounded_queue import BoundedQueue
 from tactile_rt.daemon.page.feed import Line
 from tactile_rt.daemon.page.guard import HEADERS, Guard, Refused
 
@@ -78,17 +78,18 @@ class Client:
 
     def __init__(self, source: str) -> None:
         self.source = source
-        self.dropped = 0
-        self._lines: deque[bytes] = deque()
+        self._lines = BoundedQueue[bytes](MAX_LINES)
         self._some = asyncio.Event()
         self._over = False
 
+    @property
+    def dropped(self) -> int:
+        """How many lines went because there were too many."""
+        return self._lines.dropped["items"]
+
     def put(self, line: bytes) -> None:
         """One more."""
-        if len(self._lines) >= MAX_LINES:
-            self._lines.popleft()
-            self.dropped += 1
-        self._lines.append(line)
+        self._lines.put(line)
         self._some.set()
 
     def end(self) -> None:
@@ -100,9 +101,7 @@ class Client:
         """All that wait, as soon as there are any; empty at the end."""
         await self._some.wait()
         self._some.clear()
-        lines = b"".join(self._lines)
-        self._lines.clear()
-        return b"" if self._over else lines
+        return b"" if self._over else b"".join(self._lines.take(0))
 
 
 class App:
