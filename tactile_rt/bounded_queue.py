@@ -139,7 +139,7 @@ class BoundedQueue(Generic[T]):
             if not self._queue:
                 self._wait(lambda: self._queue or self._closed, timeout)
             if self._gather_s and self._queue:
-                self._changed.wait_for(
+                self._wait(
                     lambda: self._urgent_ones or self._closed or len(self._queue) >= self._half,
                     self._gather_s,
                 )
@@ -201,6 +201,7 @@ class BoundedQueue(Generic[T]):
         )
 
     def _wait(self, until: Callable[[], object], timeout: float | None) -> None:
+        """Wait, and be known to: nobody else is told of a change."""
         self._waiting += 1
         try:
             self._changed.wait_for(until, timeout)

@@ -128,6 +128,7 @@ def test_all_that_happens_is_in_the_file(daemon, tmp_path):
 
 
 def test_a_decision_about_the_last_samples_comes_after_the_end(daemon, tmp_path, monkeypatch):
+    monkeypatch.setattr("tactile_rt.daemon.recorder.LINGER_NS", 10**15)
     made = begun(daemon, tmp_path, min_free_mb=0)
     made.handle([opened(), samples(cut(VALUES, 1000.0)[0]), Closed("whiskers", "over", 0)])
     made.handle([decision()])
@@ -203,17 +204,17 @@ def test_files_are_rotated_by_size_and_time_and_nothing_is_lost_between(config, 
 
 
 def test_a_trigger_keeps_what_came_before_it_and_after(daemon, tmp_path):
-    made = begun(daemon, tmp_path, min_free_mb=0, mode="trigger", before_s=0.05, after_s=0.1)
+    made = begun(daemon, tmp_path, min_free_mb=0, mode="trigger", before_s=100, after_s=1000)
     chunks = cut(VALUES, 1000.0)
     made.handle([opened()])
     now = time.monotonic_ns()
-    early = [samples(c, at=now - 10**9) for c in chunks[:2]]  # too long before
+    early = [samples(c, at=now - 10**12) for c in chunks[:2]]  # too long before
     made.handle([*early, samples(chunks[2], at=now - 10**7)])
     look(made)
     assert files(tmp_path) == []
     made.handle([Contact("whiskers", "best", "mount", True, time.monotonic_ns(), UTC)])
     made.handle([samples(chunks[3])])
-    time.sleep(0.15)
+    made._tracks["whiskers"].until_ns = 1  # it is over
     look(made)
     made.handle([samples(chunks[4])])
     (path,) = files(tmp_path)
@@ -270,3 +271,14 @@ def test_what_a_killed_recorder_left_is_named_and_can_be_recovered(daemon, tmp_p
     assert "tactile-rt recover" in reason
     assert level == "warning"
     same(recover(path), chunks)
+
+
+def test_what_one_left_who_was_killed_as_it_began_a_file_is_cleared_away(daemon, tmp_path):
+    old, new, other = (tmp_path / n for n in (".a.1.mcap.part", ".b.2.mcap.part", ".c.part"))
+    for path in (old, new, other):
+        path.write_bytes(b"")
+    for path in (old, other):
+        os.utime(path, (1e9, 1e9))
+    begun(daemon, tmp_path, min_free_mb=0).close()
+    assert sorted(tmp_path.iterdir()) == [new, other]
+    assert daemon.told == []
