@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any
 from tactile_rt.version import VERSION as __version__
 
 if TYPE_CHECKING:
-    from tactile_rt.classifier.classifier import Classifier
-    from tactile_rt.classifier.decisions import Classification, fuse
+    from tactile_rt.classifier.classifier import Classification, Classifier, fuse
     from tactile_rt.classifier.model_file import load_model, shipped_model
     from tactile_rt.classifier.session import Session
     from tactile_rt.drivers.codec import Codec
@@ -62,11 +61,11 @@ __all__ = [
 
 _STREAM = "tactile_rt.stream"
 _WHERE = {
-    "Classification": "tactile_rt.classifier.decisions",
+    "Classification": "tactile_rt.classifier.classifier",
     "Classifier": "tactile_rt.classifier.classifier",
     "Codec": "tactile_rt.drivers.codec",
     "Session": "tactile_rt.classifier.session",
-    "fuse": "tactile_rt.classifier.decisions",
+    "fuse": "tactile_rt.classifier.classifier",
     "load_model": "tactile_rt.classifier.model_file",
     "open_source": "tactile_rt.sources.opening",
     "shipped_model": "tactile_rt.classifier.model_file",

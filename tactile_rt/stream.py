@@ -79,16 +79,16 @@ class ArraySpec:
     """What a sensor array is. Hashable; travels inside recordings and models.
 
     Attributes:
-        name: what the array is called, e.g. ``mouse-right``.
-        elements: names of the whiskers or taxels.
-        grid: (row, column) of each element on the array's topological grid, from 0.
-        positions: base point (x, y, z) of each element in the mount frame, m.
-        orientations: unit quaternion (w, x, y, z) that turns each element's own frame into the
-            mount frame.
-        channels: names of what each element measures, e.g. ``fx``.
-        units: SI unit of each channel, e.g. ``N``.
-        rate_hz: nominal sample rate, Hz.
-        frame: name of the mount frame (right-handed).
+        name: The name of the array, e.g. ``mouse-right``.
+        elements: The names of the elements, whiskers or taxels, in the order of every sample.
+        grid: The place (row, column) of each element on the array's topological grid, from 0.
+        positions: The base point (x, y, z) of each element in the mount frame, m.
+        orientations: The unit quaternion (w, x, y, z) that turns each element's own frame into
+            the mount frame.
+        channels: The names of the quantities that each element measures, e.g. ``fx``.
+        units: The SI unit of each channel, e.g. ``N``.
+        rate_hz: The nominal sample rate, Hz.
+        frame: The name of the mount frame, which is right-handed.
 
     Raises:
         ConfigError: lengths disagree, names repeat, two elements share a grid cell, a pose is not
@@ -196,7 +196,7 @@ class Chunk:
     Attributes:
         seq: (n,) int64 sequence number of each sample; a gap means lost samples.
         t_ns: (n,) int64 host CLOCK_MONOTONIC at which each sample was taken, ns.
-        values: (n, element, channel) float32, SI units.
+        values: (n, element, channel) float32 measurements in the units of the channels.
         valid: (n, element) bool; False where the element has no trustworthy value.
     """
 
@@ -238,6 +238,13 @@ class SourceStats:
 
     ``sent + duplicated = delivered + corrupt + missing + dropped + duplicates`` where `sent` and
     `duplicated` are the sender's side.
+
+    Attributes:
+        delivered: Samples that reached the reader.
+        corrupt: Samples that came damaged and were thrown away.
+        missing: Samples that never came, as the gaps in the device's counter show.
+        dropped: Samples that came and were thrown away because nobody read them in time.
+        duplicates: Samples that came a second time and were thrown away.
     """
 
     delivered: int = 0
@@ -254,10 +261,10 @@ class Source(abc.ABC):
     A source is its own context manager and iterates over its chunks until it ends.
 
     Attributes:
-        spec: what the samples are.
-        stats: samples counted so far.
-        live: whether samples come whether or not anyone reads (a device, a real-time simulation);
-            a source that is not live waits for its reader.
+        spec: The array that the samples are of.
+        stats: The account of samples delivered and lost since the source was opened.
+        live: True if samples come whether or not anyone reads them, as of a device or a
+            simulation in real time; a source that is not live waits for its reader.
     """
 
     live = True  # a class attribute, not a field: most implementations never change it

@@ -53,16 +53,17 @@ class SweepManifest:
     """What a sweep set is.
 
     Attributes:
-        spec: the array.
-        period_ns: sample period of the stored arrays, ns.
-        lead: samples at the start of every sweep before the object can touch.
-        categories: class names; a label is an index into them.
-        split: object names per split, each name ``category-index`` unless `category_of` has it.
-        recipe: what made the set (profile, seed, sweeps per object ...), for provenance.
-        withheld: categories of the split "withheld".
-        category_of: category of objects whose name does not tell it.
-        versions: of what made the set (mujoco, numpy, ...).
-        settings: of the simulation profile.
+        spec: The description of the array.
+        period_ns: The sample period of the stored arrays, ns.
+        lead: The number of samples at the start of every sweep before the object can touch.
+        categories: The names of the classes; a label is an index into them.
+        split: The object names of each split, each ``category-index`` unless `category_of` has it.
+        recipe: What made the set (profile, seed, sweeps per object ...), for provenance.
+        withheld: The categories of the split "withheld".
+        category_of: The category of objects whose name does not tell it.
+        versions: The versions of what made the set (mujoco, numpy, ...).
+        settings: The settings of the simulation profile.
+        version: The version of the set's format.
     """
 
     spec: ArraySpec
@@ -183,11 +184,11 @@ class Sweeps:
     """Sweeps in memory.
 
     Attributes:
-        values: (sweep, sample, element, channel) float32, SI, on the set's period.
-        labels: (sweep,) int64 index into the manifest's categories; -1: withheld from training.
-        objects: (sweep,) str object name; sweeps of one object share it.
-        contacts: (sweep, sample, element) float32, arc length (m) from the whisker's base to where
-            it touches, NaN where it does not; None: the set was made without.
+        values: The (sweep, sample, element, channel) float32 loads, SI, on the set's period.
+        labels: The (sweep,) int64 index into the manifest's categories; -1: withheld from training.
+        objects: The (sweep,) names of the objects; sweeps of one object share the name.
+        contacts: The (sweep, sample, element) float32 arc length (m) from the whisker's base to
+            where it touches, NaN where it does not; None: the set was made without.
     """
 
     values: NDArray[np.float32]

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_rt.bounded_queue import BoundedQueue
+from tests.helpers.waiting import PATIENCE_S, until
 
-PATIENCE_S = 20.0
 KINDS = ("a", "b")
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
@@ -83,10 +83,12 @@ def test_a_plain_one_counts_items():
 def test_a_reader_is_woken_by_an_item_and_by_the_end(way):
     made, found = queue(), []
     reader = started(lambda: found.append(getattr(made, way)()))
+    until(lambda: made._waiting)
     made.put(("a", 1, 1))
     reader.join(PATIENCE_S)
     assert found == [("a", 1, 1)] or found == [[("a", 1, 1)]]
     reader = started(lambda: found.append(getattr(made, way)()))
+    until(lambda: made._waiting)
     made.close()
     reader.join(PATIENCE_S)
     assert not found[1]
@@ -100,6 +102,7 @@ def test_gathering_ends_with_what_is_urgent_and_when_it_is_half_full():
         reader = started(lambda made=made, found=found: found.extend(made.take()))
         for _ in range(3):
             made.put(("a", 1, 0))
+        until(lambda made=made: made._waiting)
         assert not found
         made.put(last)
         reader.join(PATIENCE_S)
@@ -112,6 +115,7 @@ def test_room_is_made_by_a_reader_and_nobody_waits_for_a_closed_one(full):
     for _ in range(4):
         made.put(("a", 1, 25 if full == "bytes" else 0))
     waited = started(lambda: made.wait_for_room(1000.0))
+    until(lambda: made._waiting)
     made.get()
     assert waited.is_alive()
     made.get()
@@ -121,6 +125,7 @@ def test_room_is_made_by_a_reader_and_nobody_waits_for_a_closed_one(full):
         made.put(("a", 1, 25))
     made.wait_for_room(0.0)
     waited = started(lambda: made.wait_for_room(1000.0))
+    until(lambda: made._waiting)
     made.close()
     waited.join(PATIENCE_S)
     assert not waited.is_alive()

@@ -18,9 +18,9 @@ LINKS = ("drivers", "export", "models", "sim_backend")
 # What a robot has none of.
 HEAVY = ("torch", "mujoco", "trimesh", "scipy", "onnx", "onnxscript", "sklearn", "matplotlib")
 ONBOARD = (
-    "calibration", "classifier.classifier", "classifier.session", "cli", "daemon.runner",
-    "drivers.opening", "recording", "settings", "sources.combined", "sources.opening", "stream",
-    "sweep_set", "testing",
+    "calibration", "classifier.classifier", "classifier.contact_point", "classifier.session",
+    "cli", "daemon.daemon", "drivers.opening", "recording", "settings", "sources.combined",
+    "sources.opening", "stream", "sweep_set", "testing",
 )  # fmt: skip
 
 MODULES = sorted(m.name for m in pkgutil.walk_packages([str(PACKAGE)], "tactile_rt."))

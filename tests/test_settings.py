@@ -33,9 +33,9 @@ def test_each_takes_what_it_knows():
     ("fields", "said"),
     [
         ({"bade": "1"}, "sensor has no option 'bade'; did you mean ba"),
-        ({"zzz": "1"}, "sensor has no option 'zzz'; it takes baud, dtr"),
-        ({"baud": "fast"}, "sensor: Expected `int`"),
-        ({"dtr": "maybe"}, "sensor: Expected `bool`"),
+        ({"zzz": "1"}, "sensor has no option 'zzz'; there are baud, dtr"),
+        ({"baud": "fast"}, "sensor: baud: expected a whole number, got 'fast'"),
+        ({"dtr": "maybe"}, "sensor: dtr: expected true or false, got 'maybe'"),
     ],
 )
 def test_a_mistake_is_named(fields, said):

@@ -1,18 +1,34 @@
 """Whether every sample that an array took is delivered, or counted for what became of it."""
 
+from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.daemon.arrays import Played
-from tactile_rt.drivers.emulation.damage import Fate
+from bench.emulated import Played
+from tactile_rt.drivers.emulation.faults import Fate
+from tactile_rt.recording.reader import Recording
 
-__all__ = ["Account", "account"]
+__all__ = ["Account", "RecordedSamples", "account", "recorded"]
 
 GONE = (Fate.DROPPED, Fate.OVERFLOWED, Fate.UNHEARD)
 HURT = (Fate.CORRUPTED, Fate.TRUNCATED)
+
+
+@dataclass(frozen=True)
+class RecordedSamples:
+    """All samples of one array in its recordings.
+
+    Attributes:
+        seq: (m,) number of each sample.
+        t_ns: (m,) stream time of each sample, ns.
+    """
+
+    seq: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -20,17 +36,26 @@ class Account:
     """One array's samples.
 
     Attributes:
-        unbalanced: samples by which sent + duplicated differs from the sum of all that is counted.
-        unexplained: sent whole over a line that was up, and not recorded; or recorded though they
-            were not sent, twice, or though they were never measured.
-        miscounted: by how many samples a cause differs from what the array did.
-        told: in words.
+        unbalanced: Samples by which sent + duplicated differs from the sum of all that is counted.
+        unexplained: Samples sent whole over a line that was up, and not recorded; or recorded
+            though they were not sent, twice, or though they were never measured.
+        miscounted: Samples by which the count of a cause differs from what the array did.
+        told: The account in words.
     """
 
     unbalanced: int
     unexplained: int
     miscounted: int
     told: str
+
+
+def recorded(files: list[Path], source: str) -> RecordedSamples:
+    """What is in the recordings of one array."""
+    seq, t_ns = array("q"), array("q")  # an hour's chunks would not fit into memory
+    for chunk in (c for f in files if f.name.startswith(f"{source}-") for c in Recording(f)):
+        seq.frombytes(chunk.seq.tobytes())
+        t_ns.frombytes(chunk.t_ns.tobytes())
+    return RecordedSamples(np.array(seq, np.int64), np.array(t_ns, np.int64))
 
 
 def account(wire: str, played: Played, stats: Mapping[str, int], seq: NDArray[np.int64]) -> Account:

@@ -2,8 +2,8 @@
 
 from bench.daemon.chaos import chaos
 from bench.daemon.kills import kill_nine
-from bench.daemon.soak import QUICK_S, WHOLE_S, soak
-from bench.daemon.soak_figures import soak_records
+from bench.daemon.soak import soak_records
+from bench.daemon.soak_rig import QUICK_S, WHOLE_S, soak
 from tactile_rt.evidence.records import Record
 
 __all__ = ["run"]

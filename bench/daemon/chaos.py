@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from bench.daemon.accounts import account
+from bench.daemon.accounts import account, recorded
 from bench.daemon.disk import disk_full
-from bench.daemon.scene import Scene
-from bench.daemon.soak import recorded
+from bench.daemon.disturbed import DisturbedDaemon
 from tactile_rt.evidence.records import Record
 from tactile_rt.stream import NS_PER_S
 
@@ -29,7 +28,7 @@ ONCE, PERHAPS = (1, 1), (0, 1)
 DAEMON = {("daemon", "degraded"): PERHAPS, ("daemon", "running"): PERHAPS}
 
 
-def _unplug(scene: Scene, n: int) -> float:
+def _unplug(scene: DisturbedDaemon, n: int) -> float:
     array, since = scene.arrays["whiskers"], scene.mark()
     array.ask("unplug")
     scene.await_told(since, "source.whiskers", "device:lost")
@@ -39,7 +38,7 @@ def _unplug(scene: Scene, n: int) -> float:
     return (told.t_ns - plugged) / NS_PER_S
 
 
-def _replace_model(scene: Scene, n: int) -> float:
+def _replace_model(scene: DisturbedDaemon, n: int) -> float:
     """By what is no model, which is refused; then by a good one, which is taken."""
     good, since, new = scene.model.read_bytes(), scene.mark(), scene.model.with_suffix(".new")
     new.write_bytes(GARBAGE)
@@ -54,7 +53,7 @@ def _replace_model(scene: Scene, n: int) -> float:
     return (told.t_ns - back) / NS_PER_S
 
 
-def _stop_reading(scene: Scene, n: int) -> float:
+def _stop_reading(scene: DisturbedDaemon, n: int) -> float:
     since = scene.mark()
     scene.read_pipe(False)
     scene.await_told(since, "publisher.jsonl", "stalled")
@@ -64,7 +63,7 @@ def _stop_reading(scene: Scene, n: int) -> float:
     return (told.t_ns - again) / NS_PER_S
 
 
-def _lose_peer(scene: Scene, n: int) -> float:
+def _lose_peer(scene: DisturbedDaemon, n: int) -> float:
     """A subscriber that is gone without a word, and the next one."""
     import zmq
 
@@ -83,13 +82,13 @@ def _lose_peer(scene: Scene, n: int) -> float:
     return took
 
 
-def _step_clock(scene: Scene, n: int) -> float:
+def _step_clock(scene: DisturbedDaemon, n: int) -> float:
     since, now = scene.mark(), time.monotonic_ns()
     scene.clock.off_ns = 0 if n % 2 else round(STEP_S * NS_PER_S)
     return (scene.await_told(since, "daemon", "clock").t_ns - now) / NS_PER_S
 
 
-def _flood(scene: Scene, n: int) -> float:
+def _flood(scene: DisturbedDaemon, n: int) -> float:
     """More connections than the page takes; then one that asks for it."""
     port = scene.ports["page"]
     with ExitStack() as stack:
@@ -113,7 +112,7 @@ def _flood(scene: Scene, n: int) -> float:
 
 
 # name: (what to do, what may be told of it, stated time to recover in s, in words)
-KINDS: dict[str, tuple[Callable[[Scene, int], float], Expected, float, str]] = {
+KINDS: dict[str, tuple[Callable[[DisturbedDaemon, int], float], Expected, float, str]] = {
     "unplugged": (
         _unplug,
         DAEMON | {
@@ -151,7 +150,7 @@ def chaos(quick: bool) -> list[Record]:
     """Every disturbance in turn, then the disk that is full."""
     times = QUICK if quick else WHOLE
     records = []
-    with Scene() as scene:
+    with DisturbedDaemon() as scene:
         for name, (disturb, expected, stated, what) in KINDS.items():
             took, wrong, starved = [], [], 0
             for n in range(times):
@@ -198,13 +197,13 @@ def _figures(
     ]  # fmt: skip
 
 
-def _starved(scene: Scene, since: int, expected: Expected) -> bool:
+def _starved(scene: DisturbedDaemon, since: int, expected: Expected) -> bool:
     """Whether an array that nobody touched told anything: then more is told, and rightly so."""
     devices = {t.part for t in scene.all_told(since) if t.state.startswith("device:")}
     return bool(devices - {part for part, _ in expected})
 
 
-def _unexpected(scene: Scene, since: int, expected: Expected) -> list[str]:
+def _unexpected(scene: DisturbedDaemon, since: int, expected: Expected) -> list[str]:
     """What was told too often, not at all, or though nothing of it was to be told."""
     counts: dict[tuple[str, str], int] = {}
     for told in scene.all_told(since):

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.daemon.scene import Scene
-from bench.daemon.soak import recorded
+from bench.daemon.accounts import recorded
+from bench.daemon.disturbed import DisturbedDaemon
 from tactile_rt.evidence.records import Record
 from tactile_rt.recording import recover
 from tactile_rt.recording.reader import is_finished
@@ -24,7 +24,7 @@ FULL = "File too large"
 
 def disk_full(times: int) -> list[Record]:
     """The recorder of a daemon that may write no file longer than 256 KiB."""
-    with Scene(before=_limit) as scene:
+    with DisturbedDaemon(before=_limit) as scene:
         since, began = scene.mark(), time.monotonic()
         folder, seen = scene.folder / "recordings", 0
         took: list[float] = []

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.daemon.process import DaemonProcess, free_port
+from bench.emulated import ArrayScript, EmulatedArray
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.drivers.emulation.damage import Fate
+from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.evidence.records import Record
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.redecoding import compare_decoding
 from tactile_rt.stream import Chunk, ConfigError, RecordingError, concatenate
-from tactile_rt.testing import FakeSerial
 
 __all__ = ["Killed", "kill_nine", "killed_once", "records_of"]
 
@@ -46,14 +46,15 @@ class Killed:
     """What was left of one recording.
 
     Attributes:
-        after_s: from the first sample that the device sent to the kill, s.
-        lost_s: from when the device sent the first sample that is lost to the kill, s.
-        files: of the recording; `cut`: those that had no end.
-        unreadable: files that, recovered, the MCAP library's own reader does not read to their end.
-        samples: recovered.
-        missing: samples that the device sent, before the last that is there, that are not.
-        wrong: samples that are not as the device sent them, or not as their packets decode again.
-        decisions: recovered.
+        after_s: Time from the first sample that the device sent to the kill, s.
+        lost_s: Age at the kill of the first sample that is lost, s; 0: none is.
+        files: Number of files that the recording has.
+        cut: Number of files that had no end.
+        unreadable: Files that, recovered, the MCAP library's own reader does not read to their end.
+        samples: Number of samples that were recovered.
+        missing: Samples that the device sent before the last that is there, and that are not there.
+        wrong: Samples that are not as the device sent them, or not as their packets decode again.
+        decisions: Number of the model's decisions that were recovered.
     """
 
     after_s: float
@@ -134,33 +135,20 @@ def killed_once(
     spec = replace(load_model(shipped_model())[1].array, rate_hz=1000.0)
     signal = _signal(spec.shape, spec.units)
     port = free_port()
-    sent_ns: list[int] = []
-    with FakeSerial(signal, spec=spec) as fake:
-        _note_times(fake, sent_ns)
-        text = CONFIGURATION.format(url=fake.url, rotate_s=rotate_s, port=port)
+    script = ArrayScript("serial", spec, SAMPLES)
+    with EmulatedArray(script, signal) as device:
+        text = CONFIGURATION.format(url=device.url, rotate_s=rotate_s, port=port)
         with DaemonProcess(folder, text, port) as daemon:
             daemon.await_state(_recording, every_s=0.01)
             moment(daemon)
             killed_ns = time.monotonic_ns()
             daemon.process.kill()
             daemon.process.wait()
-        fate = np.array(fake.emulator.log.fate)[: len(sent_ns)]
-    at = np.array(sent_ns[: len(fate)], np.int64)
-    sent = np.flatnonzero((fate == Fate.SENT) & (at < killed_ns))
-    return _looked_at(folder / "recordings", killed_ns, signal, sent, at)
-
-
-def _note_times(fake: FakeSerial, sent_ns: list[int]) -> None:
-    """Write down when each sample is handed to the line."""
-    endpoint = fake.emulator.endpoint
-    send = endpoint.send
-
-    def timed(packet: Any, answer: bool = False) -> bool:
-        if not answer:
-            sent_ns.append(time.monotonic_ns())
-        return send(packet, answer)
-
-    endpoint.send = timed  # type: ignore[method-assign]
+        played = device.played()
+    sent = np.flatnonzero(
+        (played.fate == Fate.SENT) & (played.at_ns > 0) & (played.at_ns < killed_ns)
+    )
+    return _looked_at(folder / "recordings", killed_ns, signal, sent, played.at_ns)
 
 
 def _recording(state: Mapping[str, Any]) -> bool:

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.daemon.arrays import Played
+from bench.daemon.accounts import RecordedSamples
 from bench.daemon.peers import Ping
+from bench.emulated import Played
 from tactile_rt.stream import NS_PER_S
 
-__all__ = ["Latencies", "Recorded", "latencies"]
+__all__ = ["Latencies", "latencies"]
 
 BEFORE_S, AFTER_S = 0.1, 1.0  # a fault counts for what is decided so long around it
 BEGIN_S = 3.0  # until all have begun
@@ -18,21 +19,14 @@ QUIET = ""
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """(m,) numbers and stream times of all samples of one array in the recordings."""
-
-    seq: NDArray[np.int64]
-    t_ns: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
 class Latencies:
     """Of decisions that were undisturbed, and of others.
 
     Attributes:
-        quiet, faulty: (n,) ms.
-        calm: (n,) of `quiet`, whether the machine was itself prompt meanwhile.
-        kinds: fault: (n,) ms after it.
+        quiet: (n,) latency of each undisturbed decision, ms.
+        faulty: (m,) latency of each decision near a fault, ms.
+        calm: (n,) whether the machine was itself prompt during each undisturbed decision.
+        kinds: The latencies (k,) near each kind of fault, ms, by the fault's name.
     """
 
     quiet: NDArray[np.float64]
@@ -43,7 +37,7 @@ class Latencies:
 
 def latencies(
     half_ns: int,
-    recorded: Recorded,
+    recorded: RecordedSamples,
     played: dict[str, Played],
     name: str,
     t_ns: NDArray[np.int64],

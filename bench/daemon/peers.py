@@ -30,10 +30,11 @@ class Listening:
     """Whom to listen to; what is empty is left out.
 
     Attributes:
-        pipe: of the lines of JSON.
-        zmq, zenoh: endpoints.
-        page: its port; 0: none.
-        source: whose samples the page shows.
+        pipe: Path of the pipe that the lines of JSON come through.
+        zmq: Endpoint of the ZeroMQ publisher.
+        zenoh: Endpoint of the Zenoh publisher.
+        page: TCP port of the daemon's page; 0: nobody looks at the page.
+        source: Name of the source whose samples the page shows.
     """
 
     pipe: str = ""
@@ -48,14 +49,14 @@ class Heard:
     """What one of them has heard.
 
     Attributes:
-        messages: of all kinds.
-        frames: of these, the page's: what to draw.
-        sources: names, by the number in `source`.
-        source: (n,) of each decision.
-        t_ns: (n,) stream time of its last sample.
-        at_ns: (n,) host time at which it was in hand.
-        connections: made.
-        longest_s: longest time from a message to the next.
+        messages: Number of messages of all kinds.
+        frames: Number of messages of the page that say what to draw.
+        sources: Names of the sources, by the number in `source`.
+        source: (n,) source of each decision, an index into `sources`.
+        t_ns: (n,) stream time of each decision's last sample, ns.
+        at_ns: (n,) host time at which each decision was in hand, ns.
+        connections: Number of connections that were made.
+        longest_s: Longest time from a message to the next, s.
     """
 
     messages: int
@@ -74,8 +75,8 @@ class Ping:
     a pty of their own, from one thread to another that does nothing else.
 
     Attributes:
-        at_ns: (n,) host time at which they were written.
-        took_ms: (n,) from there to the reader.
+        at_ns: (n,) host time at which each ping was written, ns.
+        took_ms: (n,) time from each ping's writing to its reader, ms.
     """
 
     at_ns: NDArray[np.int64]

@@ -26,8 +26,9 @@ class Usage:
     """What a process uses, read from /proc.
 
     Attributes:
-        resident: (n,) bytes, one for each `look`; `at`: when, CLOCK_MONOTONIC in s.
-        cores: processor seconds by core, each thread's on the core that it was last seen on.
+        at: (n,) time of each `look`, CLOCK_MONOTONIC in s.
+        resident: (n,) resident memory at each `look`, bytes.
+        cores: Processor time by core in s, each thread's on the core that it was last seen on.
     """
 
     def __init__(self, pid: int) -> None:

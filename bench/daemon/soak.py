@@ -1,206 +1,197 @@
 """The whole daemon under way for long, with faults every few seconds: what it loses and costs.
 
-    python -m bench.daemon.soak --seconds 3600 --json soak.json
-
-An array of 35 x 6 at 1 kHz over a pty and one of 30 x 6 at 110 Hz over slcan, a model on each, the
-recorder, three publishers with their peers, the page with somebody who looks at it.
+python -m bench.daemon.soak --seconds 3600 --json soak.json
 """
 
 import argparse
-import http.client
 import os
 import signal
-import tempfile
 import threading
-import time
-from array import array
-from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+from rich.console import Console
 
-from bench.daemon.arrays import Played, Stage, fault_beat, play
-from bench.daemon.latencies import Recorded
-from bench.daemon.models import finger_array, whisker_array, write_wide_model
-from bench.daemon.peers import Heard, Listening, Ping, listen
-from bench.daemon.process import DaemonProcess, Usage, free_port, until
-from bench.drivers.processes import Helper
-from tactile_rt.recording.reader import Recording, is_finished
+from bench.daemon.accounts import account
+from bench.daemon.latencies import latencies
+from bench.daemon.models import finger_array, whisker_array
+from bench.daemon.soak_rig import EVERY_S, WHOLE_S, WIRES, Soak, soak
+from tactile_rt.classifier.model_file import load_model, shipped_model
+from tactile_rt.evidence.records import Record, show, write
+from tactile_rt.stream import NS_PER_S
 
-__all__ = ["EVERY_S", "QUICK_S", "WHOLE_S", "WIRES", "Soak", "configuration", "recorded", "soak"]
+__all__ = ["soak_records"]
 
-QUICK_S, WHOLE_S = 20.0, 600.0
-FIRST_FAULT_S, EVERY_S, APART_S = 4.0, 3.0, 0.4  # the two arrays' faults do not fall together
-LOOK_S, ASK_S = 1.0, 10.0
-GRACE_S, SILENT_S = 5.0, 240.0  # beyond the arrays' streams: to end them, to give up
-WIRES = {"whiskers": "serial", "finger": "slcan"}
-
-
-@dataclass(frozen=True)
-class Soak:
-    """What a soak showed.
-
-    Attributes:
-        seconds: of the arrays' streams.
-        played: by each array.
-        state: the daemon's last snapshot.
-        recorded: what is in the recordings of each array.
-        unfinished: recordings that were not closed.
-        heard: by each peer.
-        ping: what the machine added.
-        usage: of the daemon's process.
-        waiting: most bytes seen waiting in each mailbox: (first half, second half).
-        code: of its end; `stop_s`: how long that took.
-        log: of the daemon.
-    """
-
-    seconds: float
-    played: dict[str, Played]
-    state: dict[str, Any]
-    recorded: dict[str, Recorded]
-    unfinished: int
-    heard: dict[str, Heard]
-    ping: Ping
-    usage: Usage
-    waiting: dict[str, tuple[int, int]]
-    code: int
-    stop_s: float
-    log: str
+WARM_SHARE, WARM_MOST_S = 0.25, 300.0
+STEADY_S = 240.0  # a shorter run cannot tell a leak from warming up
+TOOK = "array's write of the sample that completes a step to the decision in zmq's peer's hand"
 
 
-def configuration(urls: dict[str, str], ports: dict[str, int], further: str = "") -> str:
-    """TOML of a daemon on these sources, with everything in it."""
-    sources = "".join(f'[[source]]\nname = "{n}"\nurl = "{u}"\n' for n, u in urls.items())
-    return f"""version = 1
-{sources}[[model]]
-source = "whiskers"
-file = "wide.onnx"
-[[model]]
-source = "finger"
-[[publisher]]
-kind = "jsonl"
-[[publisher]]
-kind = "zmq"
-options = {{ bind = "tcp://127.0.0.1:{ports["zmq"]}" }}
-[[publisher]]
-kind = "zenoh"
-options = {{ listen = ["tcp/127.0.0.1:{ports["zenoh"]}"] }}
-[recorder]
-folder = "recordings"
-min_free_mb = 64
-rotate_s = 300
-[page]
-port = {ports["page"]}
-[metrics]
-port = {ports["metrics"]}
-{further}"""
+def soak_records(result: Soak) -> list[Record]:
+    """The figures of a soak."""
+    return [
+        *_losses(result), *_queues(result), *_latency(result), *_memory(result),
+        *_processor(result), *_end(result),
+    ]  # fmt: skip
 
 
-def soak(
-    seconds: float,
-    every_s: float = EVERY_S,
-    first_s: float = FIRST_FAULT_S,
-    enough: threading.Event | None = None,
-) -> Soak:
-    """Run the daemon for so long.
-
-    Args:
-        seconds: of the arrays' streams.
-        every_s: from one fault of an array to its next.
-        first_s: when its first one comes.
-        enough: ends it earlier.
-    """
-    specs = {"whiskers": whisker_array(), "finger": finger_array()}
-    with tempfile.TemporaryDirectory(prefix="tactile-soak-") as temporary, ExitStack() as stack:
-        folder = Path(temporary)
-        write_wide_model(folder / "wide.onnx", specs["whiskers"])
-        arrays = {}
-        for n, (name, spec) in enumerate(specs.items()):
-            stage = Stage(
-                WIRES[name], spec, round(seconds * spec.rate_hz), str(folder / name),
-                fault_beat(WIRES[name], seconds, first_s + n * APART_S, every_s),
-            )  # fmt: skip
-            arrays[name] = stack.enter_context(Helper(play, stage))
-        urls = {name: helper.hear() for name, helper in arrays.items()}
-        ports = {kind: free_port() for kind in ("zmq", "zenoh", "page", "metrics")}
-        pipe = folder / "lines"
-        os.mkfifo(pipe)
-        stdout = os.open(pipe, os.O_RDWR)
-        stack.callback(os.close, stdout)
-        peers = stack.enter_context(Helper(
-            listen, Listening(
-                str(pipe), f"tcp://127.0.0.1:{ports['zmq']}", f"tcp/127.0.0.1:{ports['zenoh']}",
-                ports["page"], "whiskers",
-            ),
-        ))  # fmt: skip
-        daemon = stack.enter_context(
-            DaemonProcess(folder, configuration(urls, ports), ports["metrics"], stdout)
+def _losses(result: Soak) -> list[Record]:
+    records = []
+    for source in result.state["sources"]:
+        name = source["part"]["name"].partition(".")[2]
+        found = account(
+            WIRES[name], result.played[name], source["stats"], result.recorded[name].seq
         )
-        peers.hear()
-        seconds, waiting = _watch(daemon, arrays, seconds, enough or threading.Event())
-        state = daemon.await_state(lambda s: not any(_queued(s).values()))
-        code, stop_s = daemon.stop()
-        heard, ping = peers.ask("stop")
-        played = {name: helper.ask("played", 60) for name, helper in arrays.items()}
-        files = sorted((folder / "recordings").glob("*.mcap"))
-        found = {name: recorded(files, name) for name in specs}
-        return Soak(
-            seconds, played, state, found, sum(not is_finished(f) for f in files), heard,
-            ping, daemon.usage, waiting, code, stop_s, daemon.log(),
+        records += [
+            Record(
+                f"daemon.soak.{name}_unbalanced", found.unbalanced, "samples", "== 0",
+                "sent + duplicated = delivered + corrupt + missing + dropped + duplicates",
+                found.told,
+            ),
+            Record(
+                f"daemon.soak.{name}_unexplained", found.unexplained, "samples", "== 0",
+                "sent whole over a line that was up, and not in the recording, or the reverse",
+            ),
+            Record(
+                f"daemon.soak.{name}_miscounted", found.miscounted, "samples", "== 0",
+                "each cause by itself, beside what the array did",
+            ),
+        ]  # fmt: skip
+    return records
+
+
+def _queues(result: Soak) -> list[Record]:
+    wrong = dropped = 0
+    for part in [*result.state["models"], *result.state["consumers"]]:
+        queue = part["queue"]
+        for kind, put in queue["put"].items():
+            gone = queue["taken"][kind] + queue["dropped"][kind] + queue["waiting"][kind]
+            wrong += abs(put - gone)
+            dropped += queue["dropped"][kind]
+    made = {m["source"]: m["decisions"] for m in result.state["models"]}
+    lost = 0
+    for heard in result.heard.values():
+        for source, count in made.items():
+            number = heard.sources.index(source) if source in heard.sources else -1
+            lost += abs(count - int((heard.source == number).sum()))
+    return [
+        Record(
+            "daemon.soak.queues_unbalanced", wrong, "items", "== 0",
+            "put = taken + dropped + waiting", "every mailbox, every class",
+        ),
+        Record(
+            "daemon.soak.queues_dropped", dropped, "items", "== 0", "", "of all mailboxes",
+        ),
+        Record(
+            "daemon.soak.decisions_lost", lost, "decisions", "== 0",
+            f"made: {', '.join(f'{n} of {s}' for s, n in made.items())}",
+            f"by any of {', '.join(result.heard)}",
+        ),
+        Record(
+            "daemon.soak.page_updates", result.heard["page"].frames / result.seconds, "1/s",
+            ">= 20", "what to draw, silences of the array included", "one open page",
+        ),
+    ]  # fmt: skip
+
+
+def _latency(result: Soak) -> list[Record]:
+    records = []
+    _, card = load_model(shipped_model())
+    heard = result.heard["zmq"]
+    pings = np.percentile(result.ping.took_ms, (50, 99, 100)).tolist()
+    beside = "eight bytes over a bare pty: p50 {:.1f}, p99 {:.1f}, worst {:.1f} ms".format(*pings)
+    for name, spec in (("whiskers", whisker_array()), ("finger", finger_array())):
+        if name not in heard.sources:
+            continue
+        mine = heard.source == heard.sources.index(name)
+        half_ns = max(card.period_ns, round(NS_PER_S / spec.rate_hz))
+        found = latencies(
+            half_ns, result.recorded[name], result.played, name, heard.t_ns[mine],
+            heard.at_ns[mine], result.ping,
         )  # fmt: skip
+        worst = "worst: " + ", ".join(
+            f"{fault} {ms.max():.0f}" for fault, ms in found.kinds.items() if len(ms)
+        )
+        calm = ""
+        if found.calm.any():
+            p99 = np.percentile(found.quiet[found.calm], 99)
+            calm = f"; p99 {p99:.1f} of the {found.calm.sum()} beside which none took over 2 ms"
+        for kind, took, bar in (("quiet", found.quiet, 15), ("faulty", found.faulty, 45)):
+            if not len(took):
+                continue
+            p50, p99, far, most = np.percentile(took, (50, 99, 99.9, 100)).tolist()
+            records.append(
+                Record(
+                    f"daemon.soak.{name}_{kind}_p99", p99, "ms", f"<= {bar}",
+                    f"p50 {p50:.1f}, p99.9 {far:.1f}, worst {most:.1f}, jitter (standard "
+                    f"deviation) {took.std():.1f} ms; {beside}{calm if kind == 'quiet' else ''}",
+                    f"{TOOK}; {len(took)} decisions, "
+                    + ("undisturbed" if kind == "quiet" else f"to 1 s after a fault; {worst}"),
+                )
+            )  # fmt: skip
+    return records
 
 
-def _watch(
-    daemon: DaemonProcess, arrays: dict[str, Helper], seconds: float, enough: threading.Event
-) -> tuple[float, dict[str, tuple[int, int]]]:
-    """Look until both arrays have fallen silent; (seconds, most that waited in each mailbox)."""
-    began, asked, ended = time.monotonic(), 0.0, False
-    most: dict[str, list[int]] = {}
-
-    def over() -> bool:
-        nonlocal asked, seconds, ended
-        daemon.usage.look()
-        now = time.monotonic()
-        if now - asked > ASK_S:
-            asked = now
-            try:
-                queued = _queued(daemon.state())
-            except (OSError, http.client.HTTPException):
-                queued = {}  # the machine has been busy for long: the next look will tell
-            for name, size in queued.items():
-                halves = most.setdefault(name, [0, 0])
-                second = now - began > seconds / 2
-                halves[second] = max(halves[second], size)
-        # A busy machine may have kept the arrays from measuring as fast as they should.
-        if not ended and (enough.is_set() or now - began > seconds + GRACE_S):
-            seconds, ended = min(seconds, now - began), True
-            for helper in arrays.values():
-                helper.ask("end")
-        return now - began > seconds and all(helper.ask("done") for helper in arrays.values())
-
-    if not until(over, seconds + SILENT_S, LOOK_S):
-        where = "; ".join(f"{name}: {helper.ask('where')}" for name, helper in arrays.items())
-        raise TimeoutError(f"the arrays have not fallen silent: {where}")
-    time.sleep(LOOK_S)
-    return seconds, {name: (a, b) for name, (a, b) in most.items()}
+def _memory(result: Soak) -> list[Record]:
+    at, resident = np.array(result.usage.at), np.array(result.usage.resident, float)
+    at -= at[0]
+    warm = min(WARM_SHARE * result.seconds, WARM_MOST_S)
+    tenth = max(3.0, 0.1 * (result.seconds - warm))
+    early = np.median(resident[(at >= warm) & (at < warm + tenth)])
+    late = np.median(resident[(at >= result.seconds - tenth) & (at <= result.seconds)])
+    most = ", ".join(f"{n} {a}, {b}" for n, (a, b) in result.waiting.items() if a or b)
+    steady = result.seconds >= STEADY_S
+    return [
+        Record(
+            "daemon.soak.memory_growth", 100 * (late / early - 1), "%", "<= 1" if steady else "",
+            f"{early / 1e6:.1f} MB after {warm:.0f} s, {late / 1e6:.1f} MB at the end",
+            "resident, medians of a tenth of the time each",
+        ),
+        Record(
+            "daemon.soak.waiting_most", max(map(max, result.waiting.values()), default=0) / 1e3,
+            "kB", "", f"first half, second half: {most or 'nothing'}",
+            "bytes that waited for a part",
+        ),
+    ]  # fmt: skip
 
 
-def _queued(state: dict[str, Any]) -> dict[str, int]:
-    """Bytes that wait for each part."""
-    parts = [*state["models"], *state["consumers"]]
-    return {part["part"]["name"]: part["queue"]["waiting_bytes"] for part in parts}
+def _processor(result: Soak) -> list[Record]:
+    cores = result.usage.cores
+    whole = sum(cores.values()) or 1.0
+    shares = ", ".join(
+        f"core {core}: {100 * result.usage.share * used / whole:.0f} %"
+        for core, used in sorted(cores.items())
+    )
+    how = (
+        "35 x 6 at 1 kHz over a pty, 30 x 6 at 110 Hz over slcan, a model on each, recorder, "
+        f"jsonl, zmq, zenoh and the page with a peer each, a fault every {EVERY_S:g} s on each "
+        f"array, {result.seconds:g} s; load {os.getloadavg()[1]:.1f} on {os.cpu_count()} cores"
+    )
+    return [Record("daemon.soak.cpu", 100 * result.usage.share, "% of a core", "", shares, how)]
 
 
-def recorded(files: list[Path], source: str) -> Recorded:
-    """What is in the recordings of one array."""
-    seq, t_ns = array("q"), array("q")  # an hour's chunks would not fit into memory
-    for chunk in (c for f in files if f.name.startswith(f"{source}-") for c in Recording(f)):
-        seq.frombytes(chunk.seq.tobytes())
-        t_ns.frombytes(chunk.t_ns.tobytes())
-    return Recorded(np.array(seq, np.int64), np.array(t_ns, np.int64))
+def _end(result: Soak) -> list[Record]:
+    state: dict[str, Any] = result.state
+    parts = [p["part"] for k in ("sources", "models", "consumers") for p in state[k]]
+    broke = ", ".join(f"{p['name']} {p['failures']}x" for p in parts if p["failures"])
+    again = sum(heard.connections - 1 for heard in result.heard.values())
+    apart = ", ".join(
+        f"{n}: {h.messages} messages, at most {h.longest_s:.2f} s apart"
+        for n, h in result.heard.items()
+    )
+    failures, lines = sum(p["failures"] for p in parts), len(result.log.splitlines())
+    return [
+        Record("daemon.soak.parts_broken", failures, "times", "== 0", broke),
+        Record("daemon.soak.peers_cut", again, "times", "== 0", apart),
+        Record("daemon.soak.unfinished", result.unfinished, "recordings", "== 0"),
+        Record(
+            "daemon.soak.tracebacks", result.log.count("Traceback"), "", "== 0",
+            f"{lines} lines in the log",
+        ),
+        Record("daemon.soak.stop", result.stop_s, "s", "<= 2", f"exit code {result.code}"),
+    ]  # fmt: skip
 
 
 def main() -> None:
@@ -209,12 +200,6 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=WHOLE_S)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
-    from rich.console import Console
-
-    # Now, not at the end of a long run: the files may be others by then.
-    from bench.daemon.soak_figures import soak_records
-    from tactile_rt.evidence.records import show, write
-
     enough = threading.Event()
     signal.signal(signal.SIGTERM, lambda number, frame: enough.set())
     result = soak(given.seconds, enough=enough)

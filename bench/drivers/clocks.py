@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.drivers.device_clock import DeviceClock
+from tactile_rt.drivers.clocks import DeviceClock
 from tactile_rt.evidence.records import Record
 from tactile_rt.stream import NS_PER_S
 

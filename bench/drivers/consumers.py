@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from bench.drivers.metronome import Beat, play
-from bench.drivers.processes import Helper
+from bench.processes import Helper
 from tactile_rt.classifier.session import Session
 from tactile_rt.evidence.records import Record
 from tactile_rt.sources.opening import open_source

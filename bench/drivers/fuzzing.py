@@ -1,6 +1,12 @@
-"""Damaged, cut, repeated and foreign input for every codec, and how soon it recovers."""
+"""Damaged, cut, repeated and foreign input for every codec, and how soon it recovers.
+
+At length, one codec after another (`make fuzz`):
+
+python -m bench.drivers.fuzzing [BYTES] [CODEC ...]     e.g. 1000000 "serial bota" "can xela"
+"""
 
 import random
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -49,12 +55,12 @@ class Fuzzed:
     """What fuzzing one codec showed.
 
     Attributes:
-        codec: wire and name.
-        bytes: mutated, fed.
-        exceptions: raised.
-        held: bytes that it kept at most.
-        uneven: whether another cut of the same input gave another result.
-        seconds: of CPU.
+        codec: The codec's wire and name.
+        bytes: Number of mutated bytes that were fed.
+        exceptions: Number of exceptions that the codec raised.
+        held: Bytes that the codec kept at most.
+        uneven: Whether another cut of the same input gave another result.
+        seconds: Processor time of it all, s.
     """
 
     codec: str
@@ -284,3 +290,28 @@ def _held(thing: object, depth: int = 4) -> int:
     if depth and hasattr(thing, "__dict__"):
         return sum(_held(x, depth - 1) for x in vars(thing).values())
     return 8
+
+
+def main() -> int:
+    """Print a line for each codec; 1 if one raised, kept too much or depends on cuts."""
+    size = int(sys.argv[1]) if len(sys.argv) > 1 else WHOLE
+    bad = 0
+    say = sys.stdout.write
+    say(f"{'codec':<22}{'bytes':>12}{'exceptions':>12}{'most held':>11}{'cuts':>7}{'CPU s':>8}\n")
+    with all_codecs() as codecs:
+        for name, make in codecs.items():
+            if sys.argv[2:] and name not in sys.argv[2:]:
+                continue
+            found = fuzz(name, make, size)
+            cuts = "differ" if found.uneven else "same"
+            say(
+                f"{name:<22}{found.bytes:>12}{found.exceptions:>12}{found.held:>11}{cuts:>7}"
+                f"{found.seconds:>8.1f}\n"
+            )
+            sys.stdout.flush()
+            bad += bool(found.exceptions or found.held > HELD_MOST or found.uneven)
+    return min(bad, 1)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -8,18 +8,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.drivers.emulated import Log, Stage, emulate, signal
-from bench.drivers.processes import Helper
-from tactile_rt.drivers.emulation.damage import Fate
-from tactile_rt.drivers.emulation.faults import Fault
+from bench.emulated import ArrayScript, Played, noise, play
+from bench.processes import Helper
+from tactile_rt.drivers.emulation.faults import Fate, Fault
 from tactile_rt.evidence.records import Record
 from tactile_rt.sources.opening import open_source
+from tactile_rt.sources.synthetic import synthetic_spec
 from tactile_rt.stream import SourceStats, concatenate
 
 __all__ = ["FAULTS", "UNPLUGS", "losses"]
 
 QUICK, WHOLE = 12_000, 600_000  # samples of each run
 SILENCE_S = 0.5
+SPEC = synthetic_spec(10, 6, 1000.0)
 # Often, so that a short run has each; they strike one sample at most each.
 FAULTS = (
     Fault("bit_flip", rate=4.0, amount=3),
@@ -63,14 +64,14 @@ def losses(quick: bool) -> list[Record]:
     records = []
     for seed, (name, (wire, options, faults)) in enumerate(RUNS.items()):
         with tempfile.TemporaryDirectory() as folder:
-            stage = Stage(
-                wire, QUICK if quick else WHOLE, faults=faults, seed=seed, options=options,
-                link=str(Path(folder) / "device"),
+            script = ArrayScript(
+                wire, SPEC, QUICK if quick else WHOLE, str(Path(folder) / "device"), "noise",
+                "fast", faults, seed, options,
             )  # fmt: skip
-            with Helper(emulate, stage) as device:
+            with Helper(play, script) as device:
                 got = _receive(device, device.hear())
-                log: Log = device.ask("log")
-        records.append(_compare(name, stage, got, log))
+                played: Played = device.ask("played")
+        records.append(_compare(name, script, got, played))
     return records
 
 
@@ -89,7 +90,7 @@ def _receive(device: Helper, url: str) -> _Received:
     return _Received(whole.seq, whole.values, whole.valid, stats)
 
 
-def _compare(name: str, stage: Stage, got: _Received, log: Log) -> Record:
+def _compare(name: str, script: ArrayScript, got: _Received, log: Played) -> Record:
     """What does not add up, and samples of which the receiver says other than the sender."""
     fate, stats, n = log.fate, got.stats, len(log.fate)
     counted = stats.delivered + stats.corrupt + stats.missing + stats.dropped + stats.duplicates
@@ -102,7 +103,7 @@ def _compare(name: str, stage: Stage, got: _Received, log: Log) -> Record:
     hurt, gone = np.isin(fate, HURT), np.isin(fate, GONE)
     on_the_way = _before_unplugging(fate, came)
     wrong += int((~came & ~hurt & ~gone & ~on_the_way).sum()) + int((came & gone).sum())
-    if stage.wire == "serial":
+    if script.wire == "serial":
         wrong += int((came & hurt).sum())
         # of a damaged one on its way when the plug was pulled, some may have come
         least, most = int((hurt & ~on_the_way).sum()), int(hurt.sum())
@@ -112,7 +113,7 @@ def _compare(name: str, stage: Stage, got: _Received, log: Log) -> Record:
         partly = hurt[got.seq]
         wrong += int((got.valid.all(axis=1) & partly).sum())
         wrong += int((~got.valid.all(axis=1) & ~partly).sum())
-    wrong += _altered(stage, got)
+    wrong += _altered(script, got)
     kinds = {f.name.lower(): int((fate == f).sum()) for f in Fate if (fate == f).any()}
     happened = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
     return Record(
@@ -121,7 +122,7 @@ def _compare(name: str, stage: Stage, got: _Received, log: Log) -> Record:
         "itself and each sample beside the emulator's log",
         f"{n} samples, {log.duplicated} copies: {happened}; received: {stats.delivered} "
         f"delivered, {stats.corrupt} corrupt, {stats.missing} missing, {stats.duplicates} "
-        f"duplicates; {', '.join(fault.kind for fault in stage.faults)}",
+        f"duplicates; {', '.join(fault.kind for fault in script.faults)}",
     )  # fmt: skip
 
 
@@ -136,10 +137,10 @@ def _before_unplugging(fate: NDArray[np.uint8], came: NDArray[np.bool_]) -> NDAr
     return lost
 
 
-def _altered(stage: Stage, got: _Received) -> int:
+def _altered(script: ArrayScript, got: _Received) -> int:
     """Delivered samples that are not what was measured."""
-    sent = signal(stage)[np.minimum(got.seq, stage.samples - 1)]
-    if stage.options["format"] == "float32":
+    sent = noise(script)[np.minimum(got.seq, script.samples - 1)]
+    if script.options["format"] == "float32":
         same = (got.values == sent).all(axis=2)
     else:  # to half a count
         half = np.array([0.1] * 3 + [1e-3] * 3) / 32767 / 2

@@ -28,15 +28,15 @@ class Beat:
     """What is played.
 
     Attributes:
-        wire: ``serial`` or ``slcan``.
-        drifts_ppm: how much too fast the clock of each device runs; one device for each.
-        elements: of six channels each.
-        rate_hz: of each device.
-        seconds: for so long, from each device's start.
-        fast: as fast as the host reads, not on the beat.
-        twins: whether each device has a twin that sends the same bytes at the same moment to a
+        wire: The line that each device is on, ``serial`` or ``slcan``.
+        drifts_ppm: Drift of each device's clock, ppm too fast; one device for each.
+        elements: Number of elements of a device, with six channels each.
+        rate_hz: Sample rate of each device, Hz.
+        seconds: Length of each device's stream, s.
+        fast: Whether samples go out as fast as the host reads, not on the beat.
+        twins: Whether each device has a twin that sends the same bytes at the same moment to a
             reader that only reads.
-        options: of the native protocol.
+        options: Options of the native codec, as in a URL.
     """
 
     wire: str
@@ -50,7 +50,7 @@ class Beat:
 
     @property
     def samples(self) -> int:
-        """That each device sends."""
+        """Number of samples that each device sends."""
         return round(self.seconds * self.rate_hz)
 
 
@@ -62,8 +62,8 @@ class Sent:
         due_ns: (n,) host time that each sample is of.
         at_ns: (n,) host time just before it was handed to the line.
         twin_ns: (n,) the same of its twin; empty without one.
-        refused: samples for which the line had no room.
-        packet: bytes or frames of a sample.
+        refused: Number of samples for which the line had no room.
+        packet: Number of bytes or frames of a sample.
     """
 
     due_ns: NDArray[np.int64]

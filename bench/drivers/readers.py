@@ -27,9 +27,9 @@ class Came:
         seq: (n,) number of each sample.
         at_ns: (n,) host time at which the caller had it.
         told_ns: (n,) host time that it is said to be of; empty for a bare reader.
-        reads: calls that brought something.
-        stats: losses counted.
-        drift_ppm: of the device's clock.
+        reads: Number of calls that brought something.
+        stats: The losses that the source counted.
+        drift_ppm: Drift of the device's clock as the source found it, ppm.
     """
 
     seq: NDArray[np.int64]

@@ -10,14 +10,15 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.emulated import LoopedSource
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, shipped_model
+from tactile_rt.drivers.emulation.device import EmulatedSerial
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.evidence.records import Record
 from tactile_rt.recording import Recording, StreamWriter, recover
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk
-from tactile_rt.testing import FakeSerial
 
 __all__ = ["recordings"]
 
@@ -47,9 +48,9 @@ def _replays(folder: Path) -> list[Record]:
     values = draw.normal(size=(SAMPLES, *spec.shape)) * 1e-2 * force
     values[TOUCHED] += force * draw.uniform(-1, 1, (1, *spec.shape))
     live: Replayed = []
-    fake = FakeSerial(values, spec=spec, faults=FaultSchedule(FAULTS, 0))
-    with fake, open_source(fake.url) as source, StreamWriter(path, source) as writer:
-        while not fake.emulator.done:
+    device = EmulatedSerial(LoopedSource(spec, values), faults=FaultSchedule(FAULTS, 0))
+    with device, open_source(device.url) as source, StreamWriter(path, source) as writer:
+        while not device.emulator.done:
             if (chunk := source.read(0.3)) is not None:
                 writer.push(chunk)
                 live.append(_bytes_of(chunk))

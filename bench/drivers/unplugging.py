@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.drivers.emulated import Stage, emulate
-from bench.drivers.processes import Helper
+from bench.emulated import ArrayScript, play
+from bench.processes import Helper
 from tactile_rt.drivers.device_source import DeviceSource
 from tactile_rt.drivers.health import State
 from tactile_rt.evidence.records import Record
 from tactile_rt.sources.opening import open_source
+from tactile_rt.sources.synthetic import synthetic_spec
 
 __all__ = ["unplugging"]
 
@@ -21,6 +22,7 @@ QUICK, WHOLE = 25, 100  # cycles
 BETWEEN_S = 0.05
 PATIENCE_S = 5.0
 LOST_MS, DATA_MS = 50, 250
+SPEC = synthetic_spec(10, 6, 1000.0)
 
 
 def unplugging(quick: bool) -> list[Record]:
@@ -28,8 +30,8 @@ def unplugging(quick: bool) -> list[Record]:
     cycles = QUICK if quick else WHOLE
     lost_ms, data_ms, stale = [], [], 0
     with tempfile.TemporaryDirectory() as folder:
-        stage = Stage("serial", 400_000, pace="realtime", link=str(Path(folder) / "device"))
-        with Helper(emulate, stage) as device, open_source(device.hear()) as source:
+        script = ArrayScript("serial", SPEC, 400_000, str(Path(folder) / "device"), "noise")
+        with Helper(play, script) as device, open_source(device.hear()) as source:
             assert isinstance(source, DeviceSource)
             _read_for(source, BETWEEN_S)
             before = _held()

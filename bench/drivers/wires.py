@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.drivers.metronome import Beat, Sent, play
-from bench.drivers.processes import Helper
 from bench.drivers.readers import Came, read_bare, read_sources
+from bench.processes import Helper
+from tactile_rt.drivers.clocks import Stamper
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.drivers.stamping import Stamper
 from tactile_rt.evidence.records import Record
 from tactile_rt.sources.synthetic import synthetic_spec
 from tactile_rt.stream import Chunk, SourceStats

@@ -3,7 +3,7 @@
 Maps `(batch, channel, row, column)`, `conv2d` on padded concatenations, every node at every step,
 automatic gradients. Written here from the paper (Chung et al. 2025, appendix "IntersectionRNN";
 Zhuang et al. 2017). It is not the published code, whose training step of batch 32 took 21-25
-CPU s on an idle core; `bench/peer.py` measures beside that one.
+CPU s on an idle core; `bench/models/peer.py` measures beside that one.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ from tactile_rt.models.encoders.cells import CELLS
 __all__ = ["CLASSES", "STEPS", "training_speed", "training_step"]
 
 STEPS, CLASSES = 22, 117
-PEER = "the same network, plain eager conv2d (beside the published code: bench/peer.py)"
+PEER = "the same network, plain eager conv2d (beside the published code: bench/models/peer.py)"
 
 
 def training_speed(quick: bool) -> list[Record]:

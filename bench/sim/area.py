@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bench.sim.mechanics import mechanics
 from bench.sim.reference_model import PROTOTYPE_CPU_S, reference_cost
 from tactile_rt.evidence.records import Record
-from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
 from tactile_rt.sim_backend.source import REST_SAMPLES
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
@@ -170,11 +170,13 @@ class SweepErrors:
     """A sweep beside the same sweep in finer steps, the object at the same place.
 
     Attributes:
-        moment, force: RMS of the difference over all whiskers, axes and samples, over the RMS of
-            the finer sweep.
-        spike: largest force on a whisker over the largest in the finer sweep, the worst of all
-            whiskers, where it exceeds FAINT of the largest force on the array.
-        deepest: how deep a link went into the object at the end of a millisecond, mm.
+        moment: RMS of the moments' difference over all whiskers, axes and samples, over the RMS of
+            the finer sweep's moments.
+        force: RMS of the forces' difference over all whiskers, axes and samples, over the RMS of
+            the finer sweep's forces.
+        spike: Largest force on a whisker over the largest in the finer sweep, the worst of all
+            whiskers that feel more than `FAINT` of the largest force on the array.
+        deepest: Largest depth of a link in the object at the end of a millisecond, mm.
     """
 
     def __init__(self, loads: Floats, truth: Floats, deepest: float) -> None:

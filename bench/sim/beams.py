@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays.whiskers import Whisker, mouse_whiskers
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
+from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.world import (
     Mount,
     Profile,
@@ -37,9 +38,9 @@ class Beam:
     """A mouse's whisker as an Euler-Bernoulli beam, tapered and curved.
 
     Attributes:
-        compliance: deflection of the tip per force on it, both along y of the whisker, mm/N.
-        resonance_hz: first resonance.
-        sag_mm: deflection of the tip under gravity along y.
+        compliance: Deflection of the tip per force on the tip, both along the whisker's y, mm/N.
+        resonance_hz: Frequency of the first resonance, Hz.
+        sag_mm: Deflection of the tip under gravity along y, mm.
     """
 
     compliance: float
@@ -52,12 +53,12 @@ class BeamErrors:
     """A simulated whisker beside its beam.
 
     Attributes:
-        static: deflection of the tip under a small force, relative.
-        resonance: first resonance of the linearised chain, relative.
-        ringing: of the first mode's natural frequency as it rings in the simulation, relative.
-        damping: damping ratio of that ringing, less the whisker's own; above 1 nothing rings.
-        sag: deflection of the tip under gravity, relative.
-        reaction: base force and moment under the small force, relative to them.
+        static: Relative error of the tip's deflection under a small force.
+        resonance: Relative error of the linearised chain's first resonance.
+        ringing: Relative error of the first mode's frequency as the whisker rings when simulated.
+        damping: Damping ratio of that ringing, less the whisker's own; above 1 nothing rings.
+        sag: Relative error of the tip's deflection under gravity.
+        reaction: Relative error of base force and base moment under the small force.
     """
 
     static: float

@@ -9,8 +9,9 @@ import numpy as np
 from bench.sim.beams import BeamErrors, beams, flat, measure
 from bench.sim.pegs import SLIDE_MM_S, press, presses
 from tactile_rt.evidence.records import Record
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
-from tactile_rt.sim_backend.arrays.whiskers import FRICTION, mouse_whiskers
+from tactile_rt.sim_backend.arrays.whiskers import FRICTION
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.objects.solids import box
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation

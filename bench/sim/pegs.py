@@ -44,16 +44,16 @@ class Press:
     towards +y. Attributes are in mm, mN and uN m.
 
     Attributes:
-        whisker: its name.
+        whisker: The name of the whisker.
         bend: ``straight``: the whisker without its curve; ``convex``, ``concave``: the side of
             the curved whisker that the peg presses on, from below and from above.
-        place: x of the peg's centre, of the whisker's length.
-        depth: way of the peg along y past first touch, of the whisker's length.
+        place: Coordinate x of the peg's centre, as a share of the whisker's length.
+        depth: Way of the peg along y past first touch, as a share of the whisker's length.
         friction: Coulomb coefficient; negative: of a peg that slides towards the base.
-        centre: (x, y) of the peg there.
-        moment: base moment about z, uN m.
-        force: (x, y) on the whisker, mN.
-        contact: (x, y) where the surfaces touch.
+        centre: Place (x, y) of the peg's centre when it is pressed, mm.
+        moment: Moment on the whisker's base about z, uN m.
+        force: Force (x, y) on the whisker's base, mN.
+        contact: Place (x, y) at which the surfaces touch, mm.
     """
 
     whisker: str
@@ -77,12 +77,12 @@ class Pressed:
     """What the simulated whisker does on the peg, beside the elastica.
 
     Attributes:
-        moment_error: of the base moment, relative.
-        force_error: of the base force, a vector: relative to its size.
-        contact_error: distance between the points of contact, mm.
-        deepest: deepest that a link went into the peg, mm.
-        ripple: standard deviation of the base moment about its trend, relative.
-        lost: share of the steps without contact.
+        moment_error: Relative error of the base moment.
+        force_error: Length of the error of the base force, relative to the force.
+        contact_error: Distance between the points of contact, mm.
+        deepest: Largest depth that a link went into the peg, mm.
+        ripple: Standard deviation of the base moment about its trend, relative to the moment.
+        lost: Share of the steps without contact.
     """
 
     moment_error: float

@@ -14,20 +14,17 @@ A silence too long for the resampler to bridge ends an episode early.
 
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.bad_samples import without_bad_samples
 from tactile_rt.classifier.contact import ContactDetector
-from tactile_rt.classifier.deadline import Deadline, Policy
-from tactile_rt.classifier.decisions import Classification, ClassifierStats, fuse
-from tactile_rt.classifier.early_exit import IN_A_ROW, EarlyExit
-from tactile_rt.classifier.lanes import Lanes
+from tactile_rt.classifier.exits import IN_A_ROW, Deadline, EarlyExit, Lanes, Policy
 from tactile_rt.classifier.model_file import element_order, load_model
-from tactile_rt.classifier.providers import onnxruntime_names
+from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, SpecMismatch
@@ -36,6 +33,62 @@ __all__ = ["Classification", "Classifier", "ClassifierStats", "fuse"]
 
 Mode = Literal["episode", "sliding"]
 EVERY = 4
+# Far beyond any load, and far below where squares of float32 overflow.
+ABSURD = 1e9
+
+
+@dataclass(frozen=True)
+class Classification:
+    """A decision during an episode.
+
+    Attributes:
+        onset_ns: The stream time at which contact began, ns.
+        t_ns: The stream time of the last resampled sample used, ns.
+        step: The number of steps that the decision rests on, counted from 1; earlier steps of a
+            longer contact are not in it.
+        final: Whether this decision is the last one of its window; an episode that a silence of
+            the stream cuts short has no final decision.
+        label: The name of the most probable class.
+        labels: (class,) The names of all classes, in the order of `probabilities`.
+        probabilities: (class,) The posterior probability of each class, float32.
+        latency_s: The time that the model's step took, s.
+        late: Whether more work had gathered than the deadline allows.
+    """
+
+    onset_ns: int
+    t_ns: int
+    step: int
+    final: bool
+    label: str
+    labels: tuple[str, ...]
+    probabilities: NDArray[np.float32]
+    latency_s: float
+    late: bool = False
+
+    def top(self, k: int = 5) -> list[tuple[str, float]]:
+        """The k most probable classes with their probabilities."""
+        order = np.argsort(-self.probabilities, kind="stable")[:k]
+        return [(self.labels[i], float(self.probabilities[i])) for i in order]
+
+
+@dataclass
+class ClassifierStats:
+    """Counted since the classifier was made.
+
+    Attributes:
+        steps: The number of steps that the network took.
+        late: The number of steps that missed the deadline.
+        withheld: The number of decisions that were not returned because they were late.
+        bad_samples: The number of samples of one element that were no number, infinite or absurd
+            though marked valid; they were taken for invalid.
+        bad_steps: The number of steps whose logits were not finite; they gave no decision.
+    """
+
+    steps: int = 0
+    late: int = 0
+    withheld: int = 0
+    bad_samples: int = 0
+    bad_steps: int = 0
 
 
 class Classifier:
@@ -50,20 +103,20 @@ class Classifier:
         every: steps between the windows of ``sliding``, None for 4 (180 ms at 45 ms); the network
             runs in ceil(steps / every) lanes, and takes up to as many times as long.
         sure: probability of the best class at which an episode ends early, or None: accuracy
-            given for time, see `tactile_rt.classifier.early_exit`. Of ``episode`` only.
+            given for time, see `tactile_rt.classifier.exits`. Of ``episode`` only.
         in_a_row: steps running in which the same class must be so sure.
         deadline_s: work that may gather before a step is late, s; None is the step's length.
-        late: what becomes of a late decision, see `tactile_rt.classifier.deadline.Deadline`.
+        late: what becomes of a late decision, see `tactile_rt.classifier.exits.Deadline`.
         providers: execution providers, first choice first: cpu, cuda, tensorrt, openvino, coreml.
         threads: that may share one operator of the network.
 
     Attributes:
-        card: the model's metadata.
-        detector: contact state and tare of the stream.
-        tared: last resampled sample less the tare, (element, channel) SI; zeros before the tare.
-            The next `push` overwrites it.
-        stats: what has been counted.
-        providers: names of the execution providers in use, as onnxruntime has them.
+        card: The metadata of the model file.
+        detector: The contact detector, which holds the stream's contact state and tare.
+        tared: (element, channel) The last resampled sample less the tare, SI; zeros before the
+            tare. The next `push` overwrites it.
+        stats: The counters of steps, late steps and bad samples.
+        providers: Names of the execution providers in use, as onnxruntime has them.
 
     Raises:
         ModelError: the file cannot be used.
@@ -121,7 +174,8 @@ class Classifier:
 
     def push(self, chunk: Chunk) -> list[Classification]:
         """Take samples as they come from the array, return the decisions that they complete."""
-        chunk, bad = without_bad_samples(chunk)
+        # What no sensor measures is not taken for a measurement: no number, infinite, or absurd.
+        chunk, bad = _without_bad_samples(chunk)
         self.stats.bad_samples += bad
         resampled = self._resampler.push(chunk)
         if resampled is None:
@@ -222,3 +276,34 @@ class Classifier:
         self._step = 0
         self._decided = True
         self._stepper.begin(self._offset[self._order], self._sigma[self._order])
+
+
+def fuse(posteriors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
+    """Combine posteriors (class,) of independent sweeps of one object: their normalised product.
+
+    Assumes equal priors, as the training sets have.
+
+    Raises:
+        ValueError: no posteriors.
+    """
+    evidence = np.log(np.clip(np.stack(posteriors), 1e-12, None)).sum(axis=0)
+    fused = np.exp(evidence - evidence.max())
+    normalised: NDArray[np.float32] = (fused / fused.sum()).astype(np.float32)
+    return normalised
+
+
+def _without_bad_samples(chunk: Chunk) -> tuple[Chunk, int]:
+    """Mark elements invalid that claim a value which is none.
+
+    Returns:
+        The chunk itself where nothing is wrong, else a copy with those elements marked and zero;
+        and how many element samples were marked that had not been.
+    """
+    # One product is the cheapest look at all values: what is wrong with any of them shows in it.
+    if np.vdot(chunk.values, chunk.values) < ABSURD**2:
+        return chunk, 0
+    largest = np.abs(chunk.values).max(axis=2)  # (n, element); NaN if one is
+    good: NDArray[np.bool_] = largest < ABSURD
+    bad = int((chunk.valid & ~good).sum())
+    values = np.where(good[..., None], chunk.values, np.float32(0))
+    return Chunk(chunk.seq, chunk.t_ns, values, chunk.valid & good), bad

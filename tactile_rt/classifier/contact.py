@@ -70,11 +70,13 @@ class ContactDetector:
     trusted samples, and it is left out until it has enough of them.
 
     Attributes:
-        ready: enough quiet samples have been seen for a tare; no contact is reported before.
-        contact: something is touched.
-        offset: (element, channel) tare, SI.
-        sigma: (element, channel) noise per sample, SI, not below `floor`.
-        tared: (element,) bool; False where `offset` and `sigma` rest on too few samples.
+        ready: Whether enough quiet samples have been seen for a tare; no contact is reported
+            before.
+        contact: Whether something is being touched now.
+        offset: (element, channel) The tare, which is the mean of the quiet samples, SI.
+        sigma: (element, channel) The noise per sample, one standard deviation, SI; it is never
+            below `floor`.
+        tared: (element,) Whether `offset` and `sigma` rest on enough samples, bool.
     """
 
     def __init__(self, shape: tuple[int, int], floor: NDArray[np.float32]) -> None:

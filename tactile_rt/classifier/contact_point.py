@@ -37,10 +37,10 @@ class WhiskerShapes:
     The whisker leaves its base along x of its frame and follows y = curvature x^2.
 
     Attributes:
-        length: arc length, m.
-        curvature: 1/m.
-        base_radius, tip_radius: of the cone, m.
-        young_modulus: Pa.
+        length: (element,) Arc length from base to tip, m.
+        curvature: (element,) Curvature a of the resting parabola y = a x^2, 1/m.
+        base_radius, tip_radius: (element,) Radii of the cone at its base and at its tip, m.
+        young_modulus: (element,) Young's modulus of the whisker's material, Pa.
 
     Raises:
         ConfigError: not one value of each for every whisker, or one that is not finite.

@@ -45,29 +45,30 @@ class ModelCard(msgspec.Struct, frozen=True):
     """The metadata of a model file, stored as JSON under ``tactile_rt``.
 
     Attributes:
-        name: of the model.
-        spec: JSON of the `ArraySpec` that it was trained on.
-        period_ns: sub-step period, ns; the stream is resampled to it.
-        substeps: sub-steps per step.
-        steps: steps of one episode.
-        labels: class names in the order of the logits.
-        state: recurrent state tensors.
-        clip, scale: (channel,) limits and smallest scale of the input compression, SI.
-        floor: (channel,) smallest sigma that the contact detector assumes, SI.
-        temperature: divides the logits, fitted on validation sweeps so that probabilities mean
-            what they say.
-        provenance: what made the file: network, training, data set, hashes, commands.
-        figures: what was measured on it: parity, accuracy.
-        version: of this schema.
+        name: The name of the model, at most 200 characters.
+        spec: The JSON form of the `ArraySpec` that the model was trained on.
+        period_ns: The period of a sub-step, ns; the stream is resampled to it.
+        substeps: The number of sub-steps in a step.
+        steps: The number of steps in an episode.
+        labels: (class,) The names of the classes, in the order of the logits.
+        state: The recurrent state tensors, all zero when an episode begins.
+        clip, scale: (channel,) Limits and smallest scale of the input compression, SI.
+        floor: (channel,) The smallest sigma that the contact detector assumes, SI.
+        temperature: The number that divides the logits, fitted on validation sweeps so that
+            probabilities mean what they say.
+        provenance: The origin of the file: network, training, data set, hashes, commands.
+        figures: The figures measured on the model, such as parity and accuracy.
+        version: The version of this schema, 1 or 2.
 
     Since version 2:
-        kind: "step" or "window", see the module's docstring.
-        precision: how weights are stored and multiplied.
-        opset: version of ONNX's operators.
-        hashes: SHA-256, hex; "graph" is `onnx_reading.graph_sha256` of the file.
-        thresholds: posteriors from which a decision may be taken early, by what they promise.
-        decision: defaults of the decision modes.
-        probe: (step, class) logits of the built-in probe episode, by which `tactile-rt model
+        kind: What the graph takes at once, "step" or "window", see `model_file`.
+        precision: The number format in which weights are stored and multiplied.
+        opset: The version of ONNX's operators that the graph uses.
+        hashes: SHA-256 sums, hex, by what they are of; "graph" is `onnx_check.graph_sha256` of the
+            file.
+        thresholds: Posteriors from which a decision may be taken early, by what they promise.
+        decision: The defaults of the decision modes.
+        probe: (step, class) Logits of the built-in probe episode, by which `tactile-rt model
             verify` tells whether another machine computes the same.
     """
 

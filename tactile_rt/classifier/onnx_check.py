@@ -48,12 +48,13 @@ class Contents:
     """What a model file holds.
 
     Attributes:
-        producer: the program that wrote it.
-        opset: version of each operator set, by domain; ``""`` is ONNX's own.
-        metadata: the file's key-value pairs.
-        operators: how often each is used, subgraphs included.
-        inputs, outputs: names of the graph's, without inputs that have a stored value.
-        weights: bytes of stored tensors.
+        producer: The name of the program that wrote the file.
+        opset: The version of each operator set, by domain; ``""`` is ONNX's own.
+        metadata: The key-value pairs that the file carries.
+        operators: The number of uses of each operator, by name, subgraphs included.
+        inputs, outputs: Names of the graph's inputs and outputs, without the inputs that have a
+            stored value.
+        weights: The size of all stored tensors, bytes.
     """
 
     producer: str = ""

@@ -11,9 +11,8 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import DTypeLike, NDArray
 
-from tactile_rt.classifier.denormals import FlushDenormals
-from tactile_rt.classifier.model_file import ModelCard
-from tactile_rt.classifier.providers import device_of
+from tactile_rt.classifier.model_card import ModelCard
+from tactile_rt.classifier.runtime import FlushDenormals, device_of
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Stepper"]

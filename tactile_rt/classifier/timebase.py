@@ -37,7 +37,8 @@ class Resampler:
             coincide; else the first is as early as it can be.
 
     Attributes:
-        out_of_order: input samples not later than the one before, which are left out.
+        out_of_order: The number of input samples that were not later than the one before, and
+            were therefore left out.
     """
 
     def __init__(self, period_ns: int, input_rate_hz: float, aligned: bool = False) -> None:

@@ -13,8 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from typer.core import TyperCommand
 
-from tactile_rt.cli.app import app, check_output, needs
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.app import app, check_output, needs, progress_bar
 from tactile_rt.stream import ConfigError, TactileError
 
 if TYPE_CHECKING:

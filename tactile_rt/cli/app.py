@@ -1,19 +1,44 @@
 """The application that every command adds itself to, and what commands share."""
 
+import os
 import signal
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import FrameType
+from typing import Annotated
 
 import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tactile_rt.stream import ConfigError, TactileError
 from tactile_rt.version import VERSION
 
-__all__ = ["INTERRUPTED", "USER_ERROR", "app", "check_output", "needs", "starting"]
+__all__ = [
+    "INTERRUPTED",
+    "USER_ERROR",
+    "Model",
+    "Seconds",
+    "app",
+    "check_output",
+    "leaving",
+    "needs",
+    "progress_bar",
+    "starting",
+]
 
 USER_ERROR, INTERRUPTED = 2, 130  # exit codes
+A_DAY_S = 86_400.0
+
+Model = Annotated[
+    Path | None, typer.Option(help="An .onnx model; default: the one that comes with the package.")
+]
+Seconds = Annotated[
+    float | None, typer.Option(min=0.001, max=1e9, help="Leave after so many seconds.")
+]
 
 app = typer.Typer(
     name="tactile-rt",
@@ -57,6 +82,66 @@ def starting() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
     if asked:
         raise KeyboardInterrupt
+
+
+@contextmanager
+def leaving(seconds: float | None) -> Iterator[None]:
+    """Let Ctrl-C, SIGTERM, a closed output pipe or the clock end the block, and go on after it."""
+    alike = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+    before = [signal.signal(s, signal.default_int_handler) for s in alike]
+    # A timer, not a look at the stream's clock: a silent device must not keep us waiting.
+    signal.setitimer(signal.ITIMER_REAL, seconds or 0)
+    try:
+        yield
+    except KeyboardInterrupt:
+        pass
+    except BrokenPipeError:
+        # What is still buffered would fail again when Python flushes stdout at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        for s, handler in zip(alike, before, strict=True):
+            signal.signal(s, handler)
+
+
+@contextmanager
+def progress_bar(
+    console: Console,
+    what: str,
+    total: float | None = None,
+    completed: int = 0,
+    counted: bool = False,
+) -> Iterator[Callable[..., None]]:
+    """A bar with the time left, gone when it is done or fails: an error is one line alone.
+
+    Where the console is no terminal nothing is shown: a log file keeps clean.
+
+    Args:
+        console: where.
+        what: is going on.
+        total: of the work; None until it is known.
+        completed: was done before, and says nothing about the time left.
+        counted: say how many of the total are done.
+
+    Yields:
+        What to call as the work goes on: rich's `Progress.update` without the task
+        (``advance=1``, ``completed=7``, ``total=9``, ``description="mug-1"``).
+    """
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        *((MofNCompleteColumn(),) if counted else ()),
+        TimeRemainingColumn(),
+    )
+    # Of rich's usual 30 s: a step may last minutes, and a rate takes two of them.
+    with Progress(
+        *columns,
+        console=console,
+        transient=True,
+        disable=not console.is_terminal,
+        speed_estimate_period=A_DAY_S,
+    ) as progress:
+        yield partial(progress.update, progress.add_task(what, total=total, completed=completed))
 
 
 def check_output(file: Path | None) -> None:

@@ -1,4 +1,7 @@
-"""`tactile-rt bench`: measure this installation and compare with what is promised."""
+"""`tactile-rt bench`: measure this installation and compare with what is promised.
+
+What measures stands beside the package in a checkout, in `bench/AREA/area.py`, and in no wheel.
+"""
 
 import sys
 from importlib import import_module
@@ -12,14 +15,14 @@ from tactile_rt.cli.app import app, check_output, needs
 from tactile_rt.stream import ConfigError
 
 CHECKOUT = Path(__file__).parents[2]
-# area: (module with `run(quick) -> list[Record]`, extra that it needs), None: no figures yet
-AREAS: dict[str, tuple[str, str] | None] = {
-    "sim": ("bench.sim.area", "sim"),
-    "drivers": ("bench.drivers.area", "record"),
-    "models": ("bench.models.area", "train"),
-    "inference": ("bench.inference.area", ""),
-    "daemon": ("bench.daemon.area", "train"),
-    "align": ("bench.align.area", ""),
+# Each area, and the extra that its `run(quick) -> list[Record]` needs.
+AREAS = {
+    "sim": "sim",
+    "drivers": "record",
+    "models": "train",
+    "inference": "",
+    "daemon": "train",
+    "align": "",
 }
 
 
@@ -37,32 +40,31 @@ def bench(
     if area is not None and area not in AREAS:
         raise ConfigError(f"no benchmark area {area!r}: there are {', '.join(AREAS)}")
     check_output(json)
-    progress, records, without = Console(stderr=True), [], []
+    progress, records = Console(stderr=True), []
     for name in [area] if area else AREAS:
-        there = AREAS[name]
-        if there is None:
-            without.append(name)
-            continue
-        module, extra = there
         with progress.status(f"measuring {name}"):
             try:
-                records += _rig(name, module).run(quick)
+                records += _rig(name).run(quick)
             except ModuleNotFoundError as error:
-                raise needs(extra, error) from None
-    if records:
-        show(records, Console())
-        bars = [r for r in records if r.bar]
-        typer.echo(f"{sum(bool(r.met) for r in bars)} of {len(bars)} bars met")
-    if without:
-        typer.echo(f"no figures yet for: {', '.join(without)}")
+                raise needs(AREAS[name], error) from None
+    show(records, Console())
+    bars = [r for r in records if r.bar]
+    typer.echo(f"{sum(bool(r.met) for r in bars)} of {len(bars)} bars met")
     if json:
         write(records, json)
 
 
-def _rig(area: str, module: str) -> Any:
-    """The rig of an area: it stands beside the package in a checkout, and in no wheel."""
-    if not (CHECKOUT / "bench" / "__init__.py").is_file():
-        raise ConfigError(f"bench {area} measures from a checkout: this install has no rigs")
-    if str(CHECKOUT) not in sys.path:
-        sys.path.insert(0, str(CHECKOUT))
-    return import_module(module)
+def _rig(area: str) -> Any:
+    """The module that measures an area.
+
+    Raises:
+        ConfigError: This install has none: it is no checkout.
+    """
+    if not (CHECKOUT / "bench" / area / "area.py").is_file():  # a `bench` of others may be there
+        raise ConfigError(
+            f"bench {area} measures from a checkout (pip install --editable): "
+            f"{Path(__file__).parents[1]} was installed without its rigs"
+        )
+    if sys.path[0] != str(CHECKOUT):
+        sys.path.insert(0, str(CHECKOUT))  # first, lest that `bench` be imported
+    return import_module(f"bench.{area}.area")

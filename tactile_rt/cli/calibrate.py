@@ -5,17 +5,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output, starting
-from tactile_rt.cli.calibrate_view import show_fit, show_tare, show_uncalibrated
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError, Source, concatenate
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
-    from tactile_rt.calibration import Calibration, Fit, LoadTable
+    from tactile_rt.calibration import Calibration, Fit, LoadTable, Tare
 
 LOUDER = 3.0  # noise over that of the last tare that is worth a word
 
@@ -38,8 +40,6 @@ def tare(
     Refused if an element is touched meanwhile, or drifts. What else the
     device's file holds (matrices, mapping, mirror) stays.
     """
-    from rich.console import Console
-
     from tactile_rt.calibration import (
         CalibratedSource,
         Calibration,
@@ -75,7 +75,7 @@ def tare(
         noise={**known.noise, **noise},
     )
     save_calibration(known, path if out else None)
-    show_tare(measured, Console())
+    _show_tare(measured, Console())
     if untared:
         typer.echo(f"not tared, for want of valid samples: {', '.join(measured.untared)}", err=True)
     if louder:
@@ -84,7 +84,7 @@ def tare(
             "the array shake? then tare again",
             err=True,
         )
-    show_uncalibrated(known)
+    _show_uncalibrated(known)
     typer.echo(f"tare of {known.device} written to {path}")
 
 
@@ -107,8 +107,6 @@ def calibrate(
 
     Without --device and --out nothing is written.
     """
-    from rich.console import Console
-
     from tactile_rt.calibration import (
         Calibration,
         calibration_path,
@@ -151,9 +149,9 @@ def calibrate(
     if path:
         made = _with_fit(target, element, fit, loads, table)
         save_calibration(made, path if out else None)
-    show_fit(fit, loads, Console())
+    _show_fit(fit, loads, Console())
     if made:
-        show_uncalibrated(made)
+        _show_uncalibrated(made)
         typer.echo(f"matrix of {made.device}, element {element}, written to {path}")
     else:
         typer.echo("not written: name a --device or a file (--out)")
@@ -242,3 +240,54 @@ def _louder(noise: tuple[float, ...], before: tuple[float, ...]) -> bool:
 
 def _now() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def _show_tare(measured: "Tare", console: Console) -> None:
+    """Offsets and noise, channel by channel."""
+    spec = measured.spec
+    counted = np.array([e not in measured.untared for e in spec.elements])
+    offset, noise = measured.offset[counted], measured.noise[counted]
+    names = [e for e, there in zip(spec.elements, counted, strict=True) if there]
+    table = Table("channel", "unit", "offset", "noise (median)", "noisiest", box=None)
+    for c, (channel, unit) in enumerate(zip(spec.channels, spec.units, strict=True)):
+        low, high = offset[:, c].min(), offset[:, c].max()
+        span = f"{low:.4g}" if len(names) == 1 else f"{low:.4g} to {high:.4g}"
+        most = int(noise[:, c].argmax())
+        table.add_row(
+            *map(escape, (channel, unit, span, f"{np.median(noise[:, c]):.2g}")),
+            escape(f"{names[most]} {noise[most, c]:.2g}"),
+        )
+    console.print(table)
+
+
+def _show_fit(fit: "Fit", loads: "LoadTable", console: Console) -> None:
+    """Residuals per axis, conditions, worst lines and warnings."""
+    table = Table("axis", "unit", "full scale", "residual RMS", "of full scale", "R²", box=None)
+    rows = zip(fit.axes, loads.units, fit.full_scale, fit.rms, fit.r_squared, strict=True)
+    for axis, unit, full, rms, explained in rows:
+        share = f"{100 * rms / full:.2g} %" if full else "-"
+        table.add_row(
+            axis, unit, f"{full:.4g}", f"{rms:.2g}", share, f"{explained:.6f}" if full else "-"
+        )
+    console.print(table)
+    console.print(
+        f"{len(loads.lines)} loads; condition number {fit.condition:.3g} of the readings, "
+        f"{fit.load_condition:.3g} of the loads",
+        soft_wrap=True,
+    )
+    for row in fit.worst[:3]:
+        left = ", ".join(
+            f"{a} {r:+.2g} {u}"
+            for a, r, u in zip(fit.axes, fit.residuals[row], loads.units, strict=True)
+        )
+        console.print(f"worst: line {loads.lines[row]}, off by {left}", soft_wrap=True)
+    for warning in fit.warnings:
+        console.print(f"[yellow]warning[/]: {escape(warning)}", soft_wrap=True)
+
+
+def _show_uncalibrated(calibration: "Calibration") -> None:
+    """Name the elements that cannot be used yet, if there are any."""
+    if calibration.uncalibrated:
+        typer.echo(
+            f"without a matrix, and so never valid: {', '.join(calibration.uncalibrated)}", err=True
+        )

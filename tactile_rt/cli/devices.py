@@ -6,8 +6,7 @@ from typing import Annotated
 
 import typer
 
-from tactile_rt.cli.app import app, check_output, starting
-from tactile_rt.cli.run import Seconds, leaving
+from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
 
 Url = Annotated[str, typer.Argument(help="URL of a source, e.g. serial:///dev/ttyUSB0?codec=bota.")]
 WINDOW_S = 1.0
@@ -44,8 +43,7 @@ def doctor(
     from rich.console import Console
     from rich.markup import escape
 
-    from tactile_rt.drivers.discovery import can_buses, serial_ports
-    from tactile_rt.drivers.doctor import diagnose, udev_rules
+    from tactile_rt.drivers.discovery import can_buses, diagnose, serial_ports, udev_rules
     from tactile_rt.files import write_whole
 
     check_output(udev)

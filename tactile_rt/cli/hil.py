@@ -8,9 +8,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli.app import INTERRUPTED, app, starting
+from tactile_rt.cli.app import INTERRUPTED, app, leaving, starting
 from tactile_rt.cli.emulate import codec_options
-from tactile_rt.cli.run import leaving
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:

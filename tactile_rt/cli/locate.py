@@ -75,7 +75,7 @@ def evaluate(
 def _shapes(manifest: "SweepManifest") -> "WhiskerShapes":
     """Of the whiskers that a set was made with, from mm to SI."""
     from tactile_rt.classifier.contact_point import WhiskerShapes
-    from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+    from tactile_rt.sim_backend.arrays.files import load_animals
 
     animals = load_animals(str(manifest.recipe.get("array", "mouse")))
     whiskers = [whisker for animal in animals for whisker in animal.whiskers]

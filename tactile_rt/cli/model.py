@@ -77,8 +77,7 @@ def verify(file: File) -> None:
     """
     import hashlib
 
-    from tactile_rt.classifier.model_check import verify_model
-    from tactile_rt.classifier.model_file import load_model, read_model
+    from tactile_rt.classifier.model_file import load_model, read_model, verify_model
 
     _, contents, data = read_model(file)
     typer.echo(f"sha256 {hashlib.sha256(data).hexdigest()}")

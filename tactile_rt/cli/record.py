@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tactile_rt.cli.app import app, check_output, starting
-from tactile_rt.cli.run import Seconds, leaving
+from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
 from tactile_rt.stream import ConfigError, EndOfStream, Source
 
 if TYPE_CHECKING:

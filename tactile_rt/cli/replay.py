@@ -7,8 +7,7 @@ from urllib.parse import parse_qsl
 
 import typer
 
-from tactile_rt.cli.app import app, check_output
-from tactile_rt.cli.run import leaving
+from tactile_rt.cli.app import app, check_output, leaving
 from tactile_rt.stream import ConfigError, RecordingError
 
 if TYPE_CHECKING:

@@ -1,45 +1,13 @@
-"""`tactile-rt run` and `demo`: a classifier on a live stream."""
+"""`tactile-rt run`: the daemon, or a classifier on one live stream."""
 
-import os
-import signal
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from tactile_rt.cli.app import app, needs, starting
+from tactile_rt.cli.app import Model, Seconds, app, leaving, starting
 from tactile_rt.cli.daemon import Settings, serve
 from tactile_rt.stream import ConfigError
-
-Model = Annotated[
-    Path | None, typer.Option(help="An .onnx model; default: the one that comes with the package.")
-]
-Seconds = Annotated[
-    float | None, typer.Option(min=0.001, max=1e9, help="Leave after so many seconds.")
-]
-
-
-@contextmanager
-def leaving(seconds: float | None) -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM, a closed output pipe or the clock end the block, and go on after it."""
-    alike = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
-    before = [signal.signal(s, signal.default_int_handler) for s in alike]
-    # A timer, not a look at the stream's clock: a silent device must not keep us waiting.
-    signal.setitimer(signal.ITIMER_REAL, seconds or 0)
-    try:
-        yield
-    except KeyboardInterrupt:
-        pass
-    except BrokenPipeError:
-        # What is still buffered would fail again when Python flushes stdout at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        for s, handler in zip(alike, before, strict=True):
-            signal.signal(s, handler)
 
 
 @app.command()
@@ -117,42 +85,3 @@ def run(
                     printed += 1
     dropped = session.dropped + opened.stats.dropped
     typer.echo(f"{samples} samples, {printed} decisions, {dropped} dropped", err=True)
-
-
-@app.command()
-def demo(
-    sweeps: Annotated[
-        int, typer.Option(min=0, help="Leave after so many objects; 0: go on until Ctrl-C.")
-    ] = 0,
-    seconds: Seconds = None,
-    model: Model = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the drawn objects and sweeps.")] = 0,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="As fast as it simulates, not in real time.")
-    ] = False,
-    plain: Annotated[
-        bool, typer.Option("--plain", help="One line per object instead of the view.")
-    ] = False,
-) -> None:
-    """Sweep objects that the model never saw past simulated whiskers, and keep the score."""
-    from rich.console import Console
-
-    from tactile_rt.classifier.model_file import shipped_model
-
-    console = Console()
-    try:
-        with starting(), console.status("building the array and the objects"):
-            from tactile_rt.cli.demo import Demonstration
-            from tactile_rt.cli.demo_view import watch
-
-            demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast)
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
-    with leaving(seconds), demonstration:
-        if plain or not console.is_terminal or console.is_dumb_terminal:
-            for settled in demonstration.run():
-                for outcome in settled:
-                    typer.echo(outcome.line())
-        else:
-            watch(demonstration, console)
-    typer.echo(demonstration.summary())

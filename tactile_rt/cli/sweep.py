@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, needs, starting
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.app import app, needs, progress_bar, starting
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -55,7 +54,7 @@ def sweep(
     """Sweep simulated objects past the whisker array and store what it feels."""
     console = Console(stderr=True, soft_wrap=True)
     if verify:
-        from tactile_rt.sim_backend.datasets.sums import check_sums
+        from tactile_rt.sim_backend.datasets.inventory import check_sums
 
         console.print(f"{folder}: {check_sums(folder)} files are as they were written")
         return
@@ -66,7 +65,7 @@ def sweep(
                 finished_objects,
                 make_sweeps,
             )
-            from tactile_rt.sim_backend.datasets.tally import tally
+            from tactile_rt.sim_backend.datasets.inventory import tally
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
     chosen = _override(
@@ -98,9 +97,10 @@ def _write_card(folder: Path) -> None:
         import sklearn  # noqa: F401
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
+    from tactile_rt.models.svm import fit
     from tactile_rt.sim_backend.datasets.card import write_card
 
-    write_card(folder)
+    write_card(folder, fit)
 
 
 def _recipe(folder: Path, name: str | None) -> "SweepRecipe":

@@ -8,8 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli.app import app, needs
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.app import app, needs, progress_bar
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, starting
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.app import app, check_output, needs, progress_bar, starting
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ def view(
     check_output(out)
     try:
         with starting():
-            from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+            from tactile_rt.sim_backend.arrays.files import load_animals
             from tactile_rt.sim_backend.objects.catalogue import load_object
             from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, usual_distance
             from tactile_rt.sim_backend.views.camera import VIEWS
@@ -139,9 +138,9 @@ def view(
             return
         with progress_bar(console, "drawing", total=len(footage)) as update:
 
-            def frames() -> Iterator["NDArray[np.uint8]"]:
+            def pictures() -> Iterator["NDArray[np.uint8]"]:
                 for picture in film:
                     yield picture
                     update(advance=1)
 
-            write_video(out, frames(), fps, film.picture(footage.strongest))
+            write_video(out, pictures(), fps, film.picture(footage.strongest))

@@ -1,4 +1,4 @@
-"""`tactile-rt whisk`: the array whisks against an object, or the stimuli of a recording."""
+"""`tactile-rt whisk`: the array whisks against an object, or the barrel-cortex stimuli."""
 
 import hashlib
 import math
@@ -9,8 +9,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, starting
-from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.app import app, check_output, needs, progress_bar, starting
 from tactile_rt.stream import ConfigError
 
 
@@ -62,7 +61,7 @@ def whisk(
         with starting():
             import numpy as np
 
-            from tactile_rt.sim_backend.arrays.whisker_array import load_array
+            from tactile_rt.sim_backend.arrays.files import load_array
             from tactile_rt.sim_backend.arrays.whiskers import rotation
             from tactile_rt.sim_backend.objects.catalogue import load_object
             from tactile_rt.sim_backend.stimuli import STIMULI, Surface, whisk_against, write_input

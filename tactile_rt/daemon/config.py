@@ -2,8 +2,11 @@
 
 Version 1 of the keys is promised: a file that is right for it stays right for later releases, or
 is refused by its ``version``, never misread. Relative paths are meant from the file's folder.
+`loading` reads such a file, `checks` says whether it can work.
 """
 
+import ipaddress
+import json
 from typing import Annotated, Any, Literal
 
 import msgspec
@@ -20,12 +23,15 @@ __all__ = [
     "PublisherConfig",
     "RecorderConfig",
     "SourceConfig",
+    "config_text",
+    "is_loopback",
 ]
 
 CONFIG_VERSION = 1
 
-Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,64}\Z")]
-OptionalName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{0,64}\Z")]
+NAME = "name: letters, digits, - and _, 64 at most"
+Name = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{1,64}\Z", description=NAME)]
+OptionalName = Annotated[str, msgspec.Meta(pattern=r"^[A-Za-z0-9_-]{0,64}\Z", description=NAME)]
 Text = Annotated[str, msgspec.Meta(min_length=1, max_length=4096)]
 Port = Annotated[int, msgspec.Meta(ge=1, le=65535)]
 Seconds = Annotated[float, msgspec.Meta(ge=0, le=1e6)]
@@ -40,13 +46,14 @@ class SourceConfig(_Table, frozen=True, kw_only=True):
     """``[[source]]``: an array.
 
     Attributes:
-        name: what it is called everywhere.
-        url: as for `tactile-rt run --source`.
-        calibration: file, or id of a device calibrated before; empty: none.
+        name: The name by which models, messages and recordings refer to the array.
+        url: The URL of the source, as `tactile-rt run --source` takes it.
+        calibration: A calibration file, or the id of a device calibrated before; empty if the
+            samples are used as they come.
     """
 
     name: Name
-    url: Text
+    url: str
     calibration: str = ""
 
 
@@ -54,18 +61,22 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
     """``[[model]]``: a classifier on a source.
 
     Attributes:
-        file: ``.onnx``; empty: the model that comes with the package.
-        source: name of its source; needed if there are several.
-        name: what it is called; empty: as its source.
-        decisions: what is published: ``every_step``, or ``final`` ones alone.
-        mode: ``episode``: one decision from the onset on, better with every step; ``sliding``: as
-            long as contact lasts, one about the newest 22 steps, `every` so many of them.
-        every: steps from one to the next when sliding; 0: 4.
-        sure: an episode ends early when a class is as probable as this `in_a_row` steps; 0: never.
-        deadline_ms: how long a step may take, ms; 0: as long as the step itself.
-        late: what becomes of a step that took longer: ``count``, ``report`` in the log, or
-            ``skip``: its decision is not published.
-        providers: of onnxruntime, best first: ``cpu``, ``cuda``, ``tensorrt`` ...
+        file: The ``.onnx`` file; empty for the model that comes with the package.
+        source: The name of the source whose samples are classified; needed if there are several.
+        name: The name of the model in messages; empty to name it like its source.
+        decisions: Choice of the decisions that are published: ``every_step``, or ``final`` ones
+            alone.
+        mode: ``episode`` decides from the onset on, better with every step; ``sliding`` decides as
+            long as contact lasts, each time about the newest steps, as many as an episode has.
+        every: Number of steps from one sliding decision to the next, at most those of an episode;
+            0 for 4, or those of a shorter episode.
+        sure: Probability that ends an episode early when one class reaches it `in_a_row` steps
+            running; 0 for never.
+        in_a_row: Number of steps running for `sure`, at most those of an episode.
+        deadline_ms: Longest time that a step may take, ms; 0 for the duration of the step itself.
+        late: What becomes of a step that took longer than `deadline_ms`: ``count``, ``report`` in
+            the log, or ``skip``, so that the decision is not published.
+        providers: Execution providers of onnxruntime, best first: ``cpu``, ``cuda``, ``tensorrt``.
     """
 
     file: str = ""
@@ -73,9 +84,9 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
     name: OptionalName = ""
     decisions: Literal["every_step", "final"] = "every_step"
     mode: Literal["episode", "sliding"] = "episode"
-    every: Annotated[int, msgspec.Meta(ge=0, le=22)] = 0
+    every: Annotated[int, msgspec.Meta(ge=0)] = 0
     sure: Annotated[float, msgspec.Meta(ge=0, lt=1)] = 0.0
-    in_a_row: Annotated[int, msgspec.Meta(ge=1, le=22)] = 2
+    in_a_row: Annotated[int, msgspec.Meta(ge=1)] = 2
     deadline_ms: Annotated[float, msgspec.Meta(ge=0, le=10_000)] = 0.0
     late: Literal["count", "report", "skip"] = "count"
     providers: Annotated[tuple[Text, ...], msgspec.Meta(min_length=1)] = ("cpu",)
@@ -85,9 +96,10 @@ class PublisherConfig(_Table, frozen=True, kw_only=True):
     """``[[publisher]]``: where messages go.
 
     Attributes:
-        kind: ``jsonl``, ``zmq``, ``zenoh``, ``foxglove``, or one that another package adds.
-        name: what it is called; empty: as its kind.
-        options: its own table.
+        kind: Kind of publisher: ``jsonl``, ``zmq``, ``zenoh``, ``foxglove``, or one that another
+            package adds.
+        name: The name of the publisher in the log and on the page; empty to name it like its kind.
+        options: The table of options that this kind of publisher takes.
     """
 
     kind: Text
@@ -99,11 +111,13 @@ class RecorderConfig(_Table, frozen=True, kw_only=True):
     """``[recorder]``: MCAP files.
 
     Attributes:
-        folder: where to; made if it is not there.
-        rotate_mb, rotate_s: a new file begins after so much, or so long; 0: never.
-        min_free_mb: below so much free space nothing is recorded.
-        mode: ``always``, or ``trigger``: around contacts and faults.
-        before_s, after_s: of a trigger, what is kept.
+        folder: The folder that recordings are written into; made if it is missing.
+        rotate_mb: Size at which a new file begins, MB; 0 for never.
+        rotate_s: Age at which a new file begins, s; 0 for never.
+        min_free_mb: Free space below which nothing is recorded, MB.
+        mode: ``always`` records all samples; ``trigger`` only those around contacts and faults.
+        before_s: Time before a trigger that is kept, s.
+        after_s: Time after a trigger that is kept, s.
     """
 
     folder: Text
@@ -119,10 +133,10 @@ class PageConfig(_Table, frozen=True, kw_only=True):
     """``[page]``: the web page.
 
     Attributes:
-        host: address to listen on; beyond loopback a token is needed.
-        port: of it.
-        token: what a browser must know, at least 16 characters; empty: nothing.
-        control: whether the page may do more than look.
+        host: The address that the page listens on; beyond loopback a token is needed.
+        port: The TCP port that the page listens on, 1 to 65535.
+        token: The secret that a browser must know, at least 16 characters; empty for none.
+        control: Whether the page may start and stop the recorder, besides showing things.
     """
 
     host: Text = "127.0.0.1"
@@ -142,10 +156,11 @@ class LogConfig(_Table, frozen=True, kw_only=True):
     """``[log]``: one line per event.
 
     Attributes:
-        level: the least that is worth a line.
-        format: ``text`` or ``json``.
-        file: where to; empty: stderr, which systemd keeps.
-        repeat_s: what comes again within so long is counted, and told once: "repeated n times".
+        level: The least severe level that is written: ``info``, ``warning`` or ``error``.
+        format: Format of the lines, ``text`` or ``json``.
+        file: The file that lines are appended to; empty for stderr, which systemd keeps.
+        repeat_s: Time within which an event that comes again is counted instead of written, s;
+            the count is told once: "repeated n times".
     """
 
     level: Literal["info", "warning", "error"] = "info"
@@ -155,17 +170,19 @@ class LogConfig(_Table, frozen=True, kw_only=True):
 
 
 class LimitsConfig(_Table, frozen=True, kw_only=True):
-    """``[limits]``.
+    """``[limits]``: how much may wait, and how long things may take.
 
     Attributes:
-        queue_items, queue_mb: what may wait for one consumer, before the oldest goes.
-        model_queue_items: chunks that may wait for one model.
-        gather_ms: how long a model waits for more samples before it looks at those that came; less
-            is sooner, more takes less of the processor.
-        stop_s: how long closing may take.
-        stall_s: a call that takes longer is told as stalled.
-        retry_first_s, retry_last_s: pause before a part that broke is tried again; it doubles from
-            the first to the last.
+        queue_items: Number of items that may wait for one consumer before the oldest goes.
+        queue_mb: Size of the items that may wait for one consumer before the oldest goes, MB.
+        model_queue_items: Number of chunks that may wait for one model.
+        gather_ms: Time that a model waits for more samples before it looks at those that came, ms;
+            less is sooner, more takes less of the processor.
+        stop_s: Longest time that closing may take, s.
+        stall_s: Duration from which a call is told as stalled, s.
+        retry_first_s: Pause before a part that broke is tried again for the first time, s.
+        retry_last_s: Longest pause before a part that broke is tried again, s; from the first on
+            pauses double up to this.
     """
 
     queue_items: Annotated[int, msgspec.Meta(ge=16, le=1_000_000)] = 4096
@@ -182,8 +199,16 @@ class Config(_Table, frozen=True, kw_only=True):
     """The file.
 
     Attributes:
-        version: of these keys.
-        extends: a file that this one adds to and overrides; gone once it is read.
+        version: The version of the keys, always 1.
+        extends: The file that this one adds to and overrides; empty once it has been read.
+        source: The arrays, one table ``[[source]]`` each.
+        model: The classifiers, one table ``[[model]]`` each.
+        publisher: The publishers, one table ``[[publisher]]`` each.
+        recorder: The table ``[recorder]``; None if nothing is recorded.
+        page: The table ``[page]``; None without a web page.
+        metrics: The table ``[metrics]``; None without metrics.
+        log: The table ``[log]``, which may be left out.
+        limits: The table ``[limits]``, which may be left out.
     """
 
     version: Literal[1]
@@ -196,6 +221,16 @@ class Config(_Table, frozen=True, kw_only=True):
     metrics: MetricsConfig | None = None
     log: LogConfig = LogConfig()
     limits: LimitsConfig = LimitsConfig()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer can reach what listens there."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host.strip("[]")).is_loopback
+    except ValueError:
+        return False
 
 
 EXAMPLE = """\
@@ -253,3 +288,49 @@ stall_s = 5                    # a call that takes longer is told as stalled
 retry_first_s = 0.1            # pause before a part that broke is tried again, doubling
 retry_last_s = 2
 """
+
+
+# as TOML again
+
+SECRETS = ("token", "password", "secret", "key")
+HIDDEN = "***"
+
+
+def config_text(config: Config) -> str:
+    """TOML that says the same with all defaults, but for secrets, which are hidden."""
+    lines = [f"version = {config.version}"]
+    for table, several in (
+        ("source", True), ("model", True), ("publisher", True), ("recorder", False),
+        ("page", False), ("metrics", False), ("log", False), ("limits", False),
+    ):  # fmt: skip
+        found = getattr(config, table)
+        for one in found if several else [found] if found is not None else []:
+            lines += ["", f"[[{table}]]" if several else f"[{table}]"]
+            for key, value in msgspec.structs.asdict(one).items():
+                lines.append(f"{key} = {_toml(_hide(key, value))}")
+    return "\n".join(lines) + "\n"
+
+
+def _hide(key: str, value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _hide(k, v) for k, v in value.items()}
+    secret = any(key.lower() == s or key.lower().endswith(f"_{s}") for s in SECRETS)
+    return HIDDEN if secret and isinstance(value, str) and value else value
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        # TOML's basic strings are JSON's, but for the one control character that JSON leaves bare.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, float):
+        text = repr(value)
+        return text if any(c in text for c in ".en") else f"{text}.0"
+    if isinstance(value, dict):
+        pairs = [f"{_toml(k)} = {_toml(v)}" for k, v in value.items()]
+        inner = ", ".join(pairs)
+        return f"{{ {inner} }}" if inner else "{}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    return str(value) if isinstance(value, int) else value.isoformat()

@@ -1,13 +1,18 @@
-"""What publishers, the recorder, the page, metrics and systemd are to the daemon."""
+"""What publishers, the recorder, the page, metrics and systemd are to the daemon, and how each is
+run: in a thread of its own, fed from a mailbox."""
 
 import abc
+import time
 from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol
 
+from tactile_rt.daemon.config import LimitsConfig
+from tactile_rt.daemon.health import ConsumerState, LatencyMeter, Snapshot
 from tactile_rt.daemon.items import Closed, Contact, Control, Decision, Event, Item, Opened
-from tactile_rt.daemon.snapshot import Snapshot
+from tactile_rt.daemon.mailbox import Mailbox
+from tactile_rt.daemon.part import Part, Report
 
-__all__ = ["Consumer", "View"]
+__all__ = ["Consumer", "ConsumerPart", "View"]
 
 
 class View(Protocol):
@@ -46,10 +51,13 @@ class Consumer(abc.ABC):
     oldest dropped). A `handle` that does not return is told as stalled, and harms only itself.
 
     Attributes:
-        Options: msgspec.Struct (frozen, forbid_unknown_fields) of a publisher's ``options`` table.
-        wants: which classes of items it is given. Ask for `Samples` and `Packet` only if needed.
-        gather_s: how long samples and packets may wait to come together; all else comes at once.
-        tick_s: `handle` is called at least so often, with no items if need be; 0: never without.
+        Options: The msgspec.Struct (frozen, forbid_unknown_fields) of a publisher's ``options``.
+        wants: The classes of items that are handed over. Ask for `SourceChunk` and `Packet` only
+            if needed.
+        gather_s: The time that samples and packets may wait to come together, s; all else comes
+            at once.
+        tick_s: The longest time between two calls of `handle`, with no items if need be, s; 0:
+            never without items.
     """
 
     Options: ClassVar[Any] = None
@@ -75,3 +83,75 @@ class Consumer(abc.ABC):
     def details(self) -> dict[str, str | int | float]:
         """What to tell in the snapshot; called from any thread, must be quick."""
         return {}
+
+
+class ConsumerPart(Part):
+    """Runs a consumer.
+
+    Args:
+        name: The name of the part: ``publisher.NAME``, ``recorder`` ...
+        kind: The kind of consumer, for the snapshot.
+        consumer: The consumer itself.
+        view: The daemon as the consumer sees it.
+        report, limits: As of every `Part`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        kind: str,
+        consumer: Consumer,
+        view: View,
+        report: Report,
+        limits: LimitsConfig,
+    ) -> None:
+        super().__init__(name, report, limits)
+        self.kind, self.consumer = kind, consumer
+        self.box = Mailbox(
+            consumer.wants, limits.queue_items, round(1e6 * limits.queue_mb), consumer.gather_s
+        )
+        self._view = view
+        self._latency = LatencyMeter()
+
+    @property
+    def consumer_state(self) -> ConsumerState:
+        """For the snapshot."""
+        try:
+            details = self.consumer.details()
+        except Exception as error:  # telling of itself must not break the snapshot of all others
+            details = {"error": f"{type(error).__name__}: {error}"}
+        return ConsumerState(self.state, self.kind, self.box.state, self._latency.state, details)
+
+    def stop(self) -> None:
+        super().stop()
+        self.box.close()
+
+    def _work(self) -> None:
+        consumer, box = self.consumer, self.box
+        self._busy_ns = time.monotonic_ns()
+        consumer.open(self._view)
+        self._busy_ns = 0
+        box.taking = True
+        self._up()
+        tick = consumer.tick_s or None
+        due = time.monotonic() + consumer.tick_s
+        while True:
+            items = box.take(tick and max(0.0, due - time.monotonic()))
+            if not items and box.closed:
+                return
+            self._busy_ns = time.monotonic_ns()
+            consumer.handle(items)
+            now = time.monotonic_ns()
+            self._busy_ns = 0
+            due = now / 1e9 + consumer.tick_s
+            for item in items:
+                if isinstance(item, Decision):
+                    self._latency.add((now - item.sample_ns) / 1e9)
+
+    def _release(self) -> None:
+        self.box.taking = False
+        self._busy_ns = time.monotonic_ns()
+        try:
+            self.consumer.close()
+        finally:
+            self._busy_ns = 0

@@ -10,10 +10,11 @@ from typing import Any, ClassVar, TypeAlias
 from urllib.parse import quote
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
-from tactile_rt.daemon.digits import shortest
+from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
-from tactile_rt.daemon.snapshot import Snapshot
 
 __all__ = [
     "MESSAGE_VERSION",
@@ -26,12 +27,17 @@ __all__ = [
     "StateMessage",
     "encode",
     "message_of",
+    "shortest",
     "state_message",
     "topic_of",
 ]
 
 MESSAGE_VERSION = 1
 DIGITS = 4  # of probabilities
+# Of float32s, see `shortest`.
+MOST = 9  # digits tell any float32 from all others; 6 and fewer always survive it
+FEWEST = 6
+SMALLEST, LARGEST = 1e-13, 1e8  # where powers of ten and products with them are exact enough
 
 
 class _Message(msgspec.Struct, frozen=True, tag_field="type", kw_only=True):
@@ -57,14 +63,18 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
     """A model decided.
 
     Attributes:
-        t_ns: stream time of the last sample used.
-        onset_ns: stream time at which contact began: with `source` and `model` it names the
-            episode.
-        step: since onset, from 1; `final` the last one.
-        label: the most probable class; probabilities: of all of them.
-        model_ms: time that the network took, ms.
-        latency_ms: from the sample that completed the step until the decision was there, ms.
-        late: whether the step took longer than it may.
+        t_ns: The stream time of the last sample used, ns.
+        model: The name of the model in the configuration.
+        onset_ns: The stream time at which contact began, ns: with `source` and `model` it names
+            the episode.
+        step: The number of the step since onset, from 1.
+        final: Whether the step is the last one of its episode.
+        label: The most probable class.
+        probabilities: The probability of each class by its label.
+        model_ms: The time that the network took, ms.
+        latency_ms: The time from the sample that completed the step until the decision was there,
+            ms.
+        late: Whether the step took longer than it may.
     """
 
     topic: ClassVar[str] = "decision"
@@ -101,11 +111,12 @@ class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
     """A chunk of n samples; `t_ns` and `utc_ns` are those of its last one.
 
     Attributes:
-        elements, channels, units: axes of `values`, SI.
-        seq: (n,) sequence numbers.
-        times_ns: (n,) the stream's time of each.
-        values: (n, element, channel), with the fewest digits that read back as the same float32;
-            null where the element has no trustworthy value.
+        elements, channels, units: The axes of `values`: names of elements, names of channels, and
+            the SI unit of each channel.
+        seq: (n,) The sequence numbers of the samples.
+        times_ns: (n,) The stream time of each sample, ns.
+        values: (n, element, channel) The numbers, each written as the shortest one that reads back
+            as the same float32; null where the element has no trustworthy value.
     """
 
     topic: ClassVar[str] = "samples"
@@ -118,7 +129,7 @@ class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
 
 
 class StateMessage(_Message, frozen=True, tag="state", kw_only=True):
-    """Everything; see `snapshot.Snapshot`."""
+    """Everything; see `health.Snapshot`."""
 
     topic: ClassVar[str] = "state"
     snapshot: Snapshot
@@ -204,3 +215,42 @@ def _samples(item: SourceChunk) -> SamplesMessage:
         elements=spec.elements, channels=spec.channels, units=spec.units,
         seq=chunk.seq.tolist(), times_ns=chunk.t_ns.tolist(), values=values,
     )  # fmt: skip
+
+
+def _scales() -> NDArray[np.float64]:
+    """(256,) by the bits of a float32's exponent: the power of ten that leaves 9
+    digits before the point, or 10."""
+    decimal = np.floor((np.arange(256) - 127) * np.log10(2.0)).astype(int)
+    return np.array([10.0 ** min(max(MOST - 1 - e, 0), 22) for e in decimal])
+
+
+SCALES = _scales()
+
+
+def shortest(values: NDArray[np.float32]) -> NDArray[np.float64]:
+    """The same numbers in double precision, each moved to the decimal with the fewest digits that
+    is nearer to it than to any other float32: what is written of it is short, and no less exact.
+
+    The encoder of JSON takes no float32, and of the double that it is it writes all digits: 0.1 as
+    0.10000000149011612.
+
+    Args:
+        values: Numbers in any shape; NaN and infinities stay.
+    """
+    singles = np.ascontiguousarray(values, np.float32).ravel()
+    exact = singles.astype(np.float64)
+    size = np.abs(exact)
+    within = (size >= SMALLEST) & (size < LARGEST)
+    scale = SCALES[singles.view(np.uint32) >> 23 & 0xFF]
+    # Whole numbers below 2^53 and powers of ten up to 10^22 are exact in double precision, so that
+    # their quotient is the very double that the decimal is read as.
+    found = np.rint(exact * scale) / scale
+    found[~within] = exact[~within]
+    for n in range(1, MOST - FEWEST + 1):
+        scale_n = scale / 10.0**n
+        fewer = np.rint(exact * scale_n) / scale_n
+        np.copyto(found, fewer, where=within & (fewer.astype(np.float32) == singles))
+    for i in np.flatnonzero(~within & (size > 0) & np.isfinite(size)).tolist():
+        found[i] = float(str(singles[i]))
+    made: NDArray[Any] = found.reshape(values.shape)
+    return made

@@ -11,11 +11,10 @@ from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
+from tactile_rt.daemon.health import LatencyMeter, ModelState
 from tactile_rt.daemon.items import Contact, Decision, Item, Opened, SourceChunk
-from tactile_rt.daemon.latency import LatencyMeter
 from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.part import Part, Report
-from tactile_rt.daemon.snapshot import ModelState
 from tactile_rt.daemon.source_part import device_of
 from tactile_rt.stream import NS_PER_S, ConfigError, Source, TactileError, concatenate
 

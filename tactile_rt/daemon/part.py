@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from tactile_rt.daemon.config import LimitsConfig
-from tactile_rt.daemon.snapshot import PartState
+from tactile_rt.daemon.health import PartState
 from tactile_rt.stream import TactileError
 
 __all__ = ["Part", "Report", "reason_of"]
@@ -26,9 +26,9 @@ class Part(abc.ABC):
     """Something that works in a thread of its own and is restarted when it breaks.
 
     Args:
-        name: as in `items.Event`.
-        report: where its changes of state go.
-        limits: pauses, and how long a call may take.
+        name: The name of the part, as in `items.Event`.
+        report: Takes changes of its state.
+        limits: The pauses between tries, and how long a call may take.
     """
 
     def __init__(self, name: str, report: Report, limits: LimitsConfig) -> None:

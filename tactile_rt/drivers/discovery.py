@@ -1,9 +1,21 @@
-"""Which serial ports and CAN buses there are, and what is likely there."""
+"""Which serial ports and CAN buses there are, what is likely there, and what may be in the way.
 
+`serial_ports` and `can_buses` list them, each with the URL to begin with; `diagnose` looks at
+permissions, latency timers and the state of buses, and says what to do; `udev_rules` does part of
+it for good.
+"""
+
+import getpass
+import grp
+import json
+import os
+import subprocess
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-__all__ = ["CanBus", "Port", "can_buses", "serial_ports"]
+__all__ = ["CanBus", "Finding", "Port", "can_buses", "diagnose", "serial_ports", "udev_rules"]
 
 ARPHRD_CAN = 280  # type of a CAN network interface, linux/if_arp.h
 
@@ -24,6 +36,8 @@ KNOWN = {
     (0x10C4, 0xEA60): ("CP210x adapter", "serial"),
     (0x1A86, 0x7523): ("CH340 adapter: lines of text", "serial"),
 }
+FAST_MS = 1  # latency timer of an FTDI adapter; its default of 16 ms makes bursts
+QUIET_ERRORS = 96  # an error counter beyond it warns (ISO 11898-1)
 
 
 @dataclass(frozen=True)
@@ -31,12 +45,13 @@ class Port:
     """A serial port.
 
     Attributes:
-        path: to open it by.
-        stable: name in /dev/serial/by-id, the same after every reboot; empty if it has none.
-        usb: (vendor, product) numbers; None if it is not on USB.
-        serial_number: of the device.
-        likely: what it is likely to be.
-        url: to begin with; `codec=` is a guess.
+        path: Path by which the port is opened, such as ``/dev/ttyUSB0``.
+        stable: Name in /dev/serial/by-id, the same after every reboot; empty for a port without
+            one.
+        usb: Vendor and product numbers on USB; None for a port that is not on USB.
+        serial_number: Serial number that the USB device reports; empty if none.
+        likely: What the device on this port is likely to be, in words.
+        url: The URL to begin with; the codec in it is a guess.
     """
 
     path: str
@@ -52,16 +67,33 @@ class CanBus:
     """A CAN network interface.
 
     Attributes:
-        name: e.g. ``can0``.
-        up: whether it is up.
-        bitrate: bit/s; 0 where it is not known.
-        url: to begin with.
+        name: Name of the network interface, such as ``can0``.
+        up: Whether the interface is up.
+        bitrate: Speed of the bus, bit/s; 0 where the kernel does not know it.
+        url: The URL to begin with; its codec is left to the user.
     """
 
     name: str
     up: bool
     bitrate: int
     url: str
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing looked at.
+
+    Attributes:
+        what: What was looked at: a port, a bus, a service.
+        good: Whether everything about it is as it should be.
+        says: What was found, in words.
+        do: What the user should do about it; empty when all is good.
+    """
+
+    what: str
+    good: bool
+    says: str
+    do: str = ""
 
 
 def serial_ports(by_id: Path = Path("/dev/serial/by-id")) -> list[Port]:
@@ -101,6 +133,127 @@ def can_buses(net: Path = Path("/sys/class/net")) -> list[CanBus]:
         bitrate = _number(link / "can_bittiming" / "bitrate") or 0
         found.append(CanBus(link.name, up, bitrate, f"can:socketcan:{link.name}?codec="))
     return found
+
+
+def diagnose(
+    ports: list[Port],
+    buses: list[CanBus],
+    sys: Path = Path("/sys"),
+    run: Callable[[list[str]], str] | None = None,
+) -> list[Finding]:
+    """Look at permissions, latency timers, CAN states and what else gets in the way.
+
+    Args:
+        ports, buses: What there is, from `serial_ports` and `can_buses`.
+        sys: Where sysfs is mounted.
+        run: Runs a command and returns its output ("" if it fails).
+    """
+    ask = run or _run
+    found = [f for port in ports for f in _port(port, sys)]
+    found += [_bus(bus, ask) for bus in buses]
+    if not ports and not buses:
+        found.append(
+            Finding(
+                "devices", False, "no serial port and no CAN bus",
+                "plug one in; without any, `tactile-rt emulate` makes one",
+            )
+        )  # fmt: skip
+    if ports and "active" in ask(["systemctl", "is-active", "ModemManager"]).split():
+        found.append(
+            Finding(
+                "ModemManager", False, "running: it talks to every new serial port for seconds",
+                "sudo systemctl disable --now ModemManager, or the udev rules below",
+            )
+        )  # fmt: skip
+    return found
+
+
+def udev_rules(ports: list[Port]) -> str:
+    """Rules by which group dialout may use these devices, quickly and under fixed names."""
+    lines = [
+        "# tactile_rt: access, low latency and stable names for tactile sensors.",
+        "# Install: sudo cp THIS /etc/udev/rules.d/99-tactile.rules",
+        "#          sudo udevadm control --reload && sudo udevadm trigger",
+        'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVERS=="ftdi_sio", '
+        f'ATTR{{latency_timer}}="{FAST_MS}"',
+    ]
+    for port in ports:
+        if port.usb is None:
+            continue
+        match = f'ATTRS{{idVendor}}=="{port.usb[0]:04x}", ATTRS{{idProduct}}=="{port.usb[1]:04x}"'
+        if port.serial_number:
+            match += f', ATTRS{{serial}}=="{port.serial_number}"'
+        name = f"tactile-{port.serial_number or f'{port.usb[0]:04x}-{port.usb[1]:04x}'}"
+        lines.append(
+            f'SUBSYSTEM=="tty", {match}, GROUP="dialout", MODE="0660", '
+            f'ENV{{ID_MM_DEVICE_IGNORE}}="1", SYMLINK+="{name}"'
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _port(port: Port, sys: Path) -> Iterator[Finding]:
+    if os.access(port.path, os.R_OK | os.W_OK):
+        yield Finding(port.path, True, "may be read and written")
+    else:
+        try:
+            group = grp.getgrgid(os.stat(port.path).st_gid).gr_name
+        except (OSError, KeyError):
+            group = "dialout"
+        yield Finding(
+            port.path, False, f"no permission (it belongs to group {group})",
+            f"sudo usermod -aG {group} {getpass.getuser()}, then log in again",
+        )  # fmt: skip
+    timer = sys / "bus/usb-serial/devices" / Path(port.path).name / "latency_timer"
+    try:
+        ms = int(timer.read_text())
+    except (OSError, ValueError):
+        return  # not an FTDI adapter
+    says = f"latency timer {ms} ms"
+    if ms <= FAST_MS:
+        yield Finding(port.path, True, says)
+    else:
+        yield Finding(
+            port.path, False, f"{says}: samples come in bursts, 62 reads/s at 16 ms",
+            f"echo {FAST_MS} | sudo tee {timer}; for good: the udev rules below",
+        )  # fmt: skip
+
+
+def _bus(bus: CanBus, ask: Callable[[list[str]], str]) -> Finding:
+    up = f"sudo ip link set {bus.name} up type can bitrate {bus.bitrate or 1_000_000}"
+    if not bus.up:
+        return Finding(bus.name, False, "down", up)
+    try:
+        (link,) = json.loads(
+            ask(["ip", "-details", "-statistics", "-json", "link", "show", bus.name])
+        )
+        data: dict[str, Any] = link["linkinfo"]["info_data"]
+    except (ValueError, KeyError, TypeError):
+        return Finding(bus.name, True, "up; its state cannot be read (`ip` of iproute2 is missing)")
+    state = str(data.get("state", "unknown"))
+    rate = data.get("bittiming", {}).get("bitrate", bus.bitrate)
+    errors = data.get("berr_counter", {})
+    says = (
+        f"{state}, {rate} bit/s, error counters tx {errors.get('tx', 0)} rx {errors.get('rx', 0)}"
+    )
+    if state == "BUS-OFF":
+        return Finding(
+            bus.name, False, says,
+            "the controller gave up: check bit rate, termination (60 ohm between CAN_H and CAN_L) "
+            f"and wiring, then sudo ip link set {bus.name} down && {up} restart-ms 100",
+        )  # fmt: skip
+    if max(errors.get("tx", 0), errors.get("rx", 0)) >= QUIET_ERRORS:
+        return Finding(
+            bus.name, False, says,
+            "errors on the bus: is the bit rate that of the sensor, and the bus terminated?",
+        )  # fmt: skip
+    return Finding(bus.name, True, says)
+
+
+def _run(command: list[str]) -> str:
+    try:
+        return subprocess.run(command, capture_output=True, text=True, timeout=5).stdout
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
 
 
 def _number(path: Path) -> int | None:

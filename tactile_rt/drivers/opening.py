@@ -8,16 +8,22 @@ serial:COM3?codec=ascii_line&baud=9600      can:virtual:test?codec=can-dbc&mappi
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
-from urllib.parse import parse_qsl
 
 from tactile_rt.calibration import CalibratedSource, load_calibration
 from tactile_rt.drivers.codec import CanCodec, Codec, SerialCodec, codec_class
 from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
 from tactile_rt.drivers.links import CanLink, Link, SerialLink, SlcanLink
-from tactile_rt.settings import take_options
+from tactile_rt.settings import no_such, split_url, take_options
 from tactile_rt.stream import ConfigError, Source
 
-__all__ = ["CanOptions", "SerialOptions", "make_codec", "open_can", "open_line", "open_serial"]
+__all__ = [
+    "CanOptions",
+    "SerialOptions",
+    "make_codec",
+    "open_line",
+    "prepare_can",
+    "prepare_serial",
+]
 
 
 @dataclass(frozen=True)
@@ -25,9 +31,9 @@ class SerialOptions(DeviceOptions):
     """Options of ``serial:``, besides those of its codec.
 
     Attributes:
-        baud: bit/s; 0: the codec's.
-        parity: ``N``, ``E`` or ``O``; empty: the codec's.
-        dtr: whether to assert DTR; many boards reset when it rises.
+        baud: Speed of the line, bit/s; 0 for the default of the codec.
+        parity: Parity of the line, ``N``, ``E`` or ``O``; empty for the default of the codec.
+        dtr: Whether to assert DTR; many boards reset when it rises.
     """
 
     baud: int = 0
@@ -39,7 +45,7 @@ class SerialOptions(DeviceOptions):
         if self.parity not in ("", "N", "E", "O"):
             raise ConfigError(f"parity must be N, E or O, not {self.parity!r}")
         if self.baud < 0:
-            raise ConfigError(f"baud must be positive, not {self.baud}")
+            raise ConfigError(f"baud must be 0 or more, not {self.baud}")
 
 
 @dataclass(frozen=True)
@@ -47,9 +53,9 @@ class CanOptions(DeviceOptions):
     """Options of ``can:``, besides those of its codec.
 
     Attributes:
-        bitrate: bit/s; 0: the codec's.
-        fd: whether to open the bus for CAN FD.
-        data_bitrate: of its data phase, bit/s; 0: the codec's.
+        bitrate: Speed of the bus, bit/s; 0 for the default of the codec.
+        fd: Whether to open the bus for CAN FD.
+        data_bitrate: Speed of the data phase of CAN FD, bit/s; 0 for the default of the codec.
     """
 
     bitrate: int = 0
@@ -58,8 +64,9 @@ class CanOptions(DeviceOptions):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.bitrate < 0 or self.data_bitrate < 0:
-            raise ConfigError("bitrate and data_bitrate must be positive")
+        for name in ("bitrate", "data_bitrate"):
+            if getattr(self, name) < 0:
+                raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
 
 
 def make_codec(wire: str, name: str, fields: dict[str, str]) -> Codec[Any]:
@@ -74,12 +81,12 @@ def make_codec(wire: str, name: str, fields: dict[str, str]) -> Codec[Any]:
     return made
 
 
-def open_serial(target: str, fields: dict[str, str]) -> Source:
-    """The device on a serial port.
+def prepare_serial(target: str, fields: dict[str, str]) -> Callable[[], Source]:
+    """What opens the device on a serial port.
 
     Raises:
-        ConfigError: wrong options.
-        SourceError: it cannot be opened, or does not send.
+        ConfigError: wrong options. What is returned raises `SourceError` if the port cannot be
+            opened, or the device does not send.
     """
     if not target:
         raise ConfigError("serial: needs a port, e.g. serial:///dev/ttyUSB0?codec=bota")
@@ -91,16 +98,18 @@ def open_serial(target: str, fields: dict[str, str]) -> Source:
     def connect() -> Link[Any]:
         return SerialLink(target, baud, parity, options.dtr)
 
-    return _open(connect, kind(own), options, target, _of(kind, fields))
+    return _prepared(connect, kind, own, options, target, fields)
 
 
-def open_can(target: str, fields: dict[str, str]) -> Source:
-    """The device on a CAN bus.
+def prepare_can(target: str, fields: dict[str, str]) -> Callable[[], Source]:
+    """What opens the device on a CAN bus.
 
     Raises:
-        ConfigError: wrong options.
-        SourceError: it cannot be opened, or does not send.
+        ConfigError: wrong options. What is returned raises `SourceError` if the bus cannot be
+            opened, or the device does not send.
     """
+    from can import VALID_INTERFACES
+
     interface, _, channel = target.partition(":")
     if not channel:
         raise ConfigError(
@@ -108,6 +117,10 @@ def open_can(target: str, fields: dict[str, str]) -> Source:
         )
     kind = _kind("can", target, fields)
     assert issubclass(kind, CanCodec)
+    if interface not in VALID_INTERFACES:
+        raise ConfigError(
+            f"can:{target}: {no_such('interface', interface, sorted(VALID_INTERFACES))}"
+        )
     # `fd` is the bus's affair and the codec's
     options, own = take_options(f"can:{target}", fields, CanOptions, kind.Options)
     fd = options.fd or bool(getattr(own, "fd", False))
@@ -119,7 +132,7 @@ def open_can(target: str, fields: dict[str, str]) -> Source:
             return SlcanLink(channel, bitrate, fd)
         return CanLink(interface, channel, bitrate, fd, data_bitrate)
 
-    return _open(connect, kind(own), options, target, _of(kind, fields))
+    return _prepared(connect, kind, own, options, target, fields)
 
 
 def open_line(url: str) -> Link[Any]:
@@ -132,11 +145,9 @@ def open_line(url: str) -> Link[Any]:
         ConfigError: another scheme, or a wrong option.
         SourceError: it cannot be opened.
     """
-    scheme, _, rest = url.partition(":")
-    target, _, query = rest.partition("?")
-    fields = {"codec": "", **dict(parse_qsl(query))}
+    scheme, target, fields = split_url(url)
+    fields = {"codec": "", **fields}
     if scheme == "serial":
-        target = target.removeprefix("//")
         (serial,) = take_options(f"serial:{target}", fields, SerialOptions)
         return SerialLink(target, serial.baud or SerialCodec.baud, serial.parity or "N", serial.dtr)
     interface, _, channel = target.partition(":")
@@ -157,24 +168,36 @@ def _kind(wire: str, target: str, fields: dict[str, str]) -> type[Codec[Any]]:
     return codec_class(wire, fields["codec"])
 
 
-def _of(kind: type[Codec[Any]], fields: dict[str, str]) -> dict[str, str]:
-    """Those of the fields that are the codec's."""
-    return {k: v for k, v in fields.items() if k in kind.Options.__dataclass_fields__}
-
-
-def _open(
+def _prepared(
     connect: Callable[[], Link[Any]],
-    codec: Codec[Any],
+    kind: type[Codec[Any]],
+    own: Any,
     options: DeviceOptions,
     name: str,
-    codec_options: dict[str, str],
-) -> Source:
+    fields: dict[str, str],
+) -> Callable[[], Source]:
+    """Reads the files that codec and calibration are described in; what it returns opens the line.
+
+    Args:
+        connect: opens the line.
+        kind: the codec.
+        own: its options.
+        options: of the device.
+        name: of the device, for messages.
+        fields: all options as written.
+    """
+    codec = kind(own)
     calibration = load_calibration(options.calibration) if options.calibration else None
-    source = DeviceSource(connect, codec, options, name, codec_options)
-    if calibration is None:
-        return source
-    try:
-        return CalibratedSource(source, calibration)
-    except BaseException:
-        source.close()
-        raise
+    written = {k: v for k, v in fields.items() if k in kind.Options.__dataclass_fields__}
+
+    def opened() -> Source:
+        source = DeviceSource(connect, codec, options, name, written)
+        if calibration is None:
+            return source
+        try:
+            return CalibratedSource(source, calibration)
+        except BaseException:
+            source.close()
+            raise
+
+    return opened

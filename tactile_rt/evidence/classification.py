@@ -142,9 +142,7 @@ def evaluate_model(
     if other:
         records += _compare_profiles(run, other, test, clean)
     if svm:
-        from tactile_rt.evidence.svm import compare_svm
-
-        records += compare_svm(data, test, evaluation.hits(clean[:, -1], labels))
+        records += _compare_svm(data, test, evaluation.hits(clean[:, -1], labels))
     if pictures is not None:
         from tactile_rt.evidence.pictures import (
             draw_accuracy_over_time,
@@ -293,3 +291,25 @@ def _compare_profiles(
         _record(f"top-1 at the {profile} profile", at_profile, "", how),
         Record(f"models.points lost at the {profile} profile", lost, "points", "<= 4", "", how),
     ]
+
+
+def _compare_svm(data: Path, test: SweepSet, network: NDArray[np.bool_]) -> list[Record]:
+    """A network (sweep,), right or not, beside an RBF support vector machine on the same windows.
+
+    Raises:
+        RecordingError: the set's training or validation split cannot be read.
+    """
+    from tactile_rt.models.svm import fit_svm  # scikit-learn takes a second to import
+
+    svm = fit_svm(SweepSet.read(data, "train"), SweepSet.read(data, "validation"))
+    right, objects = svm.hits(test), test.sweeps.objects
+    own = evaluation.accuracy(right, objects)
+    above = evaluation.accuracy(network.astype(np.float64) - right, objects)
+    records = []
+    for name, unit, estimate, bar in (
+        ("RBF SVM top-1", "%", own, ""), ("points above the SVM", "points", above, ">= 3"),
+    ):  # fmt: skip
+        interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
+        anchor = f"{interval}; the same test sweeps"
+        records.append(Record(f"models.{name}", 100 * estimate.value, unit, bar, anchor, svm.how))
+    return records

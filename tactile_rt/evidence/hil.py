@@ -49,20 +49,22 @@ class LoopReport:
     """What came out of a loop, and whether it is as it must be.
 
     Attributes:
-        samples: that the source delivered.
-        identical_samples: of these, that came out of the driver with the same bits.
-        direct, wire: decisions of the two paths.
-        identical: decisions that are the same in every bit, latency apart.
-        same_label: decisions of the same touch and step with the same label.
-        finals, finals_same: likewise, of the last decision of each touch.
-        exact: whether all decisions must be identical; else 99 % must have the same label.
-        faulty: whether faults were on the way; then only the account of losses must be right.
-        stats: the driver's account.
-        sent: packets of the device, copies included.
-        latency_s: (n,) from the source's delivery of a chunk's last sample to the driver's; None
-            where the source does not keep to real time.
-        stamp_error_s: (n,) by how much the driver's times are late; None with the device's time.
-        health: of the driver, at the end.
+        samples: Number of samples that the source delivered.
+        identical_samples: Number of samples that came out of the driver with the same bits.
+        direct: Number of decisions that the direct path made.
+        wire: Number of decisions that the driver's path made.
+        identical: Decisions that are the same in every bit on both paths, latency apart.
+        same_label: Decisions of the same touch and step that have the same label on both paths.
+        finals: Last decisions of a touch on the direct path.
+        finals_same: Last decisions of a touch that have the same label on both paths.
+        exact: Whether all decisions must be identical; else 99 % must have the same label.
+        faulty: Whether faults were on the way; then only the account of losses must be right.
+        stats: The driver's account of what it delivered and what it lost.
+        sent: Number of packets that the device sent, copies included.
+        latency_s: (n,) time from the source's delivery of a chunk's last sample to the driver's, s;
+            None where the source does not keep to real time.
+        stamp_error_s: (n,) delay of each of the driver's times, s; None with the device's time.
+        health: The driver's state at the end.
     """
 
     samples: int
@@ -132,17 +134,18 @@ class Loop:
     """One source, through an emulated device and its driver, and beside them.
 
     Args:
-        source: what the device measures; the loop closes it.
-        model: an ``.onnx`` file made for the source's array.
-        wire: one of `WIRES`.
-        codec: what the device speaks.
-        options: of the codec, as in a URL; a native device's ranges are `RANGES` unless given.
-        faults: what goes wrong on the way; the schedule is used up.
-        seconds: how much of the source's stream to send; None: to its end.
-        clock: times of the driver's samples: ``device``, or ``host``, in real time only.
+        source: What the device measures; the loop closes it.
+        model: An ``.onnx`` file made for the source's array.
+        wire: The kind of line, one of `WIRES`.
+        codec: Name of the codec that the device speaks.
+        options: Options of the codec, as in a URL; a native device's ranges are `RANGES` unless
+            given.
+        faults: What goes wrong on the way; the schedule is used up.
+        seconds: How much of the source's stream to send, s; None to send all.
+        clock: Which times the driver's samples have: ``device``, or ``host``, in real time only.
 
     Attributes:
-        complete: whether it has run to the end; a report is only judged then.
+        complete: Whether the loop has run to the end; a report is only judged then.
 
     Raises:
         ConfigError: an unknown wire, clock, codec or option, or ones that do not go together.
@@ -176,7 +179,6 @@ class Loop:
         }
         if wire == "virtual":
             further["bus"] = f"virtual:hil-{os.getpid()}-{id(self)}"
-            further["fd"] = self._options.get("fd", "").lower() in ("1", "true")
         make = EmulatedSerial if wire == "serial" else EmulatedCan
         self._device = make(self._tee, codec, **further)
         own = codec_class(make.wire, codec).Options

@@ -1,17 +1,11 @@
-"""Steps of model files beside the roofline, and the published networks at full size to measure.
-
-The latter are made here, with random weights, and need the `train` extra.
-"""
+"""What a step of a model file costs here, beside the least that this machine could do it in."""
 
 import gc
-import importlib
 import os
 import resource
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnxruntime as ort
@@ -22,18 +16,23 @@ from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.evidence.records import Record
 from tactile_rt.evidence.roofline import measure_machine, products, roofline_s
 
-__all__ = ["FULL_SIZE", "Subject", "full_size", "measure_model", "step_times"]
+__all__ = ["Subject", "measure_model", "step_times"]
 
 TURNS = 5
 TAIL = "<= 1.3"  # p99 over p50 of every step
-LOAD_INT8_MS = "<= 1000"
-# p50 over the roofline, of fp32 and of int8: without the GPT, with it
-FULL_SIZE = {False: ("<= 1.25", "<= 1.6"), True: ("<= 1.4", "<= 1.7")}
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A model file to measure, and the bars that it must meet; without one it is only reported."""
+    """A model file to measure, and the bars that it must meet; without one it is only reported.
+
+    Attributes:
+        name: The name of the file in its figures.
+        path: The model file, of kind "step".
+        over_roofline: The bar of the median step's CPU time over the roofline, e.g. ``<= 1.6``.
+        step_ms: The bar of the median step's CPU time in ms.
+        load_ms: The bar of the CPU time of loading in ms.
+    """
 
     name: str
     path: Path
@@ -137,23 +136,6 @@ def step_times(
             taken[step] = time.thread_time() - began
             interrupted[step] = _preemptions() > before
     return taken, interrupted
-
-
-def full_size(folder: Path, lacking: list[str]) -> Iterator[Subject]:
-    """Make the published networks with random weights; what cannot be made is told to `lacking`."""
-    try:
-        making: Any = importlib.import_module("bench.inference.full_size")
-    except ModuleNotFoundError as error:
-        lacking.append(f"full size: needs {error.name} (pip install 'tactile-rt[train]')")
-        return
-    for name, path in making.full_size_models(folder):
-        gc.collect()
-        fp32_bar, int8_bar = FULL_SIZE["gpt" in name]
-        integer = name.endswith("int8")
-        yield Subject(
-            name.replace("-", "_"), path, over_roofline=int8_bar if integer else fp32_bar,
-            load_ms=LOAD_INT8_MS if integer else "",
-        )  # fmt: skip
 
 
 def _preemptions() -> int:

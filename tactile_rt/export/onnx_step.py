@@ -25,8 +25,13 @@ from torch import Tensor, nn
 
 from tactile_rt.classifier.contact import CHANNEL_FLOOR
 from tactile_rt.classifier.model_card import Kind
-from tactile_rt.classifier.model_check import probe_logits
-from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, StateTensor, load_model
+from tactile_rt.classifier.model_file import (
+    METADATA_KEY,
+    ModelCard,
+    StateTensor,
+    load_model,
+    probe_logits,
+)
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.export.precision import Precision, in_precision
 from tactile_rt.export.streaming import streaming

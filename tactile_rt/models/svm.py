@@ -1,18 +1,47 @@
-"""What a network is compared with: an RBF support vector machine on the windows that it sees."""
+"""RBF support vector machines: the one place where one is fitted.
 
+Two questions want one. Does a network beat it on the very windows that it sees? `fit_svm` answers
+that: the machine takes the same onsets, tare and compression, and validation chooses its penalty.
+And can a set be learnt from at all? The card of a sweep set asks that with features and a penalty
+of its own (`sim_backend.datasets.separability`), and is handed `fit` by the command: simulation
+and networks do not know of each other.
+
+Standardising the features only makes the machine worse, so nothing here does.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.svm import SVC
 
-from tactile_rt.models.datasets import SweepSet, channel_values, windows
 from tactile_rt.models.onsets import find_onsets
-from tactile_rt.models.training import CLIP, SCALE
 
-__all__ = ["FittedSVM", "fit_svm"]
+if TYPE_CHECKING:
+    from tactile_rt.models.datasets import SweepSet
 
-PENALTIES = (1.0, 10.0, 100.0, 300.0)  # C; standardising the features only makes it worse
+__all__ = ["FittedSVM", "Predict", "fit", "fit_svm"]
+
+PENALTIES = (1.0, 10.0, 100.0, 300.0)  # C
+
+Predict = Callable[[NDArray[np.float32]], NDArray[Any]]  # (sweep, feature) -> (sweep,) labels
+
+
+def fit(features: NDArray[np.float32], labels: NDArray[Any], penalty: float) -> Predict:
+    """Fit one machine.
+
+    Args:
+        features: (sweep, feature) of the sweeps to learn from.
+        labels: (sweep,) classes, as numbers or names.
+        penalty: C.
+
+    Returns:
+        The machine's decisions: (sweep, feature) to (sweep,) labels.
+    """
+    predict: Predict = SVC(C=penalty).fit(features, labels).predict
+    return predict
 
 
 @dataclass(frozen=True)
@@ -20,26 +49,26 @@ class FittedSVM:
     """The machine of the penalty that validation chose.
 
     Attributes:
-        machine: the machine.
-        how: it was made, in words.
+        predict: The machine's decisions, from (sweep, feature) values to (sweep,) labels.
+        how: A sentence for reports that says how the machine was made.
     """
 
-    machine: SVC
+    predict: Predict
     how: str
 
-    def hits(self, data: SweepSet) -> NDArray[np.bool_]:
+    def hits(self, data: "SweepSet") -> NDArray[np.bool_]:
         """(sweep,) whether each is right; one without an onset is not."""
         x, usable = _features(data)
-        right: NDArray[np.bool_] = (self.machine.predict(x) == data.sweeps.labels) & usable
+        right: NDArray[np.bool_] = (self.predict(x) == data.sweeps.labels) & usable
         return right
 
 
-def fit_svm(train: SweepSet, validation: SweepSet) -> FittedSVM:
+def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
     """Fit one machine per penalty and keep the best on the validation sweeps."""
     x, usable = _features(train)
     tried = [
         FittedSVM(
-            SVC(C=c).fit(x[usable], train.sweeps.labels[usable]),
+            fit(x[usable], train.sweeps.labels[usable], c),
             "same onsets, tare, clipping and signed log; 22 steps of mean load; "
             f"C = {c:g} of {', '.join(f'{p:g}' for p in PENALTIES)} by validation",
         )
@@ -48,12 +77,16 @@ def fit_svm(train: SweepSet, validation: SweepSet) -> FittedSVM:
     return max(tried, key=lambda one: one.hits(validation).mean())
 
 
-def _features(data: SweepSet) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _features(data: "SweepSet") -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """(sweep, step * element * channel) compressed loads, and whether there was an onset."""
+    # Imported here: they bring torch, which whoever only writes a set's card does without.
+    from tactile_rt.models.checkpoints import CLIP, SCALE
+    from tactile_rt.models.datasets import channel_values, windows
+
     spec = data.manifest.spec
     clip, scale = channel_values(spec, CLIP), channel_values(spec, SCALE)
     found = find_onsets(data.sweeps.values, data.floor)
     cut = windows(data.sweeps.values, found.start) - found.offset[:, None, None]
-    cut = np.clip(cut, -clip, clip)
+    cut = np.clip(cut, -clip, clip)  # (sweep, step, sub-step, element, channel) SI
     cut = np.sign(cut) * np.log1p(np.abs(cut) / scale)
     return cut.mean(axis=2).reshape(len(cut), -1), found.start >= 0

@@ -5,7 +5,6 @@ part of it. A model's step does not depend on how its stream was cut or paced, s
 the same samples decides the same, digit for digit.
 """
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.recording.description import Description
+from tactile_rt.settings import parse_toml
 from tactile_rt.stream import NS_PER_S, ConfigError
 
 __all__ = [
@@ -53,8 +53,8 @@ def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
     """The models that decided on the source while it was recorded; none without a daemon."""
     session = about.session
     try:
-        config = tomllib.loads(session.get("config", ""))
-    except tomllib.TOMLDecodeError:
+        config = parse_toml(session.get("config", ""), "config").plain()
+    except ConfigError:
         config = {}
     tables = {t["name"]: t for t in config.get("model", ()) if "name" in t}
     found = []

@@ -8,22 +8,23 @@ replay:data/mouse24/mug-1.npz?sweep=3&rest_s=1    one object's sweeps out of a s
 """
 
 import math
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tactile_rt.calibration import CalibratedSource
+from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples
-from tactile_rt.drivers.device_time import DeviceTime
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.drivers.stamping import Stamper
 from tactile_rt.recording.layout import SAMPLES, WIRE, Packet
-from tactile_rt.recording.reader import Recording
+from tactile_rt.recording.reader import MAGIC, Recording
 from tactile_rt.settings import take_options
 from tactile_rt.stream import (
     NS_PER_S,
@@ -37,8 +38,9 @@ from tactile_rt.stream import (
 )
 from tactile_rt.sweep_set import SweepManifest, read_object
 
-__all__ = ["ReplayOptions", "ReplaySource", "SweepOptions", "open_replay"]
+__all__ = ["ReplayOptions", "ReplaySource", "SweepOptions", "open_replay", "prepare_replay"]
 
+NPZ = b"PK"  # how it begins
 SWEEP_CHUNK_NS = 9_000_000  # a chunk's length, as other sources have it
 SLICE_S = 0.1  # how soon a waiting read notices that the source was closed
 
@@ -51,8 +53,8 @@ class ReplayOptions:
     """Options of ``replay:`` of a recording, besides those of its codec.
 
     Attributes:
-        speed: The pace as a multiple of the recorded one; 0: as fast as it is read.
-        codec: The codec that decodes the raw packets; empty: the recorded one.
+        speed: Pace of the stream, as a multiple of the recorded one; 0 for as fast as it is read.
+        codec: Name of the codec that decodes raw packets; empty for the recorded one.
     """
 
     speed: float = 1.0
@@ -66,14 +68,26 @@ def open_replay(target: str, fields: dict[str, str]) -> Source:
         ConfigError: no such file, a wrong option, or the extra is not installed.
         RecordingError: the file is damaged.
     """
-    path, what = Path(target), f"source replay:{target}"
-    if path.suffix == ".npz":
-        (options,) = take_options(what, fields, SweepOptions)
-        _check_speed(what, options.speed)
-        spec, manifest = _sweep_spec(path)
-        return ReplaySource(spec, lambda _: _sweep_chunks(path, manifest, options), options.speed)
+    return prepare_replay(target, fields)()
+
+
+def prepare_replay(target: str, fields: dict[str, str]) -> Callable[[], Source]:
+    """What opens a recording, or one object of a sweep set, as a stream.
+
+    Raises:
+        ConfigError, RecordingError: as `open_replay`.
+    """
+    path, what = Path(target), f"replay:{target}"
     if not target:
         raise ConfigError("replay: needs a file, e.g. replay:run.mcap, replay:data/SET/mug-1.npz")
+    _check_file(path)
+    if path.suffix == ".npz":
+        (sweeps,) = take_options(what, fields, SweepOptions)
+        _check_speed(what, sweeps.speed)
+        spec, manifest = _sweep_spec(path)
+        return partial(
+            ReplaySource, spec, lambda _: _sweep_chunks(path, manifest, sweeps), sweeps.speed
+        )
     fields = dict(fields)
     channel = fields.pop("from", SAMPLES)
     recording = Recording(path)
@@ -83,7 +97,9 @@ def open_replay(target: str, fields: dict[str, str]) -> Source:
         _check_speed(what, options.speed)
         if options.codec:
             raise ConfigError(f"{what}: codec= is for from=wire; samples are decoded already")
-        return ReplaySource(about.spec, lambda stats: _recorded(recording, stats), options.speed)
+        return partial(
+            ReplaySource, about.spec, lambda stats: _recorded(recording, stats), options.speed
+        )
     if channel != WIRE:
         raise ConfigError(f"{what}: from must be samples or wire, not {channel!r}")
     if not about.wire:
@@ -97,9 +113,26 @@ def open_replay(target: str, fields: dict[str, str]) -> Source:
     if options.codec in ("", about.codec):
         own = {**about.codec_options, **own}
     codec = make_codec(about.wire, options.codec or about.codec, own)
-    decoding = _Decoding(str(path), codec, recording.packets(), about.clock)
-    source = ReplaySource(decoding.spec, decoding.chunks, options.speed)
-    return source if about.calibration is None else CalibratedSource(source, about.calibration)
+
+    def opened() -> Source:
+        decoding = _Decoding(str(path), codec, recording.packets(), about.clock)
+        source = ReplaySource(decoding.spec, decoding.chunks, options.speed)
+        return source if about.calibration is None else CalibratedSource(source, about.calibration)
+
+    return opened
+
+
+def _check_file(path: Path) -> None:
+    """Refuse what is no file, or begins as no recording does."""
+    if not os.path.isfile(path):
+        raise ConfigError(f"no file {path}")
+    try:
+        with path.open("rb") as file:
+            begins = file.read(len(MAGIC))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    if begins != MAGIC and not begins.startswith(NPZ):
+        raise RecordingError(f"{path} is no recording: it is neither MCAP nor npz")
 
 
 def _check_speed(what: str, speed: float) -> None:
@@ -260,11 +293,8 @@ def _sweep_spec(path: Path) -> tuple[ArraySpec, SweepManifest]:
     """The array at the rate of the stored sweeps, and the set's manifest.
 
     Raises:
-        ConfigError: no such file.
         RecordingError: it is of no sweep set.
     """
-    if not path.is_file():
-        raise ConfigError(f"no sweeps {path}")
     manifest = SweepManifest.read(path.parent)
     return replace(manifest.spec, rate_hz=NS_PER_S / manifest.period_ns), manifest
 

@@ -27,16 +27,17 @@ class Randomisation:
     Each value is the half-range of a uniform distribution: relative (0.1 is +-10 %) for material
     and shape, in degrees or mm for poses. The material is drawn once for all whiskers, which are
     made of the same stuff, and so is the mount; the geometry is drawn for each whisker. Names and
-    grid never change.
+    cells of the grid never change.
 
     Attributes:
-        young_modulus, density, damping_ratio, friction: of the material, relative.
-        length, radius, curvature: of each whisker, relative; both radii by one factor, and
-            density at base and tip too.
-        angles_deg: of each of a whisker's base angles (theta, phi, zeta).
-        base_mm: of each coordinate of a whisker's base point.
-        mount_mm: of each coordinate of the mount's position.
-        mount_deg: of the mount's roll, pitch and yaw.
+        young_modulus, density, damping_ratio, friction: The ranges of the material's properties,
+            relative.
+        length, radius, curvature: The ranges of each whisker's shape, relative; both radii by one
+            factor, and density at base and tip too.
+        angles_deg: The range of each of a whisker's base angles (theta, phi, zeta), degrees.
+        base_mm: The range of each coordinate of a whisker's base point, mm.
+        mount_mm: The range of each coordinate of the mount's position, mm.
+        mount_deg: The range of the mount's roll, pitch and yaw, degrees.
 
     Raises:
         ConfigError: a negative or infinite value, or a relative one of 1 or more.

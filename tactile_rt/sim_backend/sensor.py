@@ -37,25 +37,29 @@ class SensorModel:
     ``crosstalk_elements``, dead).
 
     Attributes:
-        gain: calibration error, relative standard deviation of every channel's constant gain.
-        crosstalk_channels: largest share that leaks from one channel of an element to another,
-            as a fraction of full scale (1 N, 10 mN m); each share is drawn uniformly from
-            +- this.
-        crosstalk_elements: share of each grid neighbour's reading (up, down, left, right) that an
-            element's same channel receives.
-        bias_force, bias_moment: constant offset, standard deviation over channels.
-        drift_force, drift_moment: wandering offset, standard deviation at any one time.
-        drift_time_s: time constant of the drift, s.
-        noise_force, noise_moment: white noise, standard deviation per sample.
-        dead_probability: of each element, drawn once. A dead element reads its bias (0 without
-            one) for ever; its ``valid`` stays True, because a robot does not know.
-        range_force, range_moment: saturation at +- this.
-        resolution_force, resolution_moment: quantisation step; readings round to the nearest,
-            after saturation.
-        latency_ms: from the sample to its time stamp, which is that of the host's receipt.
-        jitter_ms: mean (and standard deviation) of a further, exponentially distributed delay of
-            each time stamp; a sample is never received before its predecessor.
-        drop_probability: of each sample, independently; dropped samples leave gaps in ``seq``.
+        gain: The calibration error: relative standard deviation of every channel's constant gain.
+        crosstalk_channels: The largest share that leaks from one channel of an element to another,
+            as a fraction of full scale (1 N, 10 mN m); each share is drawn uniformly from +- this.
+        crosstalk_elements: The share of each grid neighbour's reading (up, down, left, right) that
+            an element's same channel receives.
+        bias_force, bias_moment: The constant offset: standard deviation over channels, N and N m.
+        drift_force, drift_moment: The wandering offset: standard deviation at any one time, N and N
+            m.
+        drift_time_s: The time constant of the drift, s.
+        noise_force, noise_moment: The white noise: standard deviation per sample, N and N m.
+        dead_probability: The probability of each element to be dead, drawn once. A dead element
+            reads its bias (0 without one) for ever; its ``valid`` stays True, because a robot does
+            not know.
+        range_force, range_moment: The largest reading of either sign, where the sensor saturates, N
+            and N m.
+        resolution_force, resolution_moment: The quantisation step, N and N m; readings round to the
+            nearest, after saturation.
+        latency_ms: The time from the sample to its time stamp, which is that of the host's receipt,
+            ms.
+        jitter_ms: The mean (and standard deviation) of a further, exponentially distributed delay
+            of each time stamp, ms; a sample is never received before its predecessor.
+        drop_probability: The probability of each sample to be dropped, independently; dropped
+            samples leave gaps in ``seq``.
 
     The drift is an Ornstein-Uhlenbeck process and not a random walk: it stays within a stated
     spread however long the stream runs, and is the same process whenever one starts to look.
@@ -111,10 +115,10 @@ class Sensor:
         seed: of everything that is drawn.
 
     Attributes:
-        dead: (element,) bool, which elements are dead.
-        bias: (element, channel) constant offset, SI.
-        saturated: readings (of one channel in one sample) clipped so far.
-        dropped: samples dropped so far.
+        dead: The (element,) bool that tells which elements are dead.
+        bias: The (element, channel) constant offset, SI.
+        saturated: The number of readings (of one channel in one sample) clipped so far.
+        dropped: The number of samples dropped so far.
     """
 
     def __init__(self, model: SensorModel, spec: ArraySpec, seed: int | Sequence[int] = 0) -> None:

@@ -1,26 +1,92 @@
 """The simulated array as a `Source`: object after object swept past it, without end.
 
+Like every simulated source (`PacedSource`) it is simulated when it is read, and delivered when due.
+
 sim:mouse?objects=mug-50,bottle-51&seed=3&pace=fast&profile=realtime&sweeps=10
 sim:mouse?noise_force=1e-5&noise_moment=5e-8&latency_ms=2&drop_probability=0.01
 sim:mouse?friction=0.3&young_modulus=0.2&angles_deg=3&mount_mm=0.5
 """
 
+import abc
+import time
 from dataclasses import dataclass, fields
+from typing import Final
 
 import numpy as np
 
-from tactile_rt.sim_backend.arrays.whisker_array import load_animals
-from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, load_object
-from tactile_rt.sim_backend.pacing import CHUNK_SAMPLES, PacedSource, check_pace
+from tactile_rt.sim_backend.arrays.files import load_animals
+from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, load_object
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation, usual_distance
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, world_spec
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStream, Source
 
-__all__ = ["Pass", "SimOptions", "SimSource"]
+__all__ = ["CHUNK_SAMPLES", "PACES", "PacedSource", "Pass", "SimOptions", "SimSource", "check_pace"]
 
+CHUNK_SAMPLES: Final = 9
+PACES: Final = ("realtime", "fast")
 REST_SAMPLES = 600  # after an object its episode ends and contact is released; before one, a tare
+
+
+def check_pace(pace: str) -> None:
+    """Raise a `ConfigError` if there is no such pace."""
+    if pace not in PACES:
+        raise ConfigError(f"no pace {pace!r}: there are {', '.join(PACES)}")
+
+
+class PacedSource(Source):
+    """What all simulated arrays have in common; implementations give `_simulate`.
+
+    Time is simulated: it starts at the first read, and in real time the reader waits for it.
+
+    Args:
+        spec: what the samples are.
+        pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
+
+    Attributes:
+        live: Whether samples wait for nobody (real-time pace).
+    """
+
+    def __init__(self, spec: ArraySpec, pace: str) -> None:
+        super().__init__(spec)
+        self.live = pace == "realtime"
+        self._start_ns: int | None = None
+        self._next: Chunk | None = None  # simulated, not yet due
+        self._closed = False
+
+    @abc.abstractmethod
+    def _simulate(self, start_ns: int) -> Chunk | None:
+        """The next samples; None when all of them are dropped.
+
+        Args:
+            start_ns: when the stream began.
+
+        Raises:
+            EndOfStream: there are no more.
+        """
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        if self._start_ns is None:
+            self._start_ns = time.monotonic_ns() if self.live else 0
+        while self._next is None:
+            if self._closed:
+                raise EndOfStream
+            self._next = self._simulate(self._start_ns)
+        chunk = self._next
+        if self.live:
+            wait = (int(chunk.t_ns[-1]) - time.monotonic_ns()) / NS_PER_S
+            if timeout is not None and wait > timeout:
+                time.sleep(max(timeout, 0))
+                return None
+            time.sleep(max(wait, 0))
+        self._next = None
+        self.stats.delivered += len(chunk)
+        return chunk
+
+    def close(self) -> None:
+        self._closed = True
+        self._next = None
 
 
 @dataclass(frozen=True)
@@ -31,13 +97,13 @@ class SimOptions(SensorModel, Randomisation):
     `Randomisation`, whose array is drawn afresh for every sweep.
 
     Attributes:
-        objects: comma-separated names (``mug-50``), categories (``mug``: its first instance) or
+        objects: Comma-separated names (``mug-50``), categories (``mug``: its first instance) or
             mesh files (.obj, .stl, .ply, .glb), drawn in random order; empty: all categories.
-        sweeps: how many objects pass before the stream ends; 0: endless.
-        repeat: sweeps of the same object in succession.
-        seed: of the drawn objects, sweep parameters, arrays and sensor imperfections; the same seed
-            gives the same stream, and the same objects and sweeps whatever the sensors.
-        profile: simulation profile, see `array.PROFILES`.
+        sweeps: The number of different objects that pass before the stream ends; 0: endless.
+        repeat: The number of sweeps of the same object in succession.
+        seed: The seed of the drawn objects, sweep parameters, arrays and sensor imperfections; the
+            same seed gives the same stream, and the same objects and sweeps whatever the sensors.
+        profile: The name of the simulation profile, one of `world.PROFILES`.
         pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
     """
 
@@ -81,12 +147,12 @@ class SimSource(PacedSource):
     Samples that the sensors drop count as missing.
 
     Args:
-        array: which array, see `arrays.load_animals`: ``mouse`` (also if empty), ``rat-left``, a
+        array: which array, see `files.load_animals`: ``mouse`` (also if empty), ``rat-left``, a
             .csv or .toml file.
         options: what it meets.
 
     Attributes:
-        passes: the objects that have come by so far, in order.
+        passes: The objects that have come by so far, in order.
     """
 
     Options = SimOptions
@@ -95,8 +161,7 @@ class SimSource(PacedSource):
         self._animals = load_animals(array or "mouse")
         super().__init__(world_spec(self._animals), options.pace)
         self._options = options
-        names = [n for n in options.objects.split(",") if n] or list(CATEGORIES)
-        self._objects = [load_object(name) for name in names]
+        self._objects = _objects(options) or [load_object(name) for name in CATEGORIES]
         self._rng = np.random.default_rng(options.seed)
         # Of its own, so that the objects are the same with and without.
         self._array_rng = np.random.default_rng([options.seed, 1])
@@ -108,6 +173,12 @@ class SimSource(PacedSource):
         self._simulation: SweepSimulation | None = None
         self._left = 0  # samples of the sweep still to deliver
         self._order: list[int] = []
+
+    @staticmethod
+    def check(array: str, options: SimOptions) -> None:
+        """Raise the `ConfigError` that opening it would raise."""
+        load_animals(array or "mouse")
+        _objects(options)
 
     def close(self) -> None:
         super().close()
@@ -162,3 +233,8 @@ class SimSource(PacedSource):
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)
         now = start_ns + round(self._sent * SAMPLE_MS * 1e6)
         self.passes.append(Pass(now, target.name, target.category, sweep))
+
+
+def _objects(options: SimOptions) -> list[TactileObject]:
+    """The objects that the options name; none: all categories are meant."""
+    return [load_object(name) for name in options.objects.split(",") if name]

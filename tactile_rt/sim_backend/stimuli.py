@@ -59,13 +59,13 @@ class Surface:
     """A bent sheet, standing upright; whiskers meet its convex or its concave face.
 
     Attributes:
-        shape: ``convex`` or ``concave``.
-        position_mm: middle of the face, in the world frame of `whisking.HEAD`, mm.
-        facing_deg: azimuth of the face's normal at its middle, degrees from x to y.
-        radius_mm: of the face's arc.
-        chord_mm, height_mm: straight width and height of the face.
-        thickness_mm: of the sheet, behind the face.
-        facets: flat strips that the face is made of; their edges lie on the arc.
+        shape: ``convex`` or ``concave``, the face that the whiskers meet.
+        position_mm: The middle of the face, in the world frame of `whisking.HEAD`, mm.
+        facing_deg: The azimuth of the face's normal at its middle, degrees from x to y.
+        radius_mm: The radius of the face's arc, mm.
+        chord_mm, height_mm: The straight width and height of the face, mm.
+        thickness_mm: The thickness of the sheet, behind the face, mm.
+        facets: The number of flat strips that the face is made of; their edges lie on the arc.
 
     Raises:
         ConfigError: no such shape, or an impossible size.
@@ -153,8 +153,8 @@ class Touch:
     """What an array felt while it whisked.
 
     Attributes:
-        loads: (sample, element, channel) base loads at 1 kHz, N and N m.
-        touch: (sample, element) whether it touched the object.
+        loads: The (sample, element, channel) base loads at 1 kHz, N and N m.
+        touch: The (sample, element) bool that tells whether a whisker touched the object.
     """
 
     loads: NDArray[np.float32]

@@ -1,7 +1,8 @@
 """An object swept past the array: the world, the motion, the base loads at 1 kHz.
 
 World frame: z up, x away from the head, y rostral; its origin is where the published sweeps have
-it (see `arrays.MOUNT`). The object moves along -y, as things do past a head that moves forward.
+it (see `whisker_array.MOUNT`). The object moves along -y, as things do past a head that moves
+forward.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,8 +22,9 @@ from tactile_rt.sim_backend.approach import (
     way_to_contact,
     within_reach,
 )
+from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.head import add_head
-from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray, load_animals
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, ContactProbe
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
@@ -60,13 +62,13 @@ class Sweep:
     """How an object is swept past the array (Chung et al. 2025, appendix A1).
 
     Attributes:
-        size_mm: largest extent of the object, mm.
-        speed_mm_s: speed along -y, mm/s.
-        yaw_deg: rotation of the object about z, degrees.
-        height_mm: z of the object's centre in the world frame, mm.
-        distance_mm: from the mean of the whiskers' base points to the object's nearest face,
-            along world x, mm; below 5.5 the stiff rostral whiskers of a mouse jam.
-        gap_mm: how far before first contact the object starts, mm.
+        size_mm: The largest extent of the object, mm.
+        speed_mm_s: The speed of the object along -y, mm/s.
+        yaw_deg: The rotation of the object about z, degrees.
+        height_mm: The z of the object's centre in the world frame, mm.
+        distance_mm: The distance from the mean of the whiskers' base points to the object's nearest
+            face, along world x, mm; below 5.5 the stiff rostral whiskers of a mouse jam.
+        gap_mm: The way before first contact at which the object starts, mm.
     """
 
     size_mm: float = 40.0
@@ -84,8 +86,9 @@ class SweepSimulation:
     simulated, nor are pieces of the object that no whisker could reach.
 
     Args:
-        array: the whiskers; a tuple of arrays for several animals in one world (`arrays.place`).
-            The object passes on the side to which most of the whiskers reach.
+        array: the whiskers; a tuple of arrays for several animals in one world
+            (`whisker_array.place`). The object passes on the side to which most of the whiskers
+            reach.
         target: the object.
         sweep: how it moves.
         profile: how finely to simulate.
@@ -93,7 +96,7 @@ class SweepSimulation:
 
     Attributes:
         touches: False when the object passes without meeting any resting whisker.
-        duration_ms: simulated time after which the object has passed all whiskers.
+        duration_ms: The simulated time after which the object has passed all whiskers, ms.
     """
 
     def __init__(

@@ -61,13 +61,13 @@ class Whisk:
     """Regular whisking: every cycle protracts and retracts smoothly, rows coupled as in the rat.
 
     Attributes:
-        frequency_hz: cycles per second.
-        protraction_deg, retraction_deg: furthest forward and backward of rest, degrees.
-        asymmetry: fraction of a cycle spent protracting; 0.5 is a sinusoid.
-        phase_deg: of the cycle at time 0, degrees; 0 is fully retracted.
-        column_lag_deg: by how much each column lags behind the one caudal to it, degrees.
-        ramp_s: whisking begins at rest and is whole after this time, s.
-        duration_s: s.
+        frequency_hz: The whisking cycles per second, Hz.
+        protraction_deg, retraction_deg: The furthest turn forward and backward of rest, degrees.
+        asymmetry: The fraction of a cycle spent protracting; 0.5 is a sinusoid.
+        phase_deg: The phase of the cycle at time 0, degrees; 0 is fully retracted.
+        column_lag_deg: The phase by which each column lags behind the one caudal to it, degrees.
+        ramp_s: The time from rest until the whisking is whole, s.
+        duration_s: The length of the whole trajectory, s.
 
     Raises:
         ConfigError: a value out of range.
@@ -120,10 +120,11 @@ class Recorded:
     """A recorded trajectory, interpolated by a cubic spline: see `read_trajectory`.
 
     Attributes:
-        times_s: (sample,) from 0 on, s.
-        turns: (sample, whisker, 3) turn from the resting angles, rad.
-        names: whiskers of `turns`.
-        ramp_s: motion grows from the first sample's posture to the recorded one in this time.
+        times_s: The (sample,) times from 0 on, s.
+        turns: The (sample, whisker, 3) turn from the resting angles, rad.
+        names: The names of the whiskers of `turns`, in their order.
+        ramp_s: The time in which motion grows from the first sample's posture to the recorded one,
+            s.
     """
 
     times_s: NDArray[np.float64]

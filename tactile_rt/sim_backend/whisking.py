@@ -53,7 +53,8 @@ class WhiskSimulation:
         mount: pose of the head frame in the world.
 
     Attributes:
-        samples: of 1 ms, that the trajectory lasts; `ENDLESS` if it has no end.
+        samples: The number of samples of 1 ms that the trajectory lasts; `ENDLESS` if it has no
+            end.
 
     Raises:
         ConfigError: a whisker begins inside the object.

@@ -40,9 +40,10 @@ class Whisking:
     """What an active array is told to do: protraction = offset + amplitude sin(2 pi f t).
 
     Attributes:
-        frequency_hz: cycles per second, 0 to 30; at 0 the whiskers are held at the offset.
-        amplitude_rad: to either side of the offset.
-        offset_rad: from rest, rostral positive. Both together stay within 1.05 rad (60 degrees).
+        frequency_hz: The cycles per second, 0 to 30; at 0 the whiskers are held at the offset.
+        amplitude_rad: The turn to either side of the offset, rad.
+        offset_rad: The middle of the whisking from rest, rad, rostral positive. Offset and
+            amplitude together stay within 1.05 rad (60 degrees).
 
     Raises:
         ConfigError: out of range, or a steady acceleration beyond 10,000 rad/s^2.
@@ -89,10 +90,11 @@ class _Segment:
     """From one command to the next.
 
     Attributes:
-        start_s: when it begins.
-        aim: (3,) frequency, amplitude and offset commanded.
-        away: (lag, 3) how far each lag's output is from the aim at the start, the last lag last.
-        phase: at the start, rad.
+        start_s: The time at which the segment begins, s.
+        aim: The (3,) frequency, amplitude and offset commanded.
+        away: The (lag, 3) distance of each lag's output from the aim at the start, the last lag
+            last.
+        phase: The phase of the whisking at the start, rad.
     """
 
     start_s: float

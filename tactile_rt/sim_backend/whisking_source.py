@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.objects.catalogue import load_object
-from tactile_rt.sim_backend.pacing import CHUNK_SAMPLES, PacedSource, check_pace
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
+from tactile_rt.sim_backend.source import CHUNK_SAMPLES, PacedSource, check_pace
 from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import Drive, Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
@@ -32,18 +32,18 @@ class WhiskingOptions(SensorModel):
     The fields of `SensorModel` are options too and concern the loads; angles are true.
 
     Attributes:
-        frequency_hz: cycles per second.
-        amplitude_deg, offset_deg: protraction is offset + amplitude sin(2 pi f t) from rest,
+        frequency_hz: The whisking cycles per second, Hz.
+        amplitude_deg, offset_deg: The protraction is offset + amplitude sin(2 pi f t) from rest,
             rostral positive, degrees. See `Whisking` for the ranges.
-        object: name (``mug-50``), category or mesh file of what stands beside the array; empty:
-            it whisks in air.
-        position_mm: of the object's centre: ``x,y,z``, x lateral (away from the head), y rostral,
-            z up, from the array's origin, mm.
-        size_mm: largest extent of the object, mm.
-        yaw_deg: its rotation about z, degrees.
-        seconds: how long the stream lasts; 0: without end.
-        seed: of the sensors' imperfections.
-        profile: simulation profile, see `world.PROFILES`.
+        object: The name (``mug-50``), category or mesh file of what stands beside the array; empty:
+            the array whisks in air.
+        position_mm: The position of the object's centre: ``x,y,z``, x lateral (away from the head),
+            y rostral, z up, from the array's origin, mm.
+        size_mm: The largest extent of the object, mm.
+        yaw_deg: The rotation of the object about z, degrees.
+        seconds: The length of the stream, s; 0: without end.
+        seed: The seed of the sensors' imperfections.
+        profile: The name of the simulation profile, one of `world.PROFILES`.
         pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
     """
 
@@ -103,12 +103,12 @@ class WhiskingSource(PacedSource):
     Two sources that are given the same commands at the same samples deliver the same.
 
     Args:
-        array: which array, see `arrays.load_array`: ``mouse`` (also if empty), ``rat-left``, a
+        array: which array, see `files.load_array`: ``mouse`` (also if empty), ``rat-left``, a
             .csv or .toml file.
         options: how it whisks, and against what.
 
     Attributes:
-        commands: (first sample that it concerns, command), in order.
+        commands: The pairs (first sample that it concerns, command), in order.
 
     Raises:
         ConfigError: no such array or object, or whiskers begin inside the object.
@@ -139,6 +139,11 @@ class WhiskingSource(PacedSource):
         self._sent = 0  # samples simulated so far
         self._wanted: Whisking | None = None
         self.commands: list[tuple[int, Whisking]] = [(0, options.whisking)]
+
+    @staticmethod
+    def check(array: str, options: WhiskingOptions) -> None:
+        """Raise the `ConfigError` that opening it would raise."""
+        WhiskingSource(array, options).close()
 
     def set_whisking(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> None:
         """Whisk like this from the next sample that is not yet simulated on; from any thread.

@@ -59,10 +59,10 @@ class Profile:
     """How finely an array is simulated.
 
     Attributes:
-        links_per_mm: links per mm of arc length.
-        least_links: links of the shortest whiskers.
-        timestep_ms: physics step, ms; divides the 1 ms output period.
-        layer_mm: thickness of the soft layer on each of two touching surfaces, mm: thin for the
+        links_per_mm: The number of rigid links per mm of arc length.
+        least_links: The number of links of the shortest whiskers.
+        timestep_ms: The length of a physics step, ms; divides the 1 ms output period.
+        layer_mm: The thickness of the soft layer on each of two touching surfaces, mm: thin for the
             right moments at a light touch, thick against chatter at a coarse step.
     """
 

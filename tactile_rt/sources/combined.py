@@ -15,18 +15,22 @@ combined:robot_head.toml, which reads
 """
 
 import contextlib
+import os
 import time
-import tomllib
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.settings import convert, read_toml, refusal
+from tactile_rt.sources.opening import check_source, open_source
 from tactile_rt.stream import (
     NS_PER_S,
     ArraySpec,
@@ -35,9 +39,10 @@ from tactile_rt.stream import (
     EndOfStream,
     Source,
     SourceError,
+    TactileError,
 )
 
-__all__ = ["CombinedSource", "MemberArray", "combine_specs", "open_combined"]
+__all__ = ["CombinedSource", "MemberArray", "combine_specs", "prepare_combined"]
 
 LATEST_NS = NS_PER_S // 5  # an array that lags so far is left out: its elements are invalid
 SLICE_S = 0.005
@@ -47,10 +52,11 @@ class MemberArray(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One array among several.
 
     Attributes:
-        name: put before the names of its elements.
-        url: of its source.
-        position: of its mount frame in the combined one, m.
-        orientation: of its mount frame, unit quaternion (w, x, y, z).
+        name: The name of the array, put before the names of its elements.
+        url: The URL of the source that delivers the array's samples.
+        position: Origin of the array's mount frame in the combined mount frame, m.
+        orientation: Unit quaternion (w, x, y, z) that turns the array's mount frame into the
+            combined one.
     """
 
     name: str
@@ -61,38 +67,54 @@ class MemberArray(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
     name: str
-    rate_hz: float
-    source: list[MemberArray]
+    rate_hz: Annotated[float, msgspec.Meta(gt=0)]
+    source: tuple[MemberArray, ...] = ()
 
 
-def open_combined(path: str, fields: dict[str, str]) -> Source:
-    """The arrays that a TOML file lists.
+# Files that are being read, one within another: none may combine itself.
+_READING: ContextVar[tuple[str, ...]] = ContextVar("_READING", default=())
+
+
+def prepare_combined(path: str, fields: dict[str, str]) -> Callable[[], Source]:
+    """What opens the arrays that a TOML file lists.
 
     Raises:
-        ConfigError: the file cannot be read, or is not of the layout above.
-        SourceError: one of the devices cannot be opened.
+        ConfigError: the file cannot be read, is not of the layout above, or a URL in it is wrong.
+            What is returned raises `SourceError` if one of the devices cannot be opened.
     """
-    from tactile_rt.sources.opening import open_source
-
+    if not path:
+        raise ConfigError("combined: needs a file, e.g. combined:head.toml")
     if fields:
         raise ConfigError(f"combined:{path} takes no options: they are in the file")
-    try:
-        wanted = msgspec.convert(tomllib.loads(Path(path).read_text(encoding="utf-8")), _File)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError, msgspec.ValidationError) as error:
-        raise ConfigError(f"{path}: {error}") from None
+    nodes = read_toml(Path(path))
+    wanted: _File = convert(nodes, _File)
     if not wanted.source:
         raise ConfigError(f"{path}: no [[source]] to combine")
-    with contextlib.ExitStack() as opened:
-        sources = [opened.enter_context(open_source(part.url)) for part in wanted.source]
-        made = CombinedSource(sources, wanted.source, wanted.name, wanted.rate_hz)
-        opened.pop_all()
-        return made
+    place, above = os.path.realpath(path), _READING.get()
+    if place in above:
+        raise ConfigError(f"{path} combines itself")
+    within = _READING.set((*above, place))
+    try:
+        for i, part in enumerate(wanted.source):
+            try:
+                check_source(part.url)
+            except TactileError as error:
+                raise refusal(nodes, ["source", i, "url"], str(error)) from None
+    finally:
+        _READING.reset(within)
+
+    def opened() -> Source:
+        with contextlib.ExitStack() as stack:
+            sources = [stack.enter_context(open_source(part.url)) for part in wanted.source]
+            made = CombinedSource(sources, wanted.source, wanted.name, wanted.rate_hz)
+            stack.pop_all()
+            return made
+
+    return opened
 
 
 def combine_specs(
-    specs: list[ArraySpec], parts: list[MemberArray], name: str, rate_hz: float
+    specs: list[ArraySpec], parts: Sequence[MemberArray], name: str, rate_hz: float
 ) -> ArraySpec:
     """One spec of all elements, each array's rows below those of the one before.
 
@@ -159,7 +181,7 @@ class CombinedSource(Source):
     """
 
     def __init__(
-        self, sources: list[Source], parts: list[MemberArray], name: str, rate_hz: float
+        self, sources: list[Source], parts: Sequence[MemberArray], name: str, rate_hz: float
     ) -> None:
         super().__init__(combine_specs([s.spec for s in sources], parts, name, rate_hz))
         self.live = any(s.live for s in sources)

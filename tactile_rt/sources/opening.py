@@ -2,30 +2,33 @@
 
 Schemes are looked up in one table, imported when used, so that a robot without MuJoCo never
 imports it; then among the entry points of group ``tactile_rt.sources``, where other packages add
-theirs.
+theirs. What can be told of a URL without opening anything is told by `check_source`, in the words
+of `open_source`: both go through `_prepared`.
 """
 
-import difflib
+from collections.abc import Callable
+from functools import partial
 from importlib import import_module, metadata
 from typing import Any
-from urllib.parse import parse_qsl, unquote, urlsplit
 
-from tactile_rt.settings import parse_options
+from tactile_rt.settings import nearest, parse_options, split_url
 from tactile_rt.stream import ConfigError, Source
 
-__all__ = ["ENTRY_POINTS", "SCHEMES", "open_source", "opener"]
+__all__ = ["ENTRY_POINTS", "SCHEMES", "check_source", "open_source"]
 
-# scheme: (module, what opens it, extra that it needs). What opens it is a function of the target
-# and the options as written, or a class of the target and an `Options` dataclass that it names.
+# scheme: (module, name, extra that it needs). The name is of a class of the target and an `Options`
+# dataclass that it names, which may have a `check` of both for what can be told without opening; or
+# of a function of the target and the options as written, which checks both and returns what opens.
 SCHEMES = {
     "sim": ("tactile_rt.sim_backend.source", "SimSource", "sim"),
     "whisking": ("tactile_rt.sim_backend.whisking_source", "WhiskingSource", "sim"),
-    "serial": ("tactile_rt.drivers.opening", "open_serial", ""),
-    "can": ("tactile_rt.drivers.opening", "open_can", ""),
+    "serial": ("tactile_rt.drivers.opening", "prepare_serial", ""),
+    "can": ("tactile_rt.drivers.opening", "prepare_can", ""),
     "synthetic": ("tactile_rt.sources.synthetic", "SyntheticSource", ""),
-    "replay": ("tactile_rt.recording.replay", "open_replay", "record"),
-    "combined": ("tactile_rt.sources.combined", "open_combined", ""),
+    "replay": ("tactile_rt.recording.replay", "prepare_replay", "record"),
+    "combined": ("tactile_rt.sources.combined", "prepare_combined", ""),
 }
+# Of other packages: a class as above, or a function of target and options that returns the source.
 ENTRY_POINTS = "tactile_rt.sources"
 
 
@@ -36,38 +39,25 @@ def open_source(url: str) -> Source:
         ConfigError: unknown scheme, unknown or ill-typed option, or an extra is not installed.
         SourceError: the device cannot be opened.
     """
-    try:
-        parts = urlsplit(url, allow_fragments=False)  # a file's name may hold a #
-    except ValueError as error:
-        raise ConfigError(f"source {url!r}: {error}") from None
-    # A + is a +, as in a file's name, not the space that web forms make of it.
-    pairs = parse_qsl(parts.query.replace("+", "%2B"), keep_blank_values=True)
-    fields = dict(pairs)
-    if len(fields) < len(pairs):
-        raise ConfigError(f"source {url!r}: an option is given twice")
-    make = opener(url, parts.scheme)
-    target = unquote(parts.netloc + parts.path)
-    options = getattr(make, "Options", None)
-    if options is not None:
-        fields = parse_options(f"source {parts.scheme}:", fields, options)
-    source: Source = make(target, fields)
-    return source
+    return _prepared(url, check=False)()
 
 
-def opener(url: str, scheme: str) -> Any:
-    """What opens sources of a scheme: see `SCHEMES`.
-
-    Args:
-        url: for the message.
-        scheme: without the colon.
+def check_source(url: str) -> None:
+    """Refuse a URL that `open_source` would refuse whatever is plugged in; nothing is opened but
+    the files that it names.
 
     Raises:
-        ConfigError: unknown scheme, or an extra is not installed.
+        ConfigError, RecordingError: as `open_source`, in the same words.
     """
+    _prepared(url, check=True)
+
+
+def _prepared(url: str, check: bool) -> Callable[[], Source]:
+    scheme, target, fields = split_url(url)
     if scheme in SCHEMES:
         module, attribute, extra = SCHEMES[scheme]
         try:
-            return getattr(import_module(module), attribute)
+            made: Any = getattr(import_module(module), attribute)
         except ModuleNotFoundError as error:
             if (error.name or "").startswith("tactile_rt"):
                 raise
@@ -75,11 +65,24 @@ def opener(url: str, scheme: str) -> Any:
                 f"source {scheme}: needs {error.name}, which is not installed: "
                 f"pip install 'tactile-rt[{extra}]'"
             ) from None
-    for point in metadata.entry_points(group=ENTRY_POINTS, name=scheme):
+        if not hasattr(made, "Options"):
+            opens: Callable[[], Source] = made(target, fields)
+            return opens
+    else:
+        made = _of_another_package(url, scheme)
+    kind = getattr(made, "Options", None)
+    if kind is None:
+        return partial(made, target, fields)
+    options = parse_options(f"{scheme}:{target}", fields, kind)
+    if check and hasattr(made, "check"):
+        made.check(target, options)
+    return partial(made, target, options)
+
+
+def _of_another_package(url: str, scheme: str) -> Any:
+    points = metadata.entry_points(group=ENTRY_POINTS)
+    for point in points.select(name=scheme):
         return point.load()
-    known = sorted({*SCHEMES, *metadata.entry_points(group=ENTRY_POINTS).names})
-    near = difflib.get_close_matches(scheme or url, known, 1)
-    raise ConfigError(
-        f"unknown source {url!r}: it begins with one of {', '.join(k + ':' for k in known)}"
-        + (f" (did you mean {near[0]}:?)" if near else "")
-    )
+    known = sorted(f"{s}:" for s in {*SCHEMES, *points.names})
+    near = nearest(f"{scheme}:" if scheme else url, known)
+    raise ConfigError(f"{url!r:.80} is no source; {near}")

@@ -29,9 +29,9 @@ class SyntheticOptions:
     """How fast, how long.
 
     Attributes:
-        rate_hz: sample rate, Hz.
-        seconds: length of the stream, s; 0: endless.
-        seed: of its noise; the same seed gives the same stream.
+        rate_hz: Sample rate of the stream, Hz.
+        seconds: Length of the stream, s; 0 for an endless one.
+        seed: Seed of the noise; the same seed gives the same stream.
         pace: ``realtime`` delivers samples when they are due, ``fast`` at once.
     """
 
@@ -43,8 +43,11 @@ class SyntheticOptions:
     def __post_init__(self) -> None:
         if self.pace not in ("realtime", "fast"):
             raise ConfigError(f"pace must be realtime or fast, not {self.pace!r}")
-        if not 0 < self.rate_hz <= 1e6 or self.seconds < 0 or self.seed < 0:
-            raise ConfigError("rate_hz must be above 0, seconds and seed 0 or more")
+        if not 0 < self.rate_hz <= 1e6:
+            raise ConfigError(f"rate_hz must be above 0, at most 1e6, not {self.rate_hz:g}")
+        for name in ("seconds", "seed"):
+            if not getattr(self, name) >= 0:
+                raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name):g}")
 
 
 def synthetic_spec(elements: int, channels: int, rate_hz: float) -> ArraySpec:
@@ -77,18 +80,18 @@ class SyntheticSource(Source):
     Options = SyntheticOptions
 
     def __init__(self, size: str, options: SyntheticOptions) -> None:
-        found = re.fullmatch(r"(\d{1,4})x([1-6])", size or "5x6")
-        if not found or int(found[1]) == 0:
-            raise ConfigError(
-                f"synthetic:{size} is not a size: ELEMENTSxCHANNELS, e.g. 35x6; at most 9999x6"
-            )
-        super().__init__(synthetic_spec(int(found[1]), int(found[2]), options.rate_hz))
+        super().__init__(synthetic_spec(*_numbers(size), options.rate_hz))
         self.live = options.pace == "realtime"
         self._rng = np.random.default_rng(options.seed)
         self._left = round(options.seconds * options.rate_hz) if options.seconds else None
         self._peak = np.array([PEAK[unit] for unit in self.spec.units])
         self._at = np.array([r + c / 10 for r, c in self.spec.grid]) * 0.05  # s; bumps arrive
         self._sent, self._start_ns, self._closed = 0, -1, False
+
+    @staticmethod
+    def check(size: str, options: SyntheticOptions) -> None:
+        """Raise the `ConfigError` that opening it would raise."""
+        _numbers(size)
 
     def read(self, timeout: float | None = None) -> Chunk | None:
         n = max(1, round(CHUNK_S * self.spec.rate_hz))
@@ -124,3 +127,13 @@ class SyntheticSource(Source):
         noise = self._rng.normal(size=clean.shape) * (NOISE * self._peak)
         values: NDArray[np.float32] = (clean + noise).astype(np.float32)
         return values
+
+
+def _numbers(size: str) -> tuple[int, int]:
+    """(elements, channels) of ``35x6``."""
+    found = re.fullmatch(r"(\d{1,4})x([1-6])", size or "5x6")
+    if not found or int(found[1]) == 0:
+        raise ConfigError(
+            f"synthetic:{size} is not a size: ELEMENTSxCHANNELS, e.g. 35x6; at most 9999x6"
+        )
+    return int(found[1]), int(found[2])

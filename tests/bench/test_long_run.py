@@ -1,4 +1,4 @@
-"""The short form of `bench/long_run.py`: the shipped model through every kind of trouble.
+"""The short form of `bench/checks/long_run.py`: the shipped model through every kind of trouble.
 
 Each run has a process of its own: in one whose heap is full of holes left by other tests, nothing
 that is kept shows in resident memory.
@@ -12,7 +12,7 @@ from types import ModuleType
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "bench" / "long_run.py"
+SCRIPT = Path(__file__).parents[2] / "bench" / "checks" / "long_run.py"
 
 LEAKS = """
 kept = []
@@ -49,8 +49,8 @@ def _needed() -> None:
 def run(steps: int, warm_up: int, fault: str = "") -> tuple[int, str]:
     """Its exit status and what it said; `fault` is Python that breaks it first."""
     code = (
-        f"import sys; sys.path.insert(0, {str(SCRIPT.parent.parent)!r})\n"
-        "from bench import long_run\n"
+        f"import sys; sys.path.insert(0, {str(SCRIPT.parents[2])!r})\n"
+        "from bench.checks import long_run\n"
         "long_run.GROWTH = 4e6  # the heap has not settled yet\n"
         f"{fault}\n"
         f"sys.exit(long_run.main(steps={steps}, warm_up={warm_up}))\n"

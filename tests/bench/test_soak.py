@@ -9,22 +9,21 @@ import pytest
 pytest.importorskip("onnx", reason="needs onnx: pip install 'tactile-rt[train]'")
 pytest.importorskip("mcap", reason="needs mcap: pip install 'tactile-rt[record]'")
 pytest.importorskip("zenoh", reason="needs zenoh: pip install 'tactile-rt[publish]'")
-pytest.importorskip("uvicorn", reason="needs uvicorn: pip install 'tactile-rt[ui]'")
 
-from bench.daemon.accounts import account
-from bench.daemon.arrays import KINDS, Played, fault_beat
+from bench.daemon.accounts import RecordedSamples, account
 from bench.daemon.disk import disk_full
-from bench.daemon.latencies import Recorded, latencies
+from bench.daemon.latencies import latencies
 from bench.daemon.models import finger_array, whisker_array, write_wide_model
-from bench.daemon.soak import soak
-from bench.daemon.soak_figures import soak_records
+from bench.daemon.soak import soak_records
+from bench.daemon.soak_rig import soak
+from bench.emulated import KINDS, Played, fault_beat
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.daemon.config import RecorderConfig
+from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Opened, SourceChunk
 from tactile_rt.daemon.recorder import Recorder
-from tactile_rt.daemon.snapshot import Snapshot
-from tactile_rt.drivers.emulation.damage import Fate
+from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource
@@ -165,7 +164,7 @@ def test_a_latency_begins_with_the_write_of_the_sample_that_completes_the_step()
     n = 8000
     one = played([S] * n, faults=(("drop", 5.0, 0.5),))
     seq = np.delete(np.arange(n, dtype=np.int64), 4109)  # lost: the next one completes the step
-    recorded = Recorded(seq, 1 + 1000 + MS * seq)  # by its clock 1 us after it was written
+    recorded = RecordedSamples(seq, 1 + 1000 + MS * seq)  # by its clock 1 us after it was written
     t_ns = np.array([500, 4000, 4100, 5200, 7000], np.int64) * MS
     at_ns = t_ns + np.array([10, 10, 12, 13, 14]) * MS + 1
     found = latencies(9 * MS, recorded, {"a": one}, "a", t_ns, at_ns)

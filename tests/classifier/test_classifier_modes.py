@@ -9,8 +9,7 @@ import pytest
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classification, Classifier
-from tactile_rt.classifier.early_exit import early_exit_curve
-from tactile_rt.classifier.lanes import Lanes
+from tactile_rt.classifier.exits import Lanes, early_exit_curve
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.stream import NS_PER_S, Chunk, ConfigError
 from tactile_rt.testing import cut

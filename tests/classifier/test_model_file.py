@@ -11,11 +11,11 @@ import pytest
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classifier
-from tactile_rt.classifier.model_check import probe_logits
 from tactile_rt.classifier.model_file import (
     StateTensor,
     element_order,
     load_model,
+    probe_logits,
     read_model,
     shipped_model,
 )

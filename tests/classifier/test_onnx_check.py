@@ -216,13 +216,13 @@ def test_many_small_parts_end_soon() -> None:
         read_onnx(b"\x08\x01" * 1_100_000)
 
 
-TINY = tiny().SerializeToString()
+MODEL = tiny().SerializeToString()
 
 
 @given(st.data())
 @hypothesis_settings(max_examples=300)
 def test_damage_is_never_anything_but_refused(data: st.DataObject) -> None:
-    damaged = bytearray(TINY[: data.draw(st.integers(0, len(TINY)))])
+    damaged = bytearray(MODEL[: data.draw(st.integers(0, len(MODEL)))])
     for at in data.draw(st.lists(st.integers(0, max(0, len(damaged) - 1)), max_size=6)):
         if damaged:
             damaged[at] ^= 1 << data.draw(st.integers(0, 7))

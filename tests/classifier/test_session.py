@@ -8,10 +8,10 @@ import pytest
 from tactile_rt.classifier.session import Session
 from tactile_rt.stream import Chunk, EndOfStream, Source, SourceError
 from tactile_rt.testing import ArraySource, cut, small_spec
+from tests.helpers.waiting import PATIENCE_S, until
 
 SPEC = small_spec()
 CHUNKS = cut(np.random.default_rng(0).normal(size=(400, *SPEC.shape)), SPEC.rate_hz, samples=4)
-SOON_S = 5.0  # far more than anything here takes, on any machine
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 
@@ -66,13 +66,6 @@ class Device(Source):
         self.closed_by.append(threading.current_thread().name)
 
 
-def wait_for(condition: Callable[[], bool]) -> None:
-    give_up = time.monotonic() + SOON_S
-    while not condition():
-        assert time.monotonic() < give_up
-        time.sleep(0.002)
-
-
 def reading() -> bool:
     return any(t.name == "tactile-rt-reader" for t in threading.enumerate())
 
@@ -109,7 +102,7 @@ def test_a_slow_consumer_gets_the_newest_and_every_loss_is_counted() -> None:
     with Session(source, listener, queue_chunks=8) as session:
         chunks = iter(session)
         first, _ = next(chunks)
-        wait_for(lambda: not reading())  # all has arrived while we did something else
+        until(lambda: not reading())  # all has arrived while we did something else
         assert source.stats.delivered == 400
         rest = [chunk for chunk, _ in chunks]
     assert rest == [chunk for chunk in CHUNKS[-8:] if chunk is not first]
@@ -123,7 +116,7 @@ def test_acquisition_never_waits_for_the_consumer() -> None:
     with Session(device, Listener(), queue_chunks=2) as session:
         device.arriving += CHUNKS[:50]
         next(iter(session))
-        wait_for(lambda: not device.arriving)
+        until(lambda: not device.arriving)
     assert device.stats.delivered == 200
 
 
@@ -176,7 +169,7 @@ def test_stop_from_another_thread_ends_the_iteration(live: bool) -> None:
         began = time.monotonic()
         for _ in session:
             pass
-        assert time.monotonic() - began < SOON_S
+        assert time.monotonic() - began < PATIENCE_S
         stopper.join()
         session.stop()
         assert not reading()

@@ -1,6 +1,9 @@
 """`tactile-rt bench`: areas, figures, the JSON form."""
 
 import json
+import os
+import subprocess
+import sys
 
 import pytest
 
@@ -17,9 +20,39 @@ def test_an_unknown_area_lists_the_areas(call):
     assert err.count("\n") == 1
 
 
-def test_an_area_without_figures_says_so(call, monkeypatch):
-    monkeypatch.setitem(bench.AREAS, "daemon", None)
-    assert call("bench", "daemon") == (0, "no figures yet for: daemon\n", "")
+def ask(code, folder, *path):
+    """What Python says from a folder, with these on its path."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, path))}
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True
+    )
+
+
+@pytest.fixture
+def strange(tmp_path):
+    """A folder with a `bench` that is not ours."""
+    folder = tmp_path / "strange"
+    (folder / "bench").mkdir(parents=True)
+    (folder / "bench" / "__init__.py").write_text("raise SystemExit('not mine')\n")
+    return folder
+
+
+def test_without_the_rigs_it_is_one_line(strange):
+    """As a wheel is installed: the package, and nothing of ours beside it."""
+    (strange / "tactile_rt").symlink_to(bench.CHECKOUT / "tactile_rt", target_is_directory=True)
+    main = "import sys; sys.argv[1:] = {}; from tactile_rt.cli import main; main()"
+    for arguments in (["bench", "align", "--quick"], ["bench"]):
+        done = ask(main.format(arguments), strange, strange)
+        assert (done.returncode, done.stdout) == (2, "")
+        assert "measures from a checkout" in done.stderr
+        assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("area", bench.AREAS)
+def test_each_area_is_found_from_any_folder(area, strange):
+    code = f"from tactile_rt.cli import bench; rig = bench._rig({area!r}); print(rig.__file__)"
+    done = ask(code, strange, strange, bench.CHECKOUT)
+    assert done.stdout.strip() == str(bench.CHECKOUT / "bench" / area / "area.py"), done.stderr
 
 
 def test_a_folder_that_is_not_there_is_named_before_measuring(call, tmp_path):

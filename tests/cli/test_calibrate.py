@@ -48,18 +48,6 @@ def device(monkeypatch):
     return made
 
 
-@pytest.fixture
-def refused(call):
-    def run(*arguments):
-        code, out, err = call(*arguments)
-        assert (code, out) == (2, "")
-        assert err.startswith("tactile-rt: ")
-        assert err.count("\n") == 1, err
-        return err
-
-    return run
-
-
 def write_table(path, loads, noise=0.0, element=0, names=("raw_s1", "raw_s0")):
     """A table of exact readings under these loads, channels in another order than the device's."""
     rng = np.random.default_rng(1)

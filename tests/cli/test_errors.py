@@ -20,28 +20,14 @@ from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sweep_set import write_object
 
-TINY = ("--recipe", "mouse12", "--objects", 3, "--validation", 1, "--test", 1, "--sweeps", 1)
+TINY_SET = ("--recipe", "mouse12", "--objects", 3, "--validation", 1, "--test", 1, "--sweeps", 1)
 
 
 def tiny_recipe():
-    """What `TINY` says."""
+    """What `TINY_SET` says."""
     recipe = read_recipe("mouse12")
     objects = replace(recipe.objects, per_category=3, validation=1, test=1)
     return replace(recipe, objects=objects, sweeps=replace(recipe.sweeps, draws=1))
-
-
-@pytest.fixture
-def refused(call):
-    """Call with these arguments, expect one line, and return it."""
-
-    def run(*arguments):
-        code, out, err = call(*arguments)
-        assert (code, out) == (2, "")
-        assert err.startswith("tactile-rt: ")
-        assert err.count("\n") == 1, err
-        return err
-
-    return run
 
 
 @pytest.fixture
@@ -69,8 +55,8 @@ def sweep_set(tmp_path):
 
 
 def test_a_set_cannot_be_made_in_or_under_a_file(refused, a_file):
-    assert f"{a_file}: is not a folder" in refused("sweep", a_file, *TINY)
-    assert f"{a_file / 'set'}: Not a directory" in refused("sweep", a_file / "set", *TINY)
+    assert f"{a_file}: is not a folder" in refused("sweep", a_file, *TINY_SET)
+    assert f"{a_file / 'set'}: Not a directory" in refused("sweep", a_file / "set", *TINY_SET)
     assert a_file.read_bytes() == b"here already\n"
 
 
@@ -83,18 +69,18 @@ def test_a_set_cannot_be_made_in_or_under_a_file(refused, a_file):
     ],
 )
 def test_an_impossible_set_is_refused_before_anything_is_written(refused, tmp_path, options, said):
-    assert said in refused("sweep", tmp_path / "set", *TINY, *options)
+    assert said in refused("sweep", tmp_path / "set", *TINY_SET, *options)
     assert not (tmp_path / "set").exists()
 
 
 def test_another_set_in_the_folder_is_one_line(refused, sweep_set):
     assert "holds another sweep set (other recipe.seed)" in refused(
-        "sweep", sweep_set, *TINY, "--seed", 1
+        "sweep", sweep_set, *TINY_SET, "--seed", 1
     )
 
 
 def test_a_split_named_twice_counts_once(call, sweep_set):
-    code, _, err = call("sweep", sweep_set, *TINY, "--split", "test, test")
+    code, _, err = call("sweep", sweep_set, *TINY_SET, "--split", "test, test")
     assert code == 0
     assert "12 sweeps" in err.replace("\n", " ")
 

@@ -6,19 +6,6 @@ for module in ("torch", "lightning", "matplotlib"):
     pytest.importorskip(module)
 
 
-@pytest.fixture
-def refused(call):
-    """Call what must fail: the one line that says why."""
-
-    def run(*arguments):
-        code, out, err = call(*arguments)
-        assert (code, out) == (2, "")
-        assert err.startswith("tactile-rt: ")
-        return err.strip()
-
-    return run
-
-
 def test_no_such_grid(refused, tmp_path):
     assert "no grid none: name a TOML file, or one of mouse24" in refused("grid", "none", tmp_path)
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tactile_rt.daemon.config_check import check_config
-from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
+from tactile_rt.daemon.loading import load_config
 from tactile_rt.recording import Recording
 from tactile_rt.recording.writer import McapFile
 from tactile_rt.testing import FakeSerial, small_spec

@@ -16,20 +16,6 @@ low,2,0,20,0.005,3.7,-2,-1,1.2,-0.1,0.5,0.06,0.03
 
 
 @pytest.fixture
-def refused(call):
-    """Call with these arguments, expect one line, and return it."""
-
-    def run(*arguments):
-        code, out, err = call(*arguments)
-        assert (code, out) == (2, "")
-        assert err.startswith("tactile-rt: ")
-        assert err.count("\n") == 1, err
-        return err
-
-    return run
-
-
-@pytest.fixture
 def robot(tmp_path):
     """Two whiskers: quick to simulate."""
     path = tmp_path / "robot.csv"

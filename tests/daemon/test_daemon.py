@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.classifier import Classifier
-from tactile_rt.daemon import consumers
+from tactile_rt.daemon import publishers
+from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.clock import Clock
-from tactile_rt.daemon.config_check import check_config
-from tactile_rt.daemon.config_file import load_config
 from tactile_rt.daemon.consumer import Consumer
 from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.items import (
@@ -26,12 +25,14 @@ from tactile_rt.daemon.items import (
     Packet,
     SourceChunk,
 )
+from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.lock import AlreadyRunning, Locks
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError, SourceError
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
 from tests.helpers.tiny_model import write_model
+from tests.helpers.waiting import until
 
 SPEC = small_spec()
 PATIENCE_S = 30.0
@@ -45,13 +46,6 @@ def touching(n=4000, seed=0):
     noise = np.random.default_rng(seed).normal(scale=1e-4, size=(n, 3, 2))
     on = (t > 0.5) & (t % 1.0 < 0.4)
     return (noise + 0.5 * on[:, None, None]).astype(np.float32)
-
-
-def until(condition):
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 class Spy(Consumer):
@@ -88,7 +82,7 @@ class Spy(Consumer):
 
 @pytest.fixture
 def spy(monkeypatch):
-    monkeypatch.setitem(consumers.PUBLISHERS, "spy", (f"{__name__}:Spy", ""))
+    monkeypatch.setitem(publishers.PUBLISHERS, "spy", (f"{__name__}:Spy", ""))
     Spy.made.clear()
     return Spy.made
 

@@ -13,14 +13,14 @@ from unittest import mock
 
 import pytest
 
-from tactile_rt.daemon.config_check import check_config
-from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.checks import check_config
+from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.messages import encode, message_of
-from tactile_rt.daemon.prometheus import exposition
+from tactile_rt.daemon.metrics import exposition
+from tactile_rt.daemon.process import ExitCode
 from tactile_rt.daemon.publishers.foxglove import FoxgloveOptions, FoxglovePublisher
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions, ZenohPublisher
 from tactile_rt.daemon.publishers.zmq import ZmqOptions, ZmqPublisher
-from tactile_rt.daemon.runner import ExitCode
 from tests.helpers.published import (
     FORCES,
     View,

@@ -9,15 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers.published import until
+from tests.helpers.waiting import until
 
-pytest.importorskip("uvicorn", reason="needs uvicorn: pip install 'tactile-rt[ui]'")
 pytest.importorskip("zmq", reason="needs pyzmq: pip install 'tactile-rt[publish]'")
 pytest.importorskip("zenoh", reason="needs zenoh: pip install 'tactile-rt[publish]'")
 
-from tactile_rt.daemon.config_check import check_config
-from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
+from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions
 from tactile_rt.daemon.publishers.zmq import ZmqOptions
 

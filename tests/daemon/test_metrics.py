@@ -5,7 +5,6 @@ import dataclasses
 import http.client
 import json
 import socket
-import threading
 import urllib.request
 
 import msgspec
@@ -14,12 +13,12 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from tactile_rt.daemon import metrics as module
 from tactile_rt.daemon.config import MetricsConfig
+from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.messages import StateMessage
-from tactile_rt.daemon.metrics import Metrics
-from tactile_rt.daemon.prometheus import exposition
-from tactile_rt.daemon.snapshot import SourceState
+from tactile_rt.daemon.metrics import Metrics, exposition
 from tactile_rt.stream import SourceError
-from tests.helpers.published import View, busy_snapshot, part, running, until
+from tests.helpers.published import View, busy_snapshot, part, running
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 
@@ -187,28 +186,32 @@ def test_whatever_is_asked_gets_an_answer_of_its_own(served, data, status):
     consumer.handle([])
 
 
-def test_those_who_drip_or_stay_away_are_hung_up_on_and_do_not_hold_others_up(served, monkeypatch):
-    port, _, consumer = served
-    monkeypatch.setattr(module, "REQUEST_S", 0.3)
-    slow = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(40)]
-    until(lambda: consumer.details()["refused"] >= 40 - module.AT_ONCE)
-    until(lambda: consumer.details()["refused"] >= 40)  # the rest ran out of time
-    assert get(port, "/state")[0] == 200
-    for line in slow:
-        line.close()
+def test_those_who_drip_or_stay_away_are_hung_up_on_and_do_not_hold_others_up(monkeypatch):
+    limits = dataclasses.replace(module.LIMITS, head_s=0.3)
+    monkeypatch.setattr(module, "LIMITS", limits)
+    port = free_port()
+    consumer = Metrics("metrics", MetricsConfig(port=port))
+    with running(consumer, View(snapshot=busy_snapshot())):
+        slow = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(40)]
+        for line in slow[::2]:
+            with contextlib.suppress(OSError):
+                line.sendall(b"GET /sta")
+        until(lambda: consumer.details()["refused"] >= 40 - limits.connections)
+        until(lambda: consumer.details()["refused"] >= 40)  # the rest ran out of time
+        assert get(port, "/state")[0] == 200
+        for line in slow:
+            line.close()
 
 
-def test_closing_waits_for_nobody_and_frees_the_port():
+def test_closing_waits_for_nobody_and_frees_the_port(monkeypatch):
+    monkeypatch.setattr(module, "LIMITS", dataclasses.replace(module.LIMITS, head_s=600.0))
     port = free_port()
     consumer = Metrics("metrics", MetricsConfig(port=port))
     consumer.open(View())
-    hanging = socket.create_connection(("127.0.0.1", port))
-    until(lambda: threading.active_count() > 2)
-    done = threading.Thread(target=consumer.close)
-    done.start()
-    done.join(1.5)  # sooner than a request may take
-    assert not done.is_alive()
-    hanging.close()
+    with socket.create_connection(("127.0.0.1", port)):  # which asks for nothing
+        until(lambda: consumer._server.connections)
+        consumer.close()
+        assert not consumer._server.alive
     other = Metrics("metrics", MetricsConfig(port=port))
     with running(other):
         with pytest.raises(SourceError, match=f"cannot listen at 127.0.0.1:{port}: Address"):

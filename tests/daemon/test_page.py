@@ -6,26 +6,26 @@ import json
 import re
 import socket
 import time
+from contextlib import suppress
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-pytest.importorskip("uvicorn", reason="needs uvicorn: pip install 'tactile-rt[ui]'")
-
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.config import PageConfig
+from tactile_rt.daemon.health import Snapshot
+from tactile_rt.daemon.http import Refused
 from tactile_rt.daemon.items import Control, Decision, Event, Opened, SourceChunk
-from tactile_rt.daemon.page import Page
+from tactile_rt.daemon.page import Page, routes
 from tactile_rt.daemon.page import feed as feed_module
-from tactile_rt.daemon.page import server as server_module
 from tactile_rt.daemon.page.feed import Feed, array_line, map_axes
-from tactile_rt.daemon.page.guard import Guard, Refused
-from tactile_rt.daemon.page.server import MAX_CONNECTIONS, MAX_LINES, MAX_STREAMS, STATIC, Client
-from tactile_rt.daemon.snapshot import Snapshot
-from tactile_rt.stream import ConfigError
+from tactile_rt.daemon.page.guard import Guard
+from tactile_rt.daemon.page.routes import LIMITS, MAX_LINES, MAX_STREAMS, STATIC, PageClient
+from tactile_rt.stream import ConfigError, SourceError
 from tactile_rt.testing import ArraySource, cut, small_spec
+from tests.helpers.waiting import until
 
 SPEC = small_spec()
 TOKEN = "correct horse battery"
@@ -125,13 +125,6 @@ class Stream:
         self.line.close()
 
 
-def until(condition):
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 def floats(text):
     return np.frombuffer(base64.b64decode(text), "<f4").reshape(SPEC.shape)
 
@@ -218,7 +211,7 @@ def test_the_array_line_tells_the_grid():
 
 
 def test_a_client_that_does_not_read_loses_the_oldest_and_they_are_counted():
-    client = Client("a")
+    client = PageClient("a")
     for i in range(MAX_LINES + 30):
         client.put(b"%d\n" % i)
     assert client.dropped == 30
@@ -258,7 +251,7 @@ def test_a_page_opens_again_after_it_was_closed(serve):
 def test_a_taken_port_is_told():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         page = Page("page", PageConfig(port=taken.getsockname()[1]))
-        with pytest.raises(OSError, match=r"cannot listen on 127\.0\.0\.1:\d+: Address already"):
+        with pytest.raises(SourceError, match=r"listen at 127\.0\.0\.1:\d+: Address already"):
             page.open(FakeView())
         page.close()
 
@@ -341,18 +334,12 @@ def test_a_cookie_is_good_after_a_restart_and_bad_for_another_token():
     ],
 )
 def test_only_this_page_may_ask_under_this_hosts_names(headers, good):
-    pairs = [(k.encode(), v.encode()) for k, v in headers.items()]
     guard = Guard("127.0.0.1", 8765, "")
     if good:
-        guard.check(pairs, "GET")
+        guard.check(headers, "GET")
     else:
         with pytest.raises(Refused):
-            guard.check(pairs, "GET")
-
-
-def test_a_host_given_twice_is_refused():
-    with pytest.raises(Refused, match="twice"):
-        Guard("::", 1, "").check([(b"host", b"localhost"), (b"Host", b"localhost")], "GET")
+            guard.check(headers, "GET")
 
 
 def test_the_server_refuses_other_sites_and_wrong_methods(serve):
@@ -395,10 +382,10 @@ def test_large_requests_are_refused(serve):
     status, _, _ = ask(port, "POST", "/control", {"action": "x" * 5000})
     assert status == 413
     with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as line:
-        line.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"y" * 100_000)
         try:
-            assert line.recv(100).split()[1] == b"400"
-        except ConnectionResetError:
+            line.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"y" * 100_000)
+            assert line.recv(100).split()[1] == b"431"
+        except (BrokenPipeError, ConnectionResetError):
             pass
     assert ask(port)[0] == 200
 
@@ -434,14 +421,14 @@ def test_at_most_so_many_browsers_and_a_flood_of_connections_ends_with_the_flood
         flood = [socket.create_connection(("127.0.0.1", port), PATIENCE_S) for _ in range(200)]
         page.handle([decision()])  # returns at once whatever they do
         assert all(s.until("decision")["label"] == "y" for s in streams)
-        until(lambda: len(page._server.server_state.connections) <= MAX_CONNECTIONS)
+        until(lambda: page._server.connections <= LIMITS.connections)
         for line in flood:
             line.close()
     finally:
         for stream in streams:
             stream.close()
     until(lambda: page.details()["browsers"] == 0)
-    until(lambda: not page._server.server_state.connections)
+    until(lambda: not page._server.connections)
     assert ask(port)[0] == 200
 
 
@@ -456,19 +443,20 @@ def test_a_fault_of_the_page_is_told_in_the_log(serve):
 
 
 def test_a_connection_that_asks_for_nothing_is_closed(serve, monkeypatch):
-    monkeypatch.setattr(server_module, "IDLE_S", 0.05)
+    monkeypatch.setattr(routes, "LIMITS", replace(LIMITS, head_s=0.05))
     _, port = serve()
     for begun in (b"", b"GET / HTTP/1.1\r\nHost: loc"):
         with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as line:
             line.sendall(begun)
-            try:
-                assert line.recv(10) == b""
-            except ConnectionResetError:
-                pass
+            told = b""
+            with suppress(ConnectionResetError):
+                while more := line.recv(1000):
+                    told += more
+            assert told == b"" or (begun and told.startswith(b"HTTP/1.1 408 "))
 
 
 def test_a_browser_that_is_gone_without_a_word_loses_its_place(serve, monkeypatch):
-    monkeypatch.setattr(server_module, "SEND_S", 0.2)
+    monkeypatch.setattr(routes, "LIMITS", replace(LIMITS, send_s=0.2))
     page, port = serve()
     with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as line:
         line.sendall(b"GET /live?source=a HTTP/1.1\r\nHost: localhost\r\n\r\n")

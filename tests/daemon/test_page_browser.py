@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("uvicorn", reason="needs uvicorn: pip install 'tactile-rt[ui]'")
 pytest.importorskip(
     "playwright.sync_api", reason="needs playwright (165 MB): pip install playwright"
 )
@@ -18,11 +17,11 @@ from playwright.sync_api import sync_playwright
 
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.config import PageConfig
-from tactile_rt.daemon.config_file import load_config
 from tactile_rt.daemon.daemon import Daemon
+from tactile_rt.daemon.health import ModelState, PartState, Snapshot, SourceState
 from tactile_rt.daemon.items import Decision, Event, Opened, SourceChunk
+from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.page import Page
-from tactile_rt.daemon.snapshot import ModelState, PartState, Snapshot, SourceState
 from tactile_rt.testing import ArraySource, cut, small_spec
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -14,6 +14,7 @@ import pytest
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, LogConfig
+from tactile_rt.daemon.health import EDGES_S, LatencyMeter
 from tactile_rt.daemon.items import (
     Closed,
     Contact,
@@ -24,7 +25,6 @@ from tactile_rt.daemon.items import (
     Packet,
     SourceChunk,
 )
-from tactile_rt.daemon.latency import EDGES_S, LatencyMeter
 from tactile_rt.daemon.lock import AlreadyRunning, Locks, lock_keys
 from tactile_rt.daemon.log import Log
 from tactile_rt.daemon.mailbox import Hub, Mailbox
@@ -32,6 +32,7 @@ from tactile_rt.daemon.messages import encode, message_of, topic_of
 from tactile_rt.daemon.part import Part, reason_of
 from tactile_rt.stream import Chunk, ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec
+from tests.helpers.waiting import until
 
 SPEC = small_spec()
 PATIENCE_S = 20.0
@@ -53,13 +54,6 @@ def event(reason="", part="source.a", state="waiting", level="warning"):
 def decision():
     d = Classification(10, 20, 3, True, "y", ("x", "y"), np.array([0.25, 0.75], np.float32), 0.0012)
     return Decision("a", "m", "mount", d, 1_000_000, 3_500_000, OFFSET_NS)
-
-
-def until(condition):
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.005)
 
 
 # mailbox

@@ -9,6 +9,7 @@ import pytest
 
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.config import RecorderConfig
+from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import (
     Closed,
     Contact,
@@ -19,7 +20,6 @@ from tactile_rt.daemon.items import (
     Packet,
     SourceChunk,
 )
-from tactile_rt.daemon.snapshot import Snapshot
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.sources.opening import open_source

@@ -14,16 +14,23 @@ from typing import ClassVar
 import pytest
 
 from tactile_rt.cli import main
-from tactile_rt.daemon.config_check import check_config
-from tactile_rt.daemon.config_file import load_config
+from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
-from tactile_rt.daemon.runner import _serve
-from tactile_rt.daemon.snapshot import Snapshot
-from tactile_rt.daemon.systemd import Systemd, hanging, status_of
-from tactile_rt.daemon.unit import install_script, unit_text, written_folders
+from tactile_rt.daemon.health import Snapshot
+from tactile_rt.daemon.loading import load_config
+from tactile_rt.daemon.process import _serve
+from tactile_rt.daemon.systemd import (
+    Systemd,
+    hanging,
+    install_script,
+    status_of,
+    unit_text,
+    written_folders,
+)
 from tactile_rt.stream import ConfigError, Source
 from tactile_rt.testing import small_spec
-from tests.helpers.published import PATIENCE_S, View, busy_snapshot, event, running, until
+from tests.helpers.published import View, busy_snapshot, event, running
+from tests.helpers.waiting import PATIENCE_S, until
 
 SMALL = 'version = 1\n[[source]]\nname = "a"\nurl = "synthetic:2x2"\n'
 pytestmark = pytest.mark.usefixtures("no_thread_left")

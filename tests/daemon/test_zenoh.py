@@ -20,8 +20,8 @@ from tests.helpers.published import (
     event,
     opened,
     running,
-    until,
 )
+from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 

@@ -7,14 +7,14 @@ import time
 import numpy as np
 import pytest
 
-from tactile_rt.drivers.emulation.damage import Fate
-from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
+from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule
 from tactile_rt.drivers.health import State
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError, EndOfStream, SourceError
 from tactile_rt.testing import FakeCan, FakeSerial
+from tests.helpers.waiting import PATIENCE_S, until
 
-PATIENCE_S = 20.0
+PATIENT = f"&start_s={PATIENCE_S:g}&stale_s={PATIENCE_S:g}"  # a busy machine is not a silent device
 
 
 def signal(n=2000, elements=4, channels=6):
@@ -28,25 +28,18 @@ def signal(n=2000, elements=4, channels=6):
 def take(source, n, over=lambda: False):
     """Read until n samples have come, or nothing comes any more because it is over."""
     chunks, have, end = [], 0, time.monotonic() + PATIENCE_S
+    ended = False
     while have < n:
         assert time.monotonic() < end, f"{have} of {n} samples in {PATIENCE_S} s"
         chunk = source.read(0.1)
         if chunk is not None:
             chunks.append(chunk)
             have += len(chunk)
-        elif over():
+        elif ended:
             break
-    return chunks
-
-
-def until(condition, source=None):
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        if source is not None:
-            source.read(0.01)
         else:
-            time.sleep(0.01)
+            ended = over()  # from then on, what is left can be read at once
+    return chunks
 
 
 DEVICES = {
@@ -66,7 +59,7 @@ def device(request):
 
 def test_what_a_device_measures_arrives_bit_for_bit(device, no_thread_left):
     values = signal()
-    with device(values, pace="fast") as fake, open_source(fake.url) as source:
+    with device(values, pace="fast") as fake, open_source(fake.url + PATIENT) as source:
         chunks = take(source, len(values))
         assert np.array_equal(np.concatenate([c.values for c in chunks]), values)
         seq = np.concatenate([c.seq for c in chunks])
@@ -83,7 +76,7 @@ def test_every_sample_is_accounted_for(kind):
     faults = FaultSchedule([Fault(kind, rate=20.0)], seed=1)
     with (
         FakeSerial(values, faults=faults, pace="fast") as fake,
-        open_source(fake.url) as source,
+        open_source(fake.url + PATIENT) as source,
     ):
         chunks = take(source, len(values), lambda: fake.emulator.done)
         assert fake.wait(PATIENCE_S)  # what has come may not be in its log yet
@@ -107,11 +100,11 @@ def test_every_sample_is_accounted_for(kind):
 def test_a_device_that_is_unplugged_comes_again(tmp_path, no_thread_left):
     link = str(tmp_path / "whisker0")
     before = len(os.listdir("/proc/self/fd"))
-    with FakeSerial(signal(60_000), link=link) as fake, open_source(fake.url) as source:
+    with FakeSerial(signal(60_000), link=link) as fake, open_source(fake.url + PATIENT) as source:
         take(source, 50)
         for connections in range(2, 7):
             fake.unplug()
-            until(lambda: source.health.state == State.LOST, source)
+            until(lambda: source.health.state == State.LOST, meanwhile=lambda: source.read(0.01))
             assert source.health.reason
             assert source.read(0.0) is None  # nothing old is given out as new
             fake.replug()
@@ -146,10 +139,10 @@ def test_a_silent_device_is_stale_not_fresh():
 
 def test_a_device_that_restarts_goes_on(tmp_path):
     link = str(tmp_path / "whisker0")
-    with FakeSerial(signal(60_000), link=link) as fake, open_source(fake.url) as source:
+    with FakeSerial(signal(60_000), link=link) as fake, open_source(fake.url + PATIENT) as source:
         first = take(source, 50)
         fake.unplug()
-        until(lambda: source.health.state == State.LOST, source)
+        until(lambda: source.health.state == State.LOST, meanwhile=lambda: source.read(0.01))
         fake.replug(restart=True)
         again = take(source, 50)
         t = np.concatenate([c.t_ns for c in first + again])
@@ -162,7 +155,7 @@ def test_whisking_commands_reach_the_device():
     with FakeSerial(signal(5000)) as fake, open_source(fake.url) as source:
         take(source, 10)
         source.set_whisking(8.0, 0.6, -0.1)
-        until(lambda: fake.codec.whisking is not None, source)
+        until(lambda: fake.codec.whisking is not None, meanwhile=lambda: source.read(0.01))
         assert fake.codec.whisking == pytest.approx((8.0, 0.6, -0.1))
 
 
@@ -200,7 +193,7 @@ def test_the_wrong_codec_is_told_from_silence():
             with open_source(f"{fake.url}") as source:  # which starts it, and leaves it running
                 take(source, 5)
                 source._link.send = lambda packet: None
-            open_source(f"{url}?codec=kwr75&start_s=0.5")
+            open_source(f"{url}?codec=kwr75&start_s=1")
 
 
 def test_a_silent_line():
@@ -231,6 +224,19 @@ def test_a_silent_line():
 def test_a_wrong_url_is_explained(url, said):
     with pytest.raises(ConfigError, match=said):
         open_source(url)
+
+
+def test_a_codec_without_time_has_no_device_clock():
+    with (
+        FakeSerial(np.zeros((100, 1, 6)), "bota") as fake,
+        pytest.raises(ConfigError, match="clock must be host or device, not 'none'"),
+    ):
+        open_source(fake.url + "&clock=none")
+    with (
+        FakeSerial(np.zeros((100, 1, 3)), "optoforce") as fake,
+        pytest.raises(ConfigError, match="codec optoforce sends no time: it needs clock=host"),
+    ):
+        open_source(fake.url + "&clock=device")
 
 
 @pytest.mark.skipif(not os.path.isdir("/sys/class/net/vcan0"), reason="no kernel CAN (vcan0)")

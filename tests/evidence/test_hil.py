@@ -1,7 +1,6 @@
 """Hardware in the loop: the comparison can fail, and does not where it must not."""
 
 import dataclasses
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -11,16 +10,14 @@ pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.drivers.codecs.native import NativeSerial
-from tactile_rt.drivers.device_time import DeviceTime
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.evidence.hil import Loop, LoopReport, pair
 from tactile_rt.stream import ConfigError, SourceError, SourceStats, SpecMismatch
-from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
+from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.tiny_model import write_model
 
 SPEC = small_spec()
-needs_sim = pytest.mark.skipif(find_spec("mujoco") is None, reason="mujoco is not installed")
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 
 
@@ -190,93 +187,3 @@ GOOD = LoopReport(
 def test_the_verdict(changes: dict, said: str) -> None:
     failure = dataclasses.replace(GOOD, **changes).failure
     assert said in failure and bool(said) == bool(failure)
-
-
-# ---- the device's own time
-
-
-def test_device_time_unwraps_and_never_goes_back() -> None:
-    clock = DeviceTime(1000.0, 32)
-    first, arrived = 2**32 - 3000, np.arange(6) * 1_000_000
-    ticks = (first + 1000 * np.arange(6)) % 2**32
-    told = clock.to_host(ticks, arrived)
-    assert told.tolist() == [(first + 1000 * i) * 1000 for i in range(6)]
-    clock.resume()
-    assert clock.to_host(ticks[-1:] + 1000, arrived[-1:] + 1).tolist() == [told[-1] + 1_000_000]
-    # it begins anew two milliseconds later, by the host's clock
-    anew = clock.to_host(np.array([0, 1000]), arrived[-1:].repeat(2) + 2_000_001)
-    assert anew.tolist() == [told[-1] + 3_000_000, told[-1] + 4_000_000] and clock.steps == 1
-    same = clock.to_host(np.array([1000]), arrived[-1:] + 3_000_000)
-    assert same[0] == anew[-1] + 1
-
-
-def test_a_short_clock_only_goes_forward() -> None:
-    clock = DeviceTime(100_000.0, 16)
-    told = clock.to_host(np.array([65_000, 60_000]), np.array([0, 1]))
-    assert np.diff(told).tolist() == [(65_536 - 5_000) * 100_000] and clock.steps == 0
-
-
-def test_a_codec_without_time_has_no_device_clock() -> None:
-    from tactile_rt.sources.opening import open_source
-
-    with (
-        FakeSerial(np.zeros((100, 1, 6)), "bota") as fake,
-        pytest.raises(ConfigError, match="clock must be host or device, not 'none'"),
-    ):
-        open_source(fake.url + "&clock=none")
-    with (
-        FakeSerial(np.zeros((100, 1, 3)), "optoforce") as fake,
-        pytest.raises(ConfigError, match="codec optoforce sends no time: it needs clock=host"),
-    ):
-        open_source(fake.url + "&clock=device")
-
-
-# ---- the command
-
-
-@needs_sim
-def test_the_command_compares_a_sweep(call) -> None:
-    code, out, err = call("hil", "--sweeps", 1, "--seed", 2)
-    assert (code, err) == (0, "")
-    cells = [line.strip("│").split("│") for line in out.splitlines() if line[0] == "│"]
-    rows = {key.strip(): value.strip() for key, value in cells}
-    n = rows["samples"].split(",")[0]
-    assert int(n) > 1500 and rows["identical samples"] == f"{n} of {n} (100.00 %)"
-    assert rows["decisions"] == "22 direct, 22 through the driver"
-    assert rows["identical decisions"] == rows["same labels"] == "22 of 22 (100.00 %)"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--wire", "usb"], "wire must be one of serial, slcan, virtual"),
-        (["--option", "form=int16"], "no option 'form'; did you mean format?"),
-        (["--source", "synthetic:", "--sweeps", 3], "--sweeps is of a sim: source"),
-        (["--source", "synthetic:3x6?seconds=1"], "was made for another array"),
-        (["--faults", "none.toml"], "none.toml: cannot be read"),
-        (["--source", "sintetic:"], "did you mean synthetic:?"),
-    ],
-)
-@needs_sim
-def test_a_mistake_is_one_line(call, arguments, said) -> None:
-    code, out, err = call("hil", *arguments)
-    assert (code, out) == (2, "")
-    assert said in err and len(err.strip().splitlines()) == 1
-
-
-def test_a_difference_is_exit_code_1(call, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tactile_rt.sources.opening.open_source", lambda url: touches(1000))
-    code, out, err = call("hil", "--source", "synthetic:3x2", "--model", model)
-    assert code == 1 and "0 direct, 0 through the driver" in out
-    assert "nothing was touched" in err and len(err.strip().splitlines()) == 1
-
-
-@needs_sim
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "arguments", [(), ("--option", "format=int16"), ("--wire", "slcan")], ids=" ".join
-)
-def test_24_sweeps(call, arguments: tuple[str, ...]) -> None:
-    """Bit-equal in float32; else 99 % of all decisions have the same label."""
-    code, out, err = call("hil", "--sweeps", 24, *arguments)
-    assert (code, err) == (0, "") and "528 direct, 528 through the driver" in out

@@ -1,13 +1,11 @@
 """Items, and a daemon as its consumers see it, for the tests of publishers."""
 
 import contextlib
-import time
 
 import numpy as np
 
 from tactile_rt.classifier.classifier import Classification
-from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Opened, SourceChunk
-from tactile_rt.daemon.snapshot import (
+from tactile_rt.daemon.health import (
     ConsumerState,
     Latency,
     ModelState,
@@ -16,11 +14,11 @@ from tactile_rt.daemon.snapshot import (
     Snapshot,
     SourceState,
 )
+from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Opened, SourceChunk
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.stream import ArraySpec, Chunk, SourceStats
 from tactile_rt.testing import small_spec
 
-PATIENCE_S = 30.0
 UTC = 1_700_000_000_000_000_000
 FORCES = ArraySpec(
     name="pair", elements=("B1", "C2"), grid=((0, 0), (1, 1)),
@@ -124,13 +122,6 @@ def busy_snapshot(seconds=0, state="degraded"):
             ConsumerState(part("recorder", "waiting", "No space left on device", 9), "recorder"),
         ),
     )  # fmt: skip
-
-
-def until(condition, seconds=PATIENCE_S):
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.01)
 
 
 @contextlib.contextmanager

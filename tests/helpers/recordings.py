@@ -8,9 +8,9 @@ import numpy as np
 from tactile_rt.recording import StreamWriter
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, cut, small_spec
+from tests.helpers.waiting import PATIENCE_S
 
 SPEC = small_spec()
-PATIENCE_S = 20.0
 
 
 def parts(chunk):

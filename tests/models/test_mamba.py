@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from tactile_rt.models.attenders.mamba import MambaAttender, MambaBlock
-from tactile_rt.models.attenders.scan import selective_scan
+from tactile_rt.models.attenders.mamba import MambaAttender, MambaBlock, selective_scan
 from tactile_rt.models.encoders.mamba import MambaEncoder
 
 TOLERANCE = 2e-6

@@ -14,7 +14,6 @@ from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError, RecordingError
 from tactile_rt.testing import ArraySource, FakeSerial, cut
 from tests.helpers.recordings import (
-    PATIENCE_S,
     SPEC,
     all_parts,
     noise,
@@ -22,6 +21,7 @@ from tests.helpers.recordings import (
     record_device,
     write,
 )
+from tests.helpers.waiting import PATIENCE_S
 
 pytest.importorskip("mcap")
 

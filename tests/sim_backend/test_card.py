@@ -11,6 +11,7 @@ pytest.importorskip("sklearn")
 
 from matplotlib.image import imread
 
+from tactile_rt.models.svm import fit
 from tactile_rt.sim_backend.datasets import separability
 from tactile_rt.sim_backend.datasets.card import write_card
 from tactile_rt.sim_backend.datasets.card_survey import survey
@@ -66,7 +67,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_card_counts_what_is_there(folder: Path) -> None:
-    card, examples = survey(folder)
+    card, examples = survey(folder, fit)
     assert card.objects == {
         "train": {"bowl": 4, "mug": 4},
         "validation": {"bowl": 1, "mug": 1},
@@ -105,7 +106,7 @@ def test_misses_noise_clips_and_nonsense_are_told_apart(folder: Path) -> None:
     values[..., 0] = np.clip(values[..., 0], -1.5e-5, 1.5e-5)
     values[:, 0, :, 0] = 1.5e-5
     write_object(folder, "mug-2", values, {})
-    card, _ = survey(folder)
+    card, _ = survey(folder, fit)
     assert (card.misses, card.unstable, card.without_touch, card.not_finite) == (1, 1, 3, 1)
     assert card.clips == {
         "1 N (published)": 1,
@@ -118,7 +119,7 @@ def test_misses_noise_clips_and_nonsense_are_told_apart(folder: Path) -> None:
 
 def test_the_card_is_written_beside_the_set(folder: Path) -> None:
     write_skipped(folder, {"mug-9": "no volume"})
-    card = write_card(folder)
+    card = write_card(folder, fit)
     numbers = msgspec.json.decode((folder / "card.json").read_bytes())
     assert numbers["coverage"] == card.coverage
     assert [s["classes"] for s in numbers["separability"]] == [2]
@@ -136,27 +137,27 @@ def test_the_card_is_written_beside_the_set(folder: Path) -> None:
         assert min(picture.shape[:2]) > 200
         assert picture[..., :3].std() > 0.05, "something is drawn"
     first = text
-    write_card(folder)
+    write_card(folder, fit)
     assert (folder / "README.md").read_text() == first
 
 
 def test_an_unfinished_set_has_a_card_of_what_is_there(folder: Path) -> None:
     for name in MANIFEST.split["test"]:
         (folder / f"{name}.npz").unlink()
-    card = write_card(folder)
+    card = write_card(folder, fit)
     assert "test" not in card.sweeps
     assert card.separability == []
     assert "Not checked" in (folder / "README.md").read_text()
     for path in folder.glob("*.npz"):
         path.unlink()
     with pytest.raises(RecordingError, match="has no sweeps yet"):
-        write_card(folder)
+        write_card(folder, fit)
 
 
 def test_a_set_that_nothing_touched_has_a_card(folder: Path) -> None:
     for name in MANIFEST.names():
         write_object(folder, name, np.zeros_like(sweeps_of(name)), {})
-    card = write_card(folder)
+    card = write_card(folder, fit)
     assert (card.without_touch, card.whiskers_touched, card.median_force) == (26, 0, 0)
     assert "examples.png" not in (folder / "README.md").read_text()
 
@@ -167,7 +168,7 @@ def test_a_set_of_version_1_has_a_card(folder: Path) -> None:
         del raw[key]
     del raw["split"]["withheld"]
     (folder / "manifest.json").write_bytes(msgspec.json.encode(raw))
-    write_card(folder)
+    write_card(folder, fit)
     assert "versions that were not noted" in (folder / "README.md").read_text()
 
 
@@ -184,24 +185,24 @@ def clouds(categories: list[str], n: int, spread: float, seed: int) -> Features:
 
 def test_what_differs_is_told_apart_and_what_does_not_is_guessed() -> None:
     names = ["a", "b", "c", "d", "mug"]
-    apart = check_separability(clouds(names, 40, 0.05, 0), clouds(names, 40, 0.05, 1))
+    apart = check_separability(clouds(names, 40, 0.05, 0), clouds(names, 40, 0.05, 1), fit)
     assert [(s.classes, s.subsets, s.chance) for s in apart] == [
         (2, 10, 1 / 2), (3, 10, 1 / 3), (4, 5, 1 / 4)
     ]  # fmt: skip
     assert all(s.accuracy > 0.99 and s.spread < 0.01 and s.of == () for s in apart)
-    alike = check_separability(clouds(names, 40, 50.0, 0), clouds(names, 40, 50.0, 1))
+    alike = check_separability(clouds(names, 40, 50.0, 0), clouds(names, 40, 50.0, 1), fit)
     assert all(abs(s.accuracy - s.chance) < 0.1 for s in alike)
 
 
 def test_the_published_classes_are_taken_where_they_are() -> None:
     names = ["car", "chair", "house", "mug", "spoon"]
-    found = check_separability(clouds(names, 9, 0.1, 0), clouds(names, 9, 0.1, 1))
+    found = check_separability(clouds(names, 9, 0.1, 0), clouds(names, 9, 0.1, 1), fit)
     named = [s.of for s in found if s.of]
     assert named == [("mug", "house"), ("mug", "house", "chair"), ("mug", "house", "chair", "car")]
     many = [f"class {i}" for i in range(30)]
-    found = check_separability(clouds(many[:8], 9, 0.1, 0), clouds(many[:8], 9, 0.1, 1))
+    found = check_separability(clouds(many[:8], 9, 0.1, 0), clouds(many[:8], 9, 0.1, 1), fit)
     assert [s.subsets for s in found] == [separability.SUBSETS] * 3
-    assert check_separability(clouds(["a"], 3, 1.0, 0), clouds(["a"], 3, 1.0, 1)) == []
+    assert check_separability(clouds(["a"], 3, 1.0, 0), clouds(["a"], 3, 1.0, 1), fit) == []
 
 
 def test_a_machine_sees_one_second_from_the_first_touch() -> None:
@@ -220,4 +221,4 @@ def test_a_machine_sees_one_second_from_the_first_touch() -> None:
 def test_a_damaged_object_is_named(folder: Path) -> None:
     shutil.copy(folder / "manifest.json", folder / "mug-0.npz")
     with pytest.raises(RecordingError, match=r"mug-0\.npz is damaged"):
-        write_card(folder)
+        write_card(folder, fit)

@@ -13,7 +13,7 @@ import mujoco
 
 from bench.sim.beams import flat
 from bench.sim.pegs import PEG_RADIUS_MM, SLIDE_MM_S, _window, presses
-from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.contacts import ContactProbe, contact_distances
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps, simulate_sweep
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict
@@ -184,5 +184,5 @@ def test_damaged_contacts_are_told(made: Path, tmp_path: Path) -> None:
 
 
 def test_a_recipe_says_true_or_false() -> None:
-    with pytest.raises(ConfigError, match="contacts must be true or false"):
+    with pytest.raises(ConfigError, match="contacts: expected true or false, got 1"):
         recipe_from_dict({"contacts": 1}, "mine.toml")

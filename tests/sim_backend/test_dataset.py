@@ -17,7 +17,7 @@ pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.sim_backend.arrays.whisker_array import load_array
+from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.datasets import dataset
 from tactile_rt.sim_backend.datasets.dataset import (
     describe_set,
@@ -25,6 +25,7 @@ from tactile_rt.sim_backend.datasets.dataset import (
     make_sweeps,
     simulate_sweep,
 )
+from tactile_rt.sim_backend.datasets.inventory import check_sums
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe, recipe_of_set
 from tactile_rt.sim_backend.datasets.recipes import (
     Between,
@@ -33,7 +34,6 @@ from tactile_rt.sim_backend.datasets.recipes import (
     SweepChoice,
     SweepRecipe,
 )
-from tactile_rt.sim_backend.datasets.sums import check_sums
 from tactile_rt.sim_backend.objects.catalogue import load_object, make_object
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import SensorModel
@@ -72,6 +72,14 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sets") / "two"
     assert sorted(make_sweeps(RECIPE, folder, processes=2)) == NAMES
     return folder
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The work is done in this process: starting another takes longer than these sweeps."""
+    monkeypatch.setattr(
+        dataset, "run_processes", lambda work, names, processes: ((n, work(n)) for n in names)
+    )
 
 
 # What a set holds
@@ -347,6 +355,7 @@ def test_an_object_that_another_run_finished_meanwhile_is_left_alone(finished: P
     assert files(finished) == before
 
 
+@pytest.mark.usefixtures("here")
 def test_one_split_alone_is_what_the_whole_set_has_of_it(finished: Path, tmp_path: Path) -> None:
     assert list(make_sweeps(RECIPE, tmp_path, processes=1, splits=("test",))) == ["mug-2"]
     assert (tmp_path / "mug-2.npz").read_bytes() == (finished / "mug-2.npz").read_bytes()
@@ -454,6 +463,7 @@ def test_a_damaged_shard_is_named(copied: Path) -> None:
         check_sums(copied)
 
 
+@pytest.mark.usefixtures("here")
 def test_damage_is_never_declared_sound_and_can_be_made_good(copied: Path, finished: Path) -> None:
     flip(copied / "mug-1.npz", 0.5)
     list(make_sweeps(RECIPE, copied, processes=1))

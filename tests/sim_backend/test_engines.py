@@ -2,7 +2,6 @@ import os
 import subprocess
 import sys
 import textwrap
-import time
 from pathlib import Path
 
 import pytest
@@ -11,6 +10,7 @@ from tactile_rt.sim_backend.datasets import engines
 from tactile_rt.sim_backend.datasets.engines import DIED, run_processes, run_ray
 from tactile_rt.stream import ConfigError
 from tests.helpers.frail_work import FrailWork
+from tests.helpers.waiting import until
 
 
 def tries(folder: Path, name: str) -> list[int]:
@@ -23,13 +23,6 @@ def alive(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
         return False
-
-
-def until(condition) -> None:
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def test_every_name_is_done_once_and_processes_are_used_again(tmp_path: Path) -> None:

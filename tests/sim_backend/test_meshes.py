@@ -83,7 +83,6 @@ def test_a_mug_of_convex_bodies_comes_back_as_they_are(tmp_path: Path, suffix: s
 
 
 def test_the_same_file_gives_the_same_pieces(tmp_path: Path) -> None:
-    pytest.importorskip("coacd")
     path = save(channel(), tmp_path / "gutter.stl")
     one, two = load_mesh(path), load_mesh(path)
     assert len(one.pieces) == len(two.pieces)
@@ -199,6 +198,5 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
 
 
 def test_cutting_says_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    pytest.importorskip("coacd")
     load_mesh(save(channel(), tmp_path / "gutter.ply"))
     assert capfd.readouterr() == ("", "")

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+from dataclasses import replace
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +14,13 @@ pytest.importorskip("manifold3d")
 import trimesh
 from scipy.spatial import ConvexHull
 
-from tactile_rt.sim_backend.datasets.dataset import make_sweeps
+from tactile_rt.sim_backend.datasets.dataset import describe_set, make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.objects import meshes
 from tactile_rt.sim_backend.objects.meshes import MeshDetail, load_mesh
 from tactile_rt.sim_backend.objects.object_sets import open_objects
 from tactile_rt.stream import ConfigError
+from tactile_rt.sweep_set import SweepManifest
 from tests.helpers import mesh_truth
 
 MM = 40.0  # largest extent that errors are given at
@@ -255,3 +258,20 @@ def test_a_recipe_sweeps_a_folder_and_lists_what_is_broken(tmp_path: Path) -> No
     skipped = json.loads((out / "skipped.json").read_text())
     assert "channel-c1" in json.dumps(skipped) and "empty" in json.dumps(skipped)
     assert len(list(out.glob("*.npz"))) == 5
+    assert SweepManifest.read(out).versions["manifold3d"] == version("manifold3d")
+
+
+def test_a_set_that_an_earlier_release_made_is_still_read(tmp_path: Path) -> None:
+    """Its manifest names the library that cut meshes then."""
+    root, out = tmp_path / "things", tmp_path / "set"
+    for kind, make in (("bracket", mesh_truth.bracket), ("channel", mesh_truth.channel)):
+        for k in range(3):
+            saved(make(), root / kind / f"{kind}{k}.stl")
+    recipe = tmp_path / "mine.toml"
+    recipe.write_text(RECIPE.format(folder=root))
+    manifest = describe_set(read_recipe(str(recipe)))
+    versions = {k: v for k, v in manifest.versions.items() if k != "manifold3d"}
+    older = replace(manifest, versions={**versions, "coacd": "1.0.5"})
+    out.mkdir()
+    older.write(out)
+    assert SweepManifest.read(out) == older

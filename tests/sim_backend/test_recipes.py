@@ -229,28 +229,34 @@ def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
     [
         (
             "sead = 1",
-            r"no key 'sead' \(did you mean 'seed'\?\): there are objects, sweeps, array, name,",
+            r":1: the file has no key 'sead'; did you mean seed\?",
         ),
-        ("[sweeps]\nspeed = 3", r"no key 'speed' .*did you mean 'speed_mm_s'.* in \[sweeps\]"),
-        ("[objects]\ncategorys = []", r"did you mean 'categories'.* in \[objects\]"),
-        ("[sweeps]\nyaw_deg = { betwen = [0, 1] }", r"did you mean 'between'.*\[sweeps.yaw_deg\]"),
-        ("[sensor]\nnoise = 1", r"no key 'noise' .* in \[sensor\]"),
-        ("[sensor]\nnoise_force = -1", r"sensor.noise_force must be 0 or more, not -1"),
-        ("[randomisation]\nfriction = 2", r"randomisation.friction is relative"),
-        ("seed = 1.5", "seed must be a whole number, not 1.5"),
-        ("seed = true", "seed must be a whole number, not True"),
+        ("[sweeps]\nspeed = 3", r":2: sweeps has no key 'speed'; did you mean speed_mm_s\?"),
+        ("[objects]\ncategorys = []", r"objects has no key 'categorys'; did you mean categories\?"),
+        (
+            "[sweeps]\nyaw_deg = { betwen = [0, 1] }",
+            r"sweeps.yaw_deg has no key 'betwen'; did you mean between\?",
+        ),
+        ("[sensor]\nnoise = 1", r"sensor has no key 'noise'; did you mean noise_"),
+        ("[sensor]\nnoise_force = -1", r"sensor: noise_force must be 0 or more, not -1"),
+        ("[randomisation]\nfriction = 2", r"randomisation: friction is relative"),
+        ("seed = 1.5", "seed: expected a whole number, got 1.5"),
+        ("seed = true", "seed: expected a whole number, got True"),
         ("seed = -1", "seed must be 0 or more, not -1"),
-        ("name = 3", "name must be a text in quotes, not 3"),
-        ("period_ms = 'nine'", "period_ms must be a number, not 'nine'"),
+        ("name = 3", "name: expected text, got 3"),
+        ("period_ms = 'nine'", "period_ms: expected a number, got 'nine' .in milliseconds"),
         ("period_ms = 0.5", "period_ms must be 1 or more, the simulator's own, not 0.5"),
         ("lead_ms = 2000", r"length_ms \(1476\) must exceed lead_ms \(2000\)"),
-        ("profile = 'realtim'", r"no profile 'realtim' \(did you mean 'realtime'\?\)"),
-        ("objects = 60", "objects must be a table, not 60"),
-        ("[sweeps]\nyaw_deg = [0, 90]", r"sweeps.yaw_deg must be a number, \{ between = .*not \[0"),
-        ("[sweeps]\nyaw_deg = { between = [0] }", r"sweeps.yaw_deg must be a number, \{ between"),
-        ("[sweeps]\nyaw_deg = { each = [] }", r"sweeps.yaw_deg must be a number, \{ between"),
-        ("[sweeps]\nyaw_deg = { each = [nan] }", "each must be a list of numbers"),
-        ("[sweeps]\nyaw_deg = inf", "sweeps.yaw_deg must be a number"),
+        ("profile = 'realtim'", r"no profile 'realtim'; did you mean realtime\?"),
+        ("objects = 60", "objects is a table of keys, not 60"),
+        (
+            "[sweeps]\nyaw_deg = [0, 90]",
+            r":2: sweeps.yaw_deg: expected a number or a table, got \[0, 90\]",
+        ),
+        ("[sweeps]\nyaw_deg = { between = [0] }", r"sweeps.yaw_deg: expected a number, \{ between"),
+        ("[sweeps]\nyaw_deg = { each = [] }", r"sweeps.yaw_deg: expected a number, \{ between"),
+        ("[sweeps]\nyaw_deg = { each = [nan] }", r"sweeps.yaw_deg.each\[0\]: nan is no quantity"),
+        ("[sweeps]\nyaw_deg = inf", "sweeps.yaw_deg: inf is no quantity"),
         ("[sweeps]\nyaw_deg = { between = [9, 1] }", "between has its lower end first, not 9, 1"),
         ("[sweeps]\nsize_mm = 1e300", "sweeps.size_mm must be within [+]-10000, not 1e[+]300"),
         ("[sweeps]\nheight_mm = { between = [-2e4, 0] }", "must be within [+]-10000, not -20000"),
@@ -264,12 +270,12 @@ def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
         ("[sweeps]\ngap_mm = { between = [-1, 1] }", "sweeps.gap_mm must be 0 or more, not -1"),
         ("[sweeps]\ndraws = 0", "sweeps.draws must be at least 1, not 0"),
         ("[sweeps]\nheld_out_draws = -1", "sweeps.held_out_draws must be 0 or more"),
-        ("[objects]\ncategories = 'mug'", "objects.categories must be a list of texts"),
-        ("[objects]\ncategories = ['a', 'a']", "objects.categories must be a list without"),
+        ("[objects]\ncategories = 'mug'", "objects.categories: expected a list, got 'mug'"),
+        ("[objects]\ncategories = ['a', 'a']", "objects.categories: 'a' is there twice"),
         ("[objects]\ncategories = ['mug']\nwithheld = ['mug']", "'mug' is also one of the cat"),
         ("[objects]\ntest = 0.5", "objects.test must be a whole number, at least 1, not 0.5"),
         ("[objects]\nvalidation = 0", "objects.validation must be a whole number, at least 1"),
-        ("\nseed = = 1", r"is not TOML: .*line 2"),
+        ("\nseed = = 1", r"mine.toml:2: not TOML: "),
     ],
 )
 def test_a_mistake_is_one_line_with_file_key_and_remedy(tmp_path, text, complaint) -> None:
@@ -283,8 +289,8 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(tmp_path, text, complain
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("[objects]\ncategories = ['mugs']", r"no category 'mugs' \(did you mean 'mug'\?\)"),
-        ("[objects]\nwithheld = ['goblets']", r"no category 'goblets' \(did you mean 'goblet'"),
+        ("[objects]\ncategories = ['mugs']", r"no category 'mugs'; did you mean mug\?"),
+        ("[objects]\nwithheld = ['goblets']", r"no category 'goblets'; did you mean goblet"),
         ("[objects]\nper_category = 16", "16 objects cannot be split with 4 .* and 12 for test"),
         ("array = 'moose'", "no simulated array 'moose': did you mean mouse"),
     ],
@@ -345,7 +351,7 @@ def test_fewer_of_a_folder_and_too_few(folder) -> None:
     with pytest.raises(ConfigError, match=r"meshes: chair has 2 objects, too few to hold out 1"):
         _ = choose_objects(recipe_from_dict({"objects": {"from": "meshes"}}).objects).split
     wrong = recipe_from_dict({"objects": {"from": "meshes", "categories": ["cups"]}})
-    with pytest.raises(ConfigError, match=r"no category 'cups' \(did you mean 'cup'\?\)"):
+    with pytest.raises(ConfigError, match=r"no category 'cups'; did you mean cup\?"):
         _ = choose_objects(wrong.objects).split
 
 
@@ -358,12 +364,12 @@ def test_a_folder_names_each_object_once(folder, monkeypatch: pytest.MonkeyPatch
 
 
 def test_no_such_recipe(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"no recipe 'default42' \(did you mean 'default24'\?\)"):
+    with pytest.raises(ConfigError, match=r"no recipe 'default42'; did you mean default24\?"):
         read_recipe("default42")
-    with pytest.raises(ConfigError, match=r"cannot read recipe .*none\.toml: No such file"):
+    with pytest.raises(ConfigError, match=r"none\.toml: no such file"):
         read_recipe(str(tmp_path / "none.toml"))
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(ConfigError, match=r"bytes\.toml is not a recipe: not UTF-8 text"):
+    with pytest.raises(ConfigError, match=r"bytes\.toml:1: not UTF-8 text"):
         read_recipe(str(tmp_path / "bytes.toml"))
 
 

@@ -7,7 +7,7 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
-from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
 from tactile_rt.sim_backend.source import CHUNK_SAMPLES, REST_SAMPLES, SimOptions, SimSource
 from tactile_rt.sim_backend.world import array_spec

@@ -10,7 +10,7 @@ pytest.importorskip("mujoco")
 
 import mujoco
 
-from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.stimuli import (
     PERIOD_NS,
     STIMULI,

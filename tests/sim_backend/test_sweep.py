@@ -12,12 +12,8 @@ import mujoco
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.sim_backend.arrays.whisker_array import (
-    WhiskerArray,
-    load_animals,
-    load_array,
-    place,
-)
+from tactile_rt.sim_backend.arrays.files import load_animals, load_array
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray, place
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.objects.catalogue import (
     CATEGORIES,

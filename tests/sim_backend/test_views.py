@@ -13,15 +13,15 @@ import mujoco
 from matplotlib.figure import Figure
 from PIL import Image
 
-from tactile_rt.sim_backend.arrays.whisker_array import load_array
-from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.arrays.files import load_array
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
 from tactile_rt.sim_backend.views.camera import VIEWS, Camera, framing
 from tactile_rt.sim_backend.views.film import Film, camera_of
 from tactile_rt.sim_backend.views.footage import Footage, record
-from tactile_rt.sim_backend.views.panels import ForceMap, rostral_sign
 from tactile_rt.sim_backend.views.scale import ForceScale, round_number
+from tactile_rt.sim_backend.views.sheet import ForceMap, rostral_sign
 from tactile_rt.sim_backend.views.stage import Stage
 from tactile_rt.sim_backend.views.window import _Player, check_display
 from tactile_rt.sim_backend.views.writing import check_suffix, write_image, write_video
@@ -405,13 +405,13 @@ def test_a_window_needs_a_display(monkeypatch, display):
 
 
 def test_the_player_runs_stops_and_steps():
-    player = _Player(frames=10, period_s=0.5)
-    assert [player.frame(now) for now in (100.0, 100.6, 104.1, 105.2)] == [0, 1, 8, 0]
+    player = _Player(moments=10, period_s=0.5)
+    assert [player.moment(now) for now in (100.0, 100.6, 104.1, 105.2)] == [0, 1, 8, 0]
     player.key(32)
-    assert player.frame(190.0) == 0
+    assert player.moment(190.0) == 0
     player.key(263)
     player.key(263)
-    assert player.frame(191.0) == 8
+    assert player.moment(191.0) == 8
     player.key(262)
     player.key(32)
-    assert player.frame(191.5) == 0
+    assert player.moment(191.5) == 0

@@ -9,13 +9,12 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers, rat_whiskers
 from tactile_rt.sim_backend.arrays.whiskers import (
     OPTIONAL,
     REQUIRED,
     Whisker,
     keratin_radii,
-    mouse_whiskers,
-    rat_whiskers,
     rotation,
 )
 from tactile_rt.stream import ConfigError

@@ -10,8 +10,8 @@ pytest.importorskip("mujoco")
 import mujoco
 
 from tactile_rt.sim_backend import whisking
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.arrays.whisker_array import Mount, mirrored
-from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
 from tactile_rt.sim_backend.trajectories import Whisk, base_angles, mirror, read_trajectory
 from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.world import (

@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,19 +15,19 @@ from scipy.integrate import solve_ivp
 
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_common import IMPOSSIBLE, MessageType
-from tactile_rt.sim_backend.arrays.whiskers import mouse_whiskers
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.trajectories import ELEVATION_SLOPES, Whisk
 from tactile_rt.sim_backend.whisking import ENDLESS, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import LAG_S, LARGEST_RAD, MOST, Drive, Whisking
 from tactile_rt.sim_backend.whisking_source import WhiskingOptions, WhiskingSource
 from tactile_rt.sim_backend.world import PROFILES, array_spec
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream, concatenate
+from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, concatenate
 from tactile_rt.testing import FakeCan, FakeSerial
+from tests.helpers.waiting import until
 
 REALTIME = PROFILES["realtime"]
 FEW = tuple(w for w in mouse_whiskers() if w.name in ("A1", "C2", "E3"))
-PATIENCE_S = 30.0
 ROBOT = Path(__file__).parents[2] / "docs" / "arrays" / "robot.csv"
 Commands = list[tuple[float, Whisking]]
 
@@ -349,12 +348,12 @@ def test_the_angle_follows_a_command_sent_over_the_wire(
     options = {"format": "float32"}
     with make(still, options=options) as fake, open_source(fake.url) as driver:
         came: list[Chunk] = []
-        until(driver, came, lambda: sum(map(len, came)) >= 100)
+        read_until(driver, came, lambda: sum(map(len, came)) >= 100)
         driver.set_whisking(10.0, 0.3, 0.1)  # type: ignore[attr-defined]
-        until(driver, came, lambda: len(still.commands) == 2)
+        read_until(driver, came, lambda: len(still.commands) == 2)
         number, command = still.commands[1]
         assert dataclasses.astuple(command) == pytest.approx((10.0, 0.3, 0.1), abs=1e-4)
-        until(driver, came, lambda: sum(map(len, came)) >= number + 700)
+        read_until(driver, came, lambda: sum(map(len, came)) >= number + 700)
         assert driver.spec == still.spec
     stream = concatenate(came)
     angle = stream.values[:, 0, 6]
@@ -381,20 +380,19 @@ def test_a_command_out_of_range_is_not_acknowledged(
         with make(still) as fake, open_source(fake.url) as driver:
             driver.set_whisking(40.0, 0.1, 0.0)  # type: ignore[attr-defined]
             driver.set_whisking(9.0, 0.1, 0.0)  # type: ignore[attr-defined]
-            until(driver, [], lambda fake=fake: fake.codec.whisking is not None)
+            read_until(driver, [], lambda fake=fake: fake.codec.whisking is not None)
             assert fake.codec.whisking == pytest.approx((9.0, 0.1, 0.0))
-            until(driver, [], lambda: still.commands[-1][1].frequency_hz == 9.0)
+            read_until(driver, [], lambda: still.commands[-1][1].frequency_hz == 9.0)
     assert all(c.frequency_hz < 10 for _, c in still.commands)
 
 
-def until(driver: object, came: list[Chunk], done: Callable[[], bool]) -> None:
-    """Read until something is true."""
-    end = time.monotonic() + PATIENCE_S
-    while not done():
-        assert time.monotonic() < end, "it never happened"
-        chunk = driver.read(0.1)  # type: ignore[attr-defined]
+def read_until(driver: Source, came: list[Chunk], done: Callable[[], bool]) -> None:
+    def read() -> None:
+        chunk = driver.read(0.1)
         if chunk is not None:
             came.append(chunk)
+
+    until(done, meanwhile=read)
 
 
 @pytest.mark.slow

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.sim_backend.arrays.whiskers import Whisker, mouse_whiskers
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers
+from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.world import (
     CHANNELS,
     MOUNT,

@@ -88,13 +88,26 @@ def test_a_file_combines_urls(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "missing required field `name`"),
+        ("", "needs a key 'name'"),
         ('name = "a"\nrate_hz = 1\nsource = []', "no \\[\\[source\\]\\]"),
-        ('name = "a"\nrate_hz = 1\nsource = [{name="x", url="y", pose=1}]', "unknown field `pose`"),
-        ("name = ", "Invalid value"),
+        (
+            'name = "a"\nrate_hz = 1\nsource = [{name="x", url="y", pose=1}]',
+            r":3: source\[0\] has no key 'pose'; did you mean position\?",
+        ),
+        ("name = ", ":1: not TOML: Invalid value"),
+        ('name = "a"\nrate_hz = 0', ":2: rate_hz: expected a number > 0"),
+        (
+            'name = "a"\nrate_hz = 1\n[[source]]\nname = "x"\nurl = "synthetic:5"',
+            r":5: source\[0\]\.url: synthetic:5 is not a size",
+        ),
+        (
+            'name = "a"\nrate_hz = 1\n[[source]]\nname = "x"\nurl = "combined:head.toml"',
+            r":5: source\[0\]\.url: head\.toml combines itself",
+        ),
     ],
 )
-def test_a_wrong_file_is_named(tmp_path, text, said):
+def test_a_wrong_file_is_named(tmp_path, monkeypatch, text, said):
+    monkeypatch.chdir(tmp_path)
     path = tmp_path / "head.toml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=said) as caught:

@@ -4,10 +4,12 @@ import hashlib
 import hmac
 import ipaddress
 import socket
-from collections.abc import Iterable
+from collections.abc import Mapping
 from urllib.parse import urlsplit
 
-__all__ = ["HEADERS", "Guard", "Refused"]
+from tactile_rt.daemon.http import Refused
+
+__all__ = ["HEADERS", "Guard"]
 
 # Trusted Types: the browser itself refuses innerHTML and its like, whatever a label contains.
 POLICY = (
@@ -29,26 +31,13 @@ COOKIE_S = 30 * 86400
 MAX_TOKEN = 1024
 
 
-class Refused(Exception):
-    """A request that is not served.
-
-    Args:
-        status: of HTTP.
-        reason: one line, shown to who asked.
-    """
-
-    def __init__(self, status: int, reason: str) -> None:
-        super().__init__(reason)
-        self.status, self.reason = status, reason
-
-
 class Guard:
     """Decides on requests by their headers alone.
 
     Args:
-        host: what the page is bound to, as configured.
-        port: of it.
-        token: what a browser must know; empty: nothing.
+        host: The address that the page is bound to, as configured.
+        port: The TCP port of the page.
+        token: The secret that a browser must know; empty: none.
     """
 
     def __init__(self, host: str, port: int, token: str) -> None:
@@ -60,35 +49,27 @@ class Guard:
         # It outlives the daemon, so that a page goes on after a restart, and tells no token.
         self._session = hmac.digest(self._token, b"tactile_rt page", hashlib.sha256).hex().encode()
 
-    def check(self, headers: Iterable[tuple[bytes, bytes]], method: str) -> dict[str, str]:
-        """The headers by name, if the request is of this page or of no page at all.
+    def check(self, headers: Mapping[str, str], method: str) -> None:
+        """Let a request pass if it is of this page or of no page at all.
 
         A foreign site can neither point a name of its own at this address (DNS rebinding): only
         numbers and this host's names are answered; nor ask from its own pages: browsers tell.
 
         Raises:
-            Refused: 400 or 403.
+            Refused: 403.
         """
-        found: dict[str, str] = {}
-        for key, value in headers:
-            name = key.decode("latin-1").lower()
-            if name in found and name in ("host", "origin", "content-length"):
-                raise Refused(400, f"{name} is given twice")
-            text = value.decode("latin-1")
-            found[name] = f"{found[name]}; {text}" if name == "cookie" and name in found else text
-        host = found.get("host", "")
+        host = headers.get("host", "")
         if not self._is_own(host):
             raise Refused(403, "this page is not served under that name; use its IP address")
-        origin = found.get("origin")
+        origin = headers.get("origin")
         if origin is not None and urlsplit_netloc(origin) != host.lower():
             raise Refused(403, "asked for by another site")
-        if found.get("sec-fetch-site", "none") not in ("same-origin", "none") and (
-            method != "GET" or found.get("sec-fetch-mode") != "navigate"
+        if headers.get("sec-fetch-site", "none") not in ("same-origin", "none") and (
+            method != "GET" or headers.get("sec-fetch-mode") != "navigate"
         ):
             raise Refused(403, "asked for by another site")
-        return found
 
-    def knows(self, headers: dict[str, str]) -> bool:
+    def knows(self, headers: Mapping[str, str]) -> bool:
         """Whether a request brings the token, in a header, or the cookie given for it."""
         if not self._token:
             return True

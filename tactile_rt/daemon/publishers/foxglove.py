@@ -17,7 +17,6 @@ from foxglove.messages import Log, LogLevel, Timestamp
 from foxglove.websocket import WebSocketServer
 
 from tactile_rt.daemon.consumer import Consumer, View
-from tactile_rt.daemon.digits import shortest
 from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import (
     DecisionMessage,
@@ -25,6 +24,7 @@ from tactile_rt.daemon.messages import (
     Message,
     encode,
     message_of,
+    shortest,
     topic_of,
 )
 from tactile_rt.daemon.publishers.scene import Scene
@@ -41,11 +41,11 @@ class FoxgloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     """Options of ``kind = "foxglove"``.
 
     Attributes:
-        host: address to listen on. Foxglove's protocol knows no password.
-        port: of it; 0: a free one.
-        prefix: what all topics begin with.
-        rate_hz: pictures and values a second, at most.
-        m_per_n: length of the arrow of 1 N, m; 0: as the forces are.
+        host: The address to listen on. Foxglove's protocol knows no password.
+        port: The TCP port to listen on; 0: a free one.
+        prefix: The beginning of all topics.
+        rate_hz: The largest number of pictures and values a second, Hz.
+        m_per_n: The length of the arrow of a force of 1 N, m; 0: chosen after the largest force.
     """
 
     host: Annotated[str, msgspec.Meta(min_length=1, max_length=255)] = "127.0.0.1"

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import msgspec
 
-from tactile_rt.daemon.config_shared import is_loopback
+from tactile_rt.daemon.config import is_loopback
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import Message, message_of, state_message
@@ -14,7 +14,11 @@ from tactile_rt.daemon.messages import Message, message_of, state_message
 __all__ = ["Repeated", "Sender", "SenderOptions", "is_port", "tell_exposed"]
 
 Prefix = Annotated[
-    str, msgspec.Meta(pattern=r"^[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64}){0,7}\Z")
+    str,
+    msgspec.Meta(
+        pattern=r"^[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64}){0,7}\Z",
+        description="prefix: one to eight words of letters, digits, ., - and _, with / between",
+    ),
 ]
 StateSeconds = Annotated[float, msgspec.Meta(ge=0, le=86400)]
 
@@ -23,10 +27,10 @@ class SenderOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Options that all of them have.
 
     Attributes:
-        prefix: what all topics begin with.
-        samples: whether samples are published, too.
-        state_s: ``state`` and all ``array`` messages are repeated so often, s, for those that come
-            late; 0: never.
+        prefix: The beginning of all topics.
+        samples: Whether samples are published, too.
+        state_s: The time after which ``state`` and all ``array`` messages are repeated, for those
+            that come late, s; 0: never.
     """
 
     prefix: Prefix = "tactile"

@@ -21,14 +21,14 @@ class Signal:
     """Where a number is in a frame's data.
 
     Attributes:
-        message: of which it is.
-        name: of the signal.
-        start: its lowest bit, counted from the lowest bit of byte 0; if `big`: its highest bit,
-            counted from the highest of byte 0.
-        length: bits.
-        big: whether its bytes are big-endian.
-        signed: whether it is in two's complement.
-        real: whether it is an IEEE 754 number.
+        message: Name of the message that the signal is part of.
+        name: Name of the signal in the DBC file.
+        start: The signal's lowest bit, counted from the lowest bit of byte 0; if `big`, the highest
+            bit, counted from the highest of byte 0.
+        length: Width of the signal, in bits.
+        big: Whether the signal's bytes are big-endian.
+        signed: Whether the number is in two's complement.
+        real: Whether the number is an IEEE 754 floating-point number.
     """
 
     message: str
@@ -69,11 +69,11 @@ class FramePart:
     """A frame that every sample has: a message, with these values of its multiplexers.
 
     Attributes:
-        id: identifier.
-        extended: whether it has 29 bits.
-        length: bytes of data.
-        when: multiplexers and the values of each that make it this part.
-        message: cantools' object.
+        id: CAN identifier of the message.
+        extended: Whether the identifier has 29 bits.
+        length: Length of the message's data, bytes.
+        when: The multiplexers in the message, and the values of each that make a frame this part.
+        message: The message as cantools read it, which encodes the data of an emulated device.
     """
 
     id: int
@@ -92,15 +92,16 @@ class DbcMapping:
     """How a sample is put together.
 
     Attributes:
-        spec: what the samples are.
-        parts: in the order in which the device sends them.
-        cells: (element * channel) signals, and the parts that each is in.
-        gain: (element, channel) SI units per raw count.
-        bias: (element, channel) SI value of a raw 0.
-        counter: signal and its parts, if there is one; also `time` and `status`.
-        tick_ns: length of a tick of `time`, ns.
-        invalid: bits of the status that make a sample invalid.
-        commands: (event, frame, identifier of the answer).
+        spec: What the samples are.
+        parts: The frames of a sample, in the order in which the device sends them.
+        cells: The signal of each of (element * channel) values, and the parts that each is in.
+        gain: Scale of each value, (element, channel), SI units per raw count.
+        bias: Value of a raw 0, (element, channel), SI.
+        counter: The signal that counts samples, and the parts that have it; None if there is none.
+            The same holds for `time` and `status`.
+        tick_ns: Length of a tick of `time`, ns; None if the device sends no time.
+        invalid: Bits of the status that make a sample invalid.
+        commands: What the host sends and when: (command, frame, identifier of the answer).
     """
 
     spec: ArraySpec

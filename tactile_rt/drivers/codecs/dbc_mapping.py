@@ -2,7 +2,6 @@
 
 import difflib
 import math
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,6 +13,7 @@ from cantools.database.errors import Error as DatabaseError
 
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.dbc_layout import DbcMapping, FramePart, Signal
+from tactile_rt.settings import convert, read_toml
 from tactile_rt.stream import ArraySpec, ConfigError
 
 __all__ = ["read_mapping"]
@@ -71,31 +71,14 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     command: list[_Command] = []
 
 
-_STRUCTS = (_File, _Channel, _Element, _Time, _Status, _Command)
-
-
 def read_mapping(path: Path) -> DbcMapping:
     """Read a mapping and the DBC file that it names.
 
     Raises:
         ConfigError: one line that names the file, the message or signal, and the nearest name.
     """
-    file = _decode(path)
+    file: _File = convert(read_toml(path), _File)
     return _Reader(path, file).mapping()
-
-
-def _decode(path: Path) -> _File:
-    try:
-        return msgspec.toml.decode(path.read_text(encoding="utf-8"), type=_File)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror or error}") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
-    except msgspec.MsgspecError as error:
-        message = str(error)
-        if unknown := re.search(r"unknown field `(.*?)`", message):
-            message += _near(unknown[1], [f for s in _STRUCTS for f in s.__struct_fields__])
-        raise ConfigError(f"{path}: {message}") from None
 
 
 def _near(name: str, known: Iterable[str]) -> str:

@@ -1,4 +1,6 @@
-"""What goes wrong on the wire, on purpose: a schedule of faults, from TOML and a seed.
+"""What goes wrong on the wire, on purpose: a schedule, what it does to a packet, and a record.
+
+The schedule comes from TOML and a seed:
 
     seed = 1
     [[fault]]
@@ -15,19 +17,35 @@ what was done, sample by sample. The first and the last half second are undistur
 lost beside a restart of the counter, where no receiver could count it.
 """
 
-import difflib
 import heapq
 import math
 import random
+from array import array
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
+from tactile_rt.drivers.codec import Packet
+from tactile_rt.settings import convert, no_such, read_toml
 from tactile_rt.stream import ConfigError
 
-__all__ = ["KINDS", "QUIET_S", "Fault", "FaultSchedule", "read_faults"]
+__all__ = [
+    "KINDS",
+    "QUIET_S",
+    "DeviceLog",
+    "Fate",
+    "Fault",
+    "FaultSchedule",
+    "damaged",
+    "read_faults",
+]
 
 QUIET_S = 0.5  # undisturbed at either end
 BESIDE_RESET_S = 0.05  # undisturbed on either side of a restart
@@ -62,12 +80,16 @@ class Fault:
     """One kind of fault, and when.
 
     Attributes:
-        kind: one of `KINDS`. ``stall``: nothing is sent for a while, then all at once.
-            ``sequence_reset``: the device's counter and clock start again, as after a restart.
-        rate: how often, per second in the mean, at random times; or
-        at_s: when, in seconds of the stream.
-        duration_s: how long, of ``stall``, ``unplug`` and ``clock_drift`` (0: to the end).
-        amount: how much, see `KINDS`; None: its default.
+        kind: Name of a kind in `KINDS`. With ``stall`` nothing is sent for a while, then all at
+            once; with ``sequence_reset`` the device's counter and clock start again, as after a
+            restart.
+        rate: Mean number of times per second that the fault happens, at random; 0 if `at_s` is
+            given.
+        at_s: Time at which the fault happens, once, in seconds of the stream; None if `rate` is
+            given.
+        duration_s: Length of the fault, s, for ``stall``, ``unplug`` and ``clock_drift`` (0: to the
+            end).
+        amount: Size of the fault, in the unit that `KINDS` tells; None for the default of its kind.
 
     Raises:
         ConfigError: which field, and what it can be.
@@ -81,9 +103,7 @@ class Fault:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            near = difflib.get_close_matches(self.kind, KINDS, 1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(KINDS)}"
-            raise ConfigError(f"no fault kind {self.kind!r}; {hint}")
+            raise ConfigError(no_such("fault kind", self.kind, KINDS))
         kind = KINDS[self.kind]
         for name in ("rate", "duration_s"):
             if not 0 <= getattr(self, name) < math.inf:
@@ -118,12 +138,12 @@ class FaultSchedule:
     """Which fault hits which sample; the same seed and times give the same faults.
 
     Args:
-        faults: what may happen.
-        seed: of the random times and of `random`.
+        faults: The faults that may happen.
+        seed: Seed of the random times and of `random`.
 
     Attributes:
-        faults: what may happen.
-        random: for whoever carries the faults out.
+        faults: The faults that may happen.
+        random: Random numbers for whoever carries the faults out.
     """
 
     def __init__(self, faults: tuple[Fault, ...] | list[Fault], seed: int = 0) -> None:
@@ -146,8 +166,8 @@ class FaultSchedule:
         sample come one after the other. ``clock_drift`` is returned once, when it begins.
 
         Args:
-            t_s: seconds since the first sample.
-            quiet: whether the stream is about to end: nothing happens any more.
+            t_s: Time since the first sample, s.
+            quiet: Whether the stream is about to end, so that nothing happens any more.
         """
         if quiet or t_s < QUIET_S:
             return None
@@ -184,9 +204,93 @@ class FaultSchedule:
         return self.faults[k]
 
 
+class Fate(IntEnum):
+    """What became of a sample's packet at the device's end of the line."""
+
+    SENT = 0  # whole, once; also after random bytes
+    DUPLICATED = 1  # whole, more than once
+    CORRUPTED = 2  # with inverted bits; on CAN, without the frames that these were in
+    TRUNCATED = 3  # without its end
+    DROPPED = 4  # not sent
+    OVERFLOWED = 5  # not sent: there was no room, the host did not read
+    UNHEARD = 6  # not sent: nobody had the port open, or the device was pulled out
+
+
+class DeviceLog:
+    """What a device did with each of its samples.
+
+    Attributes:
+        counts: Number of samples by fate.
+        duplicated: Number of packets that were sent beyond one per sample.
+    """
+
+    def __init__(self, kept: bool = True) -> None:
+        self.counts: Counter[Fate] = Counter()
+        self.duplicated = 0
+        self._kept = kept
+        self._seq, self._t_ns, self._fate = array("q"), array("q"), bytearray()
+
+    @property
+    def sent(self) -> int:
+        """Samples that the device has numbered, whatever became of them."""
+        return sum(self.counts.values())
+
+    @property
+    def seq(self) -> NDArray[np.int64]:
+        """(n,) the device's counter, not wrapped; it begins anew where the device does."""
+        return np.array(self._seq, np.int64)
+
+    @property
+    def t_ns(self) -> NDArray[np.int64]:
+        """(n,) the device's clock, not wrapped."""
+        return np.array(self._t_ns, np.int64)
+
+    @property
+    def fate(self) -> NDArray[np.uint8]:
+        """(n,) `Fate` of each."""
+        return np.array(self._fate, np.uint8)
+
+    def add(self, seq: int, t_ns: int, fate: Fate) -> int:
+        """Write down one sample; return where, for `change`."""
+        self.counts[fate] += 1
+        if self._kept:
+            self._seq.append(seq)
+            self._t_ns.append(t_ns)
+            self._fate.append(fate)
+        return len(self._fate) - 1
+
+    def change(self, at: int, old: Fate, new: Fate) -> None:
+        """What was to be sent later became something else."""
+        self.counts[old] -= 1
+        self.counts[new] += 1
+        if self._kept:
+            self._fate[at] = new
+
+
+def damaged(packet: Packet, fault: Fault, draw: random.Random) -> tuple[Packet, Fate]:
+    """What a bit flip or a truncation leaves of a packet, and what to call it.
+
+    CAN has a checksum of its own: a frame with a wrong bit does not arrive. Of a packet of bytes
+    at least one is left, of frames none may be.
+    """
+    amount = int(fault.size)
+    if fault.kind == "truncate":
+        if isinstance(packet, bytes):
+            return packet[: max(1, len(packet) - amount)], Fate.TRUNCATED
+        return packet[: max(0, len(packet) - amount)], Fate.TRUNCATED
+    if isinstance(packet, bytes):
+        hurt = bytearray(packet)
+        for bit in draw.sample(range(8 * len(hurt)), min(amount, 8 * len(hurt))):
+            hurt[bit // 8] ^= 1 << bit % 8
+        return bytes(hurt), Fate.CORRUPTED
+    lost = set(draw.sample(range(len(packet)), min(amount, len(packet))))
+    left: Sequence[object] = [frame for i, frame in enumerate(packet) if i not in lost]
+    return left, Fate.CORRUPTED  # type: ignore[return-value]
+
+
 class _File(msgspec.Struct, forbid_unknown_fields=True):
     seed: int = 0
-    fault: list[dict[str, Any]] = []
+    fault: tuple[Fault, ...] = ()
 
 
 def read_faults(path: Path | str) -> FaultSchedule:
@@ -196,33 +300,7 @@ def read_faults(path: Path | str) -> FaultSchedule:
         ConfigError: one line that names the file, the fault, the key, and what to do.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    try:
-        file = msgspec.toml.decode(text, type=_File)
-    except msgspec.MsgspecError as error:
-        raise ConfigError(f"{path}: {error}; it has seed and [[fault]] tables") from None
+    file: _File = convert(read_toml(path), _File)
     if not file.fault:
         raise ConfigError(f"{path}: has no [[fault]] tables; give at least one")
-    return FaultSchedule(
-        [_fault(f"{path}, fault {n}", fields) for n, fields in enumerate(file.fault, 1)], file.seed
-    )
-
-
-def _fault(where: str, fields: dict[str, Any]) -> Fault:
-    known = Fault.__dataclass_fields__
-    for name in fields:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
-            raise ConfigError(f"{where}: unknown key {name!r}; {hint}")
-    try:
-        return msgspec.convert(fields, Fault)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{where}: {error}") from None
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
+    return FaultSchedule(file.fault, file.seed)

@@ -1,33 +1,41 @@
-"""How an emulated device numbers, times and encodes its samples, and what goes wrong with them."""
+"""An emulated device: how it fits, numbers, times and encodes samples, and what goes wrong."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Codec
-from tactile_rt.drivers.emulation.damage import DeviceLog, Fate, damaged
 from tactile_rt.drivers.emulation.endpoints import Endpoint
-from tactile_rt.drivers.emulation.faults import QUIET_S, Fault, FaultSchedule
-from tactile_rt.stream import NS_PER_S, Chunk
+from tactile_rt.drivers.emulation.faults import (
+    QUIET_S,
+    DeviceLog,
+    Fate,
+    Fault,
+    FaultSchedule,
+    damaged,
+)
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
-__all__ = ["EmulatedClock", "Transmitter"]
+__all__ = ["EmulatedClock", "Transmitter", "fit"]
 
 
 class Transmitter:
     """Samples to packets to an endpoint, with faults on the way; in one thread at a time.
 
     Args:
-        codec: what it speaks.
-        endpoint: where to.
-        faults: what goes wrong; None: nothing.
-        log: where to write down what becomes of each sample.
-        clock: the device's.
-        start_count: the device's counter's first value.
+        codec: The codec that the device speaks.
+        endpoint: The line that the packets go to.
+        faults: What goes wrong; None for nothing.
+        log: The record of what becomes of each sample.
+        clock: The clock of the device.
+        start_count: First value of the device's counter.
 
     Attributes:
-        end_ns: when the stream ends, on the source's clock; nothing goes wrong just before.
-        away: whether a fault has it pulled out.
+        end_ns: Time at which the stream ends, on the source's clock, ns; nothing goes wrong just
+            before.
+        away: Whether a fault has the device pulled out.
     """
 
     def __init__(
@@ -164,9 +172,9 @@ class EmulatedClock:
     """The device's clock: the source's time to device time, with drift, jumps and restarts.
 
     Args:
-        start_ns: what it shows when the first sample is taken.
-        drift_ppm: how much faster than true it runs.
-        wrap_ns: what it can show on the wire.
+        start_ns: Device time when the first sample is taken, ns.
+        drift_ppm: How much faster than true the clock runs, parts per million.
+        wrap_ns: Device time at which the clock wraps on the wire, ns.
     """
 
     def __init__(self, start_ns: int, drift_ppm: float, wrap_ns: int) -> None:
@@ -214,3 +222,29 @@ class EmulatedClock:
     def _anchor(self, t_ns: int) -> None:
         self._there = int(self.at(np.array([t_ns]))[0])
         self._here = t_ns
+
+
+def fit(source: ArraySpec, device: ArraySpec) -> Callable[[Chunk], Chunk]:
+    """Make a source's chunks those of a device's spec.
+
+    The device's elements are the source's first ones, in order; those beyond are invalid. Its
+    channels are those of the same name, or, if no name is the same, those in the same place;
+    others are 0. Values pass as they are, whatever the unit.
+    """
+    if source.shape == device.shape and source.channels == device.channels:
+        return lambda chunk: chunk
+    columns = [source.channels.index(c) if c in source.channels else -1 for c in device.channels]
+    if max(columns) < 0:
+        columns = [i if i < len(source.channels) else -1 for i in range(len(device.channels))]
+    into = [i for i, column in enumerate(columns) if column >= 0]
+    taken = [columns[i] for i in into]
+    n = min(len(source.elements), len(device.elements))
+
+    def fitted(chunk: Chunk) -> Chunk:
+        values = np.zeros((len(chunk), *device.shape), np.float32)
+        values[:, :n, into] = chunk.values[:, :n, taken]
+        valid = np.zeros(values.shape[:2], np.bool_)
+        valid[:, :n] = chunk.valid[:, :n]
+        return Chunk(chunk.seq, chunk.t_ns, values, valid)
+
+    return fitted

@@ -15,8 +15,8 @@ import onnx
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.denormals import FlushDenormals
 from tactile_rt.classifier.model_file import ModelCard, load_model
+from tactile_rt.classifier.runtime import FlushDenormals
 from tactile_rt.models.alignment.layers import Layers, first_difference
 from tactile_rt.models.alignment.onnx_taps import (
     GRU_LAYERS,

@@ -11,7 +11,7 @@ from tactile_rt.stream import ConfigError
 
 __all__ = ["HEAD_BIT", "add_head"]
 
-HEAD_BIT, WHISKER_BIT = 4, 1  # collision groups, as in `world.py`
+HEAD_BIT, WHISKER_BIT = 4, 1  # collision groups, as in `world`
 HEAD_GROUP = 0  # of geoms that viewers draw and no ray of a sweep looks for
 MAX_FACES = 200_000  # MuJoCo's own limit for STL files
 LEAST_MM = 1.0  # a smaller head is one whose file is in m

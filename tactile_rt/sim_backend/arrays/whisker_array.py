@@ -1,40 +1,30 @@
 """Whisker arrays: which whiskers stand where, on which heads.
 
-Lengths in mm and angles in rad, as in `whiskers.py`. The frame of a head is x lateral (to the
+Lengths in mm and angles in rad, as in `whiskers`. The frame of a head is x lateral (to the
 animal's right), y rostral, z dorsal; the left side of an animal is its right side mirrored in x.
 """
 
-import difflib
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays.whiskers import Whisker, mouse_whiskers, rat_whiskers, rotation
+from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 from tactile_rt.stream import ConfigError
 
 __all__ = [
-    "ANIMALS",
     "MOUNT",
     "Mount",
     "WhiskerArray",
     "both_sides",
     "centred_mount",
-    "load_animals",
-    "load_array",
     "mirrored",
     "place",
 ]
 
-ANIMALS: dict[str, Callable[[], tuple[Whisker, ...]]] = {
-    "mouse": mouse_whiskers,
-    "rat": rat_whiskers,
-}
-SIDES = ("right", "left", "both")
-ARRAY_FILES = (".csv", ".toml")
 HEAD_FILES = (".obj", ".ply", ".stl")  # not .glb, which is in m and y-up by its standard
 Point = tuple[float, float, float]
 
@@ -74,10 +64,10 @@ class WhiskerArray:
     """Whiskers on one head.
 
     Attributes:
-        name: what the array is called, e.g. ``mouse-right``.
-        whiskers: in the frame of the head, mm and rad.
-        mount: pose of the head in the world.
-        head: mesh file of the head, in its frame and in mm; None: no head is drawn.
+        name: The name that the array is called by, e.g. ``mouse-right``.
+        whiskers: The array's whiskers in the frame of the head, in mm and rad.
+        mount: The pose of the head in the world.
+        head: The mesh file of the head, in the head's frame and in mm; None: no head is drawn.
 
     Raises:
         ConfigError: no whiskers, or two of one name or in one cell of the grid.
@@ -100,58 +90,6 @@ class WhiskerArray:
                         f"{what}; give each its own"
                     )
                 names[key] = w.name
-
-
-def load_array(name: str) -> WhiskerArray:
-    """The array of a name: ``mouse``, ``rat``, ``mouse-left``, ``rat-both`` ... or a file's.
-
-    ``mouse`` is ``mouse-right``. An animal's left side alone is mounted as its right side's mirror
-    image, whiskers reaching along world -x, so that a mirrored sweep gives mirrored loads; both
-    sides stand on one head, mounted as for the right side alone. The rat's pose in the published
-    sweeps is not known: its head is turned as the mouse's and placed so that the mean of its base
-    points is where the mouse's is.
-
-    Args:
-        name: of an animal and side, or a path to a .csv or .toml file (see `files`).
-
-    Raises:
-        ConfigError: no such array, or a file with a mistake.
-    """
-    if Path(name).suffix.lower() in ARRAY_FILES:
-        arrays = load_animals(name)
-        if len(arrays) > 1:
-            raise ConfigError(f"{name}: holds {len(arrays)} animals where one array is wanted")
-        return arrays[0]
-    animal, _, side = name.partition("-")
-    known = [*ANIMALS, *(f"{a}-{s}" for a in ANIMALS for s in SIDES)]
-    if name not in known:
-        near = difflib.get_close_matches(name, known, 1)
-        raise ConfigError(
-            f"no simulated array {name!r}: "
-            + (f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}")
-            + " (or give a .csv or .toml file)"
-        )
-    side = side or "right"
-    whiskers = ANIMALS[animal]()
-    right = WhiskerArray(f"{animal}-right", whiskers, _animal_mount(whiskers))
-    if side == "left":
-        left = tuple(mirrored(w) for w in whiskers)
-        return WhiskerArray(f"{animal}-left", left, right.mount.mirrored())
-    return right if side == "right" else both_sides(right, f"{animal}-both")
-
-
-def load_animals(name: str) -> tuple[WhiskerArray, ...]:
-    """The arrays that share one world: one by its name, or all that a .toml file places in it.
-
-    Raises:
-        ConfigError: no such array, or a file with a mistake.
-    """
-    path = Path(name)
-    if path.suffix.lower() not in ARRAY_FILES:
-        return (load_array(name),)
-    from tactile_rt.sim_backend.arrays.files import read_animals  # which reads into these types
-
-    return read_animals(path)
 
 
 def mirrored(whisker: Whisker) -> Whisker:
@@ -225,11 +163,3 @@ def centred_mount(
     turned = Mount((0.0, 0.0, 0.0), roll_pitch_yaw).rotation
     x, y, z = (centre - turned @ np.mean([w.base for w in whiskers], axis=0)).tolist()
     return Mount((x, y, z), roll_pitch_yaw)
-
-
-def _animal_mount(whiskers: tuple[Whisker, ...]) -> Mount:
-    mouse = mouse_whiskers()
-    if whiskers == mouse:
-        return MOUNT
-    middle = MOUNT.position + MOUNT.rotation @ np.mean([w.base for w in mouse], axis=0)
-    return centred_mount(whiskers, tuple(middle), MOUNT.roll_pitch_yaw)

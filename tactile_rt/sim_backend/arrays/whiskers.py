@@ -1,14 +1,12 @@
-"""Whiskers: the geometry and the material of one, and the animals' published measurements.
+"""Whiskers: the geometry and the material of one, and how a row of a table describes it.
 
-Lengths in mm and angles in rad here, as the field publishes them; `world.py` converts.
+Lengths in mm and angles in rad here, as the field publishes them; `world` converts.
 """
 
-import csv
 import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +23,6 @@ __all__ = [
     "YOUNG_MODULUS_PA",
     "Whisker",
     "keratin_radii",
-    "mouse_whiskers",
-    "rat_whiskers",
     "rotation",
 ]
 
@@ -75,18 +71,19 @@ class Whisker:
     """One whisker: a tapered, planar, parabolic beam on its base point.
 
     Attributes:
-        name: what it is called, without spaces, e.g. ``C2``: row letter and column.
-        row, column: place on the grid, counted from 0 (row A, column 0).
-        length: arc length S, mm.
-        curvature: a of y = a x^2 in the whisker's plane, 1/mm; 0 is straight, and a negative one
-            curves towards -y.
-        base: base point in the array frame, mm.
-        angles: base angles (theta, phi, zeta): azimuth, elevation, torsion, rad.
-        base_radius, tip_radius: of the cone, mm; equal for a cylinder, never thicker at the tip.
-        young_modulus: E, Pa.
-        density_base, density_tip: mass density at either end, kg/m^3.
-        damping_ratio: of the first mode.
-        friction: Coulomb coefficient of the surface.
+        name: The whisker's name, without spaces, e.g. ``C2``: row letter and column.
+        row, column: The whisker's cell on the array's grid, counted from 0 (row A, column 0).
+        length: The arc length S from base to tip, mm.
+        curvature: The coefficient a of y = a x^2 in the whisker's plane, 1/mm; 0 is straight, and a
+            negative one curves towards -y.
+        base: The base point (x, y, z) in the array frame, mm.
+        angles: The base angles (theta, phi, zeta): azimuth, elevation, torsion, rad.
+        base_radius, tip_radius: The radii of the cone at its two ends, mm; equal for a cylinder,
+            never thicker at the tip.
+        young_modulus: Young's modulus E of the material, Pa.
+        density_base, density_tip: The mass density at either end, kg/m^3.
+        damping_ratio: The damping ratio of the first mode (1 is critical).
+        friction: The Coulomb coefficient of friction of the surface.
 
     Raises:
         ConfigError: a value that no whisker can have.
@@ -250,22 +247,6 @@ def keratin_radii(length: float, row: int, column: int) -> tuple[float, float]:
     base = (0.041 + 0.002 * length + 0.011 * (row + 1) - 0.0039 * column) / 2
     slope = 0.0012 + 0.00017 * (row + 1) - 0.000066 * column + 0.00011 * column**2
     return base, max((base - slope * length) / 2, THINNEST_TIP_MM)
-
-
-def mouse_whiskers() -> tuple[Whisker, ...]:
-    """The 30 right-side mystacial whiskers of the mouse (Bresee et al. 2023)."""
-    return _measured("mouse.csv")
-
-
-def rat_whiskers() -> tuple[Whisker, ...]:
-    """The 30 right-side mystacial whiskers of the rat (Belli et al. 2017, 2018)."""
-    return _measured("rat.csv")
-
-
-def _measured(file: str) -> tuple[Whisker, ...]:
-    text = resources.files(__package__).joinpath("data", file).read_text(encoding="utf-8")
-    lines = [line for line in text.splitlines() if not line.startswith("#")]
-    return tuple(Whisker.from_columns(row) for row in csv.DictReader(lines))
 
 
 def _number(values: Mapping[str, object], column: str) -> float:

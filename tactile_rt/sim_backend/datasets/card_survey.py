@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.datasets.separability import (
     Features,
+    Fit,
     Separability,
     check_separability,
     window_features,
@@ -33,23 +34,25 @@ class Card:
     """What was counted in a set.
 
     Attributes:
-        sweeps, objects: counts per split and category.
-        skipped: objects that could not be made, and why.
-        parameters: least, mean and greatest value of each sweep parameter.
-        force_edges: (bin + 1,) of the histogram of the largest force of every touched whisker in
-            every sweep, N.
-        force_counts: (bin,).
-        median_force: of these, N.
-        coverage: share of the sweeps in which each whisker is touched, by name.
-        whiskers_touched: mean number of whiskers touched by a sweep that touches.
-        samples: values of one channel of one element at one time, in all sweeps.
-        clips: how many of them exceed a limit, by limit.
-        largest: the largest force, N, and where it occurs.
-        without_touch: sweeps in which nothing is felt.
-        misses: sweeps known to pass beside the array.
-        unstable: sweeps that could not be simulated at the set's profile, and are empty.
-        not_finite: sweeps with a value that is no number.
-        separability: support vector machines on few classes, see `separability`.
+        sweeps, objects: The counts of sweeps and of objects, by split and category.
+        skipped: The names of objects that could not be made, and why each could not.
+        parameters: The least, mean and greatest value of each sweep parameter.
+        force_edges: The (bin + 1,) edges of the histogram of the largest force of every touched
+            whisker in every sweep, N.
+        force_counts: The (bin,) numbers of whiskers and sweeps in each bin of that histogram.
+        median_force: The median of the forces in that histogram, N.
+        coverage: The share of the sweeps in which each whisker is touched, 0 to 1, by its name.
+        whiskers_touched: The mean number of whiskers touched by a sweep that touches.
+        samples: The number of values in all sweeps, of every channel of every element at every
+            time.
+        clips: The number of values that exceed a limit, by the name of the limit.
+        largest: The largest force, N, and the sweep in which it occurs.
+        without_touch: The number of sweeps in which nothing is felt.
+        misses: The number of sweeps known to pass beside the array.
+        unstable: The number of sweeps that could not be simulated at the set's profile, and are
+            empty.
+        not_finite: The number of sweeps with a value that is not a finite number.
+        separability: What support vector machines make of few classes, see `separability`.
     """
 
     sweeps: dict[str, dict[str, int]] = field(default_factory=dict)
@@ -86,8 +89,12 @@ class _Findings:
     examples: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # (sample, element) N
 
 
-def survey(folder: Path) -> tuple[Card, dict[str, NDArray[np.float32]]]:
+def survey(folder: Path, fit: Fit) -> tuple[Card, dict[str, NDArray[np.float32]]]:
     """Measure a set: the objects that are there.
+
+    Args:
+        folder: the set's.
+        fit: fits a support vector machine, as `models.svm.fit`.
 
     Returns:
         The card, and the force (sample, element), N, of one sweep of some categories.
@@ -109,7 +116,7 @@ def survey(folder: Path) -> tuple[Card, dict[str, NDArray[np.float32]]]:
         for s in ("train", "test")
     )
     if len(train.categories) and len(test.categories):
-        card.separability = check_separability(train, test)
+        card.separability = check_separability(train, test, fit)
     return card, found.examples
 
 

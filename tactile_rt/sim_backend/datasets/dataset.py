@@ -19,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.sim_backend.arrays.whisker_array import load_animals
+from tactile_rt.settings import no_such
+from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, contact_distances
 from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
+from tactile_rt.sim_backend.datasets.inventory import write_sums, written_sum
 from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove_leftovers
 from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObjects, choose_objects
-from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
 from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
-from tactile_rt.sim_backend.datasets.sums import write_sums, written_sum
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import SweepSimulation
@@ -63,7 +63,7 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
     morphology = repr(heads if len(heads) > 1 else heads[0])
     # Said in full: a later release may know more categories.
     chosen = replace(recipe.objects, categories=objects.categories, withheld=objects.withheld)
-    of_meshes = () if recipe.objects.source == SHAPES else ("coacd",)
+    of_meshes = () if recipe.objects.source == SHAPES else ("manifold3d",)
     packages = ("mujoco", "numpy", "scipy", "trimesh", *of_meshes)
     return SweepManifest(
         spec=world_spec(animals),
@@ -107,7 +107,7 @@ def make_sweeps(
         TactileError: an object kills every process that tries to make it.
     """
     if engine not in ENGINES:
-        raise ConfigError(misnamed("engine", engine, ENGINES))
+        raise ConfigError(no_such("engine", engine, ENGINES))
     manifest = describe_set(recipe)
     names = manifest.names(splits)  # which refuses unknown ones before anything is written
     _refuse_strays(folder, manifest)
@@ -216,8 +216,8 @@ def fingerprint(target: TactileObject) -> str:
 def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> SweepRecord:
     """Make one sweep of a set, by itself.
 
-    A drawn sweep that misses the array or turns unstable is drawn again, up to 20 times; one of a
-    grid stays.
+    A drawn sweep that misses the array or turns unstable is drawn again, up to 20 times; one of
+    the combinations of given values stays.
 
     Args:
         recipe: the set.
@@ -236,7 +236,7 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
     spec = world_spec(ideal)
     draws = recipe.rng(target.name, index, RANDOMISATION)
     animals = tuple(recipe.randomisation.draw(draws, animal) for animal in ideal)
-    for _ in range(1 if recipe.sweeps.is_grid else DRAWS):
+    for _ in range(1 if recipe.sweeps.keeps_misses else DRAWS):
         sweep = recipe.sweeps.draw(rng, index)
         simulation = SweepSimulation(animals, target, sweep, profile)
         made = _with_lead(recipe, simulation) if simulation.touches else None

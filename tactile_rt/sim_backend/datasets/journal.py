@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.datasets.sums import SUMS
+from tactile_rt.sim_backend.datasets.inventory import SUMS
 from tactile_rt.sweep_set import MANIFEST, SKIPPED
 
 __all__ = ["Journal", "SweepRecord", "remove_leftovers"]
@@ -35,9 +35,9 @@ class SweepRecord:
     """One finished sweep.
 
     Attributes:
-        values: (sample, element, channel) SI.
-        parameters: what the sweep was, by name.
-        contacts: (sample, element) see `recording.Sweeps`; None when they are not kept.
+        values: The (sample, element, channel) loads of the sweep, SI.
+        parameters: The parameters that the sweep was made with, by name.
+        contacts: The (sample, element) contacts, see `Sweeps`; None when they are not kept.
     """
 
     values: NDArray[np.float32]
@@ -64,7 +64,7 @@ class Journal:
         name: the object.
 
     Attributes:
-        records: the finished sweeps, by index.
+        records: The finished sweeps of the object, by index.
     """
 
     def __init__(self, folder: Path, name: str) -> None:

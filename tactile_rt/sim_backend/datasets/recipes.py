@@ -25,22 +25,15 @@ one of the profiles cannot simulate, which are drawn again).
 
 import zlib
 from dataclasses import asdict, dataclass, fields
+from itertools import product
 from typing import Any
 
 import numpy as np
 
-from tactile_rt.sim_backend.datasets.recipe_choices import (
-    PARAMETERS,
-    SHAPES,
-    Between,
-    Choice,
-    Each,
-    ObjectChoice,
-    SweepChoice,
-)
-from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
+from tactile_rt.settings import no_such
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import SensorModel
+from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
 from tactile_rt.stream import ConfigError
 
@@ -55,9 +48,155 @@ __all__ = [
     "SweepRecipe",
 ]
 
+SHAPES = "shapes"
+MOST_OBJECTS = 100_000
+LARGEST = 1e4  # of any of the sweep's parameters: beyond it is a slip of the pen
+POSITIVE = ("size_mm", "speed_mm_s")  # of the sweep's parameters; a gap may also be 0
+LONGEST_MS = 600_000.0
+
+
+@dataclass(frozen=True)
+class Between:
+    """Drawn evenly from an interval, afresh for every sweep."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Each:
+    """Every one of these values, with every one of the other parameters'."""
+
+    values: tuple[float, ...]
+
+
+Choice = float | Between | Each
+
+
+@dataclass(frozen=True)
+class ObjectChoice:
+    """Which objects, and who is held out.
+
+    Attributes:
+        source: The origin of the objects: "shapes" (the parametric ones) or a folder of meshes.
+        categories: The names of the classes; empty: all that there are.
+        withheld: The categories of the extra split "withheld", which is for open-set tests: their
+            objects are in no other split. Empty: none, or `catalogue.WITHHELD` if `per_withheld`
+            asks for some.
+        per_category: The number of objects of every category; 0: all that the folder has.
+        validation, test: The numbers of objects of every category that are held out; below 1 a
+            fraction.
+        per_withheld: The number of objects of every withheld category; 0: 12, or all that the
+            folder has.
+    """
+
+    source: str = SHAPES
+    categories: tuple[str, ...] = ()
+    withheld: tuple[str, ...] = ()
+    per_category: int = 60
+    validation: float = 4
+    test: float = 12
+    per_withheld: int = 0
+
+    def check(self) -> None:
+        """Raise a ConfigError for values that cannot be."""
+        both = sorted(set(self.categories) & set(self.withheld))
+        if both:
+            raise ConfigError(f"objects.withheld: {both[0]!r} is also one of the categories")
+        whole = self.source == SHAPES
+        if self.per_withheld < 0:
+            raise ConfigError(f"objects.per_withheld must be 0 or more, not {self.per_withheld}")
+        for name in ("per_category", "validation", "test"):
+            value = getattr(self, name)
+            if not value <= MOST_OBJECTS:
+                raise ConfigError(f"objects.{name} must be at most {MOST_OBJECTS}, not {value:g}")
+            if value < 0 or (whole and value < 1) or (value >= 1 and value != int(value)):
+                kinds = "a whole number" if whole else "a whole number, or a fraction below 1"
+                raise ConfigError(f"objects.{name} must be {kinds}, at least 1, not {value:g}")
+
+
+@dataclass(frozen=True)
+class SweepChoice:
+    """How every object is swept: see `sweep.Sweep` for the parameters.
+
+    Attributes:
+        draws: The number of sweeps of every combination of the `Each` values.
+        held_out_draws: The number of further sweeps of each combination, marked by a `draw` of
+            `draws` and above.
+    """
+
+    size_mm: Choice = 40.0
+    speed_mm_s: Choice = 34.0
+    yaw_deg: Choice = 0.0
+    height_mm: Choice = -2.0
+    distance_mm: Choice = 6.5
+    gap_mm: Choice = 2.0
+    draws: int = 1
+    held_out_draws: int = 0
+
+    def check(self) -> None:
+        """Raise a ConfigError for values that cannot be."""
+        if self.draws < 1:
+            raise ConfigError(f"sweeps.draws must be at least 1, not {self.draws}")
+        if self.held_out_draws < 0:
+            raise ConfigError(f"sweeps.held_out_draws must be 0 or more, not {self.held_out_draws}")
+        for name in PARAMETERS:
+            choice = getattr(self, name)
+            if isinstance(choice, Between) and choice.low > choice.high:
+                raise ConfigError(
+                    f"sweeps.{name}: between has its lower end first, not {choice.low:g}, "
+                    f"{choice.high:g}"
+                )
+            ends = _ends(choice)
+            least = min(ends)
+            if (name in POSITIVE and least <= 0) or (name == "gap_mm" and least < 0):
+                bound = "0 or more" if name == "gap_mm" else "positive"
+                raise ConfigError(f"sweeps.{name} must be {bound}, not {least:g}")
+            for value in ends:
+                if not abs(value) <= LARGEST:
+                    raise ConfigError(f"sweeps.{name} must be within +-{LARGEST:g}, not {value:g}")
+
+    def combinations(self) -> list[dict[str, float]]:
+        """The `Each` values, in every combination; the last parameter varies fastest."""
+        each = {n: c.values for n in PARAMETERS if isinstance(c := getattr(self, n), Each)}
+        return [dict(zip(each, values, strict=True)) for values in product(*each.values())]
+
+    def __len__(self) -> int:
+        return len(self.combinations()) * (self.draws + self.held_out_draws)
+
+    @property
+    def keeps_misses(self) -> bool:
+        """Whether a sweep that misses the array stays: all combinations are to be there."""
+        return any(isinstance(getattr(self, n), Each) for n in PARAMETERS)
+
+    def draw_index(self, index: int) -> int:
+        """Which draw of its combination sweep `index` of an object is, from 0."""
+        return index % (self.draws + self.held_out_draws)
+
+    def draw(self, rng: np.random.Generator, index: int) -> Sweep:
+        """Draw the parameters of sweep `index`."""
+        values = self.combinations()[index // (self.draws + self.held_out_draws)]
+        for name in PARAMETERS:
+            choice = getattr(self, name)
+            if isinstance(choice, Between):
+                values[name] = float(rng.uniform(choice.low, choice.high))
+            elif not isinstance(choice, Each):
+                values[name] = float(choice)
+        return Sweep(**values)
+
+
+PARAMETERS = tuple(f.name for f in fields(SweepChoice) if not f.name.endswith("draws"))
+
+
+def _ends(choice: Choice) -> tuple[float, ...]:
+    """What may be drawn, or the ends of it."""
+    if isinstance(choice, Between):
+        return choice.low, choice.high
+    return choice.values if isinstance(choice, Each) else (choice,)
+
+
 OBJECTS, SWEEPS = ObjectChoice(), SweepChoice()
 PERFECT, UNVARIED = SensorModel(), Randomisation()
-LONGEST_MS = 600_000.0
 
 
 @dataclass(frozen=True)
@@ -65,19 +204,19 @@ class SweepRecipe:
     """How a sweep set is made.
 
     Attributes:
-        name: what the set is called.
-        array: which whiskers, see `whisker_array.load_animals`.
-        profile: simulation profile, see `array.PROFILES`.
-        seed: of the drawn parameters.
-        period_ms: of the stored samples, ms.
-        lead_ms: at rest, before the simulation starts, ms: enough for a tare.
-        length_ms: of one sweep, the lead included, ms.
-        contacts: store where along each whisker it touches, beside the loads.
-        objects: what is swept.
-        sweeps: how it is swept.
-        sensor: what the sensors make of the loads; perfect ones unless it says otherwise.
-        randomisation: how the array of each sweep differs from its description; not at all unless
-            it says so.
+        name: The name of the set.
+        array: The name or file of the array, see `files.load_animals`.
+        profile: The name of the simulation profile, one of `world.PROFILES`.
+        seed: The seed of the drawn parameters, 0 or more.
+        period_ms: The period of the stored samples, ms.
+        lead_ms: The time at rest before the simulation starts, ms: enough for a tare.
+        length_ms: The length of one sweep with its lead, ms.
+        contacts: Whether to store where along each whisker it touches, beside the loads.
+        objects: The choice of what is swept.
+        sweeps: The choice of how each object is swept.
+        sensor: What the sensors make of the loads; perfect ones unless it says otherwise.
+        randomisation: The way the array of each sweep differs from its description; not at all
+            unless it says so.
 
     Raises:
         ConfigError: values that cannot be, or contradict each other.
@@ -166,7 +305,7 @@ def _written(choice: Choice) -> Any:
 
 def _check_recipe(recipe: SweepRecipe) -> None:
     if recipe.profile not in PROFILES:
-        raise ConfigError(misnamed("profile", recipe.profile, tuple(PROFILES)))
+        raise ConfigError(no_such("profile", recipe.profile, tuple(PROFILES)))
     if recipe.seed < 0:
         raise ConfigError(f"seed must be 0 or more, not {recipe.seed}")
     if recipe.period_ms < SAMPLE_MS:

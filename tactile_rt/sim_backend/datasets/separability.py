@@ -3,16 +3,20 @@
 Chung et al. (2025) decode 2, 3 and 4 classes (cups, microwaves, chairs, trains) from the raw
 loads. Here the same is done for every set, by object: the machine is tested on objects that it
 never saw, or it would only have to recognise sweeps of a thing that it knows.
+
+The machine itself is handed in: `models.svm.fit`, the same that networks are compared with.
 """
 
 import itertools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Features", "Separability", "check_separability", "window_features"]
+__all__ = ["Features", "Fit", "Separability", "check_separability", "window_features"]
 
 STEPS, STEP_MS = 22, 45.0  # the window that the networks see
 CLIP = {"N": 5e-3, "N m": 5e-6}
@@ -28,14 +32,19 @@ PUBLISHED = (
     ("train", "truck", "car", "plane"),
 )
 
+# (sweep, feature) values, (sweep,) names and a penalty -> a machine: other values to their names.
+Fit = Callable[
+    [NDArray[np.float32], NDArray[Any], float], Callable[[NDArray[np.float32]], NDArray[Any]]
+]
+
 
 @dataclass(frozen=True)
 class Features:
     """What a machine sees of some sweeps.
 
     Attributes:
-        values: (sweep, feature).
-        categories: (sweep,) names.
+        values: The (sweep, feature) features, see `window_features`.
+        categories: The (sweep,) names of the categories.
     """
 
     values: NDArray[np.float32]
@@ -47,12 +56,12 @@ class Separability:
     """How well classes are told apart, on objects that were not trained on.
 
     Attributes:
-        classes: how many at a time.
-        subsets: how many choices of so many classes were tried.
-        accuracy: mean over these, each the mean over its classes; 0 to 1.
-        spread: standard deviation over these.
-        chance: what guessing gives.
-        of: the classes, where there was one choice.
+        classes: The number of classes at a time.
+        subsets: The number of choices of so many classes that were tried.
+        accuracy: The mean accuracy over these choices, each the mean over its classes; 0 to 1.
+        spread: The standard deviation of the accuracy over these choices.
+        chance: The accuracy that guessing gives; 0 to 1.
+        of: The names of the classes, where there was one choice.
     """
 
     classes: int
@@ -85,11 +94,12 @@ def window_features(
     return features.ravel()
 
 
-def check_separability(train: Features, test: Features) -> list[Separability]:
+def check_separability(train: Features, test: Features, fit: Fit) -> list[Separability]:
     """2, 3 and 4 classes: the published ones or what comes nearest, then any.
 
     Args:
         train, test: sweeps of different objects.
+        fit: fits a machine.
 
     Returns:
         Nothing for a number of classes that the set does not have.
@@ -105,7 +115,7 @@ def check_separability(train: Features, test: Features) -> list[Separability]:
             subsets = [tuple(pool[:n])]
         else:
             subsets = _subsets(rng, pool, n)
-        right = [_accuracy(train, test, classes) for classes in subsets]
+        right = [_accuracy(train, test, classes, fit) for classes in subsets]
         found.append(
             Separability(
                 n,
@@ -133,14 +143,12 @@ def _subsets(rng: np.random.Generator, known: list[str], n: int) -> list[tuple[s
     return list(drawn)
 
 
-def _accuracy(train: Features, test: Features, classes: tuple[str, ...]) -> float:
+def _accuracy(train: Features, test: Features, classes: tuple[str, ...], fit: Fit) -> float:
     """Mean over classes of the share of test sweeps that are decided rightly."""
-    from sklearn.svm import SVC
-
     chosen = np.concatenate([np.flatnonzero(train.categories == c)[:PER_CLASS] for c in classes])
-    machine = SVC(C=PENALTY).fit(train.values[chosen], train.categories[chosen])
+    predict = fit(train.values[chosen], train.categories[chosen], PENALTY)
     right = []
     for c in classes:
         sweeps = test.values[test.categories == c]
-        right.append(float((machine.predict(sweeps) == c).mean()))
+        right.append(float((predict(sweeps) == c).mean()))
     return float(np.mean(right))

@@ -32,11 +32,11 @@ class Deviation:
     """Distances between a mesh and the outside of pieces, in fractions of the largest extent.
 
     Attributes:
-        points: (n, 3) the mesh's, then those of the outside of the pieces.
-        gaps: (n,) how far each is from the other surface; large where the mesh has faces buried in
-            its own inside, too.
-        missed: the farthest that the mesh is from the outside of the pieces.
-        beyond: the farthest that the outside of the pieces is from the mesh.
+        points: The (n, 3) points measured at: the mesh's, then those of the outside of the pieces.
+        gaps: The (n,) distance of each point to the other surface; large where the mesh has faces
+            buried in its own inside, too.
+        missed: The farthest that the mesh is from the outside of the pieces.
+        beyond: The farthest that the outside of the pieces is from the mesh.
     """
 
     points: Floats
@@ -69,10 +69,10 @@ class TriangleSurface:
     """A surface to measure distances from.
 
     Attributes:
-        tiles: (n, 3, 3) corners.
-        middles: (n, 3) their centroids.
-        points: (m, 3) the middles, and the corners that the surface came with.
-        reach: the farthest that a point of a tile is from its middle.
+        tiles: The (n, 3, 3) corners of the tiles that the surface is cut into.
+        middles: The (n, 3) centroids of the tiles.
+        points: The (m, 3) middles, and the corners that the surface came with.
+        reach: The farthest that a point of a tile is from its tile's middle.
     """
 
     def __init__(self, triangles: Floats, size: float = TILE) -> None:

@@ -61,11 +61,14 @@ class MeshDetail:
     """How a mesh becomes convex pieces.
 
     Attributes:
-        max_error_mm: how far the pieces may be from the mesh, mm, ...
-        size_mm: ... when its largest extent is this, mm.
-        max_pieces: at most so many; where they do not suffice, the error is larger (and known).
-        hull: one piece only, the convex hull; its error is measured but not bounded.
-        broken: what becomes of a mesh that is not closed and cannot be safely: "refuse" it,
+        max_error_mm: The largest distance allowed between pieces and mesh, mm, at the size
+            `size_mm`.
+        size_mm: The largest extent of the mesh at which `max_error_mm` is meant, mm.
+        max_pieces: The largest number of pieces; where it does not suffice, the error is larger
+            (and known).
+        hull: Whether to take one piece only, the convex hull; its error is measured but not
+            bounded.
+        broken: What becomes of a mesh that is not closed and cannot be safely: "refuse" it,
             "remesh" it (a closed surface is drawn round its faces, 0.4 mm off at 40 mm, see
             `remeshing`, and cut with an error of about 1 mm), or take its convex "hull".
 

@@ -33,9 +33,10 @@ class SetReport:
     """What a folder's objects come to.
 
     Attributes:
-        made_by: how many objects became pieces in which way, see `meshes`.
-        surface_error: of every usable object by its name, in fractions of its largest extent.
-        skipped: why each of the others cannot be used.
+        made_by: The number of objects that became pieces in each way, see `meshes`.
+        surface_error: The surface error of every usable object, by its name, in fractions of its
+            largest extent.
+        skipped: The reason why each of the other objects cannot be used, by its name.
     """
 
     made_by: dict[str, int]
@@ -48,11 +49,11 @@ class ObjectSet:
     """The objects of a folder.
 
     Attributes:
-        folder: where they are.
-        paths: file of every object, by its name ``category/object``, in alphabetical order.
-        detail: how finely meshes are cut, and what becomes of those that are not closed.
-        y_up: whether the files are y-up; None: as their format has it.
-        skipped: names of objects found broken so far, and why each is.
+        folder: The folder that the objects are in.
+        paths: The file of every object, by its name ``category/object``, in alphabetical order.
+        detail: The fineness in which meshes are cut, and what becomes of those that are not closed.
+        y_up: Whether the files are y-up; None: as their format has it.
+        skipped: The names of objects found broken so far, and why each is.
     """
 
     folder: Path

@@ -23,9 +23,10 @@ class Pieces:
     """Convex pieces of a mesh, in the unit box, and how they came about.
 
     Attributes:
-        meshes: the pieces.
-        surface_error: see `TactileObject`.
-        made_by: see `TactileObject`.
+        meshes: The convex pieces themselves, closed and wound outward.
+        surface_error: The farthest that their surface is from the mesh's, in fractions of the
+            largest extent.
+        made_by: The way in which the mesh became pieces, one of those that `meshes` lists.
     """
 
     meshes: tuple[trimesh.Trimesh, ...]

@@ -1,6 +1,6 @@
 """Cameras: from where a simulation is seen.
 
-World frame as in `sweep.py`: x away from the head, y rostral, z up; mm. Azimuth and elevation are
+World frame as in `sweep`: x away from the head, y rostral, z up; mm. Azimuth and elevation are
 MuJoCo's: the direction of view is (cos e cos a, cos e sin a, sin e), so azimuth 0 looks along +x
 and a negative elevation looks down.
 """
@@ -31,11 +31,12 @@ class Camera:
     """A point of view. Both projections show the same height at the point looked at.
 
     Attributes:
-        azimuth, elevation: direction of view, degrees.
-        lookat: point in the middle of the picture, world, mm.
-        extent_mm: height of what the picture shows at that point, mm.
-        orthographic: no perspective: sizes are independent of depth, parallels stay parallel.
-        fovy_deg: vertical field of view in perspective, degrees; small is far away.
+        azimuth, elevation: The direction of view, degrees.
+        lookat: The point (x, y, z) in the middle of the picture, world, mm.
+        extent_mm: The height of what the picture shows at that point, mm.
+        orthographic: Whether there is no perspective: sizes are independent of depth, parallels
+            stay parallel.
+        fovy_deg: The vertical field of view in perspective, degrees; small is far away.
 
     Raises:
         ConfigError: nothing can be seen so.

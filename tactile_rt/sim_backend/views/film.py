@@ -1,4 +1,4 @@
-"""A recording, drawn: scene, map and traces in one picture a frame."""
+"""Footage, drawn: scene, map and traces in one picture for each moment."""
 
 from collections.abc import Iterator
 from types import TracebackType
@@ -19,7 +19,7 @@ __all__ = ["Film", "camera_of"]
 def camera_of(
     footage: Footage, view: str, orthographic: bool = False, aspect: float = 1.5
 ) -> Camera:
-    """The camera of a named view, on the whiskers as they are in the first frame.
+    """The camera of a named view, on the whiskers as they are in the first moment.
 
     Raises:
         ConfigError: no such view.
@@ -31,10 +31,10 @@ def camera_of(
 
 
 class Film:
-    """Complete pictures of a recording. A context manager.
+    """Complete pictures of footage. A context manager.
 
     Args:
-        footage: the recording.
+        footage: what to draw.
         view: a camera, or the name of a view.
         orthographic: of a named view.
         title: what is seen, one line.
@@ -63,9 +63,9 @@ class Film:
         self._sheet = Sheet(footage, view, scale, title, detail, pixels)
         self.size = self._sheet.size
 
-    def picture(self, frame: int) -> NDArray[np.uint8]:
-        """(height, width, 3) RGB picture of a frame."""
-        return self._sheet.frame(frame, self._stage.picture(frame))
+    def picture(self, moment: int) -> NDArray[np.uint8]:
+        """(height, width, 3) RGB picture of a moment of the footage."""
+        return self._sheet.picture(moment, self._stage.picture(moment))
 
     def __iter__(self) -> Iterator[NDArray[np.uint8]]:
         return map(self.picture, range(len(self.footage)))

@@ -22,7 +22,7 @@ _STATE = int(
 
 
 class Simulation(Protocol):
-    """What can be recorded, e.g. a `SweepSimulation`."""
+    """What `record` runs, e.g. a `SweepSimulation`."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
@@ -34,14 +34,14 @@ class Simulation(Protocol):
 
 @dataclass(frozen=True)
 class Footage:
-    """A recorded simulation.
+    """A simulation as it went, moment by moment.
 
     Attributes:
-        model: of the simulation.
-        spec: the array.
-        period_ms: between frames.
-        loads: (frame, element, 6) base loads, N and N m, each the mean over the period before.
-        states: (frame, n) places of everything at the end of each period.
+        model: The MuJoCo model of the simulation.
+        spec: The description of the array.
+        period_ms: The time between moments, ms.
+        loads: The (moment, element, 6) base loads, N and N m, each the mean over the period before.
+        states: The (moment, n) places of everything at the end of each period.
     """
 
     model: mujoco.MjModel
@@ -55,28 +55,28 @@ class Footage:
 
     @property
     def times_ms(self) -> NDArray[np.float64]:
-        """(frame,) end of each period, ms since the start."""
+        """(moment,) end of each period, ms since the start."""
         return self.period_ms * np.arange(1, len(self) + 1, dtype=np.float64)
 
     @property
     def forces(self) -> NDArray[np.float64]:
-        """(frame, element) size of the force on each base, N."""
+        """(moment, element) size of the force on each base, N."""
         size: NDArray[np.float64] = np.sqrt((self.loads[..., :3] ** 2).sum(axis=2))
         return size
 
     @property
     def strongest(self) -> int:
-        """The frame in which the forces add up to most; the middle one if there are none."""
+        """The moment in which the forces add up to most; the middle one if there are none."""
         total = self.forces.sum(axis=1)
         return int(total.argmax()) if total.any() else len(self) // 2
 
     def at(self, ms: float) -> int:
-        """The frame nearest to a time, ms since the start."""
+        """The moment nearest to a time, ms since the start."""
         return int(np.clip(round(ms / self.period_ms) - 1, 0, len(self) - 1))
 
-    def restore(self, frame: int, data: mujoco.MjData) -> None:
+    def restore(self, moment: int, data: mujoco.MjData) -> None:
         """Place everything in `data`, of this model or a copy of it, as it was."""
-        mujoco.mj_setState(self.model, data, self.states[frame], _STATE)
+        mujoco.mj_setState(self.model, data, self.states[moment], _STATE)
         mujoco.mj_kinematics(self.model, data)
 
 
@@ -96,15 +96,15 @@ def record(
         simulation: fresh or advanced; it goes on from where it is. All whiskers of the array
             must be in it: a `SweepSimulation` is to be made with `whole=True`.
         spec: its array.
-        period_ms: between frames, whole ms.
+        period_ms: between moments, whole ms.
         progress: called with the share that is done, 0 to 1.
     """
-    frames = max(1, int(np.ceil(simulation.duration_ms / period_ms)))
+    moments = max(1, int(np.ceil(simulation.duration_ms / period_ms)))
     samples = round(period_ms / SAMPLE_MS)
-    loads = np.empty((frames, len(spec.elements), 6))
-    states = np.empty((frames, mujoco.mj_stateSize(simulation.model, _STATE)))
-    for k in range(frames):
+    loads = np.empty((moments, len(spec.elements), 6))
+    states = np.empty((moments, mujoco.mj_stateSize(simulation.model, _STATE)))
+    for k in range(moments):
         loads[k] = simulation.advance(samples).mean(axis=0)
         mujoco.mj_getState(simulation.model, simulation.data, states[k], _STATE)
-        progress((k + 1) / frames)
+        progress((k + 1) / moments)
     return Footage(simulation.model, spec, samples * SAMPLE_MS, loads, states)

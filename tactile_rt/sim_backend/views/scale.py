@@ -14,7 +14,7 @@ _COLOURS = mpl.colormaps["plasma_r"]
 _UNTOUCHED: RGBA = (0.62, 0.62, 0.62, 1.0)
 _FELT = 0.01  # of the top: less is drawn as untouched
 _LONGEST = 1.5  # arrows grow no longer than this, so that a snap does not cross the picture
-_HEARD_OF = 98.0  # percentile of the frames' strongest forces that gets the top colour
+_HEARD_OF = 98.0  # percentile of the moments' strongest forces that gets the top colour
 
 
 def round_number(value: float) -> float:
@@ -30,8 +30,8 @@ class ForceScale:
     """Colours and arrow lengths of forces.
 
     Attributes:
-        top_mn: force that gets the strongest colour, mN.
-        arrow_mm: length of that force's arrow, mm in the world.
+        top_mn: The force that gets the strongest colour, mN.
+        arrow_mm: The length of that force's arrow, mm in the world.
     """
 
     top_mn: float
@@ -39,7 +39,7 @@ class ForceScale:
 
     @classmethod
     def fitting(cls, forces: NDArray[np.float64], extent_mm: float) -> "ForceScale":
-        """For forces (frame, element) in N, in a picture that shows extent_mm of height."""
+        """For forces (moment, element) in N, in a picture that shows extent_mm of height."""
         strongest = 1e3 * forces.max(axis=1)
         touched = strongest[strongest > 0.02 * strongest.max()]
         top = float(np.percentile(touched, _HEARD_OF)) if len(touched) else 0.0

@@ -1,34 +1,49 @@
-"""The whole picture: the scene, the map of forces beside it, their traces below."""
+"""The whole picture: the scene, the array as a map of forces beside it, their traces below."""
+
+from typing import Any
 
 import mujoco
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.artist import Artist
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch
+from matplotlib.patches import FancyArrowPatch, Rectangle
+from matplotlib.text import Text
 from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.views.camera import Camera
 from tactile_rt.sim_backend.views.footage import Footage
-from tactile_rt.sim_backend.views.panels import (
-    INK,
-    QUIET,
-    ForceMap,
-    draw_scale,
-    draw_traces,
-    rostral_sign,
-)
 from tactile_rt.sim_backend.views.scale import ForceScale
+from tactile_rt.stream import ArraySpec
 
-__all__ = ["Sheet"]
+__all__ = [
+    "INK",
+    "QUIET",
+    "ForceMap",
+    "Sheet",
+    "draw_scale",
+    "draw_traces",
+    "rostral_sign",
+    "scene_size",
+]
+
+Place = tuple[float, float, float, float]  # left, bottom, width, height in fractions
 
 WIDE, TALL = 12.8, 7.2  # inches: 16 : 9
-SCENE = (0.0, 0.265, 0.62, 0.62)  # left, bottom, width, height in fractions
-MAP = (0.635, 0.4, 0.35, 0.425)
+SCENE: Place = (0.0, 0.265, 0.62, 0.62)
+MAP: Place = (0.635, 0.4, 0.35, 0.425)
+INK, QUIET, EMPTY = "#222222", "#6b6b6b", "#f2f2f2"
+REACH = 0.36  # of a cell: half the longest arrow in it
+HARDLY = 0.15  # of a force, along the cheek: less has no direction worth drawing
+NAMED = 6  # strongest traces that get a colour and a name
 
 
 class Sheet:
-    """Pictures of a recorded simulation, one a frame. What stays is drawn once.
+    """Pictures of footage, one for each moment. What stays is drawn once.
 
     Args:
         footage: what to draw.
@@ -39,8 +54,8 @@ class Sheet:
         pixels: width of the pictures; their height is 9/16 of it.
 
     Attributes:
-        size: (width, height) of the pictures, both even.
-        scene_size: (width, height) of the scene in them.
+        size: The (width, height) of the pictures in pixels, both even.
+        scene_size: The (width, height) in pixels of the scene in the pictures.
     """
 
     def __init__(
@@ -53,7 +68,7 @@ class Sheet:
         pixels: int = 1280,
     ) -> None:
         self._footage = footage
-        self.size = scaled_size(pixels)
+        self.size = _scaled_size(pixels)
         self.scene_size = scene_size(pixels)
         dpi = self.size[0] / WIDE
         figure = Figure(figsize=(WIDE, self.size[1] / dpi), dpi=dpi)
@@ -90,16 +105,16 @@ class Sheet:
         self._still = self._canvas.copy_from_bbox(figure.bbox)
         self._figure = figure
 
-    def frame(self, frame: int, scene: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture of one frame: (height, width, 3) RGB.
+    def picture(self, moment: int, scene: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The picture of one moment: (height, width, 3) RGB.
 
         Args:
-            frame: of the footage.
+            moment: which of the footage.
             scene: its (height, width, 3) picture of `scene_size`.
         """
-        time = float(self._footage.times_ms[frame])
+        time = float(self._footage.times_ms[moment])
         self._scene.set_data(scene)
-        cells = self._map.show(self._footage.loads[frame])
+        cells = self._map.show(self._footage.loads[moment])
         self._cursor.set_xdata([time, time])
         self._clock.set_text(f"t = {time:5.0f} ms")
         self._canvas.restore_region(self._still)
@@ -109,7 +124,7 @@ class Sheet:
         return pixels
 
 
-def scaled_size(pixels: int) -> tuple[int, int]:
+def _scaled_size(pixels: int) -> tuple[int, int]:
     """(width, height) of a sheet about so many pixels wide: even, as video formats want them."""
     width = 2 * round(pixels / 2)
     return width, 2 * round(width * TALL / WIDE / 2)
@@ -117,7 +132,7 @@ def scaled_size(pixels: int) -> tuple[int, int]:
 
 def scene_size(pixels: int) -> tuple[int, int]:
     """(width, height) of the scene in a sheet so many pixels wide."""
-    width, height = scaled_size(pixels)
+    width, height = _scaled_size(pixels)
     return round(SCENE[2] * width), round(SCENE[3] * height)
 
 
@@ -153,3 +168,164 @@ def _mirrored(footage: Footage, camera: Camera) -> bool:
     if len(set(signs.tolist())) > 1:  # a face: its right side on the left when seen from ahead
         return bool(lateral > 0.5)
     return bool(signs[0] * rostral < -0.5)
+
+
+class ForceMap:
+    """The array on its grid: each cell in the colour of |F|, with its direction on the head.
+
+    The arrow in a cell is the part of the force along the cheek: rostral (y of the mount frame)
+    and dorsal (z); it is long where all of the force is in that plane.
+
+    Args:
+        figure: to draw in.
+        place: in it: left, bottom, width, height, fractions.
+        spec: the array.
+        scale: of the colours.
+        mirrored: whether column 0 is on the right, as in a picture with the nose on the left.
+    """
+
+    def __init__(
+        self,
+        figure: Figure,
+        place: Place,
+        spec: ArraySpec,
+        scale: ForceScale,
+        mirrored: bool = False,
+    ) -> None:
+        self._scale = scale
+        self._rostral = rostral_sign(spec)
+        self._flip = -1.0 if mirrored else 1.0
+        self._turns = np.empty((len(spec.elements), 3, 3))
+        for turn, quaternion in zip(self._turns, spec.orientations, strict=True):
+            mujoco.mju_quat2Mat(turn.ravel(), np.array(quaternion))
+        rows, columns = spec.grid_shape
+        x = [columns - 1 - column if mirrored else column for _, column in spec.grid]
+        self._centres = np.array([(c, row) for c, (row, _) in zip(x, spec.grid, strict=True)])
+        self._cells: list[Rectangle] = []
+        self._arrows: list[FancyArrowPatch] = []
+        self._labels: list[Text] = []
+        axes, page = figure.add_axes(place), figure.get_size_inches()
+        cell_pt = 72 * float(min(page[0] * place[2] / columns, page[1] * place[3] / rows))
+        small = float(np.clip(0.18 * cell_pt, 5.5, 8))
+        for (cx, cy), name in zip(self._centres, spec.elements, strict=True):
+            cell = Rectangle((cx - 0.47, cy - 0.47), 0.94, 0.94, facecolor=EMPTY)
+            arrow = FancyArrowPatch(
+                (cx, cy),
+                (cx, cy),
+                arrowstyle="-|>",
+                mutation_scale=0.2 * cell_pt,
+                lw=0.035 * cell_pt,
+            )
+            arrow.set_visible(False)
+            label = axes.text(cx - 0.41, cy - 0.42, name, va="top", fontsize=small, color="0.6")
+            axes.add_patch(cell)
+            axes.add_patch(arrow)
+            self._cells.append(cell)
+            self._arrows.append(arrow)
+            self._labels.append(label)
+        if len(set(self._rostral.tolist())) == 1:
+            nose = "nose →" if self._flip * self._rostral[0] > 0 else "← nose"
+        else:  # both sides of a face
+            nose = "left      nose      right" if mirrored else "right      nose      left"
+        axes.text((columns - 1) / 2, rows - 0.1, nose, ha="center", fontsize=10, color=QUIET)
+        axes.set_xlim(-0.6, columns - 0.4)
+        axes.set_ylim(rows - 0.1, -0.6)
+        axes.set_aspect("equal", anchor="N")
+        axes.axis("off")
+
+    def show(self, loads: NDArray[np.float64]) -> list[Artist]:
+        """Set the forces: loads (element, 6), N and N m, in the element frames.
+
+        Returns:
+            What differs from the map of an untouched array, in the order to draw it.
+        """
+        forces = 1e3 * np.einsum("eij,ej->ei", self._turns, loads[:, :3])
+        changed: list[Artist] = []
+        for i, (force, (cx, cy)) in enumerate(zip(forces, self._centres, strict=True)):
+            size = float(np.linalg.norm(force))
+            felt = self._scale.felt(size)
+            cell, arrow, label = self._cells[i], self._arrows[i], self._labels[i]
+            ink = "white" if size > 0.5 * self._scale.top_mn else INK
+            cell.set_facecolor(self._scale.colour(size) if felt else EMPTY)
+            label.set_color(ink if felt else "0.6")
+            rightward, downward = self._flip * self._rostral[i] * force[1], -force[2]
+            along = np.array([rightward, downward]) / max(size, 1e-12)
+            arrow.set_visible(felt and float(np.linalg.norm(along)) > HARDLY)
+            arrow.set_color(ink)
+            dx, dy = (REACH * along).tolist()
+            arrow.set_positions((cx - dx, cy + 0.08 - dy), (cx + dx, cy + 0.08 + dy))
+            if felt:
+                changed += [cell, arrow, label]
+        return changed
+
+
+def rostral_sign(spec: ArraySpec) -> NDArray[np.float64]:
+    """(element,) 1 where columns go rostral, -1 where they go caudal, as on the left of a face."""
+    place = np.array(spec.positions)
+    columns = np.array([column for _, column in spec.grid], dtype=np.float64)
+    signs = np.ones(len(columns))
+    for side in (place[:, 0] >= 0, place[:, 0] < 0):
+        if side.any():
+            y, c = place[side, 1], columns[side]
+            signs[side] = 1.0 if (y - y.mean()) @ (c - c.mean()) >= 0 else -1.0
+    return signs
+
+
+def draw_scale(figure: Figure, place: Place, scale: ForceScale) -> None:
+    """A horizontal colour bar of the forces in these figure fractions."""
+    steps = np.linspace(0.02 * scale.top_mn, scale.top_mn, 64)
+    colours = ListedColormap([scale.colour(f) for f in steps])
+    bar = figure.colorbar(
+        ScalarMappable(Normalize(0, scale.top_mn), colours),
+        cax=figure.add_axes(place),
+        orientation="horizontal",
+        extend="max",
+    )
+    bar.set_ticks([0, scale.top_mn / 2, scale.top_mn])
+    bar.set_ticklabels(["0", f"{scale.top_mn / 2:g}", f"{scale.top_mn:g} mN"])
+    bar.outline.set_visible(False)
+    bar.ax.tick_params(labelsize=9.5, length=0, colors=QUIET)
+
+
+def draw_traces(
+    axes: Axes, times_ms: NDArray[np.float64], forces: NDArray[np.float64], names: tuple[str, ...]
+) -> None:
+    """Forces (sample, element) in mN over time; the strongest in colour and by name."""
+    peaks = forces.max(axis=0)
+    top = max(float(peaks.max()), 1e-6)
+    wide = float(times_ms[-1])
+    taken: list[tuple[float, float]] = []
+    for rank, i in enumerate(np.argsort(-peaks)):
+        if peaks[i] < 0.01 * top:
+            break
+        named = rank < NAMED
+        hue = colormaps["tab10"](rank) if named else (0.75, 0.75, 0.75, 1.0)
+        axes.plot(
+            times_ms, forces[:, i], color=hue, lw=1.5 if named else 0.7, zorder=2 - rank / 100
+        )
+        if named:
+            x, y = _free_place(times_ms, forces[:, i], taken, 0.03 * wide, 0.14 * top)
+            taken.append((x, y))
+            box = {"facecolor": "white", "edgecolor": "none", "pad": 0.4, "alpha": 0.8}
+            style: dict[str, Any] = {"ha": "center", "va": "bottom", "weight": "bold"}
+            axes.text(x, y, names[i], color=hue, fontsize=9, bbox=box, zorder=3, **style)
+    axes.set_xlim(0, wide)
+    axes.set_ylim(0, max([y for _, y in taken], default=top) + 0.2 * top)
+    axes.set_xlabel("time (ms)", color=INK)
+    axes.set_ylabel("force on base (mN)", color=INK)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=9.5)
+
+
+def _free_place(
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    taken: list[tuple[float, float]],
+    width: float,
+    height: float,
+) -> tuple[float, float]:
+    """The highest point of a curve with room for a label: this far from all that are there."""
+    for k in np.argsort(-y):
+        if not any(abs(x[k] - a) < width and abs(y[k] - b) < height for a, b in taken):
+            return float(x[k]), float(y[k])
+    return float(x[y.argmax()]), float(y.max())

@@ -34,8 +34,9 @@ class Dressed:
     """A copy of a simulation's model, and a state of it, made fit to be seen.
 
     Attributes:
-        model, data: the copies.
-        links: per element, its geoms from base to tip.
+        model, data: The copies of the simulation's model and of a state.
+        links: The geoms of each element from base to tip, by number.
+        sites: The site at each element's base, by number, in the order of the elements.
     """
 
     def __init__(self, model: mujoco.MjModel, spec: ArraySpec) -> None:
@@ -80,10 +81,10 @@ class Dressed:
         """Show everything that is not a whisker so far: 0 not at all, 1 fully."""
         self.model.geom_rgba[self._others, 3] = opacity
 
-    def pose(self, footage: Footage, frame: int, scale: ForceScale) -> None:
+    def pose(self, footage: Footage, moment: int, scale: ForceScale) -> None:
         """Place everything as it was, each whisker in the colour of its force."""
-        footage.restore(frame, self.data)
-        for geoms, force in zip(self.links, 1e3 * footage.forces[frame], strict=True):
+        footage.restore(moment, self.data)
+        for geoms, force in zip(self.links, 1e3 * footage.forces[moment], strict=True):
             self.model.geom_rgba[geoms] = scale.colour(force)
 
 
@@ -140,7 +141,7 @@ def _add(
 
 
 class Stage:
-    """Pictures of recorded states, drawn offscreen. A context manager.
+    """Pictures of the states in footage, drawn offscreen. A context manager.
 
     Args:
         footage: what to draw.
@@ -169,10 +170,10 @@ class Stage:
         self._gl, self._painter = _painter(model, *self._size)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN.value, self._painter)
 
-    def picture(self, frame: int) -> NDArray[np.uint8]:
-        """(height, width, 3) RGB picture of a frame."""
-        self.dressed.pose(self.footage, frame, self.scale)
-        loads = self.footage.loads[frame]
+    def picture(self, moment: int) -> NDArray[np.uint8]:
+        """(height, width, 3) RGB picture of a moment."""
+        self.dressed.pose(self.footage, moment, self.scale)
+        loads = self.footage.loads[moment]
         whole, bare = (self._draw(loads, opacity) for opacity in (1.0, 0.0))
         # What hides whiskers is drawn as glass: as one body, not as the pieces it is made of.
         return np.asarray(Image.blend(whole, bare, GHOST).reduce(FINE))

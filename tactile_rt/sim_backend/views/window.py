@@ -1,4 +1,4 @@
-"""A recorded simulation in MuJoCo's interactive viewer: turn it, zoom, stop the time."""
+"""Footage in MuJoCo's interactive viewer: turn it, zoom, stop the time."""
 
 import time
 import warnings
@@ -41,7 +41,7 @@ def check_display() -> None:
 
 
 def show(footage: Footage, camera: Camera, scale: ForceScale, slow: float = 10.0) -> None:
-    """Play a recording over and over in a window, until it is closed.
+    """Play footage over and over in a window, until it is closed.
 
     The space bar stops and starts the time, the arrow keys step it; the mouse turns, moves and
     zooms. It plays `slow` times slower than it was.
@@ -69,11 +69,11 @@ def show(footage: Footage, camera: Camera, scale: ForceScale, slow: float = 10.0
         with window.lock():
             camera.aim(dressed.model, window.cam)
         while window.is_running():
-            frame = player.frame(time.monotonic())
+            moment = player.moment(time.monotonic())
             with window.lock():
-                dressed.pose(footage, frame, scale)
+                dressed.pose(footage, moment, scale)
                 window.user_scn.ngeom = 0
-                loads = footage.loads[frame]
+                loads = footage.loads[moment]
                 add_forces(window.user_scn, dressed, loads, scale, camera.extent_mm)
                 add_paper(window.user_scn, camera)
             window.set_texts(
@@ -81,7 +81,7 @@ def show(footage: Footage, camera: Camera, scale: ForceScale, slow: float = 10.0
                     None,
                     mujoco.mjtGridPos.mjGRID_TOPLEFT,
                     "time\narrows\nspace, arrow keys",
-                    f"{footage.times_ms[frame]:.0f} ms\n"
+                    f"{footage.times_ms[moment]:.0f} ms\n"
                     f"{scale.arrow_mm:g} mm: {scale.top_mn:g} mN\n"
                     "stop and go, step",
                 )
@@ -91,18 +91,18 @@ def show(footage: Footage, camera: Camera, scale: ForceScale, slow: float = 10.0
 
 
 class _Player:
-    """Which frame is due: it runs, stops and steps."""
+    """Which moment is due: it runs, stops and steps."""
 
-    def __init__(self, frames: int, period_s: float) -> None:
-        self._frames, self._period = frames, period_s
+    def __init__(self, moments: int, period_s: float) -> None:
+        self._moments, self._period = moments, period_s
         self._at, self._since, self._running = 0.0, 0.0, True
 
-    def frame(self, now_s: float) -> int:
-        """The frame to show; called often."""
+    def moment(self, now_s: float) -> int:
+        """The moment to show; called often."""
         if self._running and self._since:
             self._at += (now_s - self._since) / self._period
         self._since = now_s
-        return int(self._at) % self._frames
+        return int(self._at) % self._moments
 
     def key(self, code: int) -> None:
         """A key was pressed."""

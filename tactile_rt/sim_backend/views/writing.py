@@ -45,27 +45,27 @@ def write_image(path: Path, pixels: Pixels) -> None:
         Image.fromarray(pixels).save(partial, optimize=True)
 
 
-def write_video(path: Path, frames: Iterable[Pixels], fps: int, sample: Pixels) -> None:
+def write_video(path: Path, pictures: Iterable[Pixels], fps: int, sample: Pixels) -> None:
     """Write pictures (height, width, 3) RGB, all of one even size, as .mp4 (H.264) or .gif.
 
     Args:
         path: the file.
-        frames: the pictures.
+        pictures: in their order.
         fps: pictures a second. A GIF counts time in 10 ms: 25, 20 and 10 are exact.
         sample: one that has the colours of them all; a GIF, which loops, gets its palette from it.
     """
     with _whole(path) as partial:
         if path.suffix.lower() == ".gif":
-            _write_gif(partial, frames, fps, sample)
+            _write_gif(partial, pictures, fps, sample)
         else:
-            _write_mp4(partial, frames, fps)
+            _write_mp4(partial, pictures, fps)
 
 
-def _write_mp4(path: Path, frames: Iterable[Pixels], fps: int) -> None:
+def _write_mp4(path: Path, pictures: Iterable[Pixels], fps: int) -> None:
     with av.open(str(path), "w", options={"movflags": "+faststart"}) as file:
         stream = file.add_stream("libx264", rate=fps, options={"crf": QUALITY})
         stream.pix_fmt = "yuv420p"  # what every player plays
-        for k, pixels in enumerate(frames):
+        for k, pixels in enumerate(pictures):
             if k == 0:
                 stream.height, stream.width = pixels.shape[:2]
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
@@ -73,14 +73,14 @@ def _write_mp4(path: Path, frames: Iterable[Pixels], fps: int) -> None:
         file.mux(stream.encode())
 
 
-def _write_gif(path: Path, frames: Iterable[Pixels], fps: int, sample: Pixels) -> None:
+def _write_gif(path: Path, pictures: Iterable[Pixels], fps: int, sample: Pixels) -> None:
     palette = Image.fromarray(sample).quantize(COLOURS)
     colours = np.array(palette.getpalette()).reshape(-1, 3)
     colours[(colours > PAPER).all(axis=1)] = 255  # paper is white, not nearly so
     palette.putpalette(colours.ravel().tolist())
-    # No dithering: its noise differs from frame to frame and does not pack.
+    # No dithering: its noise differs from picture to picture and does not pack.
     indexed = (
-        Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in frames
+        Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures
     )
     first = next(indexed)
     first.save(path, save_all=True, append_images=indexed, duration=round(1000 / fps), loop=0)

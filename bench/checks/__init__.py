@@ -1,0 +1,1 @@
+"""Programs that ask one question and fail if the answer is no."""

@@ -1,0 +1,284 @@
+"""The emulated arrays of all rigs: they speak the native protocol, and every write is timed.
+
+`EmulatedArray` is one in this process. `play` is one in a process of its own, so that what it
+costs is not on the bill of what is measured; it is told what to do through a pipe.
+"""
+
+import itertools
+import time
+from array import array
+from dataclasses import dataclass, field, replace
+from multiprocessing.connection import Connection
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.drivers.emulation.device import EmulatedDevice
+from tactile_rt.drivers.emulation.endpoints import SerialEndpoint, SlcanEndpoint
+from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
+from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
+
+__all__ = [
+    "ArrayScript",
+    "EmulatedArray",
+    "LoopedSource",
+    "Played",
+    "bumps",
+    "fault_beat",
+    "noise",
+    "play",
+]
+
+# What a device's own buffer loses beside a restart of its counter nobody could count: while a busy
+# machine keeps the host waiting, nothing shall be lost here.
+FIFO_BYTES = 64 << 20
+LOOP_S = 6.0  # of bumps, that come again and again: four of them
+QUIET_AT_S = 0.6  # in it: a model first measures what it feels untouched
+PIECE_S = 0.064
+# Each strikes within a moment, so that what is undisturbed is known; none beside another.
+KINDS = (
+    Fault("bit_flip", at_s=1.0, amount=3),
+    Fault("drop", at_s=1.0, amount=4),
+    Fault("unplug", at_s=1.0, duration_s=0.3),
+    Fault("duplicate", at_s=1.0, amount=2),
+    Fault("stall", at_s=1.0, duration_s=0.05),
+    Fault("truncate", at_s=1.0, amount=40),
+    Fault("burst", at_s=1.0, amount=30),
+    Fault("clock_drift", at_s=1.0, amount=150, duration_s=1.0),
+    Fault("clock_jump", at_s=1.0, amount=0.5),
+    Fault("sequence_reset", at_s=1.0),
+)
+
+
+@dataclass(frozen=True)
+class ArrayScript:
+    """An emulated array that speaks the native protocol, and what happens to it.
+
+    Attributes:
+        wire: The line that the array is on: ``serial``, or ``slcan`` for a CAN bus behind slcan.
+        spec: The description of the array, with its rate.
+        samples: Number of samples that the array measures before it falls silent.
+        link: A path that stays the port's name when the array is plugged in again; None: none.
+        signal: What the array feels: ``bumps`` that go by, or ``noise``.
+        pace: The pace of the samples: ``realtime``, or as ``fast`` as the host takes them.
+        faults: The faults that strike the array's line.
+        seed: The seed of the noise and of the faults' times.
+        options: Options of the native codec, as in a URL.
+    """
+
+    wire: str
+    spec: ArraySpec
+    samples: int
+    link: str | None = None
+    signal: str = "bumps"
+    pace: str = "realtime"
+    faults: tuple[Fault, ...] = ()
+    seed: int = 0
+    options: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Played:
+    """What an array did.
+
+    Attributes:
+        fate: (n,) `Fate` of each sample.
+        at_ns: (n,) host time at which each sample was first handed to the line, ns; 0: never whole.
+        duplicated: Copies that were sent beyond one packet per sample.
+        faults: Kind, second of the stream and duration in s of each fault that is due at a time.
+    """
+
+    fate: NDArray[np.uint8]
+    at_ns: NDArray[np.int64]
+    duplicated: int
+    faults: tuple[tuple[str, float, float], ...]
+
+
+def fault_beat(wire: str, seconds: float, first_s: float, every_s: float) -> tuple[Fault, ...]:
+    """One fault after the other, all kinds in turn; the last three seconds are undisturbed."""
+    kinds = list(KINDS)
+    if wire == "slcan":  # of frames, not of bytes
+        kinds = [replace(f, amount=1) if f.kind == "truncate" else f for f in KINDS]
+        kinds.append(Fault("can_error", at_s=1.0))
+    times = np.arange(first_s, seconds - 3.0, every_s).tolist()
+    return tuple(
+        replace(kind, at_s=at_s) for at_s, kind in zip(times, itertools.cycle(kinds), strict=False)
+    )
+
+
+def bumps(script: ArrayScript) -> NDArray[np.float32]:
+    """(n, element, channel) some seconds of what a synthetic array feels, quiet at first."""
+    elements, channels = script.spec.shape
+    options = SyntheticOptions(script.spec.rate_hz, LOOP_S, pace="fast")
+    made = SyntheticSource(f"{elements}x{channels}", options)
+    loop = np.concatenate([chunk.values for chunk in made])
+    return np.roll(loop, -round(QUIET_AT_S * script.spec.rate_hz), axis=0)
+
+
+def noise(script: ArrayScript) -> NDArray[np.float32]:
+    """(n, element, channel) other values in every sample, the same in every process."""
+    draw = np.random.default_rng(script.seed)
+    sizes = np.array([1e-2 if unit == "N" else 1e-4 for unit in script.spec.units])
+    values = draw.normal(size=(script.samples, *script.spec.shape)) * sizes
+    as_sent: NDArray[np.float32] = values.astype(np.float32)
+    return as_sent
+
+
+SIGNALS = {"bumps": bumps, "noise": noise}
+
+
+class LoopedSource(Source):
+    """A signal that comes again and again until so many samples are delivered; not live.
+
+    Args:
+        spec: What the samples are.
+        signal: (n, element, channel) SI.
+        samples: Number of samples that there are; None: one round of the signal.
+    """
+
+    live = False
+
+    def __init__(
+        self, spec: ArraySpec, signal: NDArray[np.float32], samples: int | None = None
+    ) -> None:
+        super().__init__(spec)
+        self._loop = signal.astype(np.float32, copy=False)
+        self._left = len(signal) if samples is None else samples
+        self._sent = 0
+        self._piece = max(1, round(PIECE_S * spec.rate_hz))
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        n = min(self._piece, self._left)
+        if n == 0:
+            raise EndOfStream
+        seq = self._sent + np.arange(n, dtype=np.int64)
+        self._sent, self._left = self._sent + n, self._left - n
+        t_ns = np.round(seq * (NS_PER_S / self.spec.rate_hz)).astype(np.int64)
+        values = self._loop[seq % len(self._loop)]
+        return Chunk(seq, t_ns, values, np.ones(values.shape[:2], np.bool_))
+
+    def close(self) -> None:
+        self._left = 0
+
+
+class _Bytes(bytes):
+    """A sample's packet that knows which one it is."""
+
+    nth: int
+
+
+class _Frames(list[Any]):
+    """The same on CAN."""
+
+    nth: int
+
+
+class _Timed:
+    """An endpoint that writes down when each sample is first handed to it."""
+
+    at_ns: "array[int]"
+
+    def send(self, packet: Any, answer: bool = False) -> bool:
+        nth = getattr(packet, "nth", -1)  # what was damaged has lost it
+        if nth >= 0 and not self.at_ns[nth]:
+            self.at_ns[nth] = time.monotonic_ns()
+        sent: bool = super().send(packet, answer)  # type: ignore[misc]
+        return sent
+
+
+class _TimedSerial(_Timed, SerialEndpoint):
+    pass
+
+
+class _TimedSlcan(_Timed, SlcanEndpoint):
+    pass
+
+
+class EmulatedArray(EmulatedDevice):
+    """An array as its script says; a context manager, plugged in while entered.
+
+    Args:
+        script: What the array is and what happens to it.
+        signal: (n, element, channel) SI, in place of the script's signal.
+    """
+
+    def __init__(self, script: ArrayScript, signal: NDArray[np.float32] | None = None) -> None:
+        serial = script.wire == "serial"
+        self.wire = "serial" if serial else "can"  # type: ignore[misc]
+        self._script = script
+        self._endpoint = (_TimedSerial if serial else _TimedSlcan)(
+            script.link, fifo_bytes=FIFO_BYTES
+        )
+        self._endpoint.at_ns = array("q", bytes(8 * script.samples))
+        felt = SIGNALS[script.signal](script) if signal is None else signal
+        self._source = LoopedSource(script.spec, felt, script.samples)
+        faults = FaultSchedule(script.faults, script.seed) if script.faults else None
+        super().__init__(
+            self._source, "native", self._endpoint, options=script.options, faults=faults,
+            pace=script.pace,
+        )  # fmt: skip
+        encode, counter = self.codec.encode, itertools.count()
+
+        def numbered(chunk: Chunk) -> list[Any]:
+            packets = []
+            for packet in encode(chunk):
+                known = (_Bytes if isinstance(packet, bytes) else _Frames)(packet)
+                known.nth = next(counter)
+                packets.append(known)
+            return packets
+
+        self.codec.encode = numbered  # type: ignore[method-assign]
+
+    def end(self) -> None:
+        """Measure nothing more; what is measured still goes out."""
+        self._source.close()
+
+    def where(self) -> str:
+        """How far the array has come, in words."""
+        return (
+            f"{self.emulator.log.sent} of {self._script.samples} measured, "
+            f"{self._endpoint.backlog} bytes not sent, "
+            f"{'heard' if self._endpoint.heard else 'unheard'}"
+        )
+
+    def played(self) -> Played:
+        """What the array has done so far."""
+        log = self.emulator.log
+        fate = log.fate
+        at_ns = np.array(self._endpoint.at_ns, np.int64)[: len(fate)]
+        due = [f for f in self._script.faults if f.at_s is not None]
+        struck = tuple((f.kind, float(f.at_s or 0.0), f.duration_s) for f in due)
+        return Played(fate, at_ns, log.duplicated, struck)
+
+
+def play(pipe: Connection, script: ArrayScript) -> None:
+    """Be an array in a process of its own, for `Helper`: say the URL, then obey until it hangs up.
+
+    The words: ``unplug`` (say when it began), ``replug`` (say when it was done), ``end`` (of what
+    is measured; say when), ``done`` (say whether), ``where`` (in words), ``played`` (a `Played`).
+    """
+    with EmulatedArray(script) as device:
+        pipe.send(device.url)
+        while True:
+            try:
+                word = pipe.recv()
+            except EOFError:
+                return
+            began = time.monotonic_ns()
+            answer: Any = began
+            if word == "unplug":
+                device.unplug()
+            elif word == "replug":
+                device.replug()
+                answer = time.monotonic_ns()
+            elif word == "end":
+                device.end()
+            elif word == "done":
+                answer = device.emulator.done
+            elif word == "where":
+                answer = device.where()
+            else:
+                answer = device.played()
+            pipe.send(answer)

@@ -1,0 +1,1 @@
+"""Scripts that redraw the pictures and tables of `docs/`."""

@@ -1,0 +1,108 @@
+"""ONNX Runtime as this package uses it: where a network computes, and in which floating-point mode.
+
+Two things are told honestly here rather than left to ONNX Runtime. A provider that is asked for
+and not there is an error that names what to install, not a silent fall back to the CPU. And
+denormal numbers count as zero while a network runs, and only then: a decaying state ends in
+denormals, which cost a hundred times an ordinary number.
+
+ONNX Runtime's own option for the latter (``session.set_denormal_as_zero``) changes the thread that
+opens the process's first session for ever, numpy in it included, and without helper threads does
+nothing in any later session. So the floating-point mode of the running thread is set here, and put
+back afterwards.
+"""
+
+import ctypes
+import platform
+import sys
+from collections.abc import Sequence
+
+import onnxruntime as ort
+
+from tactile_rt.stream import ConfigError
+
+__all__ = ["PROVIDERS", "FlushDenormals", "available", "device_of", "onnxruntime_names"]
+
+PROVIDERS = {
+    "cpu": "CPUExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+    "coreml": "CoreMLExecutionProvider",
+}
+COMES_WITH = {
+    "cuda": "onnxruntime-gpu",
+    "tensorrt": "onnxruntime-gpu",
+    "openvino": "onnxruntime-openvino",
+    "coreml": "onnxruntime for macOS",
+}
+# (32-bit word of fenv_t, its bits): MXCSR's FTZ and DAZ; FPCR's FZ.
+MODES = {"x86_64": (7, 0x8040), "aarch64": (0, 1 << 24)}
+WORDS = 8
+
+
+def available() -> tuple[str, ...]:
+    """Names of the providers that the installed onnxruntime was built with."""
+    built = ort.get_available_providers()
+    return tuple(name for name, known in PROVIDERS.items() if known in built)
+
+
+def onnxruntime_names(providers: Sequence[str]) -> list[str]:
+    """Translate names, first choice first; what none of them can do, the CPU does.
+
+    Raises:
+        ConfigError: none, one that we do not know, or one that this onnxruntime lacks.
+    """
+    if isinstance(providers, str):
+        providers = (providers,)
+    if not providers:
+        raise ConfigError(f"providers: name at least one of {', '.join(PROVIDERS)}")
+    for name in providers:
+        if name not in PROVIDERS:
+            raise ConfigError(f"no execution provider {name!r}; there are {', '.join(PROVIDERS)}")
+        if name not in available():
+            raise ConfigError(
+                f"execution provider {name!r} is not in the installed onnxruntime (it has "
+                f"{', '.join(available())}); it comes with {COMES_WITH.get(name, 'onnxruntime')}"
+            )
+    return [PROVIDERS[name] for name in dict.fromkeys((*providers, "cpu"))]
+
+
+def device_of(session: ort.InferenceSession) -> str:
+    """Where a session wants its state: ``cuda`` or ``cpu``."""
+    first = session.get_providers()[0]
+    return "cuda" if first in (PROVIDERS["cuda"], PROVIDERS["tensorrt"]) else "cpu"
+
+
+def _library() -> ctypes.PyDLL | None:
+    if sys.platform != "linux" or platform.machine() not in MODES:
+        return None
+    # PyDLL keeps the interpreter's lock: the calls take less time than giving it away.
+    library = ctypes.PyDLL(None)
+    return library if hasattr(library, "fegetenv") and hasattr(library, "fesetenv") else None
+
+
+LIBRARY = _library()
+
+
+class FlushDenormals:
+    """Context in which this thread's denormals are zero; use one object in one thread at a time.
+
+    Leaving it restores the thread's mode and its floating-point exception flags. On systems other
+    than Linux on x86-64 and aarch64 it does nothing.
+    """
+
+    def __init__(self) -> None:
+        self._before = (ctypes.c_uint32 * WORDS)()
+        self._within = (ctypes.c_uint32 * WORDS)()
+        self._word, self._bits = MODES.get(platform.machine(), (0, 0))
+
+    def __enter__(self) -> None:
+        if LIBRARY is not None:
+            LIBRARY.fegetenv(self._before)
+            LIBRARY.fegetenv(self._within)
+            self._within[self._word] |= self._bits
+            LIBRARY.fesetenv(self._within)
+
+    def __exit__(self, *_: object) -> None:
+        if LIBRARY is not None:
+            LIBRARY.fesetenv(self._before)

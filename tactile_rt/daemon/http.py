@@ -1,0 +1,417 @@
+"""HTTP for the page and the metrics: one small server, which each runs at an address of its own.
+
+It is there so that a robot that is only measured needs no other package, and so that what stands
+against a hostile network is written once. It does what those two need and no more: GET and small
+POSTs, answers of known length, and streams without end.
+
+A connection carries one request. Its head must be there whole within a time and a size, its body is
+read when the application asks for it, and after the answer the connection is closed. So there is
+never a second request that could be taken for the rest of the first, and nobody keeps a place
+without asking for something. Everything that a peer can make us hold is bounded: connections, bytes
+of a head and of a body, the time to send either, and the time to take an answer. Who exceeds that
+is hung up on and counted.
+
+All connections of a server are tasks of one event loop in a thread of its own. The application is
+one function, from a `Request` to a `Response`; it refuses by raising `Refused`.
+"""
+
+import asyncio
+import re
+import socket
+import threading
+from collections.abc import AsyncGenerator, Awaitable, Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from typing import Any
+
+from tactile_rt.stream import SourceError
+
+__all__ = ["HttpLimits", "HttpServer", "Refused", "Request", "Response", "listen", "parse_head"]
+
+BACKLOG = 64
+END_S = 0.5  # what streams have for their end when the server closes
+JOIN_S = 2.0
+TOKEN = re.compile(r"[!#$%&'*+.^_`|~0-9A-Za-z-]+")
+CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
+ONCE = ("host", "origin", "content-length", "transfer-encoding")  # else who reads which?
+
+
+@dataclass(frozen=True)
+class HttpLimits:
+    """What those who ask may cost.
+
+    Attributes:
+        connections: The number of connections at a time; one more is dropped at once, before a file
+            descriptor is missed elsewhere.
+        head_bytes: The largest head of a request, in bytes.
+        head_s: The time from the connection to the end of the head, however it drips in, s.
+        send_s: The time that a peer may leave what is sent to it untaken, s.
+    """
+
+    connections: int
+    head_bytes: int
+    head_s: float
+    send_s: float
+
+
+class Refused(Exception):
+    """A request that is not served.
+
+    Args:
+        status: The status of HTTP.
+        reason: One line, shown to who asked.
+        headers: More headers of the answer.
+    """
+
+    def __init__(self, status: int, reason: str, headers: Mapping[str, str] | None = None) -> None:
+        super().__init__(reason)
+        self.status, self.reason, self.headers = status, reason, headers or {}
+
+
+@dataclass
+class Request:
+    """What somebody asks.
+
+    Attributes:
+        method: The method as it was sent, such as GET.
+        path: The path as it was sent, not decoded, beginning with a slash.
+        query: What follows the first question mark of the target; empty where there is none.
+        version: The version of HTTP as it was sent, HTTP/1.0 or HTTP/1.1.
+        headers: The values by name in lower case; those given several times are joined.
+        peer: The IP address of who asks.
+        begun: The part of the body that came with the head.
+        reader: The connection, from which the rest of the body is read.
+    """
+
+    method: str
+    path: str
+    query: str
+    version: str
+    headers: dict[str, str]
+    peer: str = ""
+    begun: bytes = b""
+    reader: asyncio.StreamReader | None = None
+
+    async def body(self, most: int, seconds: float) -> bytes:
+        """The whole body.
+
+        Args:
+            most: The largest one that is read, in bytes.
+            seconds: The time that it may take, s.
+
+        Raises:
+            Refused: It is too large or too slow, breaks off, or does not tell its length.
+        """
+        if "transfer-encoding" in self.headers:
+            raise Refused(411, "tell the length of the body")
+        length = self.headers.get("content-length", "0")
+        if not re.fullmatch("[0-9]{1,15}", length):
+            raise Refused(400, "content-length is no number")
+        if int(length) > most:
+            raise Refused(413, f"more than {most} bytes")
+        data, missing = self.begun[: int(length)], int(length) - len(self.begun)
+        if missing <= 0 or self.reader is None:
+            return data
+        try:
+            async with asyncio.timeout(seconds):
+                return data + await self.reader.readexactly(missing)
+        except TimeoutError:
+            raise Refused(408, "too slow") from None
+        except asyncio.IncompleteReadError:
+            raise Refused(400, "the body breaks off") from None
+
+
+@dataclass(frozen=True)
+class Response:
+    """What is sent back.
+
+    Attributes:
+        status: The status of HTTP.
+        body: The body; or a generator of its pieces, which is closed when the peer goes or the
+            server ends. What it raises before the first piece becomes the answer instead.
+        kind: The media type of the body.
+        headers: More headers, beside those that all answers of the server carry.
+    """
+
+    status: int = 200
+    body: bytes | AsyncGenerator[bytes, None] = b""
+    kind: str = "text/plain; charset=utf-8"
+    headers: Mapping[str, str] = field(default_factory=dict)
+
+
+class HttpServer:
+    """Answers from now on until it is closed.
+
+    Args:
+        name: The name of its thread.
+        listening: The socket, see `listen`; closed with the server.
+        answer: The application, called in the thread of the server.
+        limits: What those who ask may cost.
+        headers: Headers that every answer carries.
+        failed: Told why when a request could not be answered for a fault of our own.
+
+    Attributes:
+        answered: The number of requests so far that were answered with 200.
+        refused: The number of requests so far that were refused, or that a fault left unanswered.
+        dropped: The number of connections so far that were hung up on: one too many, one that
+            asked for nothing, or one that did not take its answer.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        listening: socket.socket,
+        answer: Callable[[Request], Awaitable[Response]],
+        limits: HttpLimits,
+        headers: Mapping[str, str],
+        failed: Callable[[str], None],
+    ) -> None:
+        self._listening, self._answer, self._failed = listening, answer, failed
+        self._limits, self._headers = limits, headers
+        self.answered = self.refused = self.dropped = 0
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._asking: set[asyncio.Task[None]] = set()  # those whose request is not there yet
+        self._over = asyncio.Event()
+        self._loop = asyncio.new_event_loop()
+        # A descriptor that is missing: told here, and not by a traceback on stderr.
+        self._loop.set_exception_handler(lambda loop, context: self._drop())
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def alive(self) -> bool:
+        """Whether it still answers."""
+        return self._thread.is_alive()
+
+    @property
+    def connections(self) -> int:
+        """How many there are now; from any thread."""
+        return len(self._tasks)
+
+    def call(self, function: Callable[..., object], *arguments: Any) -> None:
+        """Call something in the thread of the server, soon.
+
+        Raises:
+            RuntimeError: The server has ended.
+        """
+        self._loop.call_soon_threadsafe(function, *arguments)
+
+    def close(self) -> None:
+        """Listen no more, give streams their end, and hang up on all others."""
+        with suppress(RuntimeError):  # it has ended already
+            self.call(self._over.set)
+        self._thread.join(JOIN_S)
+
+    def _run(self) -> None:
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
+            try:
+                runner.run(self._serve())
+            finally:
+                self._listening.close()
+
+    async def _serve(self) -> None:
+        server = await asyncio.start_server(
+            self._meet, sock=self._listening, backlog=BACKLOG, limit=self._limits.head_bytes
+        )
+        await self._over.wait()
+        server.close()
+        for task in self._asking:
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(self._tasks, timeout=END_S)
+        # The runner cancels those that are left.
+
+    def _meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        if len(self._tasks) >= self._limits.connections:
+            self._drop()
+            writer.transport.abort()
+            return
+        task = self._loop.create_task(self._connection(reader, writer))
+        self._tasks.add(task)
+        self._asking.add(task)
+        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(self._asking.discard)
+
+    def _drop(self) -> None:
+        self.dropped += 1
+
+    async def _connection(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            await self._exchange(reader, writer)
+            writer.close()
+            async with asyncio.timeout(self._limits.send_s):
+                await writer.wait_closed()
+        except (OSError, TimeoutError):  # gone, silent, or it takes nothing
+            self._drop()
+        finally:
+            writer.transport.abort()
+
+    async def _exchange(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        request: Request | None = None
+        try:
+            request = await self._read(reader, writer)
+            answer = await self._answer(request)
+            # Until its first piece is there, a stream can still be refused.
+            first = answer.body if isinstance(answer.body, bytes) else await anext(answer.body)
+        except Refused as refused:
+            self.refused += 1
+            first = refused.reason.encode()
+            answer = Response(refused.status, first, headers=refused.headers)
+        except Exception as error:
+            if request is None:  # the connection's, not ours
+                raise
+            self.refused += 1
+            self._failed(f"{request.path:.40}: {type(error).__name__}: {error}")
+            first = b"this is a fault of the server: see its log"
+            answer = Response(500, first)
+        self.answered += answer.status == 200
+        stream = None if isinstance(answer.body, bytes) else answer.body
+        # Proxies ask in HTTP/1.0, which knows no chunks: there the end of the line is the end.
+        chunked = stream is not None and request is not None and request.version != "HTTP/1.0"
+        headers = {**self._headers, "connection": "close", "content-type": answer.kind}
+        if chunked:
+            headers["transfer-encoding"] = "chunked"
+        elif stream is None:
+            headers["content-length"] = str(len(first))
+        if answer.status == 204:
+            del headers["content-type"], headers["content-length"]
+        lines = [f"HTTP/1.1 {answer.status} {HTTPStatus(answer.status).phrase}"]
+        lines += [f"{name}: {value}" for name, value in (headers | dict(answer.headers)).items()]
+        head = "\r\n".join([*lines, "", ""]).encode("latin-1")
+        if request is not None and request.method == "HEAD":
+            first = b""
+        try:
+            await self._send(writer, head + (_chunk(first) if chunked else first))
+            if stream is not None:
+                await self._pour(stream, reader, writer, chunked)
+        finally:
+            if stream is not None:
+                await stream.aclose()
+
+    async def _read(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> Request:
+        """The head of a request.
+
+        Raises:
+            Refused: It is none, or too long.
+            TimeoutError: Nothing at all has come, as of browsers that connect in advance.
+        """
+        data, most = b"", self._limits.head_bytes
+        try:
+            async with asyncio.timeout(self._limits.head_s):
+                while b"\r\n\r\n" not in data:
+                    if len(data) > most:
+                        raise Refused(431, f"more than {most} bytes of headers")
+                    more = await reader.read(most + 1 - len(data))
+                    if not more:
+                        raise Refused(400, "the request breaks off")
+                    data += more
+        except TimeoutError:
+            if not data:
+                raise
+            raise Refused(408, "too slow") from None
+        task = asyncio.current_task()
+        assert task is not None
+        self._asking.discard(task)
+        head, _, begun = data.partition(b"\r\n\r\n")
+        request = parse_head(head)
+        request.peer = str((writer.get_extra_info("peername") or ("?",))[0])
+        request.begun, request.reader = begun, reader
+        return request
+
+    async def _pour(
+        self,
+        pieces: AsyncGenerator[bytes, None],
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        chunked: bool,
+    ) -> None:
+        """Send a stream until it is over, the peer is gone, or the server ends."""
+
+        async def send_all() -> None:
+            async for piece in pieces:
+                await self._send(writer, _chunk(piece) if chunked else piece)
+
+        sending = asyncio.ensure_future(send_all())
+        # Whoever says more than its request is no longer one who listens.
+        gone = asyncio.ensure_future(reader.read(1))
+        over = asyncio.ensure_future(self._over.wait())
+        tasks: list[asyncio.Future[Any]] = [sending, gone, over]
+        try:
+            done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in tasks:
+                task.cancel()
+            found = await asyncio.gather(*tasks, return_exceptions=True)
+        if isinstance(found[0], Exception):
+            raise found[0]
+        if gone not in done:
+            await self._send(writer, b"0\r\n\r\n" if chunked else b"")
+
+    async def _send(self, writer: asyncio.StreamWriter, data: bytes) -> None:
+        writer.write(data)
+        async with asyncio.timeout(self._limits.send_s):
+            await writer.drain()
+
+
+def listen(host: str, port: int, *, both: bool = False) -> socket.socket:
+    """A socket that waits for others.
+
+    Args:
+        host: The address, or a name that means one; IPv6 with or without brackets.
+        port: The TCP port.
+        both: Whether an IPv6 address takes IPv4, too, and a name means its IPv4 address.
+
+    Raises:
+        SourceError: The port is taken, or the address is not of this computer.
+    """
+    plain = host.strip("[]")
+    family = socket.AF_INET if both and ":" not in plain else socket.AF_UNSPEC
+    try:
+        found = socket.getaddrinfo(plain, port, family, socket.SOCK_STREAM)
+        dual = both and found[0][0] == socket.AF_INET6
+        return socket.create_server(
+            (plain, port), family=found[0][0], backlog=BACKLOG, dualstack_ipv6=dual
+        )
+    except OSError as error:
+        why = str(error.strerror).partition(" (while")[0]
+        raise SourceError(f"cannot listen at {host}:{port}: {why}") from None
+
+
+def parse_head(head: bytes) -> Request:
+    """The first line and the headers of a request, without the empty line at their end.
+
+    Strict, as proxies and we must read the same: no folded lines, no bare line ends, no blanks in
+    names, nothing twice that may stand there once.
+
+    Raises:
+        Refused: 400, it is none.
+    """
+    first, *lines = head.decode("latin-1").split("\r\n")
+    words = first.split(" ")
+    if (
+        len(words) != 3
+        or not TOKEN.fullmatch(words[0])
+        or not words[1].startswith("/")
+        or not re.fullmatch(r"HTTP/1\.[0-9]", words[2])
+        or CONTROL.search(first)
+    ):
+        raise Refused(400, "this is no request of HTTP/1")
+    headers: dict[str, str] = {}
+    for line in lines:
+        name, colon, value = line.partition(":")
+        name, value = name.lower(), value.strip(" \t")
+        if not colon or not TOKEN.fullmatch(name) or CONTROL.search(value):
+            raise Refused(400, "a header is none")
+        if name in headers:
+            if name in ONCE:
+                raise Refused(400, f"{name} is given twice")
+            value = f"{headers[name]}{'; ' if name == 'cookie' else ', '}{value}"
+        headers[name] = value
+    path, _, query = words[1].partition("?")
+    return Request(words[0], path, query, words[2], headers)
+
+
+def _chunk(data: bytes) -> bytes:
+    """A piece of a stream; an empty one would be its end."""
+    return b"%x\r\n%b\r\n" % (len(data), data) if data else b""

@@ -1,0 +1,188 @@
+"""Read a configuration: one file, what it extends, and what the command line sets.
+
+Every mistake is one line that names file and line (or the ``--set``), the key, and the nearest
+valid name.
+"""
+
+import hashlib
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+import msgspec
+
+from tactile_rt.daemon.config import CONFIG_VERSION, Config
+from tactile_rt.settings import SettingNode, convert, merge, read_toml, refusal, set_key
+from tactile_rt.stream import ConfigError
+
+__all__ = ["Loaded", "load_config"]
+
+DEEPEST = 8  # files that extend files
+LARGEST = 1 << 20  # bytes of a configuration
+FILES_IN = ("replay", "combined")  # schemes of URLs whose target is a file
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A configuration, and where each value of it came from.
+
+    Attributes:
+        config: The configuration, with all names filled in and all paths absolute.
+        nodes: The tree that the configuration was made of, which knows the lines.
+        path: The path of the file, as the user named it.
+        sets: The settings of the command line, ``KEY=VALUE`` each.
+    """
+
+    config: Config
+    nodes: SettingNode
+    path: Path
+    sets: tuple[str, ...] = ()
+
+    def refuse(self, path: list[str | int], why: str) -> NoReturn:
+        """Raise the `ConfigError` of a value."""
+        raise refusal(self.nodes, path, why)
+
+    @property
+    def sha256(self) -> str:
+        """Hash of what it says, however it is written."""
+        return hashlib.sha256(msgspec.json.encode(self.config)).hexdigest()
+
+
+def load_config(path: Path, sets: Sequence[str] = ()) -> Loaded:
+    """Read a file; whatever is wrong with it, or with one that it extends, is a `ConfigError`.
+
+    Args:
+        path: of the TOML file.
+        sets: ``a.b=value``, of which ``source.NAME.url=...`` names an item of a list.
+
+    Raises:
+        ConfigError: one line with file and line.
+    """
+    nodes = _with_bases(path, [])
+    for text in sets:
+        nodes = set_key(nodes, text, Config)
+    _check_version(nodes)
+    _absolute(nodes)
+    config = convert(nodes, Config)
+    loaded = Loaded(config, nodes, path, tuple(sets))
+    return Loaded(_filled(loaded), nodes, path, tuple(sets))
+
+
+# reading
+
+
+def _with_bases(path: Path, above: list[Path]) -> SettingNode:
+    nodes = read_toml(path, LARGEST)
+    if "version" in nodes.value:
+        _check_version(nodes)  # of a base, too: its keys may mean something else
+    base = nodes.value.get("extends")
+    if base is None:
+        return nodes
+    if not isinstance(base.value, str) or not base.value:
+        raise ConfigError(f'{base.where}: extends names a file: extends = "base.toml"')
+    here = Path(os.path.realpath(path))
+    file = nodes.folder / base.value
+    if "\0" in base.value:
+        raise ConfigError(f"{base.where}: extends: no file's name has a zero byte")
+    if Path(os.path.realpath(file)) in [*above, here]:
+        raise ConfigError(f"{base.where}: extends: {base.value} extends this file in turn")
+    if len(above) >= DEEPEST:
+        raise ConfigError(f"{base.where}: extends: more than {DEEPEST} files, one in another")
+    if not file.is_file():
+        found = f"{file} is a folder" if file.is_dir() else f"no file {file}"
+        raise ConfigError(f"{base.where}: extends: {found}")
+    shown = file if path.is_absolute() else Path(os.path.relpath(file))
+    under = _with_bases(shown, [*above, here])
+    del nodes.value["extends"]
+    return merge(under, nodes)
+
+
+def _absolute(nodes: SettingNode) -> None:
+    """Relative paths from the folder of the file that they stand in."""
+    for path, node in nodes.walk():
+        if not isinstance(node.value, str) or not node.value or "\0" in node.value:
+            continue
+        last = path[-1] if path else ""
+        top = (path[0], last) if path else ()
+        if top in (("model", "file"), ("recorder", "folder"), ("log", "file")) or (
+            path[0] == "publisher"
+            and "options" in path
+            and (last in ("file", "folder") or str(last).endswith("_file"))
+        ):
+            node.value = str(_from(node, node.value))
+        elif top == ("source", "calibration") and _is_file(_from(node, node.value)):
+            node.value = str(_from(node, node.value))
+        elif top == ("source", "url"):
+            scheme, colon, rest = node.value.partition(":")
+            target, question, options = rest.partition("?")
+            if colon and scheme in FILES_IN and target:
+                node.value = f"{scheme}:{_from(node, target)}{question}{options}"
+
+
+def _from(node: SettingNode, value: str) -> Path:
+    path = Path(value)
+    if value.startswith("~"):
+        try:
+            path = path.expanduser()
+        except RuntimeError:  # no such user
+            raise ConfigError(f"{node.where}: {value} is no folder of a user here") from None
+    return path if path.is_absolute() else node.folder / path
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # too long a name
+        return False
+
+
+def _filled(loaded: Loaded) -> Config:
+    """Names that may be left out."""
+    config = loaded.config
+    sources = [s.name for s in config.source]
+    models, publishers = [], []
+    taken: set[str] = set()
+    for i, model in enumerate(config.model):
+        source = model.source
+        if not source:
+            if len(sources) != 1:
+                loaded.refuse(
+                    ["model", i], f"which source? source = one of {', '.join(sources) or 'none'}"
+                )
+            (source,) = sources
+        name = _free(model.name or source, taken, bool(model.name), loaded, ["model", i])
+        models.append(msgspec.structs.replace(model, source=source, name=name))
+    taken = {"recorder", "page", "metrics", "systemd", "log"}
+    for i, publisher in enumerate(config.publisher):
+        base = publisher.name or re.sub(r"[^A-Za-z0-9_-]", "-", publisher.kind)
+        name = _free(base, taken, bool(publisher.name), loaded, ["publisher", i])
+        publishers.append(msgspec.structs.replace(publisher, name=name))
+    return msgspec.structs.replace(
+        config, model=tuple(models), publisher=tuple(publishers), extends=""
+    )
+
+
+def _free(name: str, taken: set[str], given: bool, loaded: Loaded, path: list[str | int]) -> str:
+    made, n = name, 1
+    while made in taken:
+        if given:
+            loaded.refuse([*path, "name"], f"the name {name!r} is taken")
+        n += 1
+        made = f"{name}-{n}"
+    taken.add(made)
+    return made
+
+
+def _check_version(nodes: SettingNode) -> None:
+    version = nodes.value.get("version")
+    if version is None:
+        raise ConfigError(
+            f"{nodes.file}:1: no version: begin the file with version = {CONFIG_VERSION}"
+        )
+    if version.value != CONFIG_VERSION or isinstance(version.value, bool | float):
+        raise ConfigError(
+            f"{version.where}: version {version.value!r}; this release reads {CONFIG_VERSION}"
+        )

@@ -1,0 +1,336 @@
+"""When each sample was taken: from a device's clock or counter to times in ns.
+
+What is needed
+- A sample gets the time at which it was measured, not that at which it arrived: a USB adapter
+  hands over 16 ms of samples at once, and a busy host reads them later still.
+- It gets it at once, without waiting for what comes later; times increase strictly, and none is
+  after its arrival where that can be.
+- Quartzes differ by up to 200 ppm, counters wrap, devices restart and clocks jump: all of this is
+  followed, and none of it costs a sample.
+- Live and replayed packets take one way, so that a recording decodes as the stream did.
+
+The plan. `Stamper` makes chunks of what a codec found: `Sequencer` numbers the samples, then the
+best clock that there is dates them:
+- the device's own time, on the host's clock (`DeviceClock`);
+- if it sends a counter only, that, as a clock whose tick is the nominal period;
+- if it sends neither, the arrivals: those of one packet are spread over the time before
+  (`host_stamps`);
+- on demand (``clock=device``), the device's own time as it is (`DeviceTime`).
+
+How `DeviceClock` finds offset and drift. A sample cannot arrive before it was taken, so of all
+arrivals the promptest bound the offset from one side: the line that lies under all points (device
+time, arrival - device time) and nearest to them on average is an edge of their lower convex hull
+(Moon, Skelly and Towsley 1999, INFOCOM). Bursts and a busy host only add delay above that line, and
+so do not matter. What cannot be known is the delay that the promptest sample has, too. Only the
+promptest point of each bucket of time is kept, and buckets double in length until ten minutes fit
+into 240, so that memory and work stay small. Between two fits an arrival below the line pushes it
+down at once. Far below it means that the device's clock stepped; far above it for seconds, that it
+stepped back: then the fit begins anew.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.drivers.accounting import Sequencer
+from tactile_rt.drivers.codec import Codec, Samples
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, SourceStats
+
+__all__ = ["DeviceClock", "DeviceTime", "Stamper", "host_stamps"]
+
+COUNTED_TOLERANCE = 0.1  # of a rate that is only nominal: the counter is the device's only clock
+FIRST_BUCKET_NS: Final = NS_PER_S // 4  # of each only the promptest arrival is kept
+BUCKETS: Final = 240
+LONGEST_BUCKET_NS: Final = 5 * NS_PER_S // 2  # so ten minutes are looked back on
+DRIFT_SEEN_AFTER: Final = 1e-3  # s of uncertainty over the allowed drift: when a slope means much
+EARLY_NS: Final = 20_000_000  # a sample this early is no prompt one: the device's clock stepped
+LATE_NS: Final = 30_000_000  # so late for ...
+LATE_FOR_NS: Final = 2 * NS_PER_S  # ... so long: it stepped back
+LEAST_STEP: Final = 0.5  # of the device's, between two samples when the estimate moves back
+LONG_NS: Final = 60_000_000_000  # a clock that wraps sooner cannot show that it went back
+
+
+class Stamper:
+    """Numbers and times a device's samples.
+
+    Args:
+        codec: The codec of the device, which says what counter and clock there are.
+        spec: What the samples are.
+        stats: The account in which losses are counted; deliveries are the reader's to count.
+
+    Attributes:
+        sequencer: Numbers the samples by the device's counter.
+        clock: The clock that dates the samples; None for a device that sends neither time nor
+            count.
+        newest_ns: Host time at which the newest sample arrived, ns; 0 before the first.
+        status: Status bits of the newest sample.
+    """
+
+    def __init__(self, codec: Codec[Any], spec: ArraySpec, stats: SourceStats) -> None:
+        self.spec, self._shape = spec, spec.shape
+        self.newest_ns = self.status = 0
+        self._period_ns = round(NS_PER_S / spec.rate_hz)
+        ticks = None if codec.tick_ns is None else self._period_ns / codec.tick_ns
+        self.sequencer = Sequencer(codec.count_bits, stats, ticks, codec.tick_bits)
+        self.clock: DeviceClock | DeviceTime | None = None
+        if codec.tick_ns is not None:
+            self.clock = DeviceClock(codec.tick_ns, codec.tick_bits)
+        elif codec.count_bits is not None:
+            self.clock = DeviceClock(NS_PER_S / spec.rate_hz, codec.count_bits, COUNTED_TOLERANCE)
+        self._told = 0  # time given to the newest sample
+
+    def resume(self) -> None:
+        """The device was away."""
+        if self.clock is not None:
+            self.clock.resume()
+
+    def chunk(self, samples: Samples) -> Chunk | None:
+        """The samples that have not come before, or None."""
+        if samples.values.shape[1:] != self._shape:
+            return None  # the codec has counted it
+        seq, keep = self.sequencer.number(samples)
+        arrived, ticks, count = samples.arrived_ns, samples.ticks, samples.count
+        values, valid = samples.values, samples.valid
+        if False in keep.tolist():
+            seq, arrived, values, valid = seq[keep], arrived[keep], values[keep], valid[keep]
+            ticks = None if ticks is None else ticks[keep]
+            count = None if count is None else count[keep]
+            if not len(seq):
+                return None
+        counter = ticks if ticks is not None else count
+        if self.clock is not None and counter is not None:
+            t_ns = self.clock.to_host(counter, arrived)
+        else:
+            t_ns = host_stamps(arrived, self._told, self._period_ns)
+        self._told = int(t_ns[-1])
+        self.newest_ns = int(arrived[-1])
+        if samples.status is not None:
+            self.status = int(samples.status[-1])
+        if valid.shape != values.shape[:2]:
+            valid = np.broadcast_to(valid, values.shape[:2])
+        return Chunk(seq, t_ns, values, valid)
+
+
+class DeviceClock:
+    """Maps a device's ticks to the host's monotonic clock.
+
+    Args:
+        tick_ns: Nominal length of a tick, ns.
+        bits: Width of the device's clock, which wraps at 2^bits.
+        tolerance: Largest drift that is believed, as a fraction (a quartz is within 2e-4).
+
+    Attributes:
+        drift: Excess speed of the host's clock over the device's, as a fraction.
+        steps: Number of times that the device's clock jumped or began anew while it was connected.
+    """
+
+    def __init__(self, tick_ns: float, bits: int, tolerance: float = 5e-4) -> None:
+        self.drift = 0.0
+        self.steps = 0
+        self._tick_ns, self._wrap, self._tolerance = tick_ns, 1 << bits, tolerance
+        self._drift_after_ns = min(5 * NS_PER_S, round(NS_PER_S * DRIFT_SEEN_AFTER / tolerance))
+        self._tick: int | None = None  # of the last sample
+        self._arrived = self._told = 0
+        self._x = 0.0  # device time of the last sample since the base
+        self._begin(0)
+
+    @property
+    def drift_ppm(self) -> float:
+        """`drift` in parts per million."""
+        return 1e6 * self.drift
+
+    def to_host(self, ticks: NDArray[np.int64], arrived_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(n,) host times of samples, ns: strictly increasing, none after its arrival if possible.
+
+        Args:
+            ticks: The device's clock as it came, (n,).
+            arrived_ns: Host times of arrival, (n,), ns, never decreasing.
+        """
+        told: list[int] = []
+        waiting: list[tuple[float, float, int]] = []  # device time, since the last, arrival
+        for tick, arrived in zip(ticks.tolist(), arrived_ns.tolist(), strict=True):
+            step = self._step(tick, arrived)
+            x = self._x + step
+            early = arrived - self._base - x - self._a - self.drift * x < -EARLY_NS
+            if self._tick is None or early:
+                # In a backlog, samples are early only against a first one that came late.
+                self.steps += step - (arrived - self._arrived) > EARLY_NS
+                told += self._tell(waiting)
+                waiting, x, step = [], 0.0, 0.0
+                self._begin(arrived)
+            self._x, self._tick, self._arrived = x, tick, arrived
+            self._observe(x, arrived)
+            waiting.append((x, step, arrived))
+        # told only now: the last sample of a packet is the promptest, and dates the others
+        return np.array(told + self._tell(waiting), np.int64)
+
+    def resume(self) -> None:
+        """The device was away: its clock may have begun anew."""
+        self._tick = None
+
+    def _tell(self, waiting: list[tuple[float, float, int]]) -> list[int]:
+        """Host times of these samples, by what is known of the clock now."""
+        told = []
+        for x, step, arrived in waiting:
+            t = min(self._base + round(x + self._a + self.drift * x), arrived)
+            room = min(LEAST_STEP * step, arrived - self._told)
+            self._told = max(t, self._told + max(1, round(room)))
+            told.append(self._told)
+        return told
+
+    def _step(self, tick: int, arrived: int) -> float:
+        """Device time since the last sample, ns."""
+        if self._tick is None:
+            return 0.0
+        ticks = (tick - self._tick) % self._wrap
+        # a short counter may have wrapped more than once meanwhile
+        missed = (arrived - self._arrived) / self._tick_ns - ticks
+        if missed > self._wrap / 2:
+            ticks += self._wrap * round(missed / self._wrap)
+        return ticks * self._tick_ns
+
+    def _begin(self, arrived: int) -> None:
+        self._base, self._x = arrived, 0.0
+        self._points: list[tuple[float, float]] = []  # promptest of each bucket
+        self._bucket_ns = FIRST_BUCKET_NS
+        self._opened, self._best = 0.0, (0.0, 0.0)
+        self._a = 0.0
+        self._late_since: int | None = None  # host time
+        self._late_best = (0.0, 0.0)
+
+    def _observe(self, x: float, arrived: int) -> None:
+        d = float(arrived - self._base - x)
+        below = d - self.drift * x
+        late = below - self._a
+        if late < 0:
+            self._a += late  # the line is under all points, now
+        if late < LATE_NS:
+            self._late_since = None
+        elif self._late_since is None:
+            self._late_since, self._late_best = arrived, (x, d)
+        else:
+            if below < self._late_best[1] - self.drift * self._late_best[0]:
+                self._late_best = (x, d)
+            if arrived - self._late_since > LATE_FOR_NS:
+                best_x, best_d = self._late_best
+                self.steps += 1
+                self._points, self._bucket_ns = [], FIRST_BUCKET_NS
+                self._opened, self._best, self._late_since = x, (x, d), None
+                self._a = best_d - self.drift * best_x
+                return
+        if x - self._opened > self._bucket_ns:
+            self._points.append(self._best)
+            self._opened, self._best = x, (x, d)
+            self._forget_old()
+            self._fit()
+        elif below < self._best[1] - self.drift * self._best[0]:
+            self._best = (x, d)
+
+    def _forget_old(self) -> None:
+        if len(self._points) < BUCKETS:
+            return
+        if self._bucket_ns >= LONGEST_BUCKET_NS:
+            del self._points[0]
+            return
+        self._bucket_ns *= 2
+        pairs = zip(self._points[::2], self._points[1::2], strict=True)
+        self._points = [min(pair, key=lambda p: p[1] - self.drift * p[0]) for pair in pairs]
+
+    def _fit(self) -> None:
+        points = [*self._points, self._best]
+        if points[-1][0] - points[0][0] >= self._drift_after_ns:
+            slope = _slope_below(points)
+            self.drift = min(max(slope, -self._tolerance), self._tolerance)
+        self._a = min(d - self.drift * x for x, d in points)
+
+
+def _slope_below(points: Sequence[tuple[float, float]]) -> float:
+    """Slope of the line under all points that is nearest to them on average."""
+    hull: list[tuple[float, float]] = []
+    for x, d in points:
+        while len(hull) > 1:
+            (x1, d1), (x2, d2) = hull[-2:]
+            if (d2 - d1) * (x - x1) < (d - d1) * (x2 - x1):
+                break
+            hull.pop()
+        hull.append((x, d))
+    middle = sum(x for x, _ in points) / len(points)
+    for (x1, d1), (x2, d2) in zip(hull, hull[1:], strict=False):  # noqa: RUF007
+        if x2 >= middle:
+            return (d2 - d1) / (x2 - x1)
+    return 0.0
+
+
+class DeviceTime:
+    """Stands in for `DeviceClock`: gives the device's time instead of the host's.
+
+    The first sample has the time that its clock shows. A clock that leaps forward makes a silence;
+    one that goes back or begins anew goes on from the last sample's time after the time that passed
+    on the host's clock.
+
+    Args:
+        tick_ns: Length of a tick, ns.
+        bits: Width of the device's clock, which wraps at 2^bits.
+
+    Attributes:
+        drift_ppm: Always 0, since no other clock is compared with this one.
+        steps: Number of times that the clock went back or began anew.
+    """
+
+    drift_ppm = 0.0
+
+    def __init__(self, tick_ns: float, bits: int) -> None:
+        self.steps = 0
+        self._tick_ns, self._wrap = tick_ns, 1 << bits
+        self._can_go_back = self._wrap * tick_ns >= LONG_NS
+        self._tick: int | None = None  # of the last sample
+        self._arrived = self._told = 0
+        self._ticks, self._origin = 0, 0  # since the clock began, and its time then, ns
+
+    def to_host(self, ticks: NDArray[np.int64], arrived_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+        """(n,) device times of samples, ns: strictly increasing.
+
+        Args:
+            ticks: The device's clock as it came, (n,).
+            arrived_ns: Host times of arrival, (n,), ns, never decreasing.
+        """
+        told = np.empty(len(ticks), np.int64)
+        for i, (tick, arrived) in enumerate(zip(ticks.tolist(), arrived_ns.tolist(), strict=True)):
+            if self._tick is None:
+                self._ticks = tick
+            else:
+                ahead = (tick - self._tick) % self._wrap
+                if self._can_go_back and ahead > self._wrap // 2:
+                    self.steps += 1
+                    self._origin = self._told + max(1, arrived - self._arrived)
+                    self._ticks = 0
+                else:
+                    self._ticks += ahead
+            t = self._origin + round(self._ticks * self._tick_ns)
+            self._told = t if self._tick is None else max(t, self._told + 1)
+            self._tick, self._arrived = tick, arrived
+            told[i] = self._told
+        return told
+
+    def resume(self) -> None:
+        """The device was away; its clock tells whether it began anew."""
+
+
+def host_stamps(arrived_ns: NDArray[np.int64], before_ns: int, period_ns: int) -> NDArray[np.int64]:
+    """(n,) times for samples of a device that tells neither time nor count.
+
+    Samples that arrive together were not taken together: they are spread over the time before
+    their arrival, a nominal period apart or as much as fits after the sample before.
+
+    Args:
+        arrived_ns: Host times at which the samples of one packet arrived, (n,), ns, never
+            decreasing.
+        before_ns: Time given to the sample before these, ns.
+        period_ns: Nominal time between samples, ns.
+    """
+    n = len(arrived_ns)
+    last = max(int(arrived_ns[-1]), before_ns + n)
+    step = max(1, min(period_ns, (last - before_ns) // n))
+    return last - step * np.arange(n - 1, -1, -1, dtype=np.int64)

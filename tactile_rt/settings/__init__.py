@@ -1,0 +1,57 @@
+"""From what a user wrote to typed structs, and one wording of every mistake.
+
+TOML files, ``--set key=value``, the ``?option=value`` of a URL and the rows of a CSV file all
+become a tree of `SettingNode`, in which every value knows where it was written; `convert` makes a
+struct or a dataclass of it. A mistake is one line::
+
+    robot.toml:5: page.port: expected a whole number <= 65535, got 70000
+    serial:/dev/ttyUSB0 has no option 'boud'; did you mean baud?
+    --set page.prot=1: page has no key 'prot'; did you mean port?
+    loads.csv:3: fx: expected a number, got '1,2'
+
+tree      the tree, and TOML text as one
+structs   a tree as a struct, and what is wrong with it in words
+written   what is text alone: ``--set``, URLs, CSV
+"""
+
+from tactile_rt.settings.structs import convert, hint, nearest, no_such, refusal
+from tactile_rt.settings.tree import (
+    SettingNode,
+    find_lines,
+    make_node,
+    merge,
+    named,
+    parse_toml,
+    read_toml,
+)
+from tactile_rt.settings.written import (
+    CsvTable,
+    check_columns,
+    parse_options,
+    read_csv,
+    set_key,
+    split_url,
+    take_options,
+)
+
+__all__ = [
+    "CsvTable",
+    "SettingNode",
+    "check_columns",
+    "convert",
+    "find_lines",
+    "hint",
+    "make_node",
+    "merge",
+    "named",
+    "nearest",
+    "no_such",
+    "parse_options",
+    "parse_toml",
+    "read_csv",
+    "read_toml",
+    "refusal",
+    "set_key",
+    "split_url",
+    "take_options",
+]

@@ -1,0 +1,326 @@
+"""A tree of settings as a typed struct, and what is wrong with it in a user's words.
+
+Goals: every mistake is one line that says where it was written, which key it is, what was found and
+what is allowed; a right tree costs one call of msgspec; no wording of msgspec's reaches a user.
+
+Plan: keys are checked first, as a misspelt one is the commonest mistake, and one that msgspec would
+only call unknown. Then msgspec converts the whole tree. Only if it refuses is the culprit looked
+for, by converting the branches one by one, down to the smallest that is refused by itself: its path
+tells where, its type what is allowed. That works for whatever msgspec converts, tables under keys
+of any name and checks of the structs' own included, whose path msgspec does not tell.
+"""
+
+import dataclasses
+import difflib
+import math
+import re
+import types
+import typing
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import date, time
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+from tactile_rt.settings.tree import SettingNode, named
+from tactile_rt.stream import ConfigError
+
+__all__ = ["convert", "hint", "is_list", "is_text", "nearest", "no_such", "refusal", "types_of"]
+
+UNITS = {"_s": "seconds", "_ms": "milliseconds", "_mb": "megabytes", "_hz": "hertz"}
+ALIKE = (  # units that one may take for another
+    ("s", "ms", "us", "ns", "sec", "seconds", "min", "minutes", "h", "hours"),
+    ("mb", "b", "kb", "gb", "mib", "gib", "bytes"),
+)
+WORDS = {  # of msgspec, in a user's words
+    "float": "a number", "int": "a whole number", "bool": "true or false", "str": "text",
+    "object": "a table", "array": "a list", "null": "nothing",
+}  # fmt: skip
+SEVERAL = {float: "numbers", int: "whole numbers", str: "texts", bool: "true or false"}
+LISTED = 40  # names that a message lists
+_REFUSED = (ConfigError, ValueError, OverflowError, RecursionError)  # msgspec's are ValueErrors
+
+
+def convert(
+    root: SettingNode,
+    kind: Any,
+    path: Sequence[str | int] = (),
+    *,
+    top: Any = None,
+    lax: bool = False,
+) -> Any:
+    """What stands at a path of a tree, as a type.
+
+    Args:
+        root: the whole tree, for where things are.
+        kind: `msgspec.Struct`, dataclass, or what else msgspec converts to.
+        path: of what is converted; empty: all of it.
+        top: the type of the whole tree, to tell a table that stands in another one's place; by
+            default `kind` if the path is empty.
+        lax: whether the values are text as written, so that ``"5"`` is a number.
+
+    Raises:
+        ConfigError: an unknown key, a value of the wrong type or range, or what a struct's own
+            check refuses; one line with place, key, what was found and what is allowed.
+    """
+    node, here = root.at(path), list(path)
+    _check_keys(node, here, kind, top if path else kind)
+    if lax:
+        _check_finite(root, node, here, kind)
+    try:
+        return msgspec.convert(node.plain(), kind, strict=not lax)
+    except _REFUSED as error:
+        steps, leaf, cause = _culprit(node, kind, lax) or ([], kind, error)
+        whole = [*here, *steps]
+        raise refusal(root, whole, _said(cause, root.at(whole), leaf, whole)) from None
+
+
+def refusal(root: SettingNode, path: Sequence[str | int], why: str) -> ConfigError:
+    """The error of what stands at a path."""
+    node, name = root.at(path), named(path)
+    where = node.where if node.line or node.file != root.file else root.where
+    return ConfigError(f"{where}: {name}: {why}" if name else f"{where}: {why}")
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A phrase for a message's end: ``did you mean X?``, or what there is."""
+    names = list(known)
+    plain = {n.casefold(): n for n in names}
+    near = difflib.get_close_matches(name.casefold(), plain, 1, 0.6)
+    if near:
+        return f"did you mean {plain[near[0]]}?"
+    more = f" ... ({len(names)})" if len(names) > LISTED else ""
+    verb = "is" if len(names) == 1 else "are"
+    return f"there {verb} {', '.join(names[:LISTED]) or 'none'}{more}"
+
+
+def no_such(what: str, name: str, known: Iterable[str]) -> str:
+    """A whole message: ``no recipe 'defualt'; did you mean default?``"""
+    return f"no {what} {name!r}; {nearest(name, known)}"
+
+
+def hint(key: str, known: Sequence[str]) -> str:
+    """The nearest key; one that differs in its unit alone is told with the unit."""
+    for alike in ALIKE:
+        found = re.search(rf"_({'|'.join(alike)})$", key.lower())
+        if not found:
+            continue
+        for suffix in alike:
+            name = f"{key.lower()[: found.start()]}_{suffix}"
+            if name in known and f"_{suffix}" in UNITS:
+                return f"did you mean {name}, in {UNITS[f'_{suffix}']}?"
+    return nearest(key, known)
+
+
+# types
+
+
+def types_of(kind: Any) -> dict[str, Any]:
+    """The types of a struct's or dataclass's keys, by the keys as they are written."""
+    if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        return {f.encode_name: f.type for f in msgspec.structs.fields(kind)}
+    if dataclasses.is_dataclass(kind):
+        hints = typing.get_type_hints(kind, include_extras=True)
+        return {f.name: hints[f.name] for f in dataclasses.fields(kind) if f.init}
+    return {}
+
+
+def is_list(kind: Any, path: Sequence[str | int]) -> bool:
+    """Whether there is a list of tables at a path of a struct."""
+    return _inner(_kind_at(kind, path))[1]
+
+
+def is_text(kind: Any, path: Sequence[str | int]) -> bool:
+    """Whether there is text at a path of a struct."""
+    found = _bare(_kind_at(kind, path))
+    return found is str or (
+        typing.get_origin(found) is Literal and isinstance(typing.get_args(found)[0], str)
+    )
+
+
+def _kind_at(kind: Any, path: Sequence[str | int]) -> Any:
+    for step in path:
+        if isinstance(step, int):
+            continue
+        inner = _inner(kind)[0]
+        kind = types_of(inner).get(step) if inner is not None else None
+    return kind
+
+
+def _is_table(kind: Any) -> bool:
+    return isinstance(kind, type) and (
+        issubclass(kind, msgspec.Struct) or dataclasses.is_dataclass(kind)
+    )
+
+
+def _inner(kind: Any) -> tuple[Any, bool]:
+    """The struct that a key's value is, or is a list of; None: neither."""
+    bare = _bare(kind)
+    if _is_table(bare):
+        return bare, False
+    if typing.get_origin(bare) in (tuple, list):
+        items = typing.get_args(bare)
+        if items and _is_table(item := _bare(items[0])) and items[1:] in ((), (Ellipsis,)):
+            return item, True
+    return None, False
+
+
+def _bare(kind: Any, value: Any = None) -> Any:
+    """A type without its annotation and without None; of several the one that a value is of."""
+    while True:
+        origin = typing.get_origin(kind)
+        if origin is Annotated:
+            kind = typing.get_args(kind)[0]
+        elif origin in (typing.Union, types.UnionType):
+            choices = [c for c in typing.get_args(kind) if c is not types.NoneType]
+            if len(choices) > 1:
+                choices = [c for c in choices if _takes(_bare(c), value)]
+            if len(choices) != 1:
+                return kind
+            (kind,) = choices
+        else:
+            return kind
+
+
+def _takes(kind: Any, value: Any) -> bool:
+    """Whether a value is of the sort of a type: a table, a list, or one of the others."""
+    origin = typing.get_origin(kind)
+    if isinstance(value, dict):
+        return _is_table(kind) or origin is dict
+    return (origin in (tuple, list)) == isinstance(value, list) and not _is_table(kind)
+
+
+def _below(node: SettingNode, kind: Any) -> Iterator[tuple[str | int, SettingNode, Any]]:
+    """(step, node, type) of what a table or list holds; nothing if it is not of its type."""
+    bare = _bare(kind, node.value)
+    origin, arguments = typing.get_origin(bare), typing.get_args(bare)
+    if isinstance(node.value, dict):
+        fields = types_of(bare) if _is_table(bare) else {}
+        for key, below in node.value.items():
+            if key in fields:
+                yield key, below, fields[key]
+            elif origin is dict:
+                yield key, below, arguments[1]
+    elif isinstance(node.value, list) and origin in (tuple, list) and arguments:
+        several = origin is list or arguments[1:] == (Ellipsis,)
+        if several or len(arguments) == len(node.value):
+            for i, below in enumerate(node.value):
+                yield i, below, arguments[0 if several else i]
+
+
+# what is wrong
+
+
+def _check_keys(node: SettingNode, path: list[str | int], kind: Any, top: Any) -> None:
+    """Refuse unknown keys, and tables that are written as what they are not."""
+    bare = _bare(kind, node.value)
+    if _is_table(bare) and not isinstance(node.value, dict):
+        name = named(path) or "the file"
+        raise ConfigError(f"{node.where}: {name} is a table of keys, not {shown(node.plain())}")
+    fields = types_of(bare) if _is_table(bare) else {}
+    for key, below in node.value.items() if fields or _is_table(bare) else ():
+        if key not in fields:
+            owner = named(path) or "the file"
+            said = (path and _table_hint(key, top)) or hint(key, list(fields))
+            raise ConfigError(f"{below.where}: {owner} has no key {key!r}; {said}")
+        inner, several = _inner(fields[key])
+        if inner is not None and several and not isinstance(below.value, list):
+            name = named([*path, key])
+            raise ConfigError(f"{below.where}: there may be several of {name}: write [[{key}]]")
+        if inner is not None and not several and isinstance(below.value, list):
+            name = named([*path, key])
+            raise ConfigError(f"{below.where}: there is but one: write [{name}]")
+    for step, below, inner in _below(node, kind):
+        _check_keys(below, [*path, step], inner, top)
+
+
+def _table_hint(key: str, top: Any) -> str:
+    """Where a table of the file belongs that stands in another one; empty: it is no such table."""
+    inner, several = _inner(types_of(top).get(key)) if top is not None else (None, False)
+    if inner is None:
+        return ""
+    return f"it is a table of the file: write {f'[[{key}]]' if several else f'[{key}]'}"
+
+
+def _check_finite(root: SettingNode, node: SettingNode, path: list[str | int], kind: Any) -> None:
+    """Refuse text for a number that is none: TOML's are refused where they are read."""
+    for step, below, inner in _below(node, kind):
+        _check_finite(root, below, [*path, step], inner)
+    if _bare(kind, node.value) is float and isinstance(node.value, str):
+        try:
+            number = float(node.value)
+        except ValueError:
+            return  # told with what is allowed
+        if not math.isfinite(number):
+            raise refusal(root, path, f"{number} is no quantity")
+
+
+def _culprit(
+    node: SettingNode, kind: Any, lax: bool
+) -> tuple[list[str | int], Any, Exception] | None:
+    """(path, type, error) of the smallest branch that cannot be converted; None: all can be."""
+    for step, below, inner in _below(node, kind):
+        found = _culprit(below, inner, lax)
+        if found is not None:
+            return [step, *found[0]], found[1], found[2]
+    try:
+        msgspec.convert(node.plain(), kind, strict=not lax)
+    except _REFUSED as error:
+        return [], kind, error
+    return None
+
+
+def _said(error: Exception, node: SettingNode, kind: Any, path: Sequence[str | int]) -> str:
+    """What msgspec says of a branch, in a user's words."""
+    message = str(error)
+    if not isinstance(error, msgspec.ValidationError):
+        return message
+    message = message.partition(" - at `")[0]
+    missing = re.search(r"missing required field `(.+)`", message)
+    if missing:
+        return f"needs a key {missing[1]!r}"
+    value = node.plain()
+    bare = _bare(kind, value)
+    if typing.get_origin(bare) is Literal:
+        choices = [str(c) for c in typing.get_args(bare)]
+        near = difflib.get_close_matches(str(value).lower(), choices, 1, 0.6)
+        ask = f"; did you mean {near[0]}?" if near else ""
+        return f"{shown(value)} is not one of {', '.join(choices)}{ask}"
+    if "matching regex" in message:
+        return f"{shown(value)} is no {_described(kind)}"
+    if message.startswith("Expected `array`") and (wanted := _list_of(bare)):
+        return f"expected {wanted}, got {shown(value)}"
+    if "of length" in message:
+        return "must not be empty" if value in ("", [], {}) else "is too long"
+    if not message.startswith("Expected "):
+        return message.replace("`", "'")
+    message = message.partition(", got ")[0].replace(" | null", "").replace(" | ", " or ")
+    message = message.replace("`", "").replace("Expected", "expected")
+    message = re.sub(rf"\b({'|'.join(WORDS)})\b", lambda word: WORDS[word[0]], message)
+    key = str(path[-1]) if path else ""
+    unit = next((unit for end, unit in UNITS.items() if key.endswith(end)), "")
+    return f"{message}, got {shown(value)}" + (f" (in {unit})" if unit else "")
+
+
+def _described(kind: Any) -> str:
+    """What text is that must match a pattern: `msgspec.Meta` says so."""
+    for note in typing.get_args(kind)[1:] if typing.get_origin(kind) is Annotated else ():
+        if isinstance(note, msgspec.Meta) and note.description:
+            return note.description
+    return "such text"
+
+
+def _list_of(kind: Any) -> str:
+    """What a list is to hold, in words; empty: its length is bounded, which is told otherwise."""
+    items = typing.get_args(kind)
+    if typing.get_origin(kind) is not tuple or items[1:] == (Ellipsis,):
+        return ""
+    alike = SEVERAL.get(items[0], "values") if len(set(items)) == 1 else "values"
+    return f"a list of {len(items)} {alike}"
+
+
+def shown(value: Any) -> str:
+    """A value in a message: short, and without what would break the line."""
+    if isinstance(value, date | time):
+        return value.isoformat()
+    return f"{value!r:.60}"

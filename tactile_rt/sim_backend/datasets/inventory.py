@@ -1,0 +1,140 @@
+"""What there is of a sweep set: its sweeps counted, its files held against their checksums.
+
+Neither reads the loads. The checksums are written as the program sha256sum writes them.
+"""
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from tactile_rt.files import write_whole
+from tactile_rt.stream import RecordingError
+from tactile_rt.sweep_set import (
+    MANIFEST,
+    SKIPPED,
+    SweepManifest,
+    has_object,
+    object_path,
+    read_skipped,
+)
+
+__all__ = ["SUMS", "Tally", "check_sums", "tally", "write_sums", "written_sum"]
+
+SUMS = "SHA256SUMS"
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Counts of a set.
+
+    Attributes:
+        sweeps: The number of sweeps that are there.
+        misses: The number of these sweeps that pass beside the array.
+        unstable: The number of these sweeps that could not be simulated at the set's profile, and
+            are empty.
+        skipped: The number of objects that could not be made.
+    """
+
+    sweeps: int = 0
+    misses: int = 0
+    unstable: int = 0
+    skipped: int = 0
+
+    @property
+    def shortcomings(self) -> str:
+        """What is to be told beside the number of sweeps; nothing if all is well."""
+        parts = [
+            *([f"{self.misses} miss the array"] if self.misses else []),
+            *([f"{self.unstable} could not be simulated"] if self.unstable else []),
+            *([f"{self.skipped} objects could not be made ({SKIPPED})"] if self.skipped else []),
+        ]
+        return ", ".join(parts)
+
+
+def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
+    """Count what there is of these objects.
+
+    Args:
+        folder: the set.
+        names: objects.
+        sweeps: of each of them.
+
+    Raises:
+        RecordingError: an object's file is damaged.
+    """
+    there = [name for name in names if has_object(folder, name)]
+    misses = unstable = 0
+    for name in there:
+        path = object_path(folder, name)
+        try:
+            with path.open("rb") as file, np.load(file) as arrays:
+                known = set(arrays.files)
+                misses += int((~arrays["touches"]).sum()) if "touches" in known else 0
+                unstable += int(arrays["unstable"].sum()) if "unstable" in known else 0
+        except Exception as error:  # numpy and zipfile raise a dozen unrelated types
+            reason = str(error) or type(error).__name__
+            raise RecordingError(
+                f"{path} is damaged ({reason}): delete it and sweep again"
+            ) from None
+    return Tally(len(there) * sweeps, misses, unstable, len(read_skipped(folder)))
+
+
+def write_sums(folder: Path) -> None:
+    """Write SHA256SUMS of the set's files; sums that are there already stay.
+
+    A file that has rotted since is thereby never declared sound; one that was made anew has the
+    same content, because sweeps depend on nothing but their recipe.
+    """
+    known = _read_sums(folder) if (folder / SUMS).exists() else {}
+    names = [MANIFEST, *([SKIPPED] if (folder / SKIPPED).exists() else [])]
+    for objects in SweepManifest.read(folder).split.values():
+        names += [f"{name}.npz" for name in objects if has_object(folder, name)]
+    known.pop(SKIPPED, None)  # the one file that grows
+    lines = [f"{known.get(n) or _sha256(folder / n)}  {n}\n" for n in sorted(names)]
+    write_whole(folder / SUMS, lambda file: file.write("".join(lines).encode()))
+
+
+def written_sum(folder: Path, name: str) -> str | None:
+    """The checksum that a file of a finished set had; None if there is none."""
+    return _read_sums(folder).get(name) if (folder / SUMS).exists() else None
+
+
+def check_sums(folder: Path) -> int:
+    """Compare every file with SHA256SUMS.
+
+    Returns:
+        How many files are as they were written.
+
+    Raises:
+        RecordingError: there are no sums yet, or a file is missing or another than it was: all
+            such files are named.
+    """
+    sums = _read_sums(folder)
+    bad = [n for n, s in sums.items() if not (folder / n).exists() or _sha256(folder / n) != s]
+    if bad:
+        raise RecordingError(
+            f"{folder}: {len(bad)} of {len(sums)} files are missing or damaged: "
+            f"{', '.join(bad)}; delete them and sweep again"
+        )
+    return len(sums)
+
+
+def _read_sums(folder: Path) -> dict[str, str]:
+    path = folder / SUMS
+    try:
+        pairs = [line.split("  ", 1) for line in path.read_text().splitlines()]
+        return {name: digest for digest, name in pairs}
+    except FileNotFoundError:
+        raise RecordingError(
+            f"{folder} has no {SUMS}: it is unfinished, or older than they are"
+        ) from None
+    except (ValueError, UnicodeDecodeError):
+        raise RecordingError(f"{path} is damaged: delete it and sweep again") from None
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,135 @@
+"""`tactile-rt top`: what it shows, and where it gets it from."""
+
+import dataclasses
+import io
+import json
+import socket
+import sys
+import threading
+
+import pytest
+from rich.console import Console
+
+from tactile_rt.cli import main
+from tactile_rt.cli.top import picture, read_snapshots, snapshot_at
+from tactile_rt.daemon.config import MetricsConfig
+from tactile_rt.daemon.messages import encode, message_of, state_message
+from tactile_rt.daemon.metrics import Metrics
+from tactile_rt.stream import ConfigError, SourceError
+from tests.helpers.published import View, busy_snapshot, decision, event, running
+
+SHOWN = """\
+tactile_rt 1.2.3 degraded  up 0:00:10  pid 77  reloaded 1x  clock stepped 2x  /etc/robot.toml
+  no samples: source.finger: the device is lost
+
+SOURCE    STATE        HZ    OF  SAMPLES  MISS  BAD  DROP  DUP  AGE MS  ARRAY
+whiskers  streaming  1000  1000     7000     3    4     2    1       4  2 x 3 mouse
+finger    lost          0   110        0     0    0     0    0          unplugged
+
+MODEL     STATE    DECISIONS  FINAL  P50 MS  P99  MAX  STEP  DROP  NEWEST
+whiskers  running         40      4     5.0  9.5  9.5   5.0     2  mug 93% touching
+
+CONSUMER  STATE         STARTS  WAIT  TAKEN  DROP  P50 MS  P99  MAX  TELLS
+zmq       running            1     1      9     2     5.0  9.5  9.5  end\
+point tcp://127.0.0.1:5556, messages 40
+recorder  waiting (9x)      10     0      0     0                    No space left on device
+"""
+
+
+def text(renderable, width=118):
+    console = Console(file=io.StringIO(), width=width)
+    console.print(renderable)
+    return "".join(f"{x.rstrip()}\n" for x in console.file.getvalue().splitlines())
+
+
+@pytest.fixture
+def daemon():
+    """URL of one that is being watched."""
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        port = found.getsockname()[1]
+    with running(Metrics("metrics", MetricsConfig(port=port)), View(snapshot=busy_snapshot())):
+        yield f"http://127.0.0.1:{port}"
+
+
+def call(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["tactile-rt", "top", *map(str, arguments)])
+    monkeypatch.setenv("COLUMNS", "118")
+    with pytest.raises(SystemExit) as left:
+        main()
+    return left.value.code or 0, *capsys.readouterr()
+
+
+def test_all_that_matters_is_on_one_screen():
+    assert text(picture(busy_snapshot(2), busy_snapshot())) == SHOWN
+
+
+def test_rates_are_not_made_up():
+    first = text(picture(busy_snapshot(), None))
+    assert "whiskers  streaming      1000     5000" in first
+    # Another process under the same address, or no time between: nothing to divide by.
+    assert text(picture(busy_snapshot(), busy_snapshot())) == first
+    other = dataclasses.replace(busy_snapshot(), pid=78)
+    assert "1000  1000" not in text(picture(busy_snapshot(2), other))
+
+
+def test_markup_in_a_reason_is_text():
+    snapshot = dataclasses.replace(busy_snapshot(), degraded=("[red]x[/nonsense]",))
+    assert "[red]x[/nonsense]" in text(picture(snapshot, None))
+
+
+def test_it_looks_at_a_running_daemon(daemon, monkeypatch, capsys):
+    assert snapshot_at(daemon) == busy_snapshot()
+    code, out, err = call(monkeypatch, capsys, daemon, "--once")
+    assert code == 0, err
+    assert "mug 93% touching" in out and "No space left on device" in out
+    code, out, err = call(monkeypatch, capsys, daemon.removeprefix("http://"), "--once")
+    assert code == 0, err
+
+
+def test_it_reads_what_the_jsonl_publisher_says(monkeypatch, capsys):
+    lines = [encode(message_of(decision())), b"garbage", encode(message_of(event()))]
+    lines += [encode(state_message(busy_snapshot(s))) for s in (0, 2)]
+    assert list(read_snapshots(iter(lines))) == [busy_snapshot(), busy_snapshot(2)]
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"\n".join(lines) + b"\n")))
+    code, out, err = call(monkeypatch, capsys, "-")
+    assert code == 0, err
+    assert "7000" in out and "streaming  1000  1000" in out
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"garbage\n")))
+    code, out, err = call(monkeypatch, capsys, "-")
+    assert code == 2 and "state_s = 1" in err
+
+
+def test_whatever_is_there_instead_is_one_line():
+    with pytest.raises(ConfigError, match=r"^https://x is not like http://"):
+        snapshot_at("https://x")
+    with pytest.raises(ConfigError, match="is not like"):
+        snapshot_at("http://127.0.0.1:port")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        at = f"http://127.0.0.1:{server.getsockname()[1]}"
+
+        def answer(text):
+            line, _ = server.accept()
+            with line:
+                line.recv(4096)
+                line.sendall(text)
+
+        for said, error in (
+            (b"SSH-2.0-nonsense\r\n", SourceError),
+            (b"HTTP/1.1 200 OK\r\nContent-Length: 5\r\n\r\nhello", ConfigError),
+            (b"HTTP/1.1 404 Not Found\r\nContent-Length: 0\r\n\r\n", ConfigError),
+        ):
+            thread = threading.Thread(target=answer, args=(said,))
+            thread.start()
+            with pytest.raises(error, match=at):
+                snapshot_at(at)
+            thread.join()
+    with pytest.raises(SourceError, match="Connection refused; does its configuration have"):
+        snapshot_at(at)
+
+
+def test_a_later_daemon_may_tell_more():
+    found = json.loads(encode(state_message(busy_snapshot())))
+    found["snapshot"]["sources"][0]["colour"] = "blue"
+    found["snapshot"]["weather"] = "fine"
+    assert list(read_snapshots(iter([json.dumps(found).encode()]))) == [busy_snapshot()]

@@ -1,0 +1,119 @@
+"""Serial ports that are somewhere else: pyserial's socket:// and rfc2217://, with a real device."""
+
+import contextlib
+import socket
+import threading
+
+import numpy as np
+import pytest
+import serial
+import serial.rfc2217
+
+from tactile_rt.drivers.health import State
+from tactile_rt.sources.opening import open_source
+from tactile_rt.testing import FakeSerial
+from tests.helpers.waiting import PATIENCE_S, until
+
+SAMPLES = 600
+
+
+class Pty(serial.Serial):
+    """A pty has no control lines, which a server of RFC 2217 sets and watches."""
+
+    cts = dsr = ri = cd = False
+
+    def _update_dtr_state(self):
+        pass
+
+    _update_rts_state = _update_dtr_state
+
+
+class Raw:
+    """Bytes as they are."""
+
+    def __init__(self, port, connection):
+        pass
+
+    def escape(self, data):
+        yield data
+
+    def filter(self, data):
+        yield data
+
+
+class Rfc2217:
+    """pyserial's own server of RFC 2217."""
+
+    def __init__(self, port, connection):
+        class Peer:
+            def write(self, data):
+                connection.sendall(data)
+
+        self._manager = serial.rfc2217.PortManager(port, Peer())
+
+    def escape(self, data):
+        return self._manager.escape(data)
+
+    def filter(self, data):
+        return self._manager.filter(data)
+
+
+@contextlib.contextmanager
+def served(path, protocol):
+    """A server of one serial port for one client; gives (its TCP port, a way to hang up)."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    over, connections = threading.Event(), []
+
+    def serve():
+        try:
+            connection, _ = listener.accept()
+        except OSError:
+            return
+        connections.append(connection)
+        with Pty(path, timeout=0.02) as port:
+            speaks = protocol(port, connection)
+            connection.settimeout(0.02)
+            while not over.is_set():
+                try:
+                    with contextlib.suppress(TimeoutError):
+                        for data in speaks.filter(connection.recv(4096)):
+                            port.write(data)
+                    for data in speaks.escape(port.read(max(1, port.in_waiting))):
+                        connection.sendall(data)
+                except OSError:
+                    return
+
+    thread = threading.Thread(target=serve, daemon=True)
+    thread.start()
+
+    def hang_up():
+        for connection in connections:
+            with contextlib.suppress(OSError):
+                connection.shutdown(socket.SHUT_RDWR)
+
+    try:
+        yield listener.getsockname()[1], hang_up
+    finally:
+        over.set()
+        hang_up()
+        listener.close()
+        thread.join(5)
+        for connection in connections:
+            connection.close()
+
+
+@pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # pyserial 3.5's own
+@pytest.mark.parametrize(("scheme", "protocol"), [("socket", Raw), ("rfc2217", Rfc2217)])
+def test_a_port_on_another_host_is_read_bit_for_bit_and_known_to_be_gone(scheme, protocol):
+    values = np.random.default_rng(1).normal(size=(SAMPLES, 4, 6)).astype(np.float32) * 1e-3
+    with FakeSerial(values) as fake, served(fake.port, protocol) as (port, hang_up):
+        url = f"serial:{scheme}://127.0.0.1:{port}?codec=native&start_s={PATIENCE_S:g}"
+        with open_source(url) as source:
+            got = []
+            while sum(map(len, got)) < SAMPLES:
+                chunk = source.read(PATIENCE_S)
+                assert chunk is not None, source.health
+                got.append(chunk)
+            assert np.array_equal(np.concatenate([c.values for c in got]), values)
+            hang_up()
+            until(lambda: source.health.state == State.LOST, meanwhile=lambda: source.read(0.05))

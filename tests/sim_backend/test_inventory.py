@@ -1,0 +1,42 @@
+"""What is told of a set once it is made: what of it is no use."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+
+from tactile_rt.sim_backend.datasets.inventory import Tally, tally
+from tactile_rt.stream import RecordingError
+from tactile_rt.sweep_set import object_path, write_object, write_skipped
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Two objects of two sweeps, one that could not be made."""
+    values = np.zeros((2, 3, 1, 6), np.float32)
+    for name, touches, unstable in (
+        ("a", (True, False), (True, False)),
+        ("b", (True,) * 2, (0, 0)),
+    ):
+        flags = {"touches": np.array(touches), "unstable": np.array(unstable, np.bool_)}
+        write_object(tmp_path, name, values, flags)
+    write_skipped(tmp_path, {"c": "no triangles"})
+    return tmp_path
+
+
+def test_misses_failures_and_skipped_objects_are_counted(folder: Path) -> None:
+    counts = tally(folder, ["a", "b", "c"], 2)
+    assert counts == Tally(sweeps=4, misses=1, unstable=1, skipped=1)
+    assert counts.shortcomings == (
+        "1 miss the array, 1 could not be simulated, 1 objects could not be made (skipped.json)"
+    )
+    assert tally(folder, ["b"], 2).misses == 0
+    assert Tally(sweeps=4).shortcomings == ""
+
+
+def test_a_damaged_object_is_named(folder: Path) -> None:
+    object_path(folder, "b").write_bytes(b"PK")
+    with pytest.raises(RecordingError, match=r"b\.npz is damaged .*: delete it and sweep again"):
+        tally(folder, ["a", "b"], 2)

@@ -1,0 +1,54 @@
+"""What `from tactile_rt import ...` gives, and what it costs."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import tactile_rt
+
+README = Path(tactile_rt.__file__).parents[1] / "README.md"
+IMPORT_CPU_S = 0.2
+
+
+def test_every_name_is_there_and_listed_once_in_order() -> None:
+    assert tactile_rt.__all__ == sorted(set(tactile_rt.__all__))
+    for name in tactile_rt.__all__:
+        assert getattr(tactile_rt, name) is not None
+    assert set(tactile_rt.__all__) <= set(dir(tactile_rt))
+
+
+def test_a_name_that_is_not_there_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="has no attribute 'Classifer'"):
+        tactile_rt.Classifer  # noqa: B018
+    with pytest.raises(ImportError):
+        from tactile_rt import Classifer  # noqa: F401
+
+
+def test_names_are_loaded_when_they_are_used() -> None:
+    code = (
+        "import sys, time; began = time.process_time(); import tactile_rt\n"
+        "spent = time.process_time() - began\n"
+        "assert 'numpy' not in sys.modules and 'onnxruntime' not in sys.modules\n"
+        "from tactile_rt import Chunk, open_source\n"
+        "assert 'onnxruntime' not in sys.modules\n"
+        "from tactile_rt import Classifier\n"
+        "assert 'onnxruntime' in sys.modules and 'torch' not in sys.modules\n"
+        "print(spent)"
+    )
+    spent = [
+        float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout)
+        for _ in range(3)
+    ]
+    assert min(spent) <= IMPORT_CPU_S
+
+
+@pytest.mark.skipif(not README.exists(), reason="a source archive, without README")
+def test_the_readme_s_program_needs_one_import() -> None:
+    (program, *_) = re.findall(r"```python\n(.*?)```", README.read_text("utf-8"), re.S)
+    assert len(re.findall(r"^(?:from|import) ", program, re.M)) == 1
+    names = re.findall(r"^from tactile_rt import (.*)$", program, re.M)[0].split(", ")
+    assert set(names) <= set(tactile_rt.__all__)
+    compile(program, "README.md", "exec")
