@@ -9,13 +9,13 @@ import json
 from importlib.util import find_spec
 
 import pytest
+from tactile_rt.recording.sweep_replay import SweepOptions
 
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.drivers.codec import CODECS, codec_class
 from tactile_rt.drivers.opening import CanOptions, SerialOptions
 from tactile_rt.recording.replay import ReplayOptions
-from tactile_rt.recording.sweep_replay import SweepOptions
 from tactile_rt.sources.opening import open_source
 from tactile_rt.sources.synthetic import SyntheticOptions
 from tactile_rt.stream import TactileError
