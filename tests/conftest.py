@@ -8,15 +8,14 @@ from collections.abc import Iterator
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # Dozens of children import the package: they need not compile it, whatever the shell says.
-sys.dont_write_bytecode = False
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+os.environ["PYTHONDONTWRITEBYTECODE"] = ""
 
 import pytest
 from hypothesis import settings
 
-pytest.register_assert_rewrite("tests.helpers")
-
 from tests.helpers.waiting import until
+
+sys.dont_write_bytecode = False
 
 # No deadline: another process on the machine must not fail a test. Derandomised: whoever runs the
 # tests gets the same examples, so a pass stays a pass.

@@ -29,7 +29,6 @@ def main() -> None:
         evaluate,
         grid,
         hil,
-        install_service,
         locate,
         model,
         record,

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from tactile_rt.bounded_queue import QueueState
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.stream import SourceStats
 
@@ -53,21 +54,6 @@ class Latency:
     max_ms: float = 0.0
     edges_s: tuple[float, ...] = ()
     buckets: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True)
-class QueueState:
-    """A mailbox. In each class of items: put = taken + dropped + waiting.
-
-    The classes are ``samples`` (counted by sample), ``packets``, ``decisions`` and ``events`` (all
-    else).
-    """
-
-    waiting: dict[str, int] = field(default_factory=dict)
-    put: dict[str, int] = field(default_factory=dict)
-    taken: dict[str, int] = field(default_factory=dict)
-    dropped: dict[str, int] = field(default_factory=dict)
-    waiting_bytes: int = 0
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ def test_a_model_that_cannot_be_used_is_one_line(call, bad_models, wrong, said, 
     ("source", "said"),
     [
         ("simm:mouse", "did you mean sim:?"),
-        ("nonsense", "unknown source"),
+        ("nonsense", "'nonsense' is no source; there are can:"),
         ("sim:cat", "no simulated array 'cat'"),
         ("sim:mouse?object=mug", "did you mean objects?"),
         ("sim:mouse?objects=mugg", "did you mean 'mug'?"),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.classifier import Classifier
-from tactile_rt.daemon import consumers
+from tactile_rt.daemon import publishers
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.consumer import Consumer
@@ -81,7 +81,7 @@ class Spy(Consumer):
 
 @pytest.fixture
 def spy(monkeypatch):
-    monkeypatch.setitem(consumers.PUBLISHERS, "spy", (f"{__name__}:Spy", ""))
+    monkeypatch.setitem(publishers.PUBLISHERS, "spy", (f"{__name__}:Spy", ""))
     Spy.made.clear()
     return Spy.made
 

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import shlex
 import signal
 import socket
 import subprocess
@@ -287,6 +288,9 @@ def test_config_commands(folder, monkeypatch, capsys):
     assert call(monkeypatch, capsys, "config", "example")[1] == EXAMPLE
     assert call(monkeypatch, capsys, "config", "example", "new.toml")[0] == 0
     assert call(monkeypatch, capsys, "config", "check", "new.toml")[0] == 0
+    _, said, _ = call(monkeypatch, capsys, "config", "example", "rö bot.toml")
+    assert said.endswith("run it with: tactile-rt run 'rö bot.toml'\n")
+    assert shlex.split(said.partition("with: ")[2]) == ["tactile-rt", "run", "rö bot.toml"]
 
 
 def test_the_daemon_reaches_nothing_that_a_robot_does_not_have():

@@ -59,28 +59,44 @@ class SourceModule:
         return self.name.partition(".")[2].partition(".")[0]
 
     @cached_property
-    def imports(self) -> list[Import]:
-        return list(self._imports(self.tree))
+    def nodes(self) -> list[tuple[ast.AST, ast.ClassDef | None]]:
+        """Every node of the tree, with the class that it stands in."""
+        found: list[tuple[ast.AST, ast.ClassDef | None]] = []
+        waiting: list[tuple[ast.AST, ast.ClassDef | None]] = [(self.tree, None)]
+        while waiting:
+            node, owner = waiting.pop()
+            found.append((node, owner))
+            inside = node if isinstance(node, ast.ClassDef) else owner
+            waiting += [(child, inside) for child in _children(node)]
+        return found
 
-    def _imports(self, node: ast.AST) -> Iterator[Import]:
-        if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING"):
-            for child in node.orelse:
-                yield from self._imports(child)
-            return
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                yield Import(alias.name, "", node.lineno)
-        elif isinstance(node, ast.ImportFrom):
-            base = self._base(node)
-            for alias in node.names:
-                if f"{base}.{alias.name}" in modules():
-                    yield Import(f"{base}.{alias.name}", "", node.lineno)
-                else:
-                    yield Import(base, alias.name, node.lineno)
-        elif isinstance(node, ast.Call) and called(node) in ("import_module", "__import__"):
-            yield Import(_text(node.args[0], self.name), "", node.lineno, by_name=True)
-        for child in ast.iter_child_nodes(node):
-            yield from self._imports(child)
+    @cached_property
+    def imports(self) -> list[Import]:
+        """What it imports when it runs, wherever in the file."""
+        found: list[Import] = []
+        never_run = {
+            id(inner)
+            for node, _ in self.nodes
+            if isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
+            for statement in node.body
+            for inner in ast.walk(statement)
+        }
+        for node, _ in self.nodes:
+            if id(node) in never_run:
+                continue
+            if isinstance(node, ast.Import):
+                found += [Import(alias.name, "", node.lineno) for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                base = self._base(node)
+                for alias in node.names:
+                    inner = f"{base}.{alias.name}"
+                    known = inner in modules()
+                    found.append(
+                        Import(*((inner, "") if known else (base, alias.name)), node.lineno)
+                    )
+            elif isinstance(node, ast.Call) and called(node) in ("import_module", "__import__"):
+                found.append(Import(_text(node.args[0], self.name), "", node.lineno, by_name=True))
+        return found
 
     def _base(self, node: ast.ImportFrom) -> str:
         if not node.level:
@@ -92,12 +108,10 @@ class SourceModule:
     @cached_property
     def names(self) -> set[str]:
         """What the module's own scope holds: defined, assigned or imported, wherever in it."""
-        found = set()
-        for node in ast.walk(self.tree):
+        found = set().union(*(_bound(node) for node in self.tree.body))
+        for node, _ in self.nodes:
             if isinstance(node, ast.Import | ast.ImportFrom):
                 found |= {(a.asname or a.name).partition(".")[0] for a in node.names}
-        for node in self.tree.body:
-            found |= _bound(node)
         return found
 
     @cached_property
@@ -108,7 +122,21 @@ class SourceModule:
     @cached_property
     def documented(self) -> list[tuple[Documented, ast.ClassDef | None, str]]:
         """Everything with a docstring: (node, the class that it stands in, docstring)."""
-        return list(_documented(self.tree, None))
+        return [
+            (node, owner, said)
+            for node, owner in self.nodes
+            if isinstance(node, Documented) and (said := ast.get_docstring(node))
+        ]
+
+    @cached_property
+    def own_attributes(self) -> dict[ast.ClassDef, set[str]]:
+        """What the methods of a class assign to `self`."""
+        found: dict[ast.ClassDef, set[str]] = {}
+        for node, owner in self.nodes:
+            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and owner:
+                if isinstance(node.value, ast.Name) and node.value.id == "self":
+                    found.setdefault(owner, set()).add(node.attr)
+        return found
 
 
 @cache
@@ -227,14 +255,10 @@ def parameters(node: ast.AST) -> set[str]:
     return {p.arg for p in every}
 
 
+@cache
 def members(node: ast.ClassDef) -> set[str]:
-    """The names that a class defines, in its body and on `self`."""
-    found = set().union(*(_bound(child) for child in node.body))
-    for child in ast.walk(node):
-        if isinstance(child, ast.Attribute) and isinstance(child.value, ast.Name):
-            if child.value.id == "self" and isinstance(child.ctx, ast.Store):
-                found.add(child.attr)
-    return found
+    """The names that a class defines in its body."""
+    return set().union(*(_bound(child) for child in node.body))
 
 
 def _bound(node: ast.stmt) -> set[str]:
@@ -250,23 +274,18 @@ def _bound(node: ast.stmt) -> set[str]:
 
 def _without_functions(node: ast.AST) -> Iterator[ast.AST]:
     yield node
-    for child in ast.iter_child_nodes(node):
+    for child in _children(node):
         if not isinstance(child, (*FUNCTIONS, ast.ClassDef, ast.Lambda)):
             yield from _without_functions(child)
 
 
-def _documented(
-    node: Documented, owner: ast.ClassDef | None
-) -> Iterator[tuple[Documented, ast.ClassDef | None, str]]:
-    said = ast.get_docstring(node)
-    if said:
-        yield node, owner, said
-    if isinstance(node, ast.ClassDef):
-        owner = node
-    for child in _without_functions(node):
-        for inner in ast.iter_child_nodes(child):
-            if isinstance(inner, (*FUNCTIONS, ast.ClassDef)):
-                yield from _documented(inner, owner)
+def _children(node: ast.AST) -> Iterator[ast.AST]:
+    for field in node._fields:
+        value = getattr(node, field, None)
+        if isinstance(value, list):
+            yield from (v for v in value if isinstance(v, ast.AST))
+        elif isinstance(value, ast.AST) and not isinstance(value, ast.expr_context):
+            yield value
 
 
 def _text(node: ast.expr, module: str) -> str:

@@ -93,7 +93,7 @@ class GraphEncoder(nn.Module):
         self.features = channels[graph.readout]
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zeros: each node's cell state and, where a node hears it, its output `_h`."""
+        """Zeros: each node's cell state and, where a node hears it, its output, ``NAME_h``."""
         zeros = next(self.parameters()).new_zeros
         state = {}
         for node in self.graph.nodes:

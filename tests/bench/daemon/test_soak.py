@@ -24,7 +24,7 @@ from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Opened, SourceChunk
 from tactile_rt.daemon.recorder import Recorder
 from tactile_rt.drivers.emulation.faults import Fate
-from tactile_rt.recording import read_stream, recover
+from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource
 from tactile_rt.stream import Chunk
@@ -102,7 +102,7 @@ def test_what_was_added_to_a_file_that_cannot_grow_counts_as_lost(tmp_path):
     found = []
     for k, path in enumerate(sorted((tmp_path / "a").glob("*.mcap"))):
         whole = path if is_finished(path) else recover(path, tmp_path / f"{k}.mcap")
-        found += [int(number) for chunk in read_stream(whole) for number in chunk.seq]
+        found += [int(number) for chunk in Recording(whole) for number in chunk.seq]
     assert 0 < lost < sent
     assert len(found) == len(set(found)) == sent - lost
     assert sum("File too large" in reason for reason in view.told) == len(view.told)

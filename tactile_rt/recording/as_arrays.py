@@ -1,19 +1,23 @@
-"""A recording as arrays, and back: what a table of samples does not show goes beside it.
+"""A recording as arrays, and back; and as the .npz of them, which `numpy.load` reads.
 
 Every form (npz, CSV, HDF5) holds the same, so that each becomes the recording again but for its raw
-packets:
+packets. What a table of samples does not show goes beside it:
 
     seq, t_ns, values, valid         the samples, as in `Chunk`
     chunk_samples, chunk_log_ns      how they came: samples of each chunk, and when it was recorded
     decisions, events, health        messages, JSON, each with its time in ..._log_ns
     about                            what the recording is of, JSON
+
+In an .npz, texts are JSON lines in arrays of bytes: in numpy's own text each takes the room of the
+longest.
 """
 
 import heapq
 from collections.abc import Generator, Iterable, Iterator, Mapping
 from dataclasses import replace
 from operator import attrgetter
-from typing import Any
+from pathlib import Path
+from typing import Any, BinaryIO
 
 import msgspec
 import numpy as np
@@ -25,13 +29,23 @@ from tactile_rt.recording.layout import (
     EVENTS,
     HEALTH,
     SAMPLES,
+    Raw,
     decode_samples,
     encode_samples,
 )
-from tactile_rt.recording.reader import Raw
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError, concatenate
 
-__all__ = ["ABOUT", "COLUMNS", "TEXTS", "Told", "about_of", "about_text", "raws_of", "spec_text"]
+__all__ = [
+    "ABOUT",
+    "COLUMNS",
+    "TEXTS",
+    "Told",
+    "about_of",
+    "about_text",
+    "raws_of",
+    "read_npz",
+    "write_npz",
+]
 
 ABOUT = "about"
 COLUMNS = ("seq", "t_ns", "values", "valid")
@@ -45,10 +59,10 @@ class Told:
     """What is not a sample: how samples were cut into chunks, and what was told meanwhile.
 
     Attributes:
-        chunk_samples: of each chunk.
-        chunk_log_ns: when each was recorded, host time.
-        texts: JSON of each topic.
-        log_ns: when each text was recorded, host time.
+        chunk_samples: The number of samples of each chunk.
+        chunk_log_ns: When each chunk was recorded, host monotonic time, ns.
+        texts: The messages of each topic, JSON.
+        log_ns: When each message of a topic was recorded, host monotonic time, ns.
     """
 
     def __init__(self) -> None:
@@ -104,7 +118,7 @@ def about_of(what: str, text: str) -> Description:
     return Description.from_metadata(what, plain, session, recovered)
 
 
-def spec_text(what: str, text: str, utc_offset_ns: int) -> Description:
+def _spec_of(what: str, text: str, utc_offset_ns: int) -> Description:
     """What arrays of one's own are of: those that have a `spec` alone.
 
     Raises:
@@ -193,3 +207,64 @@ def _texts(what: str, topic: str, arrays: Mapping[str, Any], texts: Iterable[str
     if len(lines) != len(at):
         raise RecordingError(f"{what}: {len(lines)} {topic}, but {len(at)} times of them")
     return (Raw(topic, t_ns, text.encode()) for text, t_ns in zip(lines, at, strict=True))
+
+
+def write_npz(what: str, about: Description, raws: Iterable[Raw], file: BinaryIO) -> int:
+    """Write it; the number of samples.
+
+    Raises:
+        RecordingError: there is none.
+    """
+    told = Told()
+    chunks = list(told.chunks(about.spec, raws))
+    if not chunks:
+        raise RecordingError(f"{what} has no samples")
+    whole = concatenate(chunks)
+    texts = {
+        topic: np.frombuffer("".join(f"{line}\n" for line in lines).encode(), np.uint8)
+        for topic, lines in told.texts.items()
+    }
+    arrays: dict[str, Any] = {
+        **{name: getattr(whole, name) for name in COLUMNS},
+        **told.times(),
+        **texts,
+        "utc_offset_ns": np.int64(about.utc_offset_ns),
+        "spec": np.str_(about.spec.to_json()),
+        ABOUT: np.str_(about_text(about)),
+    }
+    np.savez(file, **arrays)
+    return len(whole)
+
+
+def read_npz(path: Path) -> tuple[Description, Generator[Raw, None, None]]:
+    """What it is of, and its messages.
+
+    Arrays of one's own need `COLUMNS` and ``spec``.
+
+    Raises:
+        RecordingError: it is damaged, or holds something else.
+    """
+    try:
+        with path.open("rb") as file, np.load(file) as found:
+            arrays = {name: found[name] for name in found.files}
+    except MemoryError:
+        raise
+    except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RecordingError(f"{path} is damaged, or no .npz ({reason})") from None
+    what = str(path)
+    if ABOUT in arrays:
+        about = about_of(what, str(arrays[ABOUT]))
+    elif "spec" in arrays:
+        offset = int(arrays.get("utc_offset_ns", np.int64(0)))
+        about = _spec_of(what, str(arrays["spec"]), offset)
+    else:
+        raise RecordingError(
+            f"{what} does not say what array it is of: it needs `spec`, as ArraySpec.to_json gives"
+        )
+    texts = {topic: _lines(arrays[topic]) for topic in TEXTS if topic in arrays}
+    return about, raws_of(what, about, arrays, texts)
+
+
+def _lines(data: NDArray[np.uint8]) -> list[str]:
+    return data.tobytes().decode().split("\n")[:-1]
