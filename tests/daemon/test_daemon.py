@@ -102,11 +102,12 @@ def robot(tmp_path, spy):
         assert daemon.stop() == []
 
 
-def configured(folder, text, checked=True):
+def configured(folder, text, checked=True, stop_s=60):
+    """Loaded; calls may take as long as a busy machine makes them."""
     file = folder / "robot.toml"
     file.write_text(
         'version = 1\n[[publisher]]\nkind = "spy"\n[limits]\nretry_first_s = 0.02\n'
-        f'retry_last_s = 0.1\n[log]\nfile = "log"\n{text}'
+        f'retry_last_s = 0.1\nstall_s = 600\nstop_s = {stop_s}\n[log]\nfile = "log"\n{text}'
     )
     loaded = load_config(file)
     if checked:
@@ -450,7 +451,7 @@ def test_closing_drains_what_waits(robot, tmp_path):
 
 def test_what_hangs_at_the_end_is_named_and_left_behind(tmp_path, spy):
     hangs = threading.Event()
-    daemon = Daemon(configured(tmp_path, source("a", "synthetic:")))
+    daemon = Daemon(configured(tmp_path, source("a", "synthetic:"), stop_s=1))
     daemon.start()
     until(lambda: spy[-1].items)
     inside = threading.Event()

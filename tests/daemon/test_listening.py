@@ -97,6 +97,8 @@ port = {metrics}
 [recorder]
 folder = "rec"
 min_free_mb = 1
+[limits]
+stop_s = 60
 [log]
 file = "log"
 """
