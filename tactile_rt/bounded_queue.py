@@ -37,10 +37,10 @@ class QueueState:
     """What became of all that was put into a queue, by kind: put = taken + dropped + waiting.
 
     Attributes:
-        waiting: How many of each kind wait now.
-        put: How many of each kind were put so far.
-        taken: How many of each kind the reader took so far.
-        dropped: How many of each kind were dropped so far.
+        waiting: The number of each kind that waits now.
+        put: The number of each kind that was put so far.
+        taken: The number of each kind that the reader took so far.
+        dropped: The number of each kind that was dropped so far.
         waiting_bytes: The size of all that waits now, bytes.
     """
 
