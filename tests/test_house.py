@@ -36,7 +36,7 @@ TABLES = {
     "tactile_rt",
     "tactile_rt.cli",
     "tactile_rt.cli.bench",
-    "tactile_rt.daemon.consumers",
+    "tactile_rt.daemon.publishers",
     "tactile_rt.drivers.codec",
     "tactile_rt.models",
     "tactile_rt.models.ead",

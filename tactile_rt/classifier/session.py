@@ -28,7 +28,7 @@ class Session:
 
     Args:
         source: where samples come from; the session closes it.
-        classifier: made for `source.spec`.
+        classifier: made for the source's array.
         queue_chunks: chunks that may wait for the classifier.
     """
 

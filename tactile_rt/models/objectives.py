@@ -6,7 +6,7 @@ training.
     objective(views, labels, generator) -> loss
 
 `views` are one or two batches of loads (samples, offset, sigma) as `TactileClassifier` takes them,
-`objective.views` says how many; labels (batch,) count for the supervised objective alone. The
+`Objective.views` says how many; labels (batch,) count for the supervised objective alone. The
 augmentation of frames happens inside, drawn from the generator.
 
 - `Supervised`: cross-entropy with the category.

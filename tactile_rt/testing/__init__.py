@@ -72,7 +72,7 @@ class ArraySource(Source):
         live: Whether to claim to be a device, so that a `Session` reads in a thread of its own.
 
     Raises:
-        ValueError: a chunk is not of `spec.shape`.
+        ValueError: A chunk is not of the shape that `spec` tells.
     """
 
     def __init__(self, spec: ArraySpec, chunks: Sequence[Chunk], live: bool = False) -> None:

@@ -76,7 +76,7 @@ def test_ctrl_c_leaves(tmp_path):
         (["native", "--option", "format"], "--option is NAME=VALUE, not 'format'"),
         (["native", "--option", "form=int16"], "no option 'form'; did you mean format?"),
         (["native", "--option", "format=int8"], "format must be one of float32, int16, not 'int8'"),
-        (["native", "--faults", "none.toml"], "none.toml: cannot be read (No such file"),
+        (["native", "--faults", "none.toml"], "none.toml: no such file"),
         (["native", "--source", "sintetic:"], "did you mean synthetic:?"),
         (["native", "--link", "/none/x"], "/none/x: No such file or directory"),
     ],

@@ -56,7 +56,7 @@ def test_unless_told_otherwise_objects_pass_that_the_model_has_never_met(
         (["--option", "form=int16"], "no option 'form'; did you mean format?"),
         (["--source", "synthetic:", "--sweeps", 3], "--sweeps is of a sim: source"),
         (["--source", "synthetic:3x6?seconds=1"], "was made for another array"),
-        (["--faults", "none.toml"], "none.toml: cannot be read"),
+        (["--faults", "none.toml"], "none.toml: no such file"),
         (["--source", "sintetic:"], "did you mean synthetic:?"),
     ],
 )

@@ -32,10 +32,9 @@ from tactile_rt.daemon.messages import encode, message_of, topic_of
 from tactile_rt.daemon.part import Part, reason_of
 from tactile_rt.stream import Chunk, ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec
-from tests.helpers.waiting import until
+from tests.helpers.waiting import PATIENCE_S, until
 
 SPEC = small_spec()
-PATIENCE_S = 20.0
 OFFSET_NS = 1_700_000_000_000_000_000
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")

@@ -16,8 +16,8 @@ import pytest
 from tactile_rt.cli import main
 from tactile_rt.daemon.config import EXAMPLE
 from tactile_rt.daemon.process import SIGNALS
+from tests.helpers.waiting import PATIENCE_S, until
 
-PATIENCE_S = 30.0
 RUN = [sys.executable, "-c", "from tactile_rt.cli import main; main()"]
 # Sends itself a signal when it imports for the nth time since it is the daemon; 0: at each time.
 SIGNALLED = """
@@ -93,10 +93,7 @@ def told(folder):
 
 
 def await_told(folder, part, state):
-    end = time.monotonic() + PATIENCE_S
-    while not any((m["part"], m["state"]) == (part, state) for m in told(folder)):
-        assert time.monotonic() < end
-        time.sleep(0.02)
+    until(lambda: any((m["part"], m["state"]) == (part, state) for m in told(folder)))
 
 
 def ended(process):
@@ -170,9 +167,7 @@ def test_a_signal_at_any_time_of_the_first_second_does_what_it_should(folder, nu
             [*RUN, "run", str(folder / "robot.toml")], stderr=subprocess.PIPE, text=True,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
         ) as process:  # fmt: skip
-            end = time.monotonic() + PATIENCE_S
-            while not takes(process, signal.SIGTERM):
-                assert time.monotonic() < end
+            until(lambda one=process: takes(one, signal.SIGTERM))
             time.sleep(ms / 1000)
             process.send_signal(number)
             if number == signal.SIGHUP:
@@ -241,8 +236,7 @@ def test_a_device_that_never_sends_keeps_nothing_from_stopping(folder, started, 
     with silent_line(kind) as (url, asked):
         option = f"source.a.url={url}?codec=native&start_s=60"
         process = started("--set", option, until=("daemon", "starting"))
-        while not asked():
-            time.sleep(0.02)
+        until(asked)
         process.send_signal(signal.SIGTERM)
         code, log = ended(process)
     assert code == 0, log  # 4: something did not end within 2 s

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
-from tactile_rt.drivers.codecs.dbc_layout import FramePart, Signal
-from tactile_rt.drivers.codecs.dbc_mapping import read_mapping
+from tactile_rt.drivers.codecs.dbc_mapping import FramePart, Signal, read_mapping
 from tactile_rt.drivers.codecs.framing import Rounds
 from tactile_rt.stream import Chunk, ConfigError
 

@@ -18,6 +18,7 @@ from tactile_rt.sim_backend.objects.catalogue import (
 )
 from tactile_rt.sim_backend.objects.solids import bar, box, normalised, rod, wall
 from tactile_rt.stream import ConfigError
+from tests.helpers.source_tree import ROOT
 
 KINDS = CATEGORIES + WITHHELD
 INDICES = (0, 1, 2, 3, 17, 1000)
@@ -160,12 +161,10 @@ def test_no_two_instances_are_equal(category: str) -> None:
 def test_the_same_in_another_process() -> None:
     wanted = [digest(make_object(c, 5)) for c in KINDS]
     code = (
-        "from tests.sim_backend.test_objects import KINDS, digest, make_object\n"
+        "from tests.sim_backend.objects.test_catalogue import KINDS, digest, make_object\n"
         "print([digest(make_object(c, 5)) for c in KINDS])"
     )
-    here = os.path.dirname(__file__)
-    root = os.path.dirname(os.path.dirname(here))
-    path = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     got = subprocess.run(
         [sys.executable, "-c", code],
         env={**os.environ, "PYTHONPATH": path, "PYTHONHASHSEED": "12345"},

@@ -10,6 +10,7 @@ from tactile_rt.sim_backend.datasets import engines
 from tactile_rt.sim_backend.datasets.engines import DIED, run_processes, run_ray
 from tactile_rt.stream import ConfigError
 from tests.helpers.frail_work import FrailWork
+from tests.helpers.source_tree import ROOT
 from tests.helpers.waiting import until
 
 
@@ -75,7 +76,7 @@ def test_no_process_outlives_a_parent_that_was_killed(tmp_path: Path) -> None:
         import sys
         from pathlib import Path
         if __name__ == "__main__":
-            sys.path.insert(0, {str(Path(__file__).parents[2])!r})
+            sys.path.insert(0, {str(ROOT)!r})
             from tests.helpers.frail_work import FrailWork
             from tactile_rt.sim_backend.datasets.engines import run_processes
             list(run_processes(FrailWork(Path({str(tmp_path)!r})), ["sleeps-60"], 1))

@@ -43,11 +43,12 @@ from tactile_rt.sim_backend.world import (
 )
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError
+from tests.helpers.source_tree import ROOT
 
 Floats = NDArray[np.float64]
 MIRROR = np.diag([-1.0, 1.0, 1.0])
 FLIPS = np.array([1, 1, -1, -1, -1, 1])  # of fx fy fz mx my mz under reflection
-EXAMPLES = Path(__file__).parents[2] / "docs" / "arrays"
+EXAMPLES = ROOT / "docs" / "arrays"
 NAMES = ("mouse", "mouse-left", "mouse-both", "rat", "rat-left", "rat-both")
 SIDE = {"mouse": 30, "rat": 30, "left": 30, "both": 60}
 

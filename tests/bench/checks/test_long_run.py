@@ -12,7 +12,9 @@ from types import ModuleType
 
 import pytest
 
-SCRIPT = Path(__file__).parents[2] / "bench" / "checks" / "long_run.py"
+from tests.helpers.source_tree import ROOT
+
+SCRIPT = ROOT / "bench" / "checks" / "long_run.py"
 
 LEAKS = """
 kept = []

@@ -11,7 +11,6 @@ from tactile_rt.daemon.publishers.zmq import ZmqOptions, ZmqPublisher
 from tactile_rt.stream import SourceError
 from tactile_rt.testing import small_spec
 from tests.helpers.published import (
-    PATIENCE_S,
     View,
     busy_snapshot,
     contact,
@@ -21,7 +20,7 @@ from tests.helpers.published import (
     running,
     samples,
 )
-from tests.helpers.waiting import until
+from tests.helpers.waiting import PATIENCE_S, until
 
 FREE = "tcp://127.0.0.1:*"
 pytestmark = pytest.mark.usefixtures("no_thread_left")

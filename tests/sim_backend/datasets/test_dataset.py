@@ -412,7 +412,7 @@ def test_another_recipe_in_the_same_folder_is_refused(finished: Path) -> None:
     ("options", "complaint"),
     [
         ({"splits": ("tests",)}, "no split 'tests': there are train, validation, test"),
-        ({"engine": "rays"}, r"no engine 'rays' \(did you mean 'ray'\?\)"),
+        ({"engine": "rays"}, r"no engine 'rays'; did you mean ray\?"),
     ],
 )
 def test_a_mistake_is_found_before_anything_is_written(
