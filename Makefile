@@ -2,6 +2,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# As many processes as cores; each takes the next tests from whoever has most left. `pytest` alone
+# runs the same tests in one process.
+PYTEST := $(BIN)/python -m pytest
+PARALLEL := -n logical --maxprocesses 8 --dist worksteal
 
 .PHONY: demo test check check-export bench fuzz format clean
 
@@ -9,14 +13,15 @@ demo: $(VENV)/.sim
 	$(BIN)/tactile-rt demo --sweeps 12
 
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest
+	$(PYTEST) $(PARALLEL)
 
 check: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -m "slow or not slow"
+	$(PYTEST) $(PARALLEL)
+	$(PYTEST) -m slow
 	$(BIN)/python -m bench.checks.wheel
 
 check-export: $(VENV)/.dev

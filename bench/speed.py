@@ -115,7 +115,7 @@ def align() -> Iterator[tuple[str, Work]]:
 
 def record() -> Iterator[tuple[str, Work]]:
     """Ten seconds of 35 x 6 written and read."""
-    source, writer, read = synthetic(10.0), find("StreamWriter"), find("read_stream")
+    source, writer, read = synthetic(10.0), find("StreamWriter"), find("read_stream", "Recording")
     stream = list(source)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "stream.mcap"

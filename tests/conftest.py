@@ -1,24 +1,26 @@
 import os
 import sys
 import threading
-import time
 from collections.abc import Iterator
 
 # Before numpy, torch and onnxruntime start their pools: on a shared machine more threads than one
 # make small tests slower, not faster.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+# Dozens of children import the package: they need not compile it, whatever the shell says.
+os.environ["PYTHONDONTWRITEBYTECODE"] = ""
+
 import pytest
 from hypothesis import settings
 
-pytest.register_assert_rewrite("tests.helpers")
+from tests.helpers.waiting import until
+
+sys.dont_write_bytecode = False
 
 # No deadline: another process on the machine must not fail a test. Derandomised: whoever runs the
 # tests gets the same examples, so a pass stays a pass.
 settings.register_profile("tactile_rt", deadline=None, derandomize=True)
 settings.load_profile("tactile_rt")
-
-PATIENCE_S = 5.0
 
 
 @pytest.fixture
@@ -26,10 +28,8 @@ def no_thread_left() -> Iterator[None]:
     """Fail a test that leaves a thread behind."""
     before = _threads()
     yield
-    end = time.monotonic() + PATIENCE_S
-    while not _threads() <= before and time.monotonic() < end:
-        time.sleep(0.02)  # a progress bar tells its thread to end, and does not wait for it
-    assert _threads() <= before
+    # a progress bar tells its thread to end, and does not wait for it
+    until(lambda: _threads() <= before)
 
 
 def _threads() -> set[threading.Thread]:

@@ -19,7 +19,7 @@ LINKS = ("drivers", "export", "models", "sim_backend")
 HEAVY = ("torch", "mujoco", "trimesh", "scipy", "onnx", "onnxscript", "sklearn", "matplotlib")
 ONBOARD = (
     "calibration", "classifier.classifier", "classifier.contact_point", "classifier.session",
-    "cli", "daemon.runner", "drivers.opening", "recording", "settings", "sources.combined",
+    "cli", "daemon.daemon", "drivers.opening", "recording", "settings", "sources.combined",
     "sources.opening", "stream", "sweep_set", "testing",
 )  # fmt: skip
 

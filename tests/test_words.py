@@ -2,14 +2,12 @@
 
 import ast
 import re
-from pathlib import Path
 
 import pytest
 
-import tactile_rt
+from tests.helpers.source_tree import ROOT, modules
 
-PACKAGE = Path(tactile_rt.__file__).parent
-PAGE = PACKAGE.parent / "docs" / "reference" / "words.md"
+PAGE = ROOT / "docs" / "reference" / "words.md"
 pytestmark = pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
 
 
@@ -20,10 +18,13 @@ def rows() -> list[tuple[str, str, str]]:
     return [c for c in cells if c[0] != "word"]  # type: ignore[misc]
 
 
-def public_classes() -> set[str]:
-    trees = (ast.parse(p.read_text("utf-8")) for p in PACKAGE.rglob("*.py"))
+def classes() -> set[str]:
+    """Of the package and of its rigs."""
     return {
-        node.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ClassDef)
+        node.name
+        for module in modules().values()
+        for node, _ in module.nodes
+        if isinstance(node, ast.ClassDef)
     }
 
 
@@ -44,4 +45,4 @@ def test_each_table_is_in_the_order_of_the_alphabet() -> None:
 def test_the_names_in_code_are_there() -> None:
     named = {name for *_, code in rows() for name in re.findall(r"`(\w+)`", code)}
     assert len(named) > 20
-    assert named - public_classes() == set()
+    assert named - classes() == set()

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bench.emulated import Played
 from tactile_rt.drivers.emulation.faults import Fate
-from tactile_rt.recording.reader import read_stream
+from tactile_rt.recording.reader import Recording
 
 __all__ = ["Account", "RecordedSamples", "account", "recorded"]
 
@@ -52,7 +52,7 @@ class Account:
 def recorded(files: list[Path], source: str) -> RecordedSamples:
     """What is in the recordings of one array."""
     seq, t_ns = array("q"), array("q")  # an hour's chunks would not fit into memory
-    for chunk in (c for f in files if f.name.startswith(f"{source}-") for c in read_stream(f)):
+    for chunk in (c for f in files if f.name.startswith(f"{source}-") for c in Recording(f)):
         seq.frombytes(chunk.seq.tobytes())
         t_ns.frombytes(chunk.t_ns.tobytes())
     return RecordedSamples(np.array(seq, np.int64), np.array(t_ns, np.int64))

@@ -16,7 +16,7 @@ from bench.emulated import ArrayScript, EmulatedArray
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.evidence.records import Record
-from tactile_rt.recording import read_decisions, read_stream, recover
+from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.redecoding import compare_decoding
 from tactile_rt.stream import Chunk, ConfigError, RecordingError, concatenate
 
@@ -188,9 +188,10 @@ def _looked_at(
             continue
         cut += made != path
         unreadable += not _readable(made)
-        own = list(read_stream(made))
+        recording = Recording(made)
+        own = list(recording)
         chunks += own
-        decisions += sum(1 for _ in read_decisions(made))
+        decisions += sum(1 for _ in recording.decisions())
         if own:
             again = compare_decoding(made)
             wrong += again.differing

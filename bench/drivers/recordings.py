@@ -16,7 +16,7 @@ from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.drivers.emulation.device import EmulatedSerial
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.evidence.records import Record
-from tactile_rt.recording import StreamWriter, read_stream, recover
+from tactile_rt.recording import Recording, StreamWriter, recover
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk
 
@@ -103,7 +103,7 @@ def _ended(folder: Path, times: int) -> list[Record]:
             process.kill()
         last, whole = 0, True
         expected = 0
-        for chunk in read_stream(recover(path)):
+        for chunk in Recording(recover(path)):
             whole &= chunk.seq[0] == expected
             expected, last = int(chunk.seq[-1]) + 1, int(chunk.t_ns[-1])
         lost_s.append((killed - last) / 1e9)
@@ -114,7 +114,7 @@ def _ended(folder: Path, times: int) -> list[Record]:
         process.send_signal(signal.SIGTERM)
         code = process.wait()
         took = time.monotonic() - began
-    bad += code != 0 or not list(read_stream(folder / "ended.mcap"))
+    bad += code != 0 or not list(Recording(folder / "ended.mcap"))
     how = f"{times} recorders of 35 x 6 at 1 kHz, killed within 2 s of their first second"
     return [
         Record("drivers.record.killed_lost", max(lost_s), "s", "<= 1",

@@ -9,7 +9,7 @@ loads        tables of known loads
 fitting      the matrix, by least squares from such a table
 """
 
-from tactile_rt.calibration.correction import Calibration
+from tactile_rt.calibration.correction import CalibratedSource, Calibration
 from tactile_rt.calibration.files import (
     calibration_path,
     load_calibration,
@@ -18,7 +18,6 @@ from tactile_rt.calibration.files import (
 from tactile_rt.calibration.fitting import Fit, calibrate
 from tactile_rt.calibration.loads import LoadTable, raw_readings, read_loads
 from tactile_rt.calibration.mirroring import Mirror
-from tactile_rt.calibration.source import CalibratedSource
 from tactile_rt.calibration.taring import Tare, tare
 
 __all__ = [

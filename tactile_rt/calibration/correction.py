@@ -1,9 +1,8 @@
 """What one device's samples need to become SI loads of the array that a model knows."""
 
-import difflib
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -12,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.calibration.mirroring import Mirror
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError, SpecMismatch
+from tactile_rt.settings import no_such
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError, Source, SpecMismatch
 
-__all__ = ["Calibration", "check_device", "nearest"]
+__all__ = ["CalibratedSource", "Calibration", "check_device"]
 
 Row = tuple[float, ...]
 
@@ -31,16 +31,20 @@ class Calibration:
     uncalibrated, and never valid. Then elements are mapped, then mirrored.
 
     Attributes:
-        device: id of the device, letters, digits, and ``_ . : + -``; names its file.
-        elements, channels, units: of the device's spec; units may be counts (``1``).
-        output_channels, output_units: of what comes out; empty: the raw ones.
+        device: Id of the device, which names the file: letters, digits, and ``_ . : + -``.
+        elements: Names of the elements that the device sends.
+        channels: Names of the channels that the device sends.
+        units: Units of the raw channels, which may be counts (``1``).
+        output_channels: Names of the channels that come out; empty for the raw ones.
+        output_units: Units of the channels that come out; empty for the raw ones.
         gain: (channel,) output unit per raw unit, of elements without a matrix; empty: none.
         tare: (channel,) offset in raw units by raw element; none: 0.
         noise: (channel,) standard deviation in raw units by raw element, when tared.
         matrices: (output channel, channel) output unit per raw unit, by raw element.
-        mapping: raw element by output element, in the order of the output; empty: as they are.
-        mirror: whether the output is the array's mirror image, and how; None: it is not.
-        history: what was measured when, one line each.
+        mapping: Raw element by output element, in the order of the output; empty if the elements
+            come out as the device sends them.
+        mirror: Reflection that makes the output the array's mirror image; None for none.
+        history: Measurements that the numbers come from, one line each with its date.
 
     Raises:
         ConfigError: sizes disagree, a name is unknown, or a number is not finite.
@@ -237,6 +241,37 @@ class _Plan:
     lacking: NDArray[np.bool_] | None
 
 
+class CalibratedSource(Source):
+    """A source whose samples are corrected; all else (statistics, health, commands) is its own.
+
+    Args:
+        source: of raw samples; closed with this one.
+        calibration: for its device.
+
+    Raises:
+        SpecMismatch: it is for another array.
+    """
+
+    def __init__(self, source: Source, calibration: Calibration) -> None:
+        # No `stats` of our own: like all that is not here, they are looked up in the source.
+        self.source, self.calibration = source, calibration
+        self.spec = calibration.output_spec(source.spec)
+        self.live = source.live
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        chunk = self.source.read(timeout)
+        return None if chunk is None else self.calibration.apply(chunk)
+
+    def close(self) -> None:
+        self.source.close()
+
+    def __getattr__(self, name: str) -> Any:
+        # While it is copied or unpickled there is no source yet to ask.
+        if name == "source" or name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self.source, name)
+
+
 def check_device(device: str) -> None:
     """Refuse an id that could not name a file.
 
@@ -247,17 +282,9 @@ def check_device(device: str) -> None:
         raise ConfigError(f"device id {device!r}: use letters, digits, '_', '.', ':', '+' and '-'")
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """A phrase for an error's end: the name that was probably meant, or all there are."""
-    names = list(known)
-    plain = {n.casefold(): n for n in names}
-    near = difflib.get_close_matches(name.casefold(), plain, 1)
-    return f"did you mean {plain[near[0]]}?" if near else f"there are {_listed(names) or 'none'}"
-
-
 def _known(key: str, name: str, known: tuple[str, ...], what: str) -> None:
     if name not in known:
-        raise ConfigError(f"{key}: no {what} {name!r}; {nearest(name, known)}")
+        raise ConfigError(f"{key}: {no_such(what, name, known)}")
 
 
 def _sized(key: str, items: tuple[Any, ...], n: int, of: str, what: str = "values") -> None:

@@ -8,16 +8,15 @@ A file is written whole or not at all. It carries a version; one of another vers
 import json
 import os
 import re
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
-from tactile_rt.calibration.correction import Calibration, check_device, nearest
+from tactile_rt.calibration.correction import Calibration, check_device
 from tactile_rt.calibration.mirroring import Mirror
 from tactile_rt.files import write_whole
+from tactile_rt.settings import SettingNode, convert, nearest, read_toml
 from tactile_rt.stream import ConfigError
 
 __all__ = ["calibration_path", "load_calibration", "save_calibration"]
@@ -52,14 +51,11 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     output: _Output = msgspec.field(default_factory=_Output)
     history: tuple[str, ...] = ()
     gain: tuple[float, ...] = ()
-    tare: dict[str, Any] = {}  # rows by element: see `_rows`
-    noise: dict[str, Any] = {}
-    matrix: dict[str, Any] = {}
+    tare: dict[str, Row] = {}
+    noise: dict[str, Row] = {}
+    matrix: dict[str, tuple[Row, ...]] = {}
     mapping: dict[str, str] = {}
     mirror: _Mirror | None = None
-
-
-KEYS = {"": _File, "$.raw": _Raw, "$.output": _Output, "$.mirror": _Mirror}
 
 
 def calibration_path(device: str) -> Path:
@@ -90,18 +86,7 @@ def load_calibration(which: str | Path) -> Calibration:
             raise ConfigError(
                 f"no calibration of device {named!r} in {_folder()}; {nearest(named, there)}"
             )
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    try:
-        return _parsed(text)
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
+    return _calibration(read_toml(path))
 
 
 def save_calibration(calibration: Calibration, path: Path | None = None) -> Path:
@@ -131,61 +116,32 @@ def _folder() -> Path:
     return home / "tactile_rt" / "calibration"
 
 
-def _parsed(text: str) -> Calibration:
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"is not TOML: {error}") from None
-    if raw.get("version") != VERSION:
+def _calibration(nodes: SettingNode) -> Calibration:
+    version = nodes.value.get("version")
+    if version is None or version.value != VERSION:
+        found = None if version is None else version.plain()
         raise ConfigError(
-            f"is a calibration of version {raw.get('version')!r}; this release reads {VERSION}"
+            f"{nodes.where}: is a calibration of version {found!r}; this release reads {VERSION}"
         )
+    file: _File = convert(nodes, _File)
     try:
-        file = msgspec.convert(raw, _File)
-    except msgspec.ValidationError as error:
-        raise ConfigError(_explained(str(error))) from None
-    return Calibration(
-        device=file.device,
-        elements=file.raw.elements,
-        channels=file.raw.channels,
-        units=file.raw.units,
-        output_channels=file.output.channels,
-        output_units=file.output.units,
-        gain=file.gain,
-        tare=_rows("tare", file.tare, Row),
-        noise=_rows("noise", file.noise, Row),
-        matrices=_rows("matrix", file.matrix, tuple[Row, ...]),
-        mapping=file.mapping,
-        mirror=Mirror(**msgspec.structs.asdict(file.mirror)) if file.mirror else None,
-        history=file.history,
-    )
-
-
-def _rows(what: str, table: dict[str, Any], kind: Any) -> dict[str, Any]:
-    """The entries of a table, each converted alone so that a message can name it."""
-    made = {}
-    for element, value in table.items():
-        try:
-            made[element] = msgspec.convert(value, kind)
-        except msgspec.ValidationError as error:
-            key = f"{what}.{element}"
-            where, _, at = str(error).partition(" - at `$")
-            raise ConfigError(f"{key}{at.strip('`')}: {where}") from None
-    return made
-
-
-def _explained(message: str) -> str:
-    """A message of msgspec in the words of the file."""
-    what, _, where = message.partition(" - at ")
-    key = where.strip("`")
-    if unknown := re.search(r"unknown field `(.*?)`", what):
-        names = KEYS[key].__struct_fields__
-        table = key.removeprefix("$.") + "." if key else ""
-        return f"no key {table}{unknown[1]}; {nearest(unknown[1], names)}"
-    if missing := re.search(r"required field `(.*?)`", what):
-        table = key.removeprefix("$.") + "." if key else ""
-        return f"{table}{missing[1]} is missing"
-    return f"{key.removeprefix('$.')}: {what}" if key else what
+        return Calibration(
+            device=file.device,
+            elements=file.raw.elements,
+            channels=file.raw.channels,
+            units=file.raw.units,
+            output_channels=file.output.channels,
+            output_units=file.output.units,
+            gain=file.gain,
+            tare=file.tare,
+            noise=file.noise,
+            matrices=file.matrix,
+            mapping=file.mapping,
+            mirror=Mirror(**msgspec.structs.asdict(file.mirror)) if file.mirror else None,
+            history=file.history,
+        )
+    except ConfigError as error:  # how its parts fit together
+        raise ConfigError(f"{nodes.where}: {error}") from None
 
 
 def _written(c: Calibration) -> str:

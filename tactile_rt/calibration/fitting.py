@@ -25,17 +25,19 @@ class Fit:
     """A matrix and how well it does.
 
     Attributes:
-        axes: of the loads.
+        axes: Names of the axes of the known loads.
         matrix: (axis, channel) load per raw unit.
         tare: (channel,) raw reading at no load.
         residuals: (row, axis) known load minus fitted load, N and N m.
-        rms: (axis,) of the residuals.
-        full_scale: (axis,) largest known load.
+        rms: (axis,) root mean square of the residuals, N and N m.
+        full_scale: (axis,) largest known load on each axis, N and N m.
         r_squared: (axis,) share of the known loads' variance that the matrix explains.
-        condition: of the scaled readings: how much errors in them can be magnified.
-        load_condition: of the scaled loads: 1 if every axis is loaded apart from the others.
-        worst: rows with the largest residuals for their full scale, the worst first.
-        warnings: what makes the matrix doubtful, a sentence each.
+        condition: Condition number of the scaled readings: how much errors in them can be
+            magnified.
+        load_condition: Condition number of the scaled loads: 1 if every axis is loaded apart from
+            the others.
+        worst: Rows with the largest residuals for their full scale, the worst first.
+        warnings: Reasons to doubt the matrix, a sentence each.
     """
 
     axes: tuple[str, ...]

@@ -5,15 +5,14 @@ are columns ``raw_CHANNEL``, one per raw channel, or are taken from a recording 
 ``start_s`` and ``end_s`` of its own time. Lines that begin with # are remarks.
 """
 
-import csv
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.calibration.correction import nearest
+from tactile_rt.settings import convert, nearest, read_csv
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
 __all__ = ["AXES", "LoadTable", "raw_readings", "read_loads"]
@@ -28,12 +27,13 @@ class LoadTable:
     """Known loads, one a row.
 
     Attributes:
-        axes: of the loads, in the order of `AXES`.
-        loads: (row, axis) N and N m.
-        channels: of the readings; empty if the table has times instead.
-        raw: (row, channel) readings, raw units.
-        times: (row, 2) start and end, s; no rows if the table has readings.
-        lines: (row,) in the file, from 1.
+        axes: Names of the axes that were loaded, in the order of `AXES`.
+        loads: Known loads, (row, axis), N and N m.
+        channels: Names of the raw channels that were read; empty if the table has times instead.
+        raw: Readings under each load, (row, channel), raw units.
+        times: Start and end of each load in the recording, (row, 2), s; no rows if the table has
+            readings.
+        lines: Number of each row's line in the file, (row,), counted from 1.
     """
 
     axes: tuple[str, ...]
@@ -55,37 +55,20 @@ def read_loads(path: Path) -> LoadTable:
     Raises:
         ConfigError: one line that names the file, the line, the column, and what to do.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    rows = [
-        (number, [cell.strip() for cell in next(csv.reader([line]))])
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip(" ,") and not line.startswith("#")  # spreadsheets keep empty rows as commas
-    ]
-    if len(rows) < 2:
+    table = read_csv(path)
+    if not table.rows:
         raise ConfigError(f"{path}: needs a line of column names, and lines of loads")
-    (number, header), *rows = rows
-    _check_header(f"{path}, line {number}", header)
-    values = np.empty((len(rows), len(header)))
-    for at, (number, cells) in enumerate(rows):
-        where = f"{path}, line {number}"
-        if len(cells) != len(header):
-            raise ConfigError(f"{where}: {len(cells)} values for {len(header)} columns")
-        for column, (name, cell) in enumerate(zip(header, cells, strict=True)):
-            values[at, column] = _number(f"{where}, column {name}", cell)
-    lines = tuple(number for number, _ in rows)
+    header = table.columns
+    _check_header(table.where, header)
+    rows = [list(convert(row, dict[str, float], lax=True).values()) for row in table.rows]
+    values = np.array(rows, dtype=np.float64)
+    lines = tuple(row.line for row in table.rows)
     axes = tuple(a for a in AXES if a in header)
     channels = tuple(c for c in header if c.startswith(RAW))
     times = values[:, [header.index(t) for t in TIMES if t in header]]
     for line, row in zip(lines, times, strict=True):
         if len(row) and not 0 <= row[0] < row[1]:
-            raise ConfigError(f"{path}, line {line}: start_s must be 0 or more and before end_s")
+            raise ConfigError(f"{path}:{line}: start_s must be 0 or more and before end_s")
     return LoadTable(
         axes,
         values[:, [header.index(a) for a in axes]],
@@ -126,20 +109,14 @@ def raw_readings(
     return np.stack(readings)
 
 
-def _check_header(where: str, header: list[str]) -> None:
-    if len(header) == 1 and ";" in header[0]:
-        raise ConfigError(f"{where}: columns are separated by semicolons; use commas")
+def _check_header(where: str, header: Sequence[str]) -> None:
     for column in header:
         if column not in (*AXES, *TIMES) and not (column.startswith(RAW) and column != RAW):
             known = (*AXES, *TIMES, *(RAW + a for a in AXES))
-            hint = nearest(column, known).split("there are")[0]
-            raise ConfigError(
-                f"{where}: no column {column!r} is known; "
-                + (hint or f"there are {', '.join((*AXES, *TIMES))} and {RAW}CHANNEL")
-            )
-    if len(set(header)) < len(header):
-        twice = next(c for i, c in enumerate(header) if c in header[:i])
-        raise ConfigError(f"{where}: column {twice} is there twice; remove one")
+            near = nearest(column, known)
+            if not near.startswith("did you mean"):
+                near = f"there are {', '.join((*AXES, *TIMES))} and {RAW}CHANNEL"
+            raise ConfigError(f"{where}: no column {column!r}; {near}")
     if not set(header) & set(AXES):
         raise ConfigError(f"{where}: no load; add columns of {', '.join(AXES)}")
     timed, read = set(header) & set(TIMES), any(c.startswith(RAW) for c in header)
@@ -150,13 +127,3 @@ def _check_header(where: str, header: list[str]) -> None:
             f"{where}: needs readings ({RAW}CHANNEL) or times in a recording (start_s, end_s), "
             "one of the two"
         )
-
-
-def _number(where: str, cell: str) -> float:
-    try:
-        number = float(cell)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise ConfigError(f"{where}: {cell!r} is not a number")
-    return number

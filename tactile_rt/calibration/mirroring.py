@@ -28,10 +28,11 @@ class Mirror:
     itself.
 
     Attributes:
-        axis: of the mount frame, the one that points from side to side.
-        element_axis: of the element's frame, the one to flip: for whiskers z, across the plane of
-            their curvature; where elements have the mount's axes, the same as `axis`.
-        signs: by output channel, 1 or -1, where its name and unit do not tell (an angle, a count).
+        axis: Axis of the mount frame, x, y or z, that points from side to side.
+        element_axis: Axis of the element's frame that is flipped: for whiskers z, across the plane
+            of their curvature; where elements have the mount's axes, the same as `axis`.
+        signs: Factor 1 or -1 by output channel, where its name and unit do not tell (an angle, a
+            count).
 
     Raises:
         ConfigError: no such axis, or a sign that is none.

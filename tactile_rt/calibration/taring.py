@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.calibration.source import CalibratedSource
+from tactile_rt.calibration.correction import CalibratedSource
 from tactile_rt.stream import (
     ArraySpec,
     Chunk,
@@ -43,11 +43,11 @@ class Tare:
     """What a quiet array reads.
 
     Attributes:
-        spec: of the array, as its device describes it.
+        spec: The raw array, as the device describes it.
         offset: (element, channel) median, raw units; 0 of an element without enough valid samples.
         noise: (element, channel) standard deviation of a sample, raw units; 0 likewise.
         samples: (element,) valid samples that these rest on.
-        seconds: from the first sample to the last.
+        seconds: Time from the first sample to the last one, s.
     """
 
     spec: ArraySpec

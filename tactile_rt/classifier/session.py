@@ -10,11 +10,11 @@ can be lost.
 
 import contextlib
 import threading
-from collections import deque
 from collections.abc import Generator, Iterator
 from types import TracebackType
 from typing import Self
 
+from tactile_rt.bounded_queue import BoundedQueue
 from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.stream import Chunk, EndOfStream, Source
 
@@ -28,24 +28,22 @@ class Session:
 
     Args:
         source: where samples come from; the session closes it.
-        classifier: made for `source.spec`.
+        classifier: made for the source's array.
         queue_chunks: chunks that may wait for the classifier.
-
-    Attributes:
-        dropped: The number of samples that a live source delivered and that the classifier was
-            too late for.
     """
 
     def __init__(self, source: Source, classifier: Classifier, queue_chunks: int = 256) -> None:
         self.source = source
         self.classifier = classifier
-        self.dropped = 0
-        self._limit = queue_chunks
-        self._queue: deque[Chunk] = deque()
-        self._arrived = threading.Condition()
+        self._queue = BoundedQueue[Chunk](queue_chunks, measure=_samples, kinds=("samples",))
         self._stopping = False
         self._ending: Exception | None = None
         self._reader: threading.Thread | None = None
+
+    @property
+    def dropped(self) -> int:
+        """How many samples a live source delivered and the classifier was too late for."""
+        return self._queue.dropped["samples"]
 
     def __iter__(self) -> Iterator[tuple[Chunk, list[Classification]]]:
         # Closing: an error of the classifier ends the reader now, not when its traceback is freed.
@@ -55,9 +53,8 @@ class Session:
 
     def stop(self) -> None:
         """End the iteration, which then closes the source; from any thread, safe to call twice."""
-        with self._arrived:
-            self._stopping = True
-            self._arrived.notify_all()
+        self._stopping = True
+        self._queue.close()
 
     def __enter__(self) -> Self:
         return self
@@ -98,30 +95,25 @@ class Session:
             self._close()
 
     def _take(self) -> Chunk | None:
-        with self._arrived:
-            self._arrived.wait_for(lambda: self._queue or self._ending or self._stopping)
-            if self._stopping:
-                return None
-            if self._queue:
-                return self._queue.popleft()
-            if isinstance(self._ending, EndOfStream):
-                return None
+        chunk = self._queue.get()
+        if self._stopping:
+            return None
+        if chunk is None and not isinstance(self._ending, EndOfStream):
             assert self._ending is not None
             raise self._ending
+        return chunk
 
     def _read(self) -> None:
         while not self._stopping:
             try:
                 chunk = self.source.read(POLL_S)
             except Exception as error:  # whatever it is, it belongs to the consumer's thread
-                with self._arrived:
-                    self._ending = error
-                    self._arrived.notify_all()
+                self._ending = error
+                self._queue.close()
                 return
-            if chunk is None:
-                continue
-            with self._arrived:
-                self._queue.append(chunk)
-                while len(self._queue) > self._limit:
-                    self.dropped += len(self._queue.popleft())
-                self._arrived.notify_all()
+            if chunk is not None and not self._stopping:
+                self._queue.put(chunk)
+
+
+def _samples(chunk: Chunk) -> tuple[str, int, int]:
+    return "samples", len(chunk), 0

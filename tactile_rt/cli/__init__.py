@@ -6,16 +6,16 @@ A user's mistake is one clear line on stderr and exit code 2; Ctrl-C leaves quie
 import sys
 from typing import NoReturn
 
-import typer
-
-from tactile_rt.cli.app import INTERRUPTED, USER_ERROR, app
-from tactile_rt.stream import TactileError
-
 __all__ = ["main"]
 
 
 def main() -> None:
     """Run the command line."""
+    if sys.argv[1:2] == ["run"] and not any(a.startswith("--source") for a in sys.argv):
+        # It is to be the daemon: a signal that comes before all else is imported counts, too.
+        from tactile_rt.daemon.process import note_signals
+
+        note_signals()
     # Each module adds its commands; what a command needs is imported when it runs, so that
     # `--help` is instant and a robot never imports torch.
     from tactile_rt.cli import (  # noqa: F401
@@ -29,7 +29,6 @@ def main() -> None:
         evaluate,
         grid,
         hil,
-        install_service,
         locate,
         model,
         record,
@@ -41,6 +40,8 @@ def main() -> None:
         view,
         whisk,
     )
+    from tactile_rt.cli.app import INTERRUPTED, app
+    from tactile_rt.stream import TactileError
 
     try:
         app()
@@ -55,5 +56,9 @@ def main() -> None:
 
 
 def _give_up(why: str) -> NoReturn:
+    import typer
+
+    from tactile_rt.cli.app import USER_ERROR
+
     typer.secho(f"tactile-rt: {why}", err=True, fg="red")
     sys.exit(USER_ERROR)

@@ -1,5 +1,8 @@
-"""`tactile-rt run robot.toml` and `config`: the onboard daemon."""
+"""`tactile-rt run robot.toml`, `config` and `install-service`: the onboard daemon."""
 
+import re
+import shlex
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -16,6 +19,10 @@ Settings = Annotated[
         "--set", help="Override a key: page.port=9000, source.whiskers.url=...; may be repeated."
     ),
 ]
+UNIT = "tactile-rt.service"
+HOMES = ("/home/", "/root/")
+USER = re.compile(r"[a-z_][a-z0-9_-]{0,30}")
+
 File = Annotated[Path, typer.Argument(help="The configuration, e.g. robot.toml.")]
 
 config = typer.Typer(help="The configuration of `tactile-rt run robot.toml`.", no_args_is_help=True)
@@ -25,7 +32,7 @@ app.add_typer(config, name="config")
 def serve(file: Path, sets: list[str], seconds: float | None) -> None:
     """Run the daemon; leaves the process with its exit code."""
     from tactile_rt.daemon.lock import AlreadyRunning
-    from tactile_rt.daemon.runner import ExitCode, leave, run_daemon
+    from tactile_rt.daemon.process import ExitCode, leave, run_daemon
 
     try:
         leave(run_daemon(file, sets, seconds))
@@ -78,4 +85,49 @@ def example(
     if output.exists():
         raise ConfigError(f"{output} is there already: name another file")
     output.write_text(EXAMPLE)
-    typer.echo(f"{output} is written; run it with: tactile-rt run {output}")
+    typer.echo(f"{output} is written; run it with: tactile-rt run {shlex.quote(str(output))}")
+
+
+@app.command("install-service")
+def install_service(
+    file: Annotated[Path, typer.Argument(help="The configuration, e.g. /etc/tactile/robot.toml.")],
+    to: Annotated[Path, typer.Option(help="Folder to write into; it must be new or empty.")] = Path(
+        "tactile-service"
+    ),
+    user: Annotated[str, typer.Option(help="Name that the service runs under.")] = "tactile",
+) -> None:
+    """Write a systemd unit, udev rules for what is plugged in, and a script that installs them.
+
+    Nothing is changed outside the folder: read the script, then run it as root.
+    """
+    from tactile_rt.daemon.checks import check_config
+    from tactile_rt.daemon.loading import load_config
+    from tactile_rt.daemon.systemd import install_script, unit_text
+    from tactile_rt.drivers.discovery import serial_ports, udev_rules
+
+    loaded = load_config(file.absolute())
+    check_config(loaded)
+    if not USER.fullmatch(user):
+        raise ConfigError(f"--user {user!r} is not a name that a user can have")
+    if to.exists() and (not to.is_dir() or any(to.iterdir())):
+        raise ConfigError(f"{to} is there already: name a new folder with --to")
+    program, path = _program(), str(file.absolute())
+    unit = unit_text([*program, "run", path], loaded.config, user)
+    script = install_script(UNIT, [*program, "config", "check", path], loaded.config, user)
+    to.mkdir(parents=True, exist_ok=True)
+    (to / UNIT).write_text(unit)
+    (to / "99-tactile.rules").write_text(udev_rules(serial_ports()))
+    (to / "install.sh").write_text(script)
+    typer.echo(f"{to}: {UNIT}, 99-tactile.rules, install.sh are written")
+    for name in (program[0], path):
+        if name.startswith(HOMES):
+            typer.echo(f"{name}: the user {user} must be able to read it; better /opt or /etc")
+    typer.echo(f"read them, then: sudo sh {shlex.quote(str(to / 'install.sh'))}")
+
+
+def _program() -> list[str]:
+    """How this program is started, whatever the folder and the environment."""
+    script = Path(sys.executable).with_name("tactile-rt")
+    if script.exists():
+        return [str(script)]
+    return [sys.executable, "-c", "from tactile_rt.cli import main; main()"]

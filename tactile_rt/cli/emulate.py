@@ -3,7 +3,6 @@
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
-from urllib.parse import quote, urlencode
 
 import typer
 from rich.console import Console
@@ -12,8 +11,7 @@ from tactile_rt.cli.app import app, leaving, starting
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
-    from tactile_rt.drivers.emulation.emulator import Emulator
-    from tactile_rt.drivers.emulation.endpoints import Endpoint
+    from tactile_rt.drivers.emulation.device import EmulatedDevice
 
 LOOK_S = 0.25  # how often the count is renewed
 LINGER_S = 0.5  # for the host to read the last samples before the port disappears
@@ -57,8 +55,7 @@ def emulate(
     Ctrl-C leaves.
     """
     from tactile_rt.drivers.codec import CODECS
-    from tactile_rt.drivers.emulation.emulator import Emulator
-    from tactile_rt.drivers.emulation.endpoints import BusEndpoint, SerialEndpoint, SlcanEndpoint
+    from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
     from tactile_rt.drivers.emulation.faults import read_faults
     from tactile_rt.drivers.opening import make_codec
     from tactile_rt.sources.opening import open_source
@@ -73,26 +70,24 @@ def emulate(
     if bus is not None and link is not None:
         raise ConfigError("--link names a port; a --bus has none")
     fields = codec_options(option or [])
-    spoken = make_codec("serial" if wire == "serial" else "can", codec, fields)
-    schedule = read_faults(faults) if faults else None
-    endpoint: Endpoint[Any]
-    if wire == "serial":
-        endpoint = SerialEndpoint(link)
-    elif bus is None:
-        endpoint = SlcanEndpoint(link)
-    else:
-        endpoint = BusEndpoint(bus, fields.get("fd", "").lower() in ("1", "true"))
+    make_codec("serial" if wire == "serial" else "can", codec, fields)  # refused before the rest
+    further: dict[str, Any] = {
+        "options": fields,
+        "faults": read_faults(faults) if faults else None,
+        "pace": "fast" if fast else "realtime",
+        "seconds": seconds,
+        "log": False,
+    }
     with starting():
         opened = open_source(source)
-    device = None
+    device: EmulatedDevice | None = None
     with leaving(None), opened:
-        device = Emulator(
-            spoken, opened, endpoint, schedule, log=False,
-            pace="fast" if fast else "realtime", seconds=seconds,
-        )  # fmt: skip
+        if wire == "serial":
+            device = EmulatedSerial(opened, codec, link=link, **further)
+        else:
+            device = EmulatedCan(opened, codec, bus=bus, link=link, **further)
         with device:
-            query = urlencode({"codec": codec, **fields})
-            typer.echo(f"connect to {quote(device.address, safe=':/')}?{query}")
+            typer.echo(f"connect to {device.url}")
             if (bus or "").startswith("virtual:"):
                 typer.echo("a virtual bus is seen inside its own process only", err=True)
             _watch(device)
@@ -113,21 +108,21 @@ def codec_options(given: list[str]) -> dict[str, str]:
     return fields
 
 
-def _watch(device: "Emulator") -> None:
+def _watch(device: "EmulatedDevice") -> None:
     """Show the count until it is done."""
     console = Console(stderr=True)
     if console.is_terminal:
         with console.status("") as status:
             while not device.wait(LOOK_S):
-                there = "" if device.endpoint.heard else ", nobody listens"
+                there = "" if device.emulator.endpoint.heard else ", nobody listens"
                 status.update(_count(device) + there)
     else:
         device.wait()
     time.sleep(LINGER_S)
 
 
-def _count(device: "Emulator") -> str:
-    log = device.log
+def _count(device: "EmulatedDevice") -> str:
+    log = device.emulator.log
     counts = {fate.name.lower(): n for fate, n in sorted(log.counts.items()) if n}
     counts |= {"copies": log.duplicated} if log.duplicated else {}
     rest = ", ".join(f"{n} {name}" for name, n in counts.items())

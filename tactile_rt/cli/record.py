@@ -26,6 +26,12 @@ def record(
     note: Annotated[
         list[str] | None, typer.Option(help="To keep with it: NAME=VALUE; may be repeated.")
     ] = None,
+    rotate_mb: Annotated[
+        float, typer.Option(min=0, help="Go on in a new file beyond so many MB: OUTPUT-TIME.mcap.")
+    ] = 0,
+    rotate_s: Annotated[
+        float, typer.Option(min=0, help="Go on in a new file after so many seconds.")
+    ] = 0,
     force: Force = False,
 ) -> None:
     """Record a source's samples and, of a device, its raw packets and health.
@@ -40,18 +46,23 @@ def record(
 
     need_mcap()
     check_output(output)
-    if output.exists() and not force:  # before a device is opened and started
+    rotated = rotate_mb or rotate_s  # which writes over nothing
+    if output.exists() and not force and not rotated:  # before a device is opened and started
         raise ConfigError(f"{output} is there already: name another file, or give --force")
     session = _notes(note or [])
     with starting():
         opened = open_source(source)
     with (
         opened,
-        StreamWriter(output, opened, url=source, session=session, force=force) as writer,
+        StreamWriter(
+            output, opened, url=source, session=session, force=force,
+            rotate_mb=rotate_mb, rotate_s=rotate_s,
+        ) as writer,
         leaving(seconds),
-    ):
+    ):  # fmt: skip
         _copy(opened, writer)
-    typer.echo(f"{output}: {_told(opened, writer)}")
+    files = f"{output.with_stem(f'{output.stem}-*')} ({writer.files} files)" if rotated else output
+    typer.echo(f"{files}: {_told(opened, writer)}")
 
 
 def _copy(source: Source, writer: "StreamWriter") -> None:
@@ -105,7 +116,7 @@ def recover(
     force: Force = False,
 ) -> None:
     """Make a whole recording of what is left of one; the old file stays."""
-    from tactile_rt.recording import read_stream
+    from tactile_rt.recording import Recording
     from tactile_rt.recording import recover as recovered
 
     check_output(output)
@@ -114,7 +125,7 @@ def recover(
         typer.echo(f"{recording} is whole: nothing to do")
         return
     n, first, last = 0, 0, 0
-    for chunk in read_stream(made):
+    for chunk in Recording(made):
         first = first if n else int(chunk.t_ns[0])
         n, last = n + len(chunk), int(chunk.t_ns[-1])
     typer.echo(f"{made}: {n} samples, {(last - first) / 1e9:.1f} s")

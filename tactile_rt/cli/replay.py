@@ -12,7 +12,7 @@ from tactile_rt.stream import ConfigError, RecordingError
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.classifier import Classification, Classifier
-    from tactile_rt.recording import Description
+    from tactile_rt.recording import Recording
 
 DIFFERENT = 1
 TIMING = ("model_ms", "latency_ms", "late")  # of a decision's message: not the same twice
@@ -82,7 +82,7 @@ class _Replay:
 
     def __init__(
         self,
-        files: "list[tuple[Path, Description]]",
+        files: "list[Recording]",
         model: Path | None,
         name: str,
         check: bool,
@@ -96,8 +96,7 @@ class _Replay:
         self.decided: list[dict[str, Any]] = []
         self._first = self._last = 0  # stream time, ns
         self._begins_at = 0
-        about = files[0][1]
-        self._live = live_model(str(files[0][0]), about, name, model, check)
+        self._live = live_model(str(files[0].path), files[0].description, name, model, check)
         self._model = file_of_model(model, self._live)
         sha256 = hash_of(self._model)
         known = self._live.sha256 if self._live else ""
@@ -121,8 +120,8 @@ class _Replay:
 
         classifier: Classifier | None = None
         after = 0
-        for path, about in self.files:
-            with open_replay(str(path), dict(self._fields)) as source:
+        for recording in self.files:
+            with open_replay(str(recording.path), dict(self._fields)) as source:
                 for chunk in source:
                     # Numbers that begin anew are another stream: what was touched is not known.
                     if classifier is None or chunk.seq[0] < after:
@@ -132,20 +131,19 @@ class _Replay:
                     after, self._last = int(chunk.seq[-1]) + 1, int(chunk.t_ns[-1])
                     self.samples += len(chunk)
                     for decision in classifier.push(chunk):
-                        message = self._message(decision, about)
+                        message = self._message(decision, recording)
                         self.decided.append(message)
                         yield msgspec.json.encode(message)
 
     def compare(self) -> None:
         """Tell whether the decisions are the recorded ones; leave with `DIFFERENT` if not."""
-        from tactile_rt.recording import read_decisions
         from tactile_rt.recording.checking import check_decisions
 
         assert self._live is not None
         recorded = [
             decision
-            for path, _ in self.files
-            for decision in read_decisions(path)
+            for recording in self.files
+            for decision in recording.decisions()
             if decision["model"] == self._live.name
         ]
         table = self._live.table
@@ -184,12 +182,13 @@ class _Replay:
             providers=tuple(table.get("providers", ("cpu",))),
         )  # fmt: skip
 
-    def _message(self, decision: "Classification", about: "Description") -> dict[str, Any]:
+    def _message(self, decision: "Classification", recording: "Recording") -> dict[str, Any]:
         import msgspec
 
         from tactile_rt.daemon.items import Decision
         from tactile_rt.daemon.messages import message_of
 
+        about = recording.description
         item = Decision(
             about.session.get("daemon_source", about.spec.name),
             self._live.name if self._live else self._model.stem,
@@ -199,15 +198,15 @@ class _Replay:
         return {key: value for key, value in fields.items() if key not in TIMING}
 
 
-def _in_order(files: list[Path]) -> "list[tuple[Path, Description]]":
-    """The files of one source by time, and what each is of."""
-    from tactile_rt.recording import read_description, read_stream
+def _in_order(files: list[Path]) -> "list[Recording]":
+    """The files of one source by time."""
+    from tactile_rt.recording import Recording
 
     folders = [path for path in files if path.is_dir()]
     if folders:
         raise ConfigError(f"{folders[0]} is a folder: {_sources_in(folders[0])}")
-    found = [(path, read_description(path)) for path in files]
-    names = dict.fromkeys(about.session.get("daemon_source", about.source) for _, about in found)
+    found = [Recording(path) for path in files]
+    names = dict.fromkeys(map(_source_of, found))
     if len(names) > 1:
         raise ConfigError(
             f"recordings of several sources: {', '.join(names)}; replay one at a time"
@@ -215,36 +214,43 @@ def _in_order(files: list[Path]) -> "list[tuple[Path, Description]]":
     if len(found) == 1:
         return found
     begins = []
-    for path, about in found:
-        if differing := found[0][1].spec.differences(about.spec):
-            raise ConfigError(f"{path} is of another array than {files[0]}: {differing[0]}")
-        first = next(read_stream(path), None)
-        begins.append(0 if first is None else int(first.t_ns[0]) + about.utc_offset_ns)
+    for recording in found:
+        if differing := found[0].spec.differences(recording.spec):
+            raise ConfigError(
+                f"{recording.path} is of another array than {files[0]}: {differing[0]}"
+            )
+        first = next(recording.chunks(), None)
+        offset = recording.description.utc_offset_ns
+        begins.append(0 if first is None else int(first.t_ns[0]) + offset)
     return [found[k] for k in sorted(range(len(found)), key=begins.__getitem__)]
 
 
 def _sources_in(folder: Path) -> str:
-    from tactile_rt.recording import read_description
+    from tactile_rt.recording import Recording
 
     names: dict[str, str] = {}
     for path in sorted(folder.glob("*.mcap")):
         try:
-            about = read_description(path)
+            names.setdefault(_source_of(Recording(path)), path.name)
         except RecordingError:
             continue
-        names.setdefault(about.session.get("daemon_source", about.source), path.name)
     if not names:
         return "name a recording"
     said = ", ".join(f"{name} ({file} ...)" for name, file in names.items())
     return f"name the files of one source; it has recordings of {said}"
 
 
-def _compare(files: "list[tuple[Path, Description]]", options: dict[str, str]) -> None:
+def _source_of(recording: "Recording") -> str:
+    about = recording.description
+    return about.session.get("daemon_source", about.source)
+
+
+def _compare(files: "list[Recording]", options: dict[str, str]) -> None:
     from tactile_rt.recording.redecoding import compare_decoding
 
     if len(files) > 1:
         raise ConfigError("packets are decoded again from one file at a time")
-    for line in compare_decoding(files[0][0], options).lines():
+    for line in compare_decoding(files[0].path, options).lines():
         typer.echo(line, err=True)
 
 

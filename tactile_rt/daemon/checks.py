@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from tactile_rt.calibration import load_calibration
-from tactile_rt.classifier.model_file import load_model, shipped_model
+from tactile_rt.classifier.model_file import load_model, read_model, shipped_model
 from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.daemon.config import Config, ModelConfig, is_loopback
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
@@ -76,16 +76,18 @@ def _check_model(loaded: Loaded, path: KeyPath, model: ModelConfig) -> None:
     if model.file and os.path.isdir(model.file):
         loaded.refuse([*path, "file"], f"{model.file} is a folder")
     file = Path(model.file) if model.file else shipped_model()
-    _, card = _try(loaded, [*path, "file"], load_model, file)
+    if model.file:
+        _try(loaded, [*path, "file"], load_model, file)
     _try(loaded, [*path, "providers"], onnxruntime_names, model.providers)
     if model.every and model.mode != "sliding":
         loaded.refuse([*path, "every"], 'it is for mode = "sliding"')
     for key in ("every", "in_a_row"):
-        if (value := getattr(model, key)) > card.steps:
-            steps = f"the steps that {file.name} has"
-            loaded.refuse(
-                [*path, key], f"expected a whole number <= {card.steps}, {steps}, got {value}"
-            )
+        if key not in loaded.nodes.at(path).value:
+            continue
+        value, steps = getattr(model, key), read_model(file)[0].steps
+        if value > steps:
+            allowed = f"a whole number <= {steps}, the steps that {file.name} has"
+            loaded.refuse([*path, key], f"expected {allowed}, got {value}")
 
 
 def _check_devices(loaded: Loaded, config: Config) -> None:

@@ -64,7 +64,8 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
         file: The ``.onnx`` file; empty for the model that comes with the package.
         source: The name of the source whose samples are classified; needed if there are several.
         name: The name of the model in messages; empty to name it like its source.
-        decisions: Which decisions are published: ``every_step``, or ``final`` ones alone.
+        decisions: Choice of the decisions that are published: ``every_step``, or ``final`` ones
+            alone.
         mode: ``episode`` decides from the onset on, better with every step; ``sliding`` decides as
             long as contact lasts, each time about the newest steps, as many as an episode has.
         every: Number of steps from one sliding decision to the next, at most those of an episode;

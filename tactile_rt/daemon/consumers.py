@@ -3,33 +3,26 @@
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any
 
 from tactile_rt.daemon.config import Config, PublisherConfig
 from tactile_rt.daemon.consumer import Consumer
 from tactile_rt.daemon.loading import Loaded
-from tactile_rt.settings import convert, make_node, no_such
+from tactile_rt.daemon.publishers import load_class, publisher_class
+from tactile_rt.settings import convert, make_node
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Wanted", "wanted_consumers"]
 
 _HERE = "tactile_rt.daemon"
 
-# kind: (where the class is, extra that it needs); imported when used
-PUBLISHERS = {
-    "jsonl": (f"{_HERE}.publishers.jsonl:JsonlPublisher", ""),
-    "zmq": (f"{_HERE}.publishers.zmq:ZmqPublisher", "publish"),
-    "zenoh": (f"{_HERE}.publishers.zenoh:ZenohPublisher", "publish"),
-    "foxglove": (f"{_HERE}.publishers.foxglove:FoxglovePublisher", "publish"),
-}
+# table: (where the class is, extra that it needs); imported when used
 TABLES = {
     "recorder": (f"{_HERE}.recorder:Recorder", "record"),
     "page": (f"{_HERE}.page:Page", ""),
     "metrics": (f"{_HERE}.metrics:Metrics", ""),
 }
-ENTRY_POINTS = "tactile_rt.publishers"
 
 
 @dataclass(frozen=True)
@@ -66,14 +59,14 @@ def wanted_consumers(loaded: Loaded) -> list[Wanted]:
         options = getattr(config, table)
         if options is not None:
             try:
-                cls = _class(where, table, extra)
+                cls = load_class(where, table, extra)
             except ConfigError as error:
                 loaded.refuse([table], str(error))
             wanted.append(
                 Wanted(table, table, (options, limits), _maker(cls, table, options), options)
             )
     if os.environ.get("NOTIFY_SOCKET"):
-        cls = _class(f"{_HERE}.systemd:Systemd", "systemd", "")
+        cls = load_class(f"{_HERE}.systemd:Systemd", "systemd", "")
         wanted.append(Wanted("systemd", "systemd", limits, _maker(cls, "systemd", None)))
     return wanted
 
@@ -88,7 +81,7 @@ def _log(loaded: Loaded) -> Wanted:
 
 def _publisher(loaded: Loaded, i: int, config: PublisherConfig) -> Wanted:
     try:
-        cls = _publisher_class(config.kind)
+        cls = publisher_class(config.kind)
     except ConfigError as error:
         loaded.refuse(["publisher", i, "kind"], str(error))
     path: list[str | int] = ["publisher", i, "options"]
@@ -106,34 +99,6 @@ def _publisher(loaded: Loaded, i: int, config: PublisherConfig) -> Wanted:
     key = (config.kind, config.name, options, loaded.config.limits)
     name = f"publisher.{config.name}"
     return Wanted(name, config.kind, key, _maker(cls, name, options), options)
-
-
-def _publisher_class(kind: str) -> Any:
-    if kind in PUBLISHERS:
-        where, extra = PUBLISHERS[kind]
-        return _class(where, f"publisher {kind}", extra)
-    points = metadata.entry_points(group=ENTRY_POINTS)
-    for point in points:
-        if point.name == kind:
-            try:
-                return point.load()
-            except Exception as error:  # another package's code
-                raise ConfigError(f"publisher {kind} cannot be loaded: {error}") from None
-    raise ConfigError(no_such("publisher", kind, sorted({*PUBLISHERS, *points.names})))
-
-
-def _class(where: str, what: str, extra: str) -> Any:
-    module, _, name = where.partition(":")
-    try:
-        return getattr(import_module(module), name)
-    except ModuleNotFoundError as error:
-        if error.name == module:
-            raise ConfigError(f"{what} is not in this release") from None
-        if (error.name or "").startswith("tactile_rt"):
-            raise
-        raise ConfigError(
-            f"{what} needs {error.name}, which is not installed: pip install 'tactile-rt[{extra}]'"
-        ) from None
 
 
 def _maker(cls: Any, name: str, options: Any) -> Callable[[], Consumer]:

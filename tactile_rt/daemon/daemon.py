@@ -12,10 +12,10 @@ from tactile_rt.daemon.config import config_text
 from tactile_rt.daemon.consumer import ConsumerPart
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.health import Snapshot, degraded
-from tactile_rt.daemon.hub import Hub
 from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.lock import Locks, lock_keys
+from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.model_part import ModelPart, file_stamp, model_path
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.source_part import SourcePart

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from tactile_rt.bounded_queue import QueueState
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.stream import SourceStats
 
@@ -38,11 +39,12 @@ class Latency:
     """Of a repeated thing.
 
     Attributes:
-        count: measured since the start.
-        sum_s: of all of them, s.
-        p50_ms, p99_ms, max_ms: of the newest 1000, ms; 0 when there is none.
-        edges_s: (b,) upper edges of the buckets, s.
-        buckets: (b + 1,) counts since the start, the last beyond all edges; not cumulative.
+        count: The number of measurements since the start.
+        sum_s: The sum of all measurements since the start, s.
+        p50_ms, p99_ms, max_ms: The median, the 99th percentile and the maximum of the newest 1000
+            measurements, ms; 0 where there is none.
+        edges_s: (b,) The upper edges of the histogram's buckets, s.
+        buckets: (b + 1,) The counts since the start, the last beyond all edges; not cumulative.
     """
 
     count: int = 0
@@ -55,32 +57,17 @@ class Latency:
 
 
 @dataclass(frozen=True)
-class QueueState:
-    """A mailbox. In each class of items: put = taken + dropped + waiting.
-
-    The classes are ``samples`` (counted by sample), ``packets``, ``decisions`` and ``events`` (all
-    else).
-    """
-
-    waiting: dict[str, int] = field(default_factory=dict)
-    put: dict[str, int] = field(default_factory=dict)
-    taken: dict[str, int] = field(default_factory=dict)
-    dropped: dict[str, int] = field(default_factory=dict)
-    waiting_bytes: int = 0
-
-
-@dataclass(frozen=True)
 class PartState:
     """A supervised part.
 
     Attributes:
-        name: as in `Event.part`.
+        name: The name of the part, as in `Event.part`.
         state: ``starting``; ``running``; ``stalled``: in a call that does not return; ``waiting``:
             it broke and is tried again after a pause; ``ended``: its stream is over; ``stopped``.
-        reason: why it is not running, in words.
-        since_ns: since when, host CLOCK_MONOTONIC.
-        starts: times that it was started.
-        failures: times that it broke.
+        reason: The reason why the part is not running, in words.
+        since_ns: The time at which the part came into this state, host CLOCK_MONOTONIC, ns.
+        starts: The number of times that the part was started.
+        failures: The number of times that the part broke.
     """
 
     name: str
@@ -96,13 +83,16 @@ class SourceState:
     """A source: `part`, where it is, its array, and what came of it.
 
     Attributes:
-        part: of the daemon.
-        url: where it is.
-        array, frame, rate_hz, elements, channels, units: of its array; empty before it was opened.
-        device: how the device is doing; None: not a device, or not open.
-        stats: losses, summed over all times it was opened.
-        samples: read.
-        newest_ns: when the newest sample was read; 0: none yet.
+        part: The state of the source as a part of the daemon.
+        url: The URL of the source as configured.
+        array, frame, rate_hz, elements, channels, units: The name of the sensor array, its mount
+            frame, nominal rate (Hz), elements, channels and their units; empty before the source
+            was first opened.
+        device: The health of the device; None: there is no device, or it is not open.
+        stats: The samples delivered and lost, summed over all times that the source was opened.
+        samples: The number of samples read.
+        newest_ns: The time at which the newest sample was read, host CLOCK_MONOTONIC, ns; 0: none
+            was read yet.
     """
 
     part: PartState
@@ -124,19 +114,21 @@ class ModelState:
     """A model: its source and file, and what it decided.
 
     Attributes:
-        part: of the daemon.
-        source: name of its source.
-        file: the model's.
-        sha256: of that file; empty if it cannot be read.
-        labels: its classes.
-        queue: of samples for it.
-        decisions: so far; `final`: of these the last ones of their episode.
-        touching: whether there is contact.
-        label, probability: of the newest decision; empty and 0 before.
-        latency: from the sample that completed a step to the decision.
-        step: time the network took alone.
-        late: steps that took longer than they may.
-        bad_samples: that held what is no number, and were left out.
+        part: The state of the model as a part of the daemon.
+        source: The name of the source that is classified.
+        file: The path of the model file.
+        sha256: The hash of the model file, hexadecimal; empty if the file cannot be read.
+        labels: The classes that the model tells apart.
+        queue: The mailbox of samples for the model.
+        decisions, final: The number of decisions so far, and of those that were the last ones of
+            their episode.
+        touching: Whether there is contact now.
+        label, probability: The most probable class of the newest decision, and how probable; empty
+            and 0 before the first one.
+        latency: The time from the sample that completed a step to the decision.
+        step: The time that the network alone took for a step.
+        late: The number of steps that took longer than they may.
+        bad_samples: The number of samples that held what is no number, and were left out.
     """
 
     part: PartState
@@ -161,11 +153,12 @@ class ConsumerState:
     """A consumer.
 
     Attributes:
-        part: of the daemon.
-        kind: ``jsonl``, ``recorder``, ...
-        queue: of items for it.
-        latency: from the sample that completed a step to the decision having been published.
-        details: whatever it says of itself.
+        part: The state of the consumer as a part of the daemon.
+        kind: The kind of consumer, such as ``jsonl`` or ``recorder``.
+        queue: The mailbox of items for the consumer.
+        latency: The time from the sample that completed a step to the decision having been
+            published.
+        details: Whatever the consumer tells of itself, by name.
     """
 
     part: PartState
@@ -180,15 +173,17 @@ class Snapshot:
     """The daemon.
 
     Attributes:
-        version: of this package.
-        pid: of the process.
-        config: path of the configuration.
-        t_ns, utc_ns: when this is true.
-        started_ns: when the daemon started, host CLOCK_MONOTONIC.
-        reloads: of the configuration.
+        version: The version of this package.
+        pid: The process id of the daemon.
+        config: The path of the configuration.
+        t_ns, utc_ns: The time at which all this is true, host CLOCK_MONOTONIC and UTC, ns.
+        started_ns: The time at which the daemon started, host CLOCK_MONOTONIC, ns.
+        reloads: The number of times that the configuration was reloaded.
         state: ``starting``, ``running``, ``degraded`` or ``stopping``.
-        degraded: what does not work, and what goes on all the same; one line each.
-        clock_steps: times that the wall clock jumped.
+        degraded: The lines, one for each thing that does not work, with what
+            goes on all the same.
+        clock_steps: The number of times that the wall clock jumped.
+        sources, models, consumers: The states of all sources, models and consumers.
     """
 
     version: str

@@ -24,14 +24,14 @@ class Opened:
     """A source has been opened, or opened again; samples and packets of it follow.
 
     Attributes:
-        source: its name in the configuration.
-        spec: its array.
-        url: where it is.
-        stream: the source itself, for `health`, `stats` and what it is; never read or close it.
-        t_ns: when, host CLOCK_MONOTONIC.
-        utc_offset_ns: UTC less monotonic time then.
-        prelude: (packet, arrival) of what came of a device while it was started: it describes
-            itself in them. The same packets also come as `Packet` items.
+        source: The name of the source in the configuration.
+        spec: The sensor array of the source.
+        url: The URL of the source as configured.
+        stream: The opened source, for `health`, `stats` and what it is; never read or close it.
+        t_ns: The time at which the source was opened, host CLOCK_MONOTONIC, ns.
+        utc_offset_ns: UTC less monotonic time then, ns.
+        prelude: The (packet, arrival in ns) pairs that came of a device while it was started, in
+            which it describes itself. The same packets also come as `Packet` items.
     """
 
     source: str
@@ -57,11 +57,11 @@ class SourceChunk:
     """A chunk of a source as it came, calibrated.
 
     Attributes:
-        source: its name.
-        spec: its array.
-        chunk: the samples.
-        arrived_ns: when it was read, host CLOCK_MONOTONIC.
-        utc_offset_ns: UTC less monotonic time then.
+        source: The name of the source in the configuration.
+        spec: The sensor array of the source.
+        chunk: The samples as they came, calibrated.
+        arrived_ns: The time at which the chunk was read, host CLOCK_MONOTONIC, ns.
+        utc_offset_ns: UTC less monotonic time then, ns.
     """
 
     source: str
@@ -85,12 +85,12 @@ class Decision:
     """A model's decision.
 
     Attributes:
-        source, model: names in the configuration.
-        frame: mount frame of the array.
-        decision: label, probabilities, step; its times are the stream's.
-        sample_ns: host time of the sample that completed the step.
-        made_ns: host time at which the decision was there.
-        utc_offset_ns: UTC less monotonic time then.
+        source, model: The names of the source and of the model in the configuration.
+        frame: The mount frame of the array.
+        decision: The label, probabilities and step; its times are the stream's.
+        sample_ns: The host time of the sample that completed the step, CLOCK_MONOTONIC, ns.
+        made_ns: The host time at which the decision was there, CLOCK_MONOTONIC, ns.
+        utc_offset_ns: UTC less monotonic time then, ns.
     """
 
     source: str
@@ -121,11 +121,12 @@ class Event:
     Attributes:
         part: ``source.NAME``, ``model.NAME``, ``publisher.NAME``, ``recorder``, ``page``,
             ``metrics``, ``systemd``, or ``daemon``.
-        state: see `snapshot.PartState`; a device's state is ``device:streaming`` and so on.
-        reason: in words.
+        state: The new state, as in `PartState.state`; a device's state is ``device:streaming`` and
+            so on.
+        reason: The reason for the change, in words.
         level: ``info``, ``warning`` or ``error``.
-        t_ns: when, host CLOCK_MONOTONIC.
-        utc_offset_ns: UTC less monotonic time then.
+        t_ns: The time of the change, host CLOCK_MONOTONIC, ns.
+        utc_offset_ns: UTC less monotonic time then, ns.
     """
 
     part: str

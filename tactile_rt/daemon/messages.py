@@ -63,14 +63,18 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
     """A model decided.
 
     Attributes:
-        t_ns: stream time of the last sample used.
-        onset_ns: stream time at which contact began: with `source` and `model` it names the
-            episode.
-        step: since onset, from 1; `final` the last one.
-        label: the most probable class; probabilities: of all of them.
-        model_ms: time that the network took, ms.
-        latency_ms: from the sample that completed the step until the decision was there, ms.
-        late: whether the step took longer than it may.
+        t_ns: The stream time of the last sample used, ns.
+        model: The name of the model in the configuration.
+        onset_ns: The stream time at which contact began, ns: with `source` and `model` it names
+            the episode.
+        step: The number of the step since onset, from 1.
+        final: Whether the step is the last one of its episode.
+        label: The most probable class.
+        probabilities: The probability of each class by its label.
+        model_ms: The time that the network took, ms.
+        latency_ms: The time from the sample that completed the step until the decision was there,
+            ms.
+        late: Whether the step took longer than it may.
     """
 
     topic: ClassVar[str] = "decision"
@@ -107,11 +111,12 @@ class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
     """A chunk of n samples; `t_ns` and `utc_ns` are those of its last one.
 
     Attributes:
-        elements, channels, units: axes of `values`, SI.
-        seq: (n,) sequence numbers.
-        times_ns: (n,) the stream's time of each.
-        values: (n, element, channel), with the fewest digits that read back as the same float32;
-            null where the element has no trustworthy value.
+        elements, channels, units: The axes of `values`: names of elements, names of channels, and
+            the SI unit of each channel.
+        seq: (n,) The sequence numbers of the samples.
+        times_ns: (n,) The stream time of each sample, ns.
+        values: (n, element, channel) The numbers, each written as the shortest one that reads back
+            as the same float32; null where the element has no trustworthy value.
     """
 
     topic: ClassVar[str] = "samples"
@@ -124,7 +129,7 @@ class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
 
 
 class StateMessage(_Message, frozen=True, tag="state", kw_only=True):
-    """Everything; see `snapshot.Snapshot`."""
+    """Everything; see `health.Snapshot`."""
 
     topic: ClassVar[str] = "state"
     snapshot: Snapshot

@@ -12,9 +12,8 @@ from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.health import LatencyMeter, ModelState
-from tactile_rt.daemon.hub import Hub
 from tactile_rt.daemon.items import Contact, Decision, Item, Opened, SourceChunk
-from tactile_rt.daemon.mailbox import Mailbox
+from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.source_part import device_of
 from tactile_rt.stream import NS_PER_S, ConfigError, Source, TactileError, concatenate

@@ -26,9 +26,9 @@ class Part(abc.ABC):
     """Something that works in a thread of its own and is restarted when it breaks.
 
     Args:
-        name: as in `items.Event`.
-        report: where its changes of state go.
-        limits: pauses, and how long a call may take.
+        name: The name of the part, as in `items.Event`.
+        report: Takes changes of its state.
+        limits: The pauses between tries, and how long a call may take.
     """
 
     def __init__(self, name: str, report: Report, limits: LimitsConfig) -> None:

@@ -11,6 +11,7 @@ begins.
 import shutil
 import time
 from collections import deque
+from contextlib import suppress
 from pathlib import Path
 
 from tactile_rt.daemon.config import RecorderConfig
@@ -27,18 +28,21 @@ from tactile_rt.daemon.items import (
     SourceChunk,
 )
 from tactile_rt.daemon.messages import encode, message_of
-from tactile_rt.daemon.recording_file import Message, RecordingFile
+from tactile_rt.recording.description import describe
 from tactile_rt.recording.layout import (
     DECISIONS,
     EVENTS,
     SAMPLES,
     WIRE,
+    Raw,
     encode_packet,
     encode_samples,
     need_mcap,
+    samples_in,
 )
 from tactile_rt.recording.reader import is_finished
-from tactile_rt.recording.writer import WriterStats, describe
+from tactile_rt.recording.rotation import Rotation
+from tactile_rt.recording.writer import PART, RecordingWriter
 from tactile_rt.stream import RecordingError
 from tactile_rt.version import VERSION
 
@@ -46,6 +50,7 @@ __all__ = ["Recorder"]
 
 FLUSH_S = 0.4  # with the gathering still well under the second that may be lost
 LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
+STALE_S = 3600.0  # a file that is begun has its name long before
 RING_BYTES = 64 << 20  # of each source, before a trigger
 MB, NS = 1e6, 1e9
 
@@ -53,18 +58,18 @@ MB, NS = 1e6, 1e9
 class _Track:
     """A source, the file that is open for it, and what is kept for a trigger."""
 
-    def __init__(self, opened: Opened) -> None:
-        self.opened = opened
+    def __init__(self, opened: Opened, rotation: Rotation) -> None:
+        self.opened, self.rotation = opened, rotation
         self.wire = describe(opened.stream).wire
         self.prelude_ns = opened.prelude[-1][1] if opened.prelude else -1
-        self.file: RecordingFile | None = None
-        self.ring: deque[Message] = deque()
+        self.file: RecordingWriter | None = None
+        self.ring: deque[Raw] = deque()
         self.ring_bytes = 0
         self.until_ns = 0  # of a trigger; 0: none
         self.closed_ns = 0  # when its source ended; 0: it has not
-        self.lost = WriterStats()  # for want of room on the disk
+        self.lost = (0, 0)  # samples and packets, for want of room on the disk
 
-    def keep(self, message: Message, before_ns: int) -> None:
+    def keep(self, message: Raw, before_ns: int) -> None:
         """Into the ring, from which the oldest goes."""
         self.ring.append(message)
         self.ring_bytes += len(message.data)
@@ -73,7 +78,7 @@ class _Track:
         ):
             self.ring_bytes -= len(self.ring.popleft().data)
 
-    def empty(self) -> list[Message]:
+    def empty(self) -> list[Raw]:
         """All of the ring."""
         kept = list(self.ring)
         self.ring.clear()
@@ -122,6 +127,10 @@ class Recorder(Consumer):
                 self._name, "running", f"{self._folder}: cut short: {some}; `tactile-rt recover` "
                 "makes whole ones of them", "warning",
             )  # fmt: skip
+        for left in self._folder.glob(f".*{PART}"):  # of one who was killed as it began a file
+            with suppress(OSError):
+                if time.time() - left.stat().st_mtime > STALE_S:  # else it is just being begun
+                    left.unlink()
         for opened in view.streams().values():
             self._begin(opened)
 
@@ -164,15 +173,12 @@ class Recorder(Consumer):
                 track.closed_ns = time.monotonic_ns()
         elif isinstance(item, SourceChunk):
             if (track := self._tracks.get(item.source)) is not None:
-                chunk = item.chunk
-                data = encode_samples(chunk)
-                self._add(track, Message(SAMPLES, item.arrived_ns, data, len(chunk)))
+                self._add(track, Raw(SAMPLES, item.arrived_ns, encode_samples(item.chunk)))
         elif isinstance(item, Packet):
             track = self._tracks.get(item.source)
             # what described the device stands at the head of every file
             if track is not None and track.wire and item.t_ns > track.prelude_ns:
-                data = encode_packet(item.packet, track.wire)
-                self._add(track, Message(WIRE, item.t_ns, data))
+                self._add(track, Raw(WIRE, item.t_ns, encode_packet(item.packet, track.wire)))
         elif isinstance(item, Control):
             self._obey(item)
         else:
@@ -185,7 +191,7 @@ class Recorder(Consumer):
             return
         topic = DECISIONS if isinstance(item, Decision) else EVENTS
         at = item.made_ns if isinstance(item, Decision) else item.t_ns
-        told = Message(topic, at, encode(message))
+        told = Raw(topic, at, encode(message))
         mine = getattr(item, "source", None)
         happened = item.level != "info" if isinstance(item, Event) else isinstance(item, Contact)
         for name, track in self._tracks.items():
@@ -195,7 +201,7 @@ class Recorder(Consumer):
             if happened and getattr(item, "part", "") != self._name:
                 self._trigger(track)
 
-    def _add(self, track: _Track, message: Message) -> None:
+    def _add(self, track: _Track, message: Raw) -> None:
         if track.file is None and self._config.mode == "trigger":
             if self._on:
                 track.keep(message, round(self._config.before_s * NS))
@@ -205,19 +211,19 @@ class Recorder(Consumer):
                 self._lose(track, message)
             return
         try:
-            track.file.write((message,))
+            track.file.add(message.topic, message.data, message.t_ns)
         except OSError as error:
             self._lose(track, message)
             self._no_room(track, error)
 
-    def _lose(self, track: _Track, *messages: Message) -> None:
+    def _lose(self, track: _Track, *messages: Raw) -> None:
         self._count_lost(
-            track, sum(m.samples for m in messages), sum(m.topic == WIRE for m in messages)
-        )
+            track, sum(samples_in(m.data) for m in messages if m.topic == SAMPLES),
+            sum(m.topic == WIRE for m in messages),
+        )  # fmt: skip
 
     def _count_lost(self, track: _Track, samples: int, packets: int) -> None:
-        track.lost.dropped_samples += samples
-        track.lost.dropped_packets += packets
+        track.lost = track.lost[0] + samples, track.lost[1] + packets
         self._lost_samples += samples
 
     def _trigger(self, track: _Track) -> None:
@@ -247,7 +253,9 @@ class Recorder(Consumer):
 
     def _begin(self, opened: Opened) -> None:
         self._end(opened.source)
-        track = self._tracks[opened.source] = _Track(opened)
+        config = self._config
+        rotation = Rotation(self._folder, opened.source, config.rotate_mb, config.rotate_s)
+        track = self._tracks[opened.source] = _Track(opened, rotation)
         if self._config.mode == "always" and self._on:
             self._start_file(track)
 
@@ -259,23 +267,26 @@ class Recorder(Consumer):
     def _start_file(self, track: _Track) -> None:
         if track.file is not None or track.closed_ns or not self._room():
             return
-        snapshot = self._view.snapshot()
+        opened, snapshot = track.opened, self._view.snapshot()
         session = {
             "by": f"tactile_rt {VERSION}",
-            "daemon_source": track.opened.source,
+            "daemon_source": opened.source,
             "config": self._view.config_text(),
             **{m.part.name: f"{m.file} sha256:{m.sha256}" for m in snapshot.models},
         }
         try:
-            track.file = RecordingFile(self._folder, track.opened, session, track.lost)
+            about = describe(opened.stream, opened.url, session)
+            track.file = track.rotation.begin(
+                opened.stream, about, prelude=opened.prelude, dropped=track.lost
+            )
         except OSError as error:
             self._no_room(track, error)
             return
-        track.lost = WriterStats()
+        track.lost = (0, 0)
         kept = track.empty()
         for n, message in enumerate(kept):
             try:
-                track.file.write((message,))
+                track.file.add(message.topic, message.data, message.t_ns)
             except OSError as error:
                 self._lose(track, *kept[n:])
                 self._no_room(track, error)
@@ -288,7 +299,7 @@ class Recorder(Consumer):
         if file is None:
             return
         try:
-            file.finish()
+            file.close()
         except OSError as error:
             if not told:
                 self._view.report(
@@ -307,7 +318,7 @@ class Recorder(Consumer):
     def _look_after(self) -> None:
         """Flush, rotate, end what a trigger began or whose source ended, look at the disk."""
         self._room()
-        now, config = time.monotonic_ns(), self._config
+        now = time.monotonic_ns()
         closed = [
             n for n, t in self._tracks.items() if t.closed_ns and now > t.closed_ns + LINGER_NS
         ]
@@ -319,11 +330,11 @@ class Recorder(Consumer):
         for track in self._tracks.values():
             file = track.file
             if file is None:
-                if config.mode == "always" and self._on:
+                if self._config.mode == "always" and self._on:
                     self._start_file(track)  # there is room again
                 continue
             try:
-                size = file.flush()
+                file.flush()
             except OSError as error:
                 self._no_room(track, error)
                 continue
@@ -331,9 +342,7 @@ class Recorder(Consumer):
                 self._finish_file(track)
             elif track.until_ns and now > track.until_ns:
                 self._finish_file(track)
-            elif (config.rotate_mb and size > config.rotate_mb * MB) or (
-                config.rotate_s and now - file.begun_ns > config.rotate_s * NS
-            ):
+            elif track.rotation.is_due(file):
                 self._rotate(track)
 
     def _room(self) -> bool:

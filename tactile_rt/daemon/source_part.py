@@ -9,8 +9,8 @@ from tactile_rt.calibration import CalibratedSource, load_calibration
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, SourceConfig
 from tactile_rt.daemon.health import SourceState
-from tactile_rt.daemon.hub import Hub
 from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
+from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.drivers.device_source import DeviceSource
 from tactile_rt.drivers.health import Health, State

@@ -1,4 +1,23 @@
-"""Which samples came, came twice or never, by the device's own counter."""
+"""Which samples came, came twice or never, by the device's own counter.
+
+What is needed is one sum that adds up, whatever happens on the wire:
+
+    sent + duplicated = delivered + corrupt + missing + dropped + duplicates
+
+The left side is the device's, the right side `SourceStats`. A sample number counts from 0, goes on
+over restarts of the device, and has a gap exactly where the stream has one.
+
+The plan. A device's counter is narrow, may begin anywhere and begins anew with the device. So only
+its steps count, modulo its width:
+- a step of one is the next sample; a step of g + 1 is a gap of g. If d damaged frames came within
+  the gap, min(d, g) of it count as corrupt and the rest as missing: noise looks like damage, too;
+- a step of zero, or back, is a copy if a sample with this counter and this very content came
+  lately; else the counter has begun anew;
+- a step forward though the device's clock hardly moved is a restart as well, not a gap of
+  thousands. What was lost around a restart nobody knows, so nothing is counted.
+
+A device without a counter can show damage only.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,21 +31,17 @@ REMEMBERED = 64  # samples back that a repeated one is looked for
 
 
 class Sequencer:
-    """Numbers samples and counts what is lost, keeping to the counter that the device sends.
-
-    A gap of g samples with d damaged frames in it counts min(d, g) as corrupt and the rest as
-    missing. A counter that moves back to a sample that is not one already seen, or that moves
-    forward though the device's clock did not, has begun anew: what was lost meanwhile nobody knows.
-    A device without a counter can show damage only.
+    """Numbers samples and counts what is lost, as the head of this module says.
 
     Args:
-        bits: the counter wraps at 2^bits; None: there is none.
-        stats: where to count.
-        period_ticks: nominal, of the device's clock; None: it has none.
-        tick_bits: that clock wraps at 2^tick_bits.
+        bits: Width of the device's counter, which wraps at 2^bits; None for a device without one.
+        stats: The account in which losses are counted.
+        period_ticks: Nominal time between samples, in ticks of the device's clock; None for a
+            device without a clock.
+        tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
 
     Attributes:
-        resets: times that the counter began anew.
+        resets: Number of times that the counter began anew.
     """
 
     def __init__(

@@ -56,15 +56,16 @@ class Stamper:
     """Numbers and times a device's samples.
 
     Args:
-        codec: what the device speaks.
-        spec: what the samples are.
-        stats: where losses are counted; not what is delivered.
+        codec: The codec of the device, which says what counter and clock there are.
+        spec: What the samples are.
+        stats: The account in which losses are counted; deliveries are the reader's to count.
 
     Attributes:
-        sequencer: by the device's counter.
-        clock: the device's, on the host's; None: it has neither clock nor counter.
-        newest_ns: arrival of the newest sample; 0: none yet.
-        status: status bits of the newest sample.
+        sequencer: Numbers the samples by the device's counter.
+        clock: The clock that dates the samples; None for a device that sends neither time nor
+            count.
+        newest_ns: Host time at which the newest sample arrived, ns; 0 before the first.
+        status: Status bits of the newest sample.
     """
 
     def __init__(self, codec: Codec[Any], spec: ArraySpec, stats: SourceStats) -> None:
@@ -116,13 +117,13 @@ class DeviceClock:
     """Maps a device's ticks to the host's monotonic clock.
 
     Args:
-        tick_ns: nominal length of a tick, ns.
-        bits: the counter wraps at 2^bits.
-        tolerance: largest drift believed, as a fraction (a quartz is within 2e-4).
+        tick_ns: Nominal length of a tick, ns.
+        bits: Width of the device's clock, which wraps at 2^bits.
+        tolerance: Largest drift that is believed, as a fraction (a quartz is within 2e-4).
 
     Attributes:
-        drift: how much faster the host's clock runs than the device's, as a fraction.
-        steps: times that the device's clock jumped or began anew, as long as it was connected.
+        drift: Excess speed of the host's clock over the device's, as a fraction.
+        steps: Number of times that the device's clock jumped or began anew while it was connected.
     """
 
     def __init__(self, tick_ns: float, bits: int, tolerance: float = 5e-4) -> None:
@@ -144,8 +145,8 @@ class DeviceClock:
         """(n,) host times of samples, ns: strictly increasing, none after its arrival if possible.
 
         Args:
-            ticks: (n,) the counter as it came.
-            arrived_ns: (n,) host times of arrival, never decreasing.
+            ticks: The device's clock as it came, (n,).
+            arrived_ns: Host times of arrival, (n,), ns, never decreasing.
         """
         told: list[int] = []
         waiting: list[tuple[float, float, int]] = []  # device time, since the last, arrival
@@ -270,12 +271,12 @@ class DeviceTime:
     on the host's clock.
 
     Args:
-        tick_ns: length of a tick, ns.
-        bits: the counter wraps at 2^bits.
+        tick_ns: Length of a tick, ns.
+        bits: Width of the device's clock, which wraps at 2^bits.
 
     Attributes:
-        drift_ppm: 0: nothing is compared.
-        steps: times that the clock went back or began anew.
+        drift_ppm: Always 0, since no other clock is compared with this one.
+        steps: Number of times that the clock went back or began anew.
     """
 
     drift_ppm = 0.0
@@ -292,8 +293,8 @@ class DeviceTime:
         """(n,) device times of samples, ns: strictly increasing.
 
         Args:
-            ticks: (n,) the counter as it came.
-            arrived_ns: (n,) host times of arrival, never decreasing.
+            ticks: The device's clock as it came, (n,).
+            arrived_ns: Host times of arrival, (n,), ns, never decreasing.
         """
         told = np.empty(len(ticks), np.int64)
         for i, (tick, arrived) in enumerate(zip(ticks.tolist(), arrived_ns.tolist(), strict=True)):
@@ -324,9 +325,10 @@ def host_stamps(arrived_ns: NDArray[np.int64], before_ns: int, period_ns: int) -
     their arrival, a nominal period apart or as much as fits after the sample before.
 
     Args:
-        arrived_ns: (n,) of one packet, never decreasing.
-        before_ns: time given to the sample before these.
-        period_ns: nominal.
+        arrived_ns: Host times at which the samples of one packet arrived, (n,), ns, never
+            decreasing.
+        before_ns: Time given to the sample before these, ns.
+        period_ns: Nominal time between samples, ns.
     """
     n = len(arrived_ns)
     last = max(int(arrived_ns[-1]), before_ns + n)

@@ -72,11 +72,11 @@ class CanFrame(NamedTuple):
     """One CAN frame.
 
     Attributes:
-        id: arbitration identifier, 11 bits, or 29 if `extended`.
-        data: 0 to 8 bytes, to 64 if `fd`.
-        extended: whether the identifier is of 29 bits.
-        fd: whether it is a CAN FD frame.
-        remote: whether it asks for data (RTR) and has none.
+        id: Arbitration identifier, of 11 bits, or of 29 if `extended`.
+        data: Payload of the frame, 0 to 8 bytes, or up to 64 if `fd`.
+        extended: Whether the identifier has 29 bits.
+        fd: Whether this is a frame of CAN FD.
+        remote: Whether the frame asks for data (RTR) and carries none.
     """
 
     id: int
@@ -94,11 +94,13 @@ class Step(Generic[Packet]):
     """One thing to send to a device, and what to wait for.
 
     Attributes:
-        send: what to send; empty: only wait.
-        expect: what the answer has in it: bytes, or the identifier of a CAN frame; None: no answer.
-        timeout_s: how long the answer may take; without one the device counts as not there.
-        pause_s: how long to wait before the next step, answer or not.
-        what: the step in words, for the message when no answer comes.
+        send: The packet to send; an empty one means that the host only waits.
+        expect: What the answer contains, bytes or the identifier of a CAN frame; None when no
+            answer is awaited.
+        timeout_s: Longest time that the answer may take, s; a device that does not answer in time
+            counts as not there.
+        pause_s: Time to wait before the next step, answer or not, s.
+        what: The step in words, for the message when no answer comes.
     """
 
     send: Packet
@@ -113,14 +115,16 @@ class Samples:
     """n >= 1 samples as the device numbers and times them.
 
     Attributes:
-        values: (n, element, channel) float32, SI units.
-        valid: (n, element) bool; False where the device or the wire says that there is no value.
-        arrived_ns: (n,) int64 host time at which the last part of each sample arrived.
-        damaged: (n,) int64 frames that failed a check since the sample before.
-        count: (n,) int64 the device's sample counter as it came (modulo 2^count_bits); None if it
-            has none.
-        ticks: (n,) int64 the device's clock as it came (modulo 2^tick_bits); None if it has none.
-        status: (n,) int64 the device's status bits; None if it has none.
+        values: Measured values, (n, element, channel) float32, SI units.
+        valid: Validity of each value, (n, element) bool; False where the device or the wire says
+            that there is no value.
+        arrived_ns: Host time at which the last part of each sample arrived, (n,) int64, ns.
+        damaged: Number of frames that failed a check since the sample before, (n,) int64.
+        count: The device's sample counter as it came, (n,) int64, modulo 2^count_bits; None for a
+            device without one.
+        ticks: The device's clock as it came, (n,) int64, modulo 2^tick_bits; None for a device
+            without one.
+        status: The device's status bits, (n,) int64; None for a device without them.
     """
 
     values: NDArray[np.float32]
@@ -140,10 +144,11 @@ class WireStats:
     """What came over the wire since the codec was made.
 
     Attributes:
-        intact: frames that passed every check.
-        corrupt: frames that failed one.
-        skipped: bytes between frames; on CAN, frames of identifiers that are not this device's.
-        incomplete: samples of which parts never came (devices that send a sample in parts).
+        intact: Number of frames that passed every check.
+        corrupt: Number of frames that failed a check.
+        skipped: Bytes that lay between frames; on CAN, frames with identifiers that are not this
+            device's.
+        incomplete: Samples of which a part never came, from devices that send samples in parts.
     """
 
     intact: int = 0
@@ -156,18 +161,18 @@ class Codec(abc.ABC, Generic[Packet]):
     """One device's protocol. Implementations are of `SerialCodec` or `CanCodec`.
 
     Args (of every implementation):
-        options: its `Options`.
+        options: The codec's options, an instance of its class `Options`.
 
     Attributes:
-        Options: frozen dataclass of what a URL may set; its docstring explains them.
-        wire: ``serial`` or ``can``.
-        count_bits: width of the device's sample counter; None: it has none.
-        tick_ns: length of a tick of the device's clock, ns; None: it sends no time.
-        tick_bits: width of that clock.
-        status_bits: what each bit of the status means when set.
-        cannot_detect: which losses and damages this protocol cannot show, in a sentence.
-        spec: what the samples are; None until the device has described itself.
-        stats: what has come so far.
+        Options: Frozen dataclass of what a URL may set; its docstring explains each field.
+        wire: What the device is attached to: ``serial`` or ``can``.
+        count_bits: Width of the device's sample counter; None for a device without one.
+        tick_ns: Length of a tick of the device's clock, ns; None for a device that sends no time.
+        tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
+        status_bits: What each bit of the status means when set, by the number of the bit.
+        cannot_detect: The losses and damages that this protocol cannot show, in a sentence.
+        spec: What the samples are; None until the device has described itself.
+        stats: Counts of the frames that have come so far.
     """
 
     wire: ClassVar[str]
@@ -195,13 +200,14 @@ class Codec(abc.ABC, Generic[Packet]):
         """What the device sends for each of these samples.
 
         Args:
-            chunk: of `spec`; `seq` is the device's counter and `t_ns` its clock, neither wrapped.
+            chunk: Samples of `spec`; `seq` is the device's counter and `t_ns` its clock, neither
+                wrapped.
 
         Returns:
             One packet per sample.
         """
 
-    def commands(self, event: Command) -> tuple[Step[Packet], ...]:
+    def commands(self, command: Command) -> tuple[Step[Packet], ...]:
         """What to send to the device when this happens."""
         return ()
 
@@ -225,8 +231,8 @@ class SerialCodec(Codec[bytes]):
     """A protocol over a serial line.
 
     Attributes:
-        baud: the device's default.
-        parity: ``N``, ``E`` or ``O``.
+        baud: Speed of the line that the device has by default, bit/s.
+        parity: Parity that the device has by default: ``N``, ``E`` or ``O``.
     """
 
     wire = "serial"
@@ -238,8 +244,8 @@ class CanCodec(Codec[Sequence[CanFrame]]):
     """A protocol over a CAN bus.
 
     Attributes:
-        bitrate: the device's default, bit/s.
-        data_bitrate: of the data phase, if it speaks CAN FD.
+        bitrate: Speed of the bus that the device has by default, bit/s.
+        data_bitrate: Speed of the data phase, bit/s, for a device that speaks CAN FD; else None.
     """
 
     wire = "can"
@@ -262,8 +268,8 @@ class SampleBatch:
         """All samples so far, or None; each list is empty or of one entry per sample.
 
         Args:
-            shape: (element, channel) of a sample.
-            t_ns: when they arrived.
+            shape: Shape of a sample, (element, channel).
+            t_ns: Host time at which the samples arrived, ns.
         """
         n = len(self.values)
         if n == 0:

@@ -33,12 +33,15 @@ class DeviceOptions:
     """Options of every device.
 
     Attributes:
-        codec: what the device speaks, see `tactile-rt codecs`.
-        start_s: how long the first sample may take, s; 0 does not wait for it.
-        stale_s: without a sample for so long the stream is stale, s; 0: ten periods, at least 0.1.
-        reconnect: whether to try again when the line is lost; else the source breaks.
-        calibration: file, or id of a device calibrated before; empty: none.
-        clock: ``host``: samples have the host's time; ``device``: that of the device's own clock,
+        codec: Name of the codec that the device speaks, one of those that `tactile-rt codecs`
+            lists.
+        start_s: Longest time that the first sample may take, s; with 0 nobody waits for it.
+        stale_s: Time without a sample after which the stream counts as stale, s; 0 stands for ten
+            periods, at least 0.1 s.
+        reconnect: Whether a lost line is opened again and again; without, reading breaks with a
+            `SourceError`.
+        calibration: A calibration file, or the id of a device calibrated before; empty for none.
+        clock: ``host`` gives samples the host's time; ``device`` that of the device's own clock,
             which depends on the device alone, and agrees with nothing else's.
     """
 
@@ -61,11 +64,11 @@ class DeviceSource(Source):
     """Samples from a device on a serial line or a CAN bus.
 
     Args:
-        connect: opens the line; called again after it was lost.
-        codec: what the device speaks.
-        options: how patient to be.
-        name: of the device, for messages.
-        codec_options: of the codec as written, for a recording to tell.
+        connect: Opens the line; called again after the line was lost.
+        codec: The codec that the device speaks.
+        options: How long to wait for what, and what to do when the line is lost.
+        name: Name of the device, for messages.
+        codec_options: Options of the codec as the user wrote them, for a recording to tell.
 
     Raises:
         SourceError: it cannot be opened, does not answer, or nothing that comes is of its codec.

@@ -45,12 +45,13 @@ class Port:
     """A serial port.
 
     Attributes:
-        path: to open it by.
-        stable: name in /dev/serial/by-id, the same after every reboot; empty if it has none.
-        usb: (vendor, product) numbers; None if it is not on USB.
-        serial_number: of the device.
-        likely: what it is likely to be.
-        url: to begin with; `codec=` is a guess.
+        path: Path by which the port is opened, such as ``/dev/ttyUSB0``.
+        stable: Name in /dev/serial/by-id, the same after every reboot; empty for a port without
+            one.
+        usb: Vendor and product numbers on USB; None for a port that is not on USB.
+        serial_number: Serial number that the USB device reports; empty if none.
+        likely: What the device on this port is likely to be, in words.
+        url: The URL to begin with; the codec in it is a guess.
     """
 
     path: str
@@ -66,10 +67,10 @@ class CanBus:
     """A CAN network interface.
 
     Attributes:
-        name: e.g. ``can0``.
-        up: whether it is up.
-        bitrate: bit/s; 0 where it is not known.
-        url: to begin with.
+        name: Name of the network interface, such as ``can0``.
+        up: Whether the interface is up.
+        bitrate: Speed of the bus, bit/s; 0 where the kernel does not know it.
+        url: The URL to begin with; its codec is left to the user.
     """
 
     name: str
@@ -83,10 +84,10 @@ class Finding:
     """One thing looked at.
 
     Attributes:
-        what: a port, a bus, the user.
-        good: whether it is as it should be.
-        says: how it is.
-        do: what to do about it; empty if it is good.
+        what: What was looked at: a port, a bus, a service.
+        good: Whether everything about it is as it should be.
+        says: What was found, in words.
+        do: What the user should do about it; empty when all is good.
     """
 
     what: str
@@ -143,9 +144,9 @@ def diagnose(
     """Look at permissions, latency timers, CAN states and what else gets in the way.
 
     Args:
-        ports, buses: what there is, see `discovery`.
-        sys: where sysfs is.
-        run: runs a command, returns its output ("" if it fails).
+        ports, buses: What there is, from `serial_ports` and `can_buses`.
+        sys: Where sysfs is mounted.
+        run: Runs a command and returns its output ("" if it fails).
     """
     ask = run or _run
     found = [f for port in ports for f in _port(port, sys)]

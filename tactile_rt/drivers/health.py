@@ -9,7 +9,7 @@ __all__ = ["Health", "State"]
 
 
 class State(StrEnum):
-    """Of a device's stream."""
+    """State of a device's stream."""
 
     CONNECTING = "connecting"  # opened, no sample yet
     STREAMING = "streaming"  # samples come
@@ -19,20 +19,21 @@ class State(StrEnum):
 
 @dataclass(frozen=True)
 class Health:
-    """What is known of a device.
+    """What is known of a device at one moment.
 
     Attributes:
-        state: of its stream.
-        since_ns: since when, host CLOCK_MONOTONIC.
-        reason: why it is not streaming, in words; empty when it is.
-        connections: times it has been connected.
-        newest_ns: arrival of the newest sample; 0: none yet.
-        drift_ppm: how much faster the host's clock runs; 0 for a device that tells no time.
-        clock_steps: times that the device's clock jumped or began anew.
-        counter_resets: times that its sample counter began anew.
-        status: what its status bits of the newest sample mean.
-        can_errors: CAN error frames.
-        wire: frames that came, and what was wrong with them.
+        state: State of the device's stream.
+        since_ns: Host time (CLOCK_MONOTONIC) since which the stream is in this state, ns.
+        reason: Why the device is not streaming, in words; empty when it is.
+        connections: Number of times that the line has been opened.
+        newest_ns: Host time at which the newest sample arrived, ns; 0 before the first.
+        drift_ppm: Excess speed of the host's clock over the device's, parts per million; 0 for a
+            device that tells no time.
+        clock_steps: Number of times that the device's clock jumped or began anew.
+        counter_resets: Number of times that the device's sample counter began anew.
+        status: What the status bits of the newest sample mean, in words.
+        can_errors: Number of CAN error frames that have come.
+        wire: Counts of the frames that came, and of what was wrong with them.
     """
 
     state: State

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any, Generic
 
 from tactile_rt.drivers.codec import CanFrame, Packet
+from tactile_rt.drivers.slcan import SlcanDecoder, closing, encode, opening
 from tactile_rt.stream import ConfigError, SourceError
 
 __all__ = ["CanLink", "Link", "SerialLink", "SlcanLink"]
@@ -22,8 +23,8 @@ class Link(abc.ABC, Generic[Packet]):
     """A line to a device; opened when made.
 
     Attributes:
-        name: of the line, for messages.
-        can_errors: CAN error frames so far.
+        name: Name of the line, for messages.
+        can_errors: Number of CAN error frames that have come so far.
 
     Raises:
         SourceError: it cannot be opened: what and why.
@@ -57,10 +58,10 @@ class SerialLink(Link[bytes]):
     """Any port that pyserial opens: a device, a pty, ``socket://``, ``rfc2217://``.
 
     Args:
-        port: name or URL.
-        baud: rate, bit/s.
-        parity: ``N``, ``E`` or ``O``.
-        dtr: whether to assert DTR; boards that reset on it are left alone with False.
+        port: Name or URL of the port.
+        baud: Speed of the line, bit/s.
+        parity: Parity of the line: ``N``, ``E`` or ``O``.
+        dtr: Whether to assert DTR; boards that reset when DTR rises are left alone with False.
     """
 
     def __init__(self, port: str, baud: int, parity: str = "N", dtr: bool = True) -> None:
@@ -128,11 +129,11 @@ class CanLink(Link[Sequence[CanFrame]]):
     """Any interface of python-can: socketcan, pcan, kvaser, virtual, ...
 
     Args:
-        interface: python-can's name of it.
-        channel: which bus.
-        bitrate: bit/s.
-        fd: whether to open it for CAN FD.
-        data_bitrate: of the data phase, bit/s.
+        interface: Name that python-can has for the interface, such as ``socketcan``.
+        channel: Which bus of that interface, such as ``can0``.
+        bitrate: Speed of the bus, bit/s.
+        fd: Whether to open the bus for CAN FD.
+        data_bitrate: Speed of the data phase of CAN FD, bit/s.
     """
 
     def __init__(
@@ -218,15 +219,12 @@ class SlcanLink(Link[Sequence[CanFrame]]):
     python-can speaks it too, byte by byte: 5,500 frames/s where a saturated bus carries 9,000.
 
     Args:
-        port: the adapter's serial port.
-        bitrate: of the bus, bit/s.
-        fd: whether the bus carries CAN FD.
+        port: Serial port of the adapter.
+        bitrate: Speed of the bus, bit/s.
+        fd: Whether the bus carries CAN FD.
     """
 
     def __init__(self, port: str, bitrate: int, fd: bool = False) -> None:
-        from tactile_rt.drivers.slcan import SlcanDecoder, encode, opening
-
-        self._encode = encode
         self._decoder = SlcanDecoder()
         self._serial = SerialLink(port, 115200)
         self.name = f"slcan:{port}"
@@ -244,11 +242,11 @@ class SlcanLink(Link[Sequence[CanFrame]]):
                 return frames, found[1]
 
     def send(self, packet: Sequence[CanFrame]) -> None:
-        self._serial.send(self._encode(packet))
+        self._serial.send(encode(packet))
 
     def close(self) -> None:
         try:
-            self._serial.send(b"C\r")
+            self._serial.send(closing())
         except SourceError:
             pass  # it is gone, which is what we want
         self._serial.close()

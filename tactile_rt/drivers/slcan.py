@@ -49,10 +49,10 @@ class SlcanDecoder:
     changes when two lines in succession agree that it has, so that a damaged length is noticed.
 
     Attributes:
-        corrupt: lines that are neither a frame nor an answer.
-        acks: commands answered with OK.
-        bells: commands answered with an error.
-        replies: the last 16 answers to V, N and F, without their end of line.
+        corrupt: Number of lines that were neither a frame nor an answer.
+        acks: Number of commands that were answered with OK.
+        bells: Number of commands that were answered with an error.
+        replies: The last 16 answers to V, N and F, without their end of line.
     """
 
     def __init__(self) -> None:
@@ -140,8 +140,9 @@ def encode(frames: Iterable[CanFrame], stamp_ms: int | None = None) -> bytes:
     """Frames as lines; FD frames with bit-rate switching.
 
     Args:
-        frames: data longer than 8 bytes is padded with zeros to the next length CAN FD has.
-        stamp_ms: append this time, modulo a minute; None: no time stamps.
+        frames: Frames to write; data longer than 8 bytes is padded with zeros to the next length
+            CAN FD has.
+        stamp_ms: Time to append to each frame, ms, modulo a minute; None for no time stamps.
     """
     end = b"\r" if stamp_ms is None else b"%04X\r" % (stamp_ms % 60_000)
     lines = []
@@ -191,13 +192,14 @@ class SlcanAdapter:
     """The device's side: an adapter that answers commands, for an emulator.
 
     Args:
-        bitrate: of the bus that it is on: opened with another one it hears and says nothing and
-            reports bus errors; None: whichever the host chooses.
+        bitrate: Speed of the bus that the adapter is on, bit/s; opened with another one, the
+            adapter hears and says nothing and reports bus errors. None accepts whichever the host
+            chooses.
 
     Attributes:
-        open: whether the channel is open.
-        hears: whether frames come through: it is open, and at the bus's bit rate.
-        flags: status as F reports it and clears it; bit 3: data overrun, bit 7: bus error.
+        open: Whether the host has opened the channel.
+        hears: Whether frames come through: the channel is open, and at the bus's bit rate.
+        flags: Status that F reports and clears: bit 3 is a data overrun, bit 7 a bus error.
     """
 
     VERSION = b"V1013"

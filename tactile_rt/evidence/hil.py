@@ -134,14 +134,15 @@ class Loop:
     """One source, through an emulated device and its driver, and beside them.
 
     Args:
-        source: what the device measures; the loop closes it.
-        model: an ``.onnx`` file made for the source's array.
-        wire: one of `WIRES`.
-        codec: what the device speaks.
-        options: of the codec, as in a URL; a native device's ranges are `RANGES` unless given.
-        faults: what goes wrong on the way; the schedule is used up.
-        seconds: how much of the source's stream to send; None: to its end.
-        clock: times of the driver's samples: ``device``, or ``host``, in real time only.
+        source: What the device measures; the loop closes it.
+        model: An ``.onnx`` file made for the source's array.
+        wire: The kind of line, one of `WIRES`.
+        codec: Name of the codec that the device speaks.
+        options: Options of the codec, as in a URL; a native device's ranges are `RANGES` unless
+            given.
+        faults: What goes wrong on the way; the schedule is used up.
+        seconds: How much of the source's stream to send, s; None to send all.
+        clock: Which times the driver's samples have: ``device``, or ``host``, in real time only.
 
     Attributes:
         complete: Whether the loop has run to the end; a report is only judged then.
@@ -178,7 +179,6 @@ class Loop:
         }
         if wire == "virtual":
             further["bus"] = f"virtual:hil-{os.getpid()}-{id(self)}"
-            further["fd"] = self._options.get("fd", "").lower() in ("1", "true")
         make = EmulatedSerial if wire == "serial" else EmulatedCan
         self._device = make(self._tee, codec, **further)
         own = codec_class(make.wire, codec).Options

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tactile_rt.models.intervals import Interval
+from tactile_rt.models.evaluation import Interval
 
 __all__ = ["draw_accuracy_over_time", "draw_confusion", "draw_robustness"]
 

@@ -194,7 +194,7 @@ class StreamingGraph(nn.Module):
         return out
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zeros: each node's cell state and, where a node hears it, its output `_h`."""
+        """Zeros: each node's cell state and, where a node hears it, its output, ``NAME_h``."""
         zeros = next(self.buffers()).new_zeros
         state = {}
         for node in self.graph.nodes:

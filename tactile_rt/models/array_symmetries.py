@@ -30,8 +30,8 @@ class Symmetry:
     """One of an array.
 
     Attributes:
-        source: (element,) whose loads each element takes.
-        matrix: (element, channel, channel) what they are multiplied by.
+        source: (element,) The index of the element whose loads each element takes.
+        matrix: (element, channel, channel) The matrix that those loads are multiplied by.
     """
 
     source: NDArray[np.int64]

@@ -41,8 +41,10 @@ class Augmentation:
     """What happens to a batch before and after the input stage; draws come from a generator.
 
     Attributes:
-        loads: (samples, offset, sigma) in SI units, and a CPU generator, to the same.
-        frames: (batch, step, sub-step * channel, row, column), and a generator on their device.
+        loads: The function that augments loads: (samples, offset, sigma) in SI units and a CPU
+            generator, to the same three.
+        frames: The function that augments frames: (batch, step, sub-step * channel, row, column)
+            and a generator on their device, to the same shape.
     """
 
     loads: Callable[[Loads, Generator], Loads]

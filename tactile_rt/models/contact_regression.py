@@ -47,10 +47,10 @@ class ContactConfig:
     """How to train.
 
     Attributes:
-        hidden: units of the recurrent layer.
-        epochs, batch: passes over the training split; whiskers (of one sweep each) per update.
-        learning_rate: peak; falls to nothing along a cosine.
-        seed: of weights, order and noise.
+        hidden: The number of units in the recurrent layer.
+        epochs, batch: Passes over the training split, and whiskers (of one sweep each) per update.
+        learning_rate: The peak of the learning rate, from which it falls to nothing along a cosine.
+        seed: The seed of the weights, the order of the sweeps and the noise.
 
     Raises:
         ConfigError: a value that cannot be.
@@ -137,8 +137,8 @@ class Felt:
     """Loads as a robot has them: noisy, and tared on the samples before the object came.
 
     Attributes:
-        loads: (sweep, sample, element, 6) N and N m.
-        sigma: (sweep, element, 6) noise at rest.
+        loads: (sweep, sample, element, 6) Tared forces and moments, N and N m.
+        sigma: (sweep, element, 6) The noise at rest, one standard deviation, N and N m.
     """
 
     loads: Floats

@@ -83,7 +83,7 @@ class MLPAllDecoder(nn.Module):
         steps = features.shape[1]
         if steps > len(self.weight):
             raise ValueError(f"{steps} steps, but this decoder ends at {len(self.weight)}")
-        products = torch.einsum("btf,thf->bth", features, self.weight[:steps])
+        products = torch.einsum("btf,thf->bth", features, self.weight[:steps])  # (b, step, hidden)
         # At least single precision: sums of many steps would stall in autocast's types.
         exact = torch.promote_types(products.dtype, torch.float32)
         return self._rest(products.cumsum(1, dtype=exact))
@@ -100,17 +100,19 @@ class MLPAllDecoder(nn.Module):
         Steps past the last weight change nothing.
         """
         weight = self.weight[index.clamp(max=len(self.weight) - 1)]  # (batch, hidden, feature)
-        product = torch.matmul(weight, features[:, :, None])[:, :, 0]
-        inside = (index < len(self.weight))[:, None]
+        product = torch.matmul(weight, features[:, :, None])[:, :, 0]  # (batch, hidden)
+        inside = (index < len(self.weight))[:, None]  # (batch, 1)
         total = state["decoder_sum"] + torch.where(inside, product, 0.0)
         return self._rest(total), {"decoder_sum": total}
 
     def _rest(self, total: Tensor) -> Tensor:
+        """The first layer's sum (..., hidden) -> logits (..., class)"""
         logits: Tensor = self.layer3(F.relu(self.layer2(F.relu(total + self.bias))))
         return logits
 
 
 def hidden(width: float) -> tuple[int, int]:
+    """Sizes of the two hidden layers at a width."""
     wide, narrow = (round(units * width) for units in HIDDEN)
     return wide, narrow
 

@@ -100,7 +100,8 @@ class EAD(nn.Module):
     (batch, step, channel[, row, column]) for a window, without the step for one step.
 
     Attributes:
-        lag: the first `lag` steps of a window know of no frame, the last `lag` frames do not count.
+        lag: The number of steps that a frame takes to reach the logits: the first `lag` steps of a
+            window know of no frame, the last `lag` frames do not count.
     """
 
     def __init__(self, config: EADConfig) -> None:
@@ -135,8 +136,8 @@ class EAD(nn.Module):
             return logits
         # At least single precision: sums of many steps would stall in autocast's types.
         exact = torch.promote_types(logits.dtype, torch.float32)
-        total = logits[:, self.lag :].cumsum(dim=1, dtype=exact)
-        counts = torch.arange(1, total.shape[1] + 1, device=total.device)
+        total = logits[:, self.lag :].cumsum(dim=1, dtype=exact)  # (batch, step - lag, class)
+        counts = torch.arange(1, total.shape[1] + 1, device=total.device)  # (step - lag,)
         return torch.cat([logits[:, : self.lag], total / counts[:, None]], dim=1)
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
@@ -160,9 +161,9 @@ class EAD(nn.Module):
         A lane is reset by putting its rows of `initial_state` back.
         """
         index = state["index"]
-        features, encoder = self.encoder.step(frame, index, state, *others)
+        features, encoder = self.encoder.step(frame, index, state, *others)  # (batch, feature)
         features, attender = self.attender.step(features, index, state)
-        logits, decoder = self.decoder.step(features, index, state)
+        logits, decoder = self.decoder.step(features, index, state)  # (batch, class)
         new = {"index": index + 1, **encoder, **attender, **decoder}
         if self.config.readout == "mean":
             count = index[:, None] - self.lag + 1  # steps in the mean; none before the lag is over
@@ -185,4 +186,5 @@ def _encoder(config: EADConfig) -> Any:
 
 
 def count_parameters(module: nn.Module) -> int:
+    """The number of numbers in a module's parameters; buffers do not count."""
     return sum(parameter.numel() for parameter in module.parameters())

@@ -1,23 +1,30 @@
 """How well does a classifier do on objects that it never saw? Accuracy with honest intervals.
 
+The sweeps may be disturbed first, by what a real sensor does that a simulated one does not
+(`Disturbance`). Sweeps of one object are not independent, so intervals resample objects.
+
 Predictions are (sweep, step, class) posteriors; a sweep in which no contact was detected has no
 decision, and counts as wrong everywhere.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import fuse
-from tactile_rt.models.datasets import STEPS, SweepSet, windows
-from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.models.intervals import Interval, accuracy, bootstrap
+from tactile_rt.models.datasets import STEPS, SweepSet, channel_values, windows
 from tactile_rt.models.onsets import find_onsets
+from tactile_rt.stream import ConfigError
 
 __all__ = [
+    "CLEAN",
+    "OFFSET",
+    "Disturbance",
     "Interval",
+    "Step",
     "accuracy",
     "accuracy_over_time",
     "at_temperature",
@@ -31,9 +38,87 @@ __all__ = [
     "predict",
 ]
 
+# samples (batch, step, sub-step, element, channel), offset and sigma (batch, element, channel), SI
+# -> logits (batch, step, class)
 Step = Callable[
     [NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]
 ]
+OFFSET = {"N": 20e-6, "N m": 1e-7}  # a unit of offset that appears after the tare, SI
+LEVELS = (2.5, 97.5)  # percentiles of the 95 % interval
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What is wrong with the sensor; each sweep is a draw of its own.
+
+    Attributes:
+        noise: The white noise on every stored sample, in units of the rated noise.
+        gain: The standard deviation of every whisker's relative gain error.
+        dead: The number of whiskers, drawn at random, that read zero throughout.
+        offset: The size of a constant that appears with the contact, after the tare, in units of
+            `OFFSET`; a sign is drawn for every whisker and channel.
+        rest: The number of stored samples of silence before each sweep, for the tare; a robot has
+            them, the sweeps have only a short lead.
+
+    Raises:
+        ConfigError: a negative amount.
+    """
+
+    noise: float = 0.0
+    gain: float = 0.0
+    dead: int = 0
+    offset: float = 0.0
+    rest: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "gain", "dead", "offset", "rest"):
+            if not getattr(self, name) >= 0:  # which NaN is not either
+                raise ConfigError(f"{name} is {getattr(self, name)}, must not be negative")
+
+    def of_samples(
+        self, values: NDArray[np.float32], data: SweepSet, rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """What the detector sees, of (sweep, sample, element, channel) SI."""
+        n, elements = len(values), values.shape[2]
+        if self.rest:
+            silence = np.zeros((n, self.rest, *values.shape[2:]), dtype=np.float32)
+            values = np.concatenate([silence, values], axis=1)
+        if self.gain:
+            error = rng.normal(size=(n, 1, elements, 1)).astype(np.float32)
+            values = values * (1 + np.float32(self.gain) * error)
+        if self.dead:
+            rank = rng.permuted(np.tile(np.arange(elements), (n, 1)), axis=1)
+            values = values * (rank >= self.dead)[:, None, :, None]
+        if self.noise:
+            noise = rng.normal(size=values.shape).astype(np.float32)
+            values = values + noise * data.noise * np.float32(self.noise)
+        return values
+
+    def of_windows(
+        self, samples: NDArray[np.float32], data: SweepSet, rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """What the network sees, of (sweep, step, sub-step, element, channel) SI."""
+        if not self.offset:
+            return samples
+        size = channel_values(data.manifest.spec, OFFSET) * np.float32(self.offset)
+        sign = rng.choice(np.array([-1, 1], dtype=np.float32), (len(samples), *samples.shape[3:]))
+        there: NDArray[np.float32] = samples + (sign * size)[:, None, None]
+        return there
+
+
+CLEAN = Disturbance()
+
+
+@dataclass(frozen=True)
+class Interval:
+    """An estimate with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{100 * self.value:.1f} % [{100 * self.low:.1f}, {100 * self.high:.1f}]"
 
 
 def predict(
@@ -168,3 +253,51 @@ def expected_calibration_error(
         for b in np.unique(which)
     ]
     return float(sum(gaps) / max(len(right), 1))
+
+
+def accuracy(correct: NDArray[Any], objects: NDArray[np.str_], resamples: int = 2000) -> Interval:
+    """A mean over sweeps with a percentile bootstrap over objects.
+
+    Args:
+        correct: (sweep,) whether each was right; or the difference of two such arrays, for the
+            points that one condition loses to another on the same sweeps; or (seed, sweep), whose
+            seeds are then resampled too.
+        objects: (sweep,) object of each sweep.
+        resamples: bootstrap resamples.
+    """
+    runs = np.atleast_2d(correct).astype(np.float64)
+    _, which = np.unique(objects, return_inverse=True)
+    count = np.bincount(which)
+    right = np.stack([np.bincount(which, weights=run) for run in runs])  # (seed, object)
+    rng = np.random.default_rng(0)
+    drawn = rng.integers(0, len(count), (resamples, len(count)))
+    seeds = rng.integers(0, len(right), (resamples, len(right)))
+    total = np.zeros(resamples)
+    for seed in seeds.T:
+        total += right[seed[:, None], drawn].sum(axis=1)
+    means = total / len(right) / count[drawn].sum(axis=1)
+    low, high = np.percentile(means, LEVELS)
+    return Interval(float(runs.mean()), float(low), float(high))
+
+
+def bootstrap(
+    statistic: Callable[[NDArray[np.int64]], float],
+    objects: NDArray[np.str_],
+    resamples: int = 300,
+) -> Interval:
+    """Any statistic of a set of sweeps with a percentile bootstrap over objects.
+
+    Args:
+        statistic: of the sweeps with these indices (k,), some of which may come more than once.
+        objects: (sweep,) object of each sweep.
+        resamples: bootstrap resamples.
+    """
+    _, which = np.unique(objects, return_inverse=True)
+    of = np.split(np.argsort(which, kind="stable"), np.cumsum(np.bincount(which))[:-1])
+    rng = np.random.default_rng(0)
+    values = [
+        statistic(np.concatenate([of[k] for k in rng.integers(0, len(of), len(of))]))
+        for _ in range(resamples)
+    ]
+    low, high = np.percentile(values, LEVELS)
+    return Interval(statistic(np.arange(len(objects))), float(low), float(high))

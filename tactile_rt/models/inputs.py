@@ -26,6 +26,10 @@ class InputStage(nn.Module):
         shape: rows and columns of the grid; cells without an element are zero.
         clip: per channel, the largest magnitude that is believed (channel,), SI.
         scale: per channel, the floor of the logarithm's scale (channel,), SI.
+
+    Raises:
+        ConfigError: clip and scale of unlike lengths or not positive, two elements in one place,
+            or one outside the grid.
     """
 
     clip: Tensor
@@ -67,6 +71,9 @@ class InputStage(nn.Module):
         samples         (batch, ..., sub-step, element, channel)  SI
         offset, sigma   (batch, element, channel)                 SI: mean and noise at rest
         ->              (batch, ..., sub-step * channel, row, column)
+
+        Raises:
+            ValueError: samples of another number of elements or channels.
         """
         if samples.shape[-2:] != (self.elements, len(self.clip)):
             found = " x ".join(map(str, samples.shape[-2:]))
@@ -75,9 +82,10 @@ class InputStage(nn.Module):
             )
         for _ in range(samples.dim() - offset.dim()):
             offset, sigma = offset.unsqueeze(1), sigma.unsqueeze(1)
-        value = torch.clamp(samples - offset, -self.clip, self.clip)
-        scale = torch.sqrt(self.scale**2 + (NOISE_FLOOR * sigma) ** 2)
-        value = torch.sign(value) * torch.log1p(value.abs() / scale)
+        value = torch.clamp(samples - offset, -self.clip, self.clip)  # as samples, SI
+        scale = torch.sqrt(self.scale**2 + (NOISE_FLOOR * sigma) ** 2)  # as offset, SI
+        value = torch.sign(value) * torch.log1p(value.abs() / scale)  # as samples, no unit
         cells = F.pad(value, (0, 0, 0, 1)).index_select(-2, self.element)
+        # (batch, ..., sub-step, cell, channel) -> (batch, ..., sub-step * channel, row, column)
         frames: Tensor = cells.transpose(-2, -1).flatten(-3, -2).unflatten(-1, self.shape)
         return frames

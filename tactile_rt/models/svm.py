@@ -3,8 +3,8 @@
 Two questions want one. Does a network beat it on the very windows that it sees? `fit_svm` answers
 that: the machine takes the same onsets, tare and compression, and validation chooses its penalty.
 And can a set be learnt from at all? The card of a sweep set asks that with features and a penalty
-of its own (`sim_backend.datasets.separability`), and is handed `fit` by the command: simulation
-and networks do not know of each other.
+of its own (`tactile_rt.sim_backend.datasets.separability`), and is handed `fit` by the command:
+simulation and networks do not know of each other.
 
 Standardising the features only makes the machine worse, so nothing here does.
 """
@@ -50,7 +50,7 @@ class FittedSVM:
 
     Attributes:
         predict: The machine's decisions, from (sweep, feature) values to (sweep,) labels.
-        how: How the machine was made, in words, for a report.
+        how: A sentence for reports that says how the machine was made.
     """
 
     predict: Predict

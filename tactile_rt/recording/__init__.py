@@ -1,6 +1,6 @@
 """A stream at rest: an MCAP file (https://mcap.dev) that any MCAP reader opens, Foxglove for one.
 
-    source --chunks, raw packets--> StreamWriter --> FILE.mcap --> read_stream, replay:FILE.mcap
+    source --chunks, raw packets--> StreamWriter --> FILE.mcap --> Recording, replay:FILE.mcap
 
     metadata  ``tactile_rt``: the array, what the device speaks, the clock's UTC offset
               ``session``: what the user notes
@@ -13,25 +13,8 @@ The layout is described in docs/recording.md. It needs the extra ``record``.
 """
 
 from tactile_rt.recording.description import Description
-from tactile_rt.recording.reader import (
-    read_decisions,
-    read_description,
-    read_events,
-    read_health,
-    read_packets,
-    read_stream,
-)
+from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.recovery import recover
-from tactile_rt.recording.writer import StreamWriter
+from tactile_rt.recording.stream_writer import StreamWriter
 
-__all__ = [
-    "Description",
-    "StreamWriter",
-    "read_decisions",
-    "read_description",
-    "read_events",
-    "read_health",
-    "read_packets",
-    "read_stream",
-    "recover",
-]
+__all__ = ["Description", "Recording", "StreamWriter", "recover"]

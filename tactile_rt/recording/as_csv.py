@@ -1,4 +1,4 @@
-"""A recording as text: a line per sample; what is no sample goes into a file beside it; see `flat`.
+"""A recording as text: a line per sample, and all else in a file beside it; see `as_arrays`.
 
     seq,t_ns,A0.fx [N],...,bits
     0,1000000,0.00012,...,
@@ -22,9 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.files import write_whole
+from tactile_rt.recording.as_arrays import ABOUT, COLUMNS, Told, about_of, about_text, raws_of
 from tactile_rt.recording.description import Description
-from tactile_rt.recording.flat import ABOUT, COLUMNS, Told, about_of, about_text, raws_of
-from tactile_rt.recording.reader import Raw
+from tactile_rt.recording.layout import Raw
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError, RecordingError, concatenate
 
 __all__ = ["beside", "read_csv", "write_csv"]

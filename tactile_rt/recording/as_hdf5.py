@@ -1,4 +1,4 @@
-"""A recording as HDF5, written and read piece by piece: it need not fit into memory; see `flat`.
+"""A recording as HDF5, piece by piece: it need not fit into memory; see `as_arrays`.
 
 Beside the arrays it names the axes of `values`: ``elements``, ``channels`` and ``units``, with the
 attributes ``frame`` (of mounting), ``rate_hz`` and ``utc_offset_ns``. It needs the extra ``hdf5``.
@@ -10,8 +10,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from tactile_rt.recording.description import Description
-from tactile_rt.recording.flat import (
+from tactile_rt.recording.as_arrays import (
     ABOUT,
     BLOCK,
     COLUMNS,
@@ -21,7 +20,8 @@ from tactile_rt.recording.flat import (
     about_text,
     raws_of,
 )
-from tactile_rt.recording.reader import Raw
+from tactile_rt.recording.description import Description
+from tactile_rt.recording.layout import Raw
 from tactile_rt.stream import Chunk, ConfigError, RecordingError, TactileError, concatenate
 
 __all__ = ["need_h5py", "read_hdf5", "write_hdf5"]

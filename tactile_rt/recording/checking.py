@@ -5,7 +5,6 @@ part of it. A model's step does not depend on how its stream was cut or paced, s
 the same samples decides the same, digit for digit.
 """
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 
 from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.recording.description import Description
+from tactile_rt.settings import parse_toml
 from tactile_rt.stream import NS_PER_S, ConfigError
 
 __all__ = [
@@ -37,10 +37,10 @@ class RecordedModel:
     """A model of the daemon that decided on the recorded source.
 
     Attributes:
-        name: in the configuration, and in its decisions.
-        file: where it was.
-        sha256: of the file; empty: the recording does not tell.
-        table: its table ``[[model]]`` in the configuration.
+        name: The name of the model in the configuration, and in its decisions.
+        file: The path that the model's file had.
+        sha256: The SHA-256 of the file, in hexadecimal; empty: the recording does not tell.
+        table: The model's table ``[[model]]`` in the configuration.
     """
 
     name: str
@@ -53,8 +53,8 @@ def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
     """The models that decided on the source while it was recorded; none without a daemon."""
     session = about.session
     try:
-        config = tomllib.loads(session.get("config", ""))
-    except tomllib.TOMLDecodeError:
+        config = parse_toml(session.get("config", ""), "config").plain()
+    except ConfigError:
         config = {}
     tables = {t["name"]: t for t in config.get("model", ()) if "name" in t}
     found = []
@@ -127,11 +127,13 @@ class Checked:
     """What became of the comparison.
 
     Attributes:
-        same: decisions that are as recorded.
-        before: recorded ones about samples before the first.
-        late: replayed ones of the last second, which the recording ended too early for.
-        withheld: replayed ones that were not recorded because they were late (``late = "skip"``).
-        difference: the first one, in words; empty: none.
+        same: The number of decisions that are as recorded.
+        before: The number of recorded decisions about samples before the first.
+        late: The number of replayed decisions of the last second, for which the recording ended
+            too early.
+        withheld: The number of replayed decisions that were not recorded because they were late
+            (``late = "skip"``).
+        difference: The first difference, in words; empty: there is none.
     """
 
     same: int
@@ -152,7 +154,7 @@ def check_decisions(
     """Compare decisions of one model, in their order.
 
     Args:
-        recorded: as `read_decisions` gives them.
+        recorded: as `Recording.decisions` gives them.
         replayed: with `FACTS`, of every step.
         span_ns: stream time of the first and the last sample.
         final_only: whether only final ones were recorded.

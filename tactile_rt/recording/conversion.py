@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 from tactile_rt.files import write_whole
+from tactile_rt.recording.as_arrays import TEXTS, read_npz, write_npz
 from tactile_rt.recording.as_csv import beside, read_csv, write_csv
 from tactile_rt.recording.as_hdf5 import need_h5py, read_hdf5, write_hdf5
-from tactile_rt.recording.as_npz import read_npz, write_npz
 from tactile_rt.recording.description import RECOVERED, Description
-from tactile_rt.recording.flat import TEXTS
-from tactile_rt.recording.layout import SAMPLES, decode_samples, need_mcap
-from tactile_rt.recording.mcap_file import McapFile
-from tactile_rt.recording.reader import Raw, read_description, read_raw
+from tactile_rt.recording.layout import SAMPLES, Raw, need_mcap, samples_in
+from tactile_rt.recording.reader import Recording
+from tactile_rt.recording.writer import McapFile
 from tactile_rt.stream import ConfigError
 
 __all__ = ["convert", "outputs_of"]
@@ -66,8 +65,8 @@ def convert(path: str | Path, output: str | Path) -> int:
 
 def _read(path: Path) -> tuple[Description, Generator[Raw, None, None]]:
     if path.suffix == MCAP:
-        raws = (raw for _, raw in read_raw(path, SAMPLES, *TEXTS))
-        return read_description(path), raws
+        recording = Recording(path)
+        return recording.description, recording.raw(SAMPLES, *TEXTS)
     if not path.is_file():
         raise ConfigError(f"no file {path}")
     return READERS[path.suffix](path)
@@ -86,6 +85,6 @@ def _write(what: str, about: Description, raws: Iterable[Raw], file: BinaryIO, o
     for raw in raws:
         made.add(raw.topic, raw.data, raw.t_ns)
         if raw.topic == SAMPLES:
-            n += len(decode_samples(raw.data, about.spec.shape))
+            n += samples_in(raw.data)
     made.finish()
     return n

@@ -1,15 +1,29 @@
 """What a recording says of itself, in metadata that carries a checksum."""
 
+import time
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import msgspec
 
-from tactile_rt.calibration import Calibration
-from tactile_rt.stream import ArraySpec, ConfigError, RecordingError
+from tactile_rt.calibration import CalibratedSource, Calibration
+from tactile_rt.drivers.device_source import DeviceSource
+from tactile_rt.stream import ArraySpec, ConfigError, RecordingError, Source
 
-__all__ = ["METADATA", "RECOVERED", "SESSION", "SUMMARY", "Description", "seal", "unseal"]
+__all__ = [
+    "METADATA",
+    "RECOVERED",
+    "SESSION",
+    "SUMMARY",
+    "Description",
+    "describe",
+    "device_of",
+    "seal",
+    "unseal",
+    "utc_offset_ns",
+]
 
 LAYOUT_VERSION = 1
 METADATA, SESSION, SUMMARY, RECOVERED = "tactile_rt", "session", "summary", "recovered"
@@ -20,16 +34,18 @@ class Description:
     """What a recording is of.
 
     Attributes:
-        spec: the array of the samples.
-        utc_offset_ns: UTC less the host's monotonic time, when the recording began.
-        source: where it came from: a URL, or a device's name.
-        wire: ``serial`` or ``can``; empty: no device, so no packets.
-        codec: what the device spoke.
-        codec_options: as in a URL; paths are absolute.
+        spec: The array of the samples.
+        utc_offset_ns: UTC less the host's monotonic time when the recording began, ns.
+        source: The URL of the source that was recorded, or the device's name.
+        wire: ``serial`` or ``can``; empty where the source is no device, so that there are no
+            packets.
+        codec: The name of the codec that the device spoke; empty without a device.
+        codec_options: The options of the codec, as in a URL; paths are absolute.
         clock: ``host`` or ``device``: whose time the samples have.
-        calibration: of the samples, not of the packets; None: the samples are the codec's.
-        session: what the user notes.
-        recovered: whether the file was made whole after an interruption, and may have gaps.
+        calibration: The calibration of the samples, not of the packets; None: the samples are as
+            the codec gave them.
+        session: The notes of whoever recorded, by name.
+        recovered: Whether the file was made whole after an interruption, and may have gaps.
     """
 
     spec: ArraySpec
@@ -112,3 +128,37 @@ def unseal(what: str, fields: Mapping[str, str]) -> dict[str, str]:
 
 def _crc(fields: Mapping[str, str]) -> str:
     return f"{zlib.crc32(msgspec.json.encode(sorted(fields.items()))):08x}"
+
+
+def utc_offset_ns() -> int:
+    """UTC less monotonic time, now, ns."""
+    before = time.monotonic_ns()
+    utc = time.time_ns()
+    return utc - (before + time.monotonic_ns()) // 2
+
+
+def device_of(source: Source) -> DeviceSource | None:
+    """The device behind a source, if there is one."""
+    while isinstance(source, CalibratedSource):
+        source = source.source
+    return source if isinstance(source, DeviceSource) else None
+
+
+def describe(
+    source: Source, url: str = "", session: Mapping[str, str] | None = None
+) -> Description:
+    """What a recording of this source is of; its UTC offset is that of now."""
+    about = Description(source.spec, utc_offset_ns(), url, session=dict(session or {}))
+    device = device_of(source)
+    if device is None:
+        return about
+    options = {
+        # A recording is read elsewhere than where its options were written.
+        name: str(Path(value).resolve()) if value and Path(value).is_file() else value
+        for name, value in device.codec_options.items()
+    }
+    return replace(
+        about, source=url or device.name, wire=device.codec.wire, codec=device.options.codec,
+        codec_options=options, clock=device.options.clock,
+        calibration=source.calibration if isinstance(source, CalibratedSource) else None,
+    )  # fmt: skip

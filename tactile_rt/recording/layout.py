@@ -24,12 +24,14 @@ __all__ = [
     "SAMPLES",
     "WIRE",
     "Packet",
+    "Raw",
     "Schema",
     "decode_packet",
     "decode_samples",
     "encode_packet",
     "encode_samples",
     "need_mcap",
+    "samples_in",
 ]
 
 SAMPLES, WIRE, HEALTH = "samples", "wire", "health"
@@ -101,6 +103,21 @@ class Schema:
     message_encoding: str
 
 
+@dataclass(frozen=True)
+class Raw:
+    """One message of a recording, as it stands in the file.
+
+    Attributes:
+        topic: The name of its channel, e.g. ``samples``.
+        t_ns: The time under which it was recorded, host monotonic time, ns.
+        data: The encoded message.
+    """
+
+    topic: str
+    t_ns: int
+    data: bytes
+
+
 CHANNELS = {
     (SAMPLES, ""): Schema("tactile_rt/msg/Samples", "ros2msg", SAMPLES_MSG, "cdr"),
     (WIRE, "serial"): Schema("tactile_rt/msg/SerialPacket", "ros2msg", SERIAL_MSG, "cdr"),
@@ -151,6 +168,12 @@ def encode_samples(chunk: Chunk) -> bytes:
     )
 
 
+def samples_in(data: bytes) -> int:
+    """How many samples a message of `SAMPLES_MSG` holds."""
+    (n,) = struct.unpack_from("<I", data, 4)
+    return int(n)
+
+
 def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
     """The chunk in a message.
 
@@ -162,7 +185,7 @@ def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
         ValueError: it is not such a message.
     """
     elements, channels = shape
-    (n,) = struct.unpack_from("<I", data, 4)
+    n = samples_in(data)
     values_at = 4 + 16 + 16 * n + 12
     valid_at = values_at + 4 * n * elements * channels + 4
     if n == 0 or data[:4] != _CDR or len(data) != valid_at + n * elements:

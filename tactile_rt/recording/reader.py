@@ -1,10 +1,9 @@
 """Read a recording back. What is damaged is named, never misread."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 import msgspec
 
@@ -16,144 +15,117 @@ from tactile_rt.recording.layout import (
     SAMPLES,
     WIRE,
     Packet,
+    Raw,
     decode_packet,
     decode_samples,
     need_mcap,
 )
-from tactile_rt.stream import Chunk, ConfigError, RecordingError, TactileError
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError, RecordingError, TactileError
 
 if TYPE_CHECKING:
     from mcap.records import McapRecord
 
-__all__ = [
-    "Raw",
-    "is_finished",
-    "read_decisions",
-    "read_description",
-    "read_events",
-    "read_health",
-    "read_packets",
-    "read_raw",
-    "read_stream",
-]
+__all__ = ["MAGIC", "Recording", "is_finished"]
 
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER = b"\x02" + (20).to_bytes(8, "little")  # its opcode and length
 FOOTER_BYTES = len(FOOTER) + 20 + len(MAGIC)
 
-
-@dataclass(frozen=True)
-class Raw:
-    """One message: of which channel, host time in ns, bytes."""
-
-    topic: str
-    t_ns: int
-    data: bytes
+T = TypeVar("T")
 
 
-def read_description(path: str | Path) -> Description:
-    """What a recording is of.
+class Recording:
+    """A recording, read from its file: what it is of, and all that is in it.
+
+        recording = Recording("run.mcap")
+        for chunk in recording: ...
+
+    Every iteration opens the file, and reads it from its beginning. Where damage is met, what comes
+    before it has been given out.
+
+    Args:
+        path: of the file, MCAP.
+
+    Attributes:
+        path: The path of the file.
+        description: What the recording is of.
 
     Raises:
         ConfigError: there is no such file, or the extra is not installed.
-        RecordingError: it is no recording, unfinished, damaged, or of another version.
+        RecordingError: it is no recording, unfinished, damaged, or of another version. All that
+            iterates raises it, too.
     """
-    with _opened(Path(path)) as file:
-        return _described(Path(path), _records(file))[0]
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        with _opened(self.path) as file:
+            self.description = _described(self.path, _records(file))[0]
+
+    @property
+    def spec(self) -> ArraySpec:
+        """The array of the samples."""
+        return self.description.spec
+
+    def __iter__(self) -> Iterator[Chunk]:
+        return self.chunks()
+
+    def chunks(self) -> Iterator[Chunk]:
+        """The chunks, as they were recorded."""
+        return self._decoded(SAMPLES, lambda raw: decode_samples(raw.data, self.spec.shape))
+
+    def packets(self) -> Iterator[tuple[Packet, int]]:
+        """The raw packets and their arrival, host time in ns; None where the line was opened."""
+        wire = self.description.wire
+        return self._decoded(WIRE, lambda raw: (decode_packet(raw.data, wire), raw.t_ns))
+
+    def health(self) -> Iterator[dict[str, Any]]:
+        """How source and recorder were, whenever it changed; fields as in docs/recording.md."""
+        return self._decoded(HEALTH, _fields)
+
+    def decisions(self) -> Iterator[dict[str, Any]]:
+        """What the daemon's models decided, as it published it."""
+        return self._decoded(DECISIONS, _fields)
+
+    def events(self) -> Iterator[dict[str, Any]]:
+        """What changed in the daemon meanwhile: contacts, and states of its parts."""
+        return self._decoded(EVENTS, _fields)
+
+    def raw(self, *topics: str) -> Generator[Raw, None, None]:
+        """The messages of these channels, undecoded; of none, the file is only checked."""
+        from mcap.records import Channel, Message
+
+        path = self.path
+        with _opened(path) as file, _naming(path):
+            records = _records(file)
+            about, record = _described(path, records)
+            names: dict[int, str] = {}
+            due: dict[int, int] = {}
+            while record is not None:
+                if isinstance(record, Channel):
+                    names[record.id] = record.topic
+                elif isinstance(record, Message):
+                    name = names[record.channel_id]
+                    expected = due.get(record.channel_id, 0)
+                    if record.sequence != expected:
+                        raise RecordingError(
+                            f"{path} is damaged: message {expected} of {name} is missing; "
+                            "`tactile-rt recover` keeps what is whole"
+                        )
+                    due[record.channel_id] = (expected + 1) % (1 << 32)
+                    if name in topics:
+                        t_ns = record.log_time - about.utc_offset_ns
+                        yield Raw(name, t_ns, record.data)
+                record = next(records, None)
+
+    def _decoded(self, topic: str, decode: Callable[[Raw], T]) -> Iterator[T]:
+        for raw in self.raw(topic):
+            with _naming(self.path):
+                decoded = decode(raw)
+            yield decoded
 
 
-def read_stream(path: str | Path) -> Iterator[Chunk]:
-    """The chunks of a recording, as they were pushed.
-
-    Raises:
-        ConfigError, RecordingError: as `read_description`; where damage is met, what comes before
-            it has been given out.
-    """
-    for about, raw in read_raw(path, SAMPLES):
-        with _naming(Path(path)):
-            chunk = decode_samples(raw.data, about.spec.shape)
-        yield chunk
-
-
-def read_packets(path: str | Path) -> Iterator[tuple[Packet, int]]:
-    """The raw packets of a recording and their arrival, host time in ns.
-
-    A packet of None stands where the line was opened.
-
-    Raises:
-        ConfigError, RecordingError: as `read_stream`.
-    """
-    for about, raw in read_raw(path, WIRE):
-        with _naming(Path(path)):
-            packet = decode_packet(raw.data, about.wire)
-        yield packet, raw.t_ns
-
-
-def read_health(path: str | Path) -> Iterator[dict[str, Any]]:
-    """How source and recorder were, whenever that changed; fields as in docs/recording.md.
-
-    Raises:
-        ConfigError, RecordingError: as `read_stream`.
-    """
-    return _read_json(path, HEALTH)
-
-
-def read_decisions(path: str | Path) -> Iterator[dict[str, Any]]:
-    """What the daemon's models decided, as it published it.
-
-    Raises:
-        ConfigError, RecordingError: as `read_stream`.
-    """
-    return _read_json(path, DECISIONS)
-
-
-def read_events(path: str | Path) -> Iterator[dict[str, Any]]:
-    """What changed in the daemon while it recorded: contacts, and states of its parts.
-
-    Raises:
-        ConfigError, RecordingError: as `read_stream`.
-    """
-    return _read_json(path, EVENTS)
-
-
-def _read_json(path: str | Path, topic: str) -> Iterator[dict[str, Any]]:
-    for _, raw in read_raw(path, topic):
-        with _naming(Path(path)):
-            fields = msgspec.json.decode(raw.data, type=dict[str, Any])
-        yield fields
-
-
-def read_raw(path: str | Path, *topics: str) -> Iterator[tuple[Description, Raw]]:
-    """The messages of these channels, undecoded, with what the recording is of.
-
-    Raises:
-        ConfigError, RecordingError: as `read_stream`.
-    """
-    need_mcap()
-    from mcap.records import Channel, Message
-
-    path = Path(path)
-    with _opened(path) as file, _naming(path):
-        records = _records(file)
-        about, record = _described(path, records)
-        names: dict[int, str] = {}
-        due: dict[int, int] = {}
-        while record is not None:
-            if isinstance(record, Channel):
-                names[record.id] = record.topic
-            elif isinstance(record, Message):
-                name = names[record.channel_id]
-                expected = due.get(record.channel_id, 0)
-                if record.sequence != expected:
-                    raise RecordingError(
-                        f"{path} is damaged: message {expected} of {name} is missing; "
-                        "`tactile-rt recover` keeps what is whole"
-                    )
-                due[record.channel_id] = (expected + 1) % (1 << 32)
-                if name in topics:
-                    t_ns = record.log_time - about.utc_offset_ns
-                    yield about, Raw(name, t_ns, record.data)
-            record = next(records, None)
+def _fields(raw: Raw) -> dict[str, Any]:
+    return msgspec.json.decode(raw.data, type=dict[str, Any])
 
 
 def _records(file: BinaryIO) -> "Iterator[McapRecord]":

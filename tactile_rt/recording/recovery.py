@@ -7,12 +7,9 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from tactile_rt.files import write_whole
 from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
-from tactile_rt.recording.layout import (
-    CHANNELS,
-    need_mcap,
-)
-from tactile_rt.recording.mcap_file import McapFile
-from tactile_rt.recording.reader import MAGIC, read_raw
+from tactile_rt.recording.layout import CHANNELS, need_mcap
+from tactile_rt.recording.reader import MAGIC, Recording
+from tactile_rt.recording.writer import McapFile
 from tactile_rt.stream import ConfigError, RecordingError
 
 if TYPE_CHECKING:
@@ -58,7 +55,7 @@ def recover(path: str | Path, output: str | Path | None = None, force: bool = Fa
 
 def _is_whole(path: Path) -> bool:
     try:
-        for _ in read_raw(path):
+        for _ in Recording(path).raw():
             pass
     except RecordingError:
         return False

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.recording.layout import WIRE
-from tactile_rt.recording.reader import read_description, read_stream
+from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.replay import open_replay
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, RecordingError, concatenate
 
@@ -22,13 +22,14 @@ class Redecoded:
     """Recorded samples beside those that the packets decode to.
 
     Attributes:
-        recorded, decoded: samples of either.
-        equal: samples of both whose values and validity are the same, bit for bit.
-        differing: samples of both that are not.
-        validity: of those, samples in which an element is valid in one of them alone.
-        largest: (channel, unit, largest difference where both are valid), of channels that differ.
-        time_ns: largest difference of the times of one sample, ns.
-        array: where the arrays differ, in words; values then are not compared.
+        recorded: The number of samples that were recorded.
+        decoded: The number of samples that the packets decode to.
+        equal: The number of samples of both whose values and validity are the same, bit for bit.
+        differing: The number of samples of both whose values or validity are not the same.
+        validity: The number of differing samples in which an element is valid in one of both alone.
+        largest: (channel, unit, largest difference where both are valid) of channels that differ.
+        time_ns: The largest difference between the two times of one sample, ns.
+        array: Where the arrays differ, in words; values then are not compared.
     """
 
     recorded: int
@@ -74,14 +75,15 @@ def compare_decoding(path: str | Path, options: Mapping[str, str] | None = None)
         ConfigError: there are no packets, or the codec cannot be.
         RecordingError: the codec finds no sample in them.
     """
-    recorded = list(read_stream(path))
+    recording = Recording(path)
+    recorded = list(recording)
     with open_replay(str(path), {**(options or {}), "from": WIRE, "speed": "0"}) as source:
         spec, decoded = source.spec, list(source)
     if not recorded or not decoded:
         raise RecordingError(
             f"{path}: {sum(map(len, recorded))} samples recorded, {sum(map(len, decoded))} decoded"
         )
-    return _compared(read_description(path).spec, concatenate(recorded), spec, concatenate(decoded))
+    return _compared(recording.spec, concatenate(recorded), spec, concatenate(decoded))
 
 
 def _compared(old_spec: ArraySpec, old: Chunk, new_spec: ArraySpec, new: Chunk) -> Redecoded:

@@ -12,18 +12,19 @@ import os
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from tactile_rt.calibration import CalibratedSource
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.layout import SAMPLES, WIRE, Packet
-from tactile_rt.recording.reader import MAGIC, read_description, read_packets, read_stream
-from tactile_rt.recording.sweep_replay import SweepOptions, sweep_chunks, sweep_spec
+from tactile_rt.recording.reader import MAGIC, Recording
 from tactile_rt.settings import take_options
 from tactile_rt.stream import (
     NS_PER_S,
@@ -35,10 +36,12 @@ from tactile_rt.stream import (
     Source,
     SourceStats,
 )
+from tactile_rt.sweep_set import SweepManifest, read_object
 
-__all__ = ["ReplayOptions", "ReplaySource", "open_replay", "prepare_replay"]
+__all__ = ["ReplayOptions", "ReplaySource", "SweepOptions", "open_replay", "prepare_replay"]
 
 NPZ = b"PK"  # how it begins
+SWEEP_CHUNK_NS = 9_000_000  # a chunk's length, as other sources have it
 SLICE_S = 0.1  # how soon a waiting read notices that the source was closed
 
 # Chunks and when each is due: ns on any clock, from 0 or not.
@@ -81,20 +84,21 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Callable[[], Source]:
     if path.suffix == ".npz":
         (sweeps,) = take_options(what, fields, SweepOptions)
         _check_speed(what, sweeps.speed)
-        spec, manifest = sweep_spec(path)
+        spec, manifest = _sweep_spec(path)
         return partial(
-            ReplaySource, spec, lambda _: sweep_chunks(path, manifest, sweeps), sweeps.speed
+            ReplaySource, spec, lambda _: _sweep_chunks(path, manifest, sweeps), sweeps.speed
         )
     fields = dict(fields)
     channel = fields.pop("from", SAMPLES)
-    about = read_description(path)
+    recording = Recording(path)
+    about = recording.description
     if channel == SAMPLES:
         (options,) = take_options(what, fields, ReplayOptions)
         _check_speed(what, options.speed)
         if options.codec:
             raise ConfigError(f"{what}: codec= is for from=wire; samples are decoded already")
         return partial(
-            ReplaySource, about.spec, lambda stats: _recorded(path, stats), options.speed
+            ReplaySource, about.spec, lambda stats: _recorded(recording, stats), options.speed
         )
     if channel != WIRE:
         raise ConfigError(f"{what}: from must be samples or wire, not {channel!r}")
@@ -111,7 +115,7 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Callable[[], Source]:
     codec = make_codec(about.wire, options.codec or about.codec, own)
 
     def opened() -> Source:
-        decoding = _Decoding(str(path), codec, read_packets(path), about.clock)
+        decoding = _Decoding(str(path), codec, recording.packets(), about.clock)
         source = ReplaySource(decoding.spec, decoding.chunks, options.speed)
         return source if about.calibration is None else CalibratedSource(source, about.calibration)
 
@@ -198,10 +202,10 @@ class ReplaySource(Source):
         return (since - (now - self._begin[1])) / NS_PER_S
 
 
-def _recorded(path: Path, stats: SourceStats) -> Timed:
+def _recorded(recording: Recording, stats: SourceStats) -> Timed:
     """The chunks as recorded; what their numbers leave out was lost."""
     after: int | None = None
-    for chunk in read_stream(path):
+    for chunk in recording:
         first, last = int(chunk.seq[0]), int(chunk.seq[-1])
         before = first if after is None else after
         stats.missing += max(0, last + 1 - before - len(chunk))
@@ -263,3 +267,72 @@ class _Decoding:
             return [(None, t_ns)]
         samples = self._codec.feed(packet, t_ns)
         return [] if samples is None else [(samples, t_ns)]
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """Options of ``replay:`` of a sweep set's object.
+
+    Attributes:
+        speed: The pace as a multiple of real time; 0: as fast as it is read.
+        sweep: The number of the only sweep to stream, from 0; None: all, one after another.
+        rest_s: The rest before each sweep, s, besides the lead that is stored with it: so that a
+            contact ends, and a tare is taken, before the next.
+    """
+
+    speed: float = 1.0
+    sweep: int | None = None
+    rest_s: float = 0.5
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rest_s <= 3600:
+            raise ConfigError(f"rest_s must be 0 to 3600 s, not {self.rest_s:g}")
+
+
+def _sweep_spec(path: Path) -> tuple[ArraySpec, SweepManifest]:
+    """The array at the rate of the stored sweeps, and the set's manifest.
+
+    Raises:
+        RecordingError: it is of no sweep set.
+    """
+    manifest = SweepManifest.read(path.parent)
+    return replace(manifest.spec, rate_hz=NS_PER_S / manifest.period_ns), manifest
+
+
+def _sweep_chunks(
+    path: Path, manifest: SweepManifest, options: SweepOptions
+) -> Iterator[tuple[int, Chunk]]:
+    """The chunks, times from 0, and when they are due.
+
+    Raises:
+        ConfigError: no such sweep.
+        RecordingError: the file is damaged, or not of the manifest's array.
+    """
+    values, _ = read_object(path.parent, path.stem)
+    if values.ndim != 4 or values.shape[2:] != manifest.spec.shape or not values.shape[1]:
+        raise RecordingError(
+            f"{path} holds {values.shape}, not (sweep, sample, *{manifest.spec.shape})"
+        )
+    which = range(len(values)) if options.sweep is None else [options.sweep]
+    if options.sweep is not None and not 0 <= options.sweep < len(values):
+        raise ConfigError(f"{path} has sweeps 0 to {len(values) - 1}, not {options.sweep}")
+    period = manifest.period_ns
+    return _cut(values, which, round(options.rest_s * NS_PER_S / period), manifest)
+
+
+def _cut(
+    values: np.ndarray, which: "range | list[int]", rest: int, manifest: SweepManifest
+) -> Iterator[tuple[int, Chunk]]:
+    period, size = manifest.period_ns, max(1, SWEEP_CHUNK_NS // manifest.period_ns)
+    first = 0
+    for k in which:
+        sweep = values[k].astype(np.float32)
+        # The lead again and again, so that the rest has the noise of the sweep.
+        lead = sweep[: max(1, manifest.lead)]
+        stream = np.concatenate([np.resize(lead, (rest, *lead.shape[1:])), sweep])
+        for at in range(0, len(stream), size):
+            piece = stream[at : at + size]
+            seq = first + at + np.arange(len(piece), dtype=np.int64)
+            t_ns = seq * period
+            yield int(t_ns[-1]), Chunk(seq, t_ns, piece, np.isfinite(piece).all(axis=2))
+        first += len(stream)

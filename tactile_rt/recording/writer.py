@@ -1,37 +1,108 @@
-"""Write a stream while it runs, without ever holding it up."""
+"""Write a recording: one file, in one thread.
 
-import threading
+    RecordingWriter    a file in a folder, with counts, health and summary
+    McapFile           the channels of a recording in whatever is written to
+
+What is killed while it writes leaves a file from which `recover` takes all that had been flushed.
+For that the file must say what it is of, which takes several steps; so it gets its name only when
+it does. Until then it is hidden in the same folder, as ``.NAME.XXXXXXXX.mcap.part``.
+
+When one file follows another is the matter of `tactile_rt.recording.rotation`; how a stream is
+recorded beside what else is done with it, that of `tactile_rt.recording.stream_writer` and of the
+daemon's recorder.
+"""
+
+import errno
+import os
+import secrets
 import time
-from collections import deque
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Mapping
+from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 import msgspec
 
-from tactile_rt.calibration import CalibratedSource, Calibration
-from tactile_rt.drivers.device_source import DeviceSource
 from tactile_rt.drivers.health import Health
-from tactile_rt.recording.description import SUMMARY, Description
+from tactile_rt.recording.description import (
+    METADATA,
+    SESSION,
+    SUMMARY,
+    Description,
+    device_of,
+    seal,
+    utc_offset_ns,
+)
 from tactile_rt.recording.layout import (
+    CHANNELS,
     HEALTH,
     SAMPLES,
     WIRE,
+    Packet,
     encode_packet,
-    encode_samples,
-    need_mcap,
+    samples_in,
 )
-from tactile_rt.recording.mcap_file import McapFile
-from tactile_rt.stream import Chunk, ConfigError, RecordingError, Source
+from tactile_rt.stream import Source
 
-__all__ = ["HealthTeller", "StreamWriter", "WriterStats", "describe", "utc_offset_ns"]
+__all__ = ["PART", "McapFile", "RecordingWriter", "WriterStats"]
 
-WAKE_S = 0.05  # how often the thread looks: what a recording is late by, at most
-FLUSH_S = 0.5  # with the wake and a slow write still well under the second that may be lost
-QUEUE_BYTES = 64 << 20
-ITEM_BYTES, FRAME_BYTES = 500, 200  # what Python needs around the bytes
+SEQUENCES = 1 << 32
+PART = ".mcap.part"  # ends the name of a file until it says what it is of
+
+
+class McapFile:
+    """The channels of a recording in an MCAP file; knows nothing of names, counts or health.
+
+    Args:
+        file: to write; not closed with this.
+        about: what it is of.
+    """
+
+    def __init__(self, file: BinaryIO, about: Description) -> None:
+        import mcap.writer
+
+        self.about, self._file = about, file
+        # Checksums over the whole file, too: a record that is lost altogether must be noticed.
+        self._writer: Any = mcap.writer.Writer(file, enable_data_crcs=True)
+        self._writer.start(profile="", library="tactile_rt")
+        # In this order: a file that says what it is of has the notes, too, wherever it is cut.
+        if about.session:
+            self._writer.add_metadata(SESSION, seal(about.session))
+        self._writer.add_metadata(METADATA, about.to_metadata())
+        self._channels: dict[str, int] = {}
+        self._counts: dict[str, int] = {}
+        for topic, wire in CHANNELS:
+            if wire not in ("", about.wire):
+                continue
+            schema = CHANNELS[topic, wire]
+            kind = self._writer.register_schema(schema.name, schema.encoding, schema.text.encode())
+            self._channels[topic] = self._writer.register_channel(
+                topic, schema.message_encoding, kind
+            )
+            self._counts[topic] = 0
+
+    def add(self, topic: str, data: bytes, t_ns: int) -> None:
+        """Add a message of this host time, ns; messages are numbered so that none gets lost."""
+        utc = max(0, t_ns + self.about.utc_offset_ns)
+        count = self._counts[topic]
+        self._writer.add_message(self._channels[topic], utc, data, utc, count % SEQUENCES)
+        self._counts[topic] = count + 1
+
+    def note(self, name: str, fields: Mapping[str, str]) -> None:
+        """Add metadata."""
+        self._writer.add_metadata(name, seal(fields))
+
+    def flush(self) -> int:
+        """Let the system have all that was added; the size of the file."""
+        self._writer.flush()
+        return self._file.tell()
+
+    def finish(self) -> int:
+        """Write the index; the size of the file."""
+        self._writer.finish()
+        self._file.flush()
+        return self._file.tell()
 
 
 @dataclass
@@ -39,9 +110,11 @@ class WriterStats:
     """What became of what was to be recorded.
 
     Attributes:
-        samples, packets: written.
-        dropped_samples, dropped_packets: not written, because the disk was too slow or full.
-        bytes: of the file.
+        samples: The number of samples that were written.
+        packets: The number of raw packets that were written.
+        dropped_samples: The number of samples that were not written: the disk was slow or full.
+        dropped_packets: The number of raw packets that were not written, for the same reason.
+        bytes: The size of the file when it was last flushed.
     """
 
     samples: int = 0
@@ -51,258 +124,74 @@ class WriterStats:
     bytes: int = 0
 
 
-class StreamWriter:
-    """Record a source. Make it before the first read, and `push` every chunk that is read.
-
-    A thread of its own writes, at least every half second, so that a killed process leaves a file
-    from which `recover` takes all but the last moment. What waits for a slow disk is bounded: the
-    oldest is dropped then, and counted. Of a device, the raw packets and its health are recorded
-    without further ado.
+class RecordingWriter:
+    """A recording of a source, written by the thread that calls.
 
     Args:
-        path: of the file, as a rule ``.mcap``.
-        source: what is recorded; stays its owner's.
-        url: where the source is, for the record.
-        session: what else to note: who, where, why.
+        path: of the file.
+        source: what is recorded, for its health and losses; it is not read here.
+        about: what the recording is of.
+        prelude: packets in which a device described itself, and their arrivals, ns: it must be
+            understood from every file.
+        dropped: samples and packets that could not be recorded before.
         force: whether to replace a file that is there.
-        flush_s: between two writes to the file.
-        queue_bytes: that may wait for the disk.
 
     Attributes:
-        path: of the file.
-        stats: what became of what was to be recorded.
+        path: The path of the file.
+        begun_ns: When the file was begun, host monotonic time, ns.
+        stats: The counts so far; `dropped_samples` and `dropped_packets` are the caller's to keep.
 
     Raises:
-        ConfigError: the file is there already, its folder is not, or the extra is not installed.
+        FileExistsError: there is such a file.
+        OSError: it cannot be written.
     """
 
     def __init__(
         self,
-        path: str | Path,
+        path: Path,
         source: Source,
+        about: Description,
         *,
-        url: str = "",
-        session: Mapping[str, str] | None = None,
+        prelude: Iterable[tuple[Packet, int]] = (),
+        dropped: tuple[int, int] = (0, 0),
         force: bool = False,
-        flush_s: float = FLUSH_S,
-        queue_bytes: int = QUEUE_BYTES,
     ) -> None:
-        need_mcap()
-        self.path, self.stats = Path(path), WriterStats()
-        self._source = source
-        self._device = _device_of(source)[0]
-        self.about = describe(source, url, session or {})
-        self._flush_s, self._limit = flush_s, queue_bytes
-        self._lock = threading.Lock()
-        self._queue: deque[tuple[str, Any, int, int]] = deque()  # topic, what, time, size
-        self._queued = 0
-        self._stop = threading.Event()
-        self._error: Exception | None = None
-        self._closed = False
-        self._health = HealthTeller(source)
-        self._raw = _create(self.path, force)
+        self.path, self.begun_ns = path, time.monotonic_ns()
+        self.stats = WriterStats(dropped_samples=dropped[0], dropped_packets=dropped[1])
+        self._source, self._device = source, device_of(source)
+        self._told: tuple[Any, ...] = ()  # the health that was last written
+        self._safe = (0, 0)  # samples and packets that the system has
+        target = path.resolve() if force else path  # a link is followed, not replaced
+        special = force and target.exists() and not target.is_file()  # a pipe, /dev/null
+        hidden = target if special else _hidden(target, force)
+        self._raw = _create(hidden, special)
         try:
-            self._file = McapFile(self._raw, self.about)
-            self._health.tell(self._file, self.stats, always=True)
-            self.stats.bytes = self._file.flush()  # whatever happens now, it can be recovered
+            self._file = McapFile(self._raw, about)
+            for packet, t_ns in prelude if about.wire else ():
+                self.add(WIRE, encode_packet(packet, about.wire), t_ns)
+            self.tell(always=True)
+            self.flush()
+            if not special:
+                _reveal(hidden, target, force)
         except BaseException:
-            self._raw.close()
-            self.path.unlink(missing_ok=True)
-            raise
-        self._thread = threading.Thread(target=self._run, name="tactile-rt-recorder", daemon=True)
-        self._thread.start()
-        if self._device is not None:
-            self._device.tap(self._packet)
-
-    def push(self, chunk: Chunk) -> None:
-        """Record a chunk; returns at once, but lets a source that is not live wait for the disk.
-
-        Raises:
-            RecordingError: the file cannot be written any more (a full disk).
-        """
-        if self._error is not None:
-            raise self._broken()
-        size = chunk.values.nbytes + chunk.valid.nbytes + 16 * len(chunk) + ITEM_BYTES
-        while not self._source.live and self._queued > self._limit // 2 and self._error is None:
-            time.sleep(WAKE_S / 10)
-        # Times of a device's own clock would put the samples far from all else in the file.
-        own = self.about.clock == "device"
-        self._put(SAMPLES, chunk, time.monotonic_ns() if own else int(chunk.t_ns[-1]), size)
-
-    def close(self) -> None:
-        """Write what waits, and the index; safe to call twice.
-
-        Raises:
-            RecordingError: the file could not be written to its end.
-        """
-        if self._closed:
-            return
-        self._closed = True
-        if self._device is not None:
-            self._device.tap(None)
-        self._stop.set()
-        self._thread.join()
-        try:
-            if self._error is None:
-                self._health.tell(self._file, self.stats, always=True, closed=True)
-                summary = {k: str(v) for k, v in asdict(self.stats).items() if k != "bytes"}
-                self._file.note(SUMMARY, summary)
-                self.stats.bytes = self._file.finish()
-        except OSError as error:
-            self._error = error
-        finally:
-            try:
+            with suppress(OSError):
                 self._raw.close()
-            except OSError as error:  # what is still buffered finds no room either
-                self._error = self._error or error
-        if self._error is not None:
-            raise self._broken()
+            if not special:
+                hidden.unlink(missing_ok=True)
+            raise
+        self._special = special
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        try:
-            self.close()
-        except RecordingError:
-            if error is None:
-                raise
-
-    def _broken(self) -> RecordingError:
-        assert self._error is not None
-        why = getattr(self._error, "strerror", None) or repr(self._error)
-        return RecordingError(
-            f"{self.path} cannot be written any more ({why}); `tactile-rt recover` keeps what is "
-            "in it"
-        )
-
-    def _packet(self, packet: Any, t_ns: int) -> None:
-        each = 1 if isinstance(packet, bytes) else FRAME_BYTES
-        self._put(WIRE, packet, t_ns, ITEM_BYTES + each * len(packet or ()))
-
-    def _put(self, topic: str, what: Any, t_ns: int, size: int) -> None:
-        with self._lock:
-            self._queue.append((topic, what, t_ns, size))
-            self._queued += size
-            while self._queued > self._limit and self._queue:
-                self._drop(self._queue.popleft())
-
-    def _drop(self, item: tuple[str, Any, int, int]) -> None:
-        topic, what, _, size = item
-        self._queued -= size
+    def add(self, topic: str, data: bytes, t_ns: int) -> None:
+        """Add an encoded message of this host time, ns."""
+        self._file.add(topic, data, t_ns)
         if topic == SAMPLES:
-            self.stats.dropped_samples += len(what)
-        else:
-            self.stats.dropped_packets += 1
-
-    # in the thread
-
-    def _run(self) -> None:
-        flush_at = time.monotonic() + self._flush_s
-        while True:
-            stopping = self._stop.wait(WAKE_S)
-            try:
-                while (item := self._take()) is not None:
-                    self._write(*item)
-                    if time.monotonic() >= flush_at:
-                        flush_at = self._flush()
-                if time.monotonic() >= flush_at:
-                    flush_at = self._flush()
-                self._health.tell(self._file, self.stats)
-            except Exception as error:  # whatever it is, it belongs to the user's thread
-                self._error = error
-                with self._lock:
-                    while self._queue:
-                        self._drop(self._queue.popleft())
-                    self._limit = -1
-                return
-            if stopping:
-                return
-
-    def _take(self) -> tuple[str, Any, int] | None:
-        with self._lock:
-            if not self._queue:
-                return None
-            topic, what, t_ns, size = self._queue.popleft()
-            self._queued -= size
-            return topic, what, t_ns
-
-    def _write(self, topic: str, what: Any, t_ns: int) -> None:
-        if topic == SAMPLES:
-            self._file.add(SAMPLES, encode_samples(what), t_ns)
-            self.stats.samples += len(what)
-        else:
-            self._file.add(WIRE, encode_packet(what, self.about.wire), t_ns)
+            self.stats.samples += samples_in(data)
+        elif topic == WIRE:
             self.stats.packets += 1
 
-    def _flush(self) -> float:
-        self.stats.bytes = self._file.flush()
-        return time.monotonic() + self._flush_s
-
-
-def utc_offset_ns() -> int:
-    """UTC less monotonic time, now, ns."""
-    before = time.monotonic_ns()
-    utc = time.time_ns()
-    return utc - (before + time.monotonic_ns()) // 2
-
-
-def _changing(health: Health | None) -> tuple[Any, ...]:
-    """Of a device's health, what is told at once when it changes."""
-    if health is None:
-        return ()
-    return (
-        health.state, health.connections, health.clock_steps, health.counter_resets, health.status,
-        health.can_errors,
-    )  # fmt: skip
-
-
-def _device_of(source: Source) -> tuple[DeviceSource | None, Calibration | None]:
-    if isinstance(source, CalibratedSource):
-        return _device_of(source.source)[0], source.calibration
-    return (source if isinstance(source, DeviceSource) else None), None
-
-
-def describe(
-    source: Source, url: str = "", session: Mapping[str, str] | None = None
-) -> Description:
-    """What a recording of this source is of; its UTC offset is that of now."""
-    device, calibration = _device_of(source)
-    about = Description(source.spec, utc_offset_ns(), url, session=dict(session or {}))
-    if device is None:
-        return about
-    options = {
-        # A recording is read elsewhere than where its options were written.
-        name: str(Path(value).resolve()) if value and Path(value).is_file() else value
-        for name, value in device.codec_options.items()
-    }
-    return replace(
-        about, source=url or device.name, wire=device.codec.wire, codec=device.options.codec,
-        codec_options=options, clock=device.options.clock, calibration=calibration,
-    )  # fmt: skip
-
-
-class HealthTeller:
-    """Writes into a recording how source and recorder are, when that has changed.
-
-    Args:
-        source: the source that is recorded.
-    """
-
-    def __init__(self, source: Source) -> None:
-        self._source, self._device = source, _device_of(source)[0]
-        self._told: tuple[Any, ...] = ()  # what was last written
-
-    def tell(
-        self, file: McapFile, mine: WriterStats, always: bool = False, closed: bool = False
-    ) -> None:
-        """Write it, if it has changed or `always`; `mine` is what the recorder did."""
-        health = self._device.health if self._device is not None else None
+    def tell(self, always: bool = False, closed: bool = False) -> None:
+        """Add how source and recorder are, if that has changed, or `always`."""
+        health, mine = self._device.health if self._device is not None else None, self.stats
         told = (_changing(health), mine.dropped_samples, mine.dropped_packets)
         if told == self._told and not always:
             return
@@ -318,17 +207,77 @@ class HealthTeller:
             "stats": asdict(self._source.stats),
             "recorder": mine,
         }
-        file.add(HEALTH, msgspec.json.encode(fields), now)
+        self._file.add(HEALTH, msgspec.json.encode(fields), now)
+
+    def flush(self) -> int:
+        """Let the system have all of it; the file's size."""
+        self.tell()
+        self.stats.bytes = self._file.flush()
+        self._safe = (self.stats.samples, self.stats.packets)
+        return self.stats.bytes
+
+    def unsafe(self) -> tuple[int, int]:
+        """Samples and packets that were added and may not be in the file, because writing failed;
+        they no longer count as written."""
+        stats = self.stats
+        samples, packets = stats.samples - self._safe[0], stats.packets - self._safe[1]
+        stats.samples, stats.packets = self._safe
+        return samples, packets
+
+    def close(self, finish: bool = True) -> None:
+        """Write the index and close. Also when that fails the file is closed: it can be recovered.
+
+        Args:
+            finish: whether to write the index; not, where writing has failed before.
+
+        Raises:
+            OSError: no room for the index.
+        """
+        try:
+            if finish:
+                self.tell(always=True, closed=True)
+                told = {k: str(v) for k, v in asdict(self.stats).items() if k != "bytes"}
+                self._file.note(SUMMARY, told)
+                self.stats.bytes = self._file.finish()
+                if not self._special:
+                    os.fsync(self._raw.fileno())
+        finally:
+            self._raw.close()
+
+
+def _changing(health: Health | None) -> tuple[Any, ...]:
+    """Of a device's health, what is told at once when it changes."""
+    if health is None:
+        return ()
+    return (
+        health.state, health.connections, health.clock_steps, health.counter_resets, health.status,
+        health.can_errors,
+    )  # fmt: skip
+
+
+def _hidden(path: Path, force: bool) -> Path:
+    """What the file is called until it says what it is of."""
+    if not force and os.path.lexists(path):
+        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
+    return path.with_name(f".{path.stem[:50]}.{secrets.token_hex(4)}{PART}")
 
 
 def _create(path: Path, force: bool) -> BinaryIO:
+    return path.open("wb" if force else "xb")
+
+
+def _reveal(hidden: Path, path: Path, force: bool) -> None:
+    """Give the file its name; unless forced, never that of another one."""
+    if force:
+        hidden.replace(path)
+        return
     try:
-        return path.open("wb" if force else "xb")
+        path.hardlink_to(hidden)  # unlike renaming, fails if there is such a file by now
     except FileExistsError:
-        raise ConfigError(f"{path} is there already: name another file, or force it") from None
-    except IsADirectoryError:
-        raise ConfigError(f"{path} is a folder: name a file to write") from None
-    except FileNotFoundError:
-        raise ConfigError(f"no folder {path.parent} to write {path.name} in") from None
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be written: {error.strerror}") from None
+        raise
+    except OSError:  # a file system without links, as on a memory card
+        if os.path.lexists(path):
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path)) from None
+        hidden.rename(path)
+    else:
+        hidden.unlink()

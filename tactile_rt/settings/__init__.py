@@ -14,7 +14,7 @@ structs   a tree as a struct, and what is wrong with it in words
 written   what is text alone: ``--set``, URLs, CSV
 """
 
-from tactile_rt.settings.structs import convert, nearest, no_such, refusal
+from tactile_rt.settings.structs import convert, hint, nearest, no_such, refusal
 from tactile_rt.settings.tree import (
     SettingNode,
     find_lines,
@@ -40,6 +40,7 @@ __all__ = [
     "check_columns",
     "convert",
     "find_lines",
+    "hint",
     "make_node",
     "merge",
     "named",

@@ -86,7 +86,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """A phrase for a message's end: ``did you mean X?``, or what there is."""
     names = list(known)
     plain = {n.casefold(): n for n in names}
-    near = difflib.get_close_matches(name.casefold(), plain, 1, 0.5)
+    near = difflib.get_close_matches(name.casefold(), plain, 1, 0.6)
     if near:
         return f"did you mean {plain[near[0]]}?"
     more = f" ... ({len(names)})" if len(names) > LISTED else ""
@@ -283,7 +283,7 @@ def _said(error: Exception, node: SettingNode, kind: Any, path: Sequence[str | i
     bare = _bare(kind, value)
     if typing.get_origin(bare) is Literal:
         choices = [str(c) for c in typing.get_args(bare)]
-        near = difflib.get_close_matches(str(value).lower(), choices, 1, 0.5)
+        near = difflib.get_close_matches(str(value).lower(), choices, 1, 0.6)
         ask = f"; did you mean {near[0]}?" if near else ""
         return f"{shown(value)} is not one of {', '.join(choices)}{ask}"
     if "matching regex" in message:

@@ -29,7 +29,7 @@ class SyntheticOptions:
     """How fast, how long.
 
     Attributes:
-        rate_hz: Sample rate, Hz.
+        rate_hz: Sample rate of the stream, Hz.
         seconds: Length of the stream, s; 0 for an endless one.
         seed: Seed of the noise; the same seed gives the same stream.
         pace: ``realtime`` delivers samples when they are due, ``fast`` at once.

@@ -44,10 +44,10 @@ def cut(values: ArrayLike, rate_hz: float, samples: int = 9, start_ns: int = 0) 
     """Cut a signal into chunks of evenly spaced, wholly valid samples.
 
     Args:
-        values: (n, element, channel) SI.
-        rate_hz: sample rate.
-        samples: of each chunk; the last one may be shorter.
-        start_ns: time of the first sample.
+        values: The signal, (n, element, channel), SI units.
+        rate_hz: Sample rate, Hz.
+        samples: Samples of each chunk; the last chunk may be shorter.
+        start_ns: Time of the first sample, ns.
     """
     signal = np.asarray(values, dtype=np.float32)
     seq = np.arange(len(signal), dtype=np.int64)
@@ -67,12 +67,12 @@ class ArraySource(Source):
     """Chunks in memory as a source: one per read, at once, then the end.
 
     Args:
-        spec: what the samples are.
-        chunks: what to deliver.
-        live: claim to be a device, so that a `Session` reads in a thread of its own.
+        spec: What the samples are.
+        chunks: The chunks to deliver, in order.
+        live: Whether to claim to be a device, so that a `Session` reads in a thread of its own.
 
     Raises:
-        ValueError: a chunk is not of `spec.shape`.
+        ValueError: A chunk is not of the shape that `spec` tells.
     """
 
     def __init__(self, spec: ArraySpec, chunks: Sequence[Chunk], live: bool = False) -> None:

@@ -68,16 +68,24 @@ def test_a_decision_comes_with_the_chunk_that_completes_its_window(model: Path) 
             assert chunk.t_ns[0] == d.t_ns + PERIOD_NS
 
 
+@pytest.fixture(scope="module")
+def uncut(model: Path) -> tuple[Chunk, list[Classification]]:
+    """Two touches in one chunk, and what is decided of it."""
+    whole = concatenate(stream(signal([(QUIET, 180, 0.1), (230, 300, 0.2)], 300)))
+    return whole, push_all(Classifier(model, SAME_RATE), [whole])
+
+
 @settings(max_examples=25)
 @given(st.lists(st.integers(1, 299), max_size=20, unique=True).map(sorted))
-def test_decisions_do_not_depend_on_how_the_stream_was_cut(model: Path, cuts: list[int]) -> None:
-    whole = concatenate(stream(signal([(QUIET, 180, 0.1), (230, 300, 0.2)], 300)))
+def test_decisions_do_not_depend_on_how_the_stream_was_cut(
+    model: Path, uncut: tuple[Chunk, list[Classification]], cuts: list[int]
+) -> None:
+    whole, expected = uncut
     edges = [0, *cuts, 300]
     chunks = [
         Chunk(*(getattr(whole, name)[a:b] for name in ("seq", "t_ns", "values", "valid")))
         for a, b in itertools.pairwise(edges)
     ]
-    expected = push_all(Classifier(model, SAME_RATE), [whole])
     got = push_all(Classifier(model, SAME_RATE), chunks)
     assert len(expected) == 2 * STEPS
     assert [(d.onset_ns, d.t_ns, d.step) for d in got] == [

@@ -5,6 +5,7 @@ import itertools
 import logging
 import tracemalloc
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -221,21 +222,28 @@ def test_a_network_that_says_no_number_ends_the_episode_and_recovers(tmp_path: P
 # The same stream, however it comes
 
 
+@cache
+def uncut(sliding: bool) -> tuple[Chunk, list[Classification]]:
+    """A stream of the shipped array in one chunk, and what is decided of it."""
+    values = loads(1200)
+    values[500:540] = np.nan
+    whole = concatenate(cut(values, FAST.rate_hz))
+    options = {"mode": "sliding", "every": 11} if sliding else {}
+    return whole, push_all(Classifier(shipped_model(), FAST, **options), [whole])
+
+
 @settings(max_examples=5, deadline=None)
 @given(cuts=st.sets(st.integers(1, 1199), max_size=60), sliding=st.booleans())
 def test_the_shipped_model_does_not_mind_how_the_stream_was_cut(
     cuts: set[int], sliding: bool
 ) -> None:
-    values = loads(1200)
-    values[500:540] = np.nan
-    whole = concatenate(cut(values, FAST.rate_hz))
+    whole, expected = uncut(sliding)
     edges = [0, *sorted(cuts), 1200]
     chunks = [
         Chunk(*(getattr(whole, name)[a:b] for name in ("seq", "t_ns", "values", "valid")))
         for a, b in itertools.pairwise(edges)
     ]
     options = {"mode": "sliding", "every": 11} if sliding else {}
-    expected = push_all(Classifier(shipped_model(), FAST, **options), [whole])
     classifier = Classifier(shipped_model(), FAST, **options)
     assert len(expected) >= 14
     assert same(push_all(classifier, chunks), expected)

@@ -8,11 +8,10 @@ import pytest
 from tactile_rt.classifier.session import Session
 from tactile_rt.stream import Chunk, EndOfStream, Source, SourceError
 from tactile_rt.testing import ArraySource, cut, small_spec
-from tests.helpers.waiting import until
+from tests.helpers.waiting import PATIENCE_S, until
 
 SPEC = small_spec()
 CHUNKS = cut(np.random.default_rng(0).normal(size=(400, *SPEC.shape)), SPEC.rate_hz, samples=4)
-SOON_S = 5.0  # far more than anything here takes, on any machine
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 
@@ -170,7 +169,7 @@ def test_stop_from_another_thread_ends_the_iteration(live: bool) -> None:
         began = time.monotonic()
         for _ in session:
             pass
-        assert time.monotonic() - began < SOON_S
+        assert time.monotonic() - began < PATIENCE_S
         stopper.join()
         session.stop()
         assert not reading()

@@ -2,12 +2,15 @@
 
 from importlib.util import find_spec
 from pathlib import Path
+from urllib.parse import parse_qsl
 
 import numpy as np
 import pytest
 
 pytest.importorskip("onnx")
 
+from tactile_rt.classifier.model_file import load_model, shipped_model
+from tactile_rt.stream import ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.tiny_model import write_model
 
@@ -18,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("no_thread_left")
 
 @needs_sim
 def test_the_command_compares_a_sweep(call) -> None:
-    code, out, err = call("hil", "--sweeps", 1, "--seed", 2)
+    code, out, err = call("hil", "--source", "sim:mouse?objects=mug-1&seed=2", "--sweeps", 1)
     assert (code, err) == (0, "")
     cells = [line.strip("│").split("│") for line in out.splitlines() if line[0] == "│"]
     rows = {key.strip(): value.strip() for key, value in cells}
@@ -28,6 +31,24 @@ def test_the_command_compares_a_sweep(call) -> None:
     assert rows["identical decisions"] == rows["same labels"] == "22 of 22 (100.00 %)"
 
 
+def test_unless_told_otherwise_objects_pass_that_the_model_has_never_met(
+    call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked = []
+
+    def refuse(url: str) -> None:
+        asked.append(url)
+        raise ConfigError("enough")
+
+    monkeypatch.setattr("tactile_rt.sources.opening.open_source", refuse)
+    assert call("hil", "--seed", 2)[0] == 2
+    (url,) = asked
+    options = dict(parse_qsl(url.partition("?")[2]))
+    unseen = load_model(shipped_model())[1].provenance["unseen_objects"]
+    assert url.startswith("sim:mouse?") and options["objects"].split(",") == unseen
+    assert (options["seed"], options["sweeps"], options["pace"]) == ("2", "6", "fast")
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -35,7 +56,7 @@ def test_the_command_compares_a_sweep(call) -> None:
         (["--option", "form=int16"], "no option 'form'; did you mean format?"),
         (["--source", "synthetic:", "--sweeps", 3], "--sweeps is of a sim: source"),
         (["--source", "synthetic:3x6?seconds=1"], "was made for another array"),
-        (["--faults", "none.toml"], "none.toml: cannot be read"),
+        (["--faults", "none.toml"], "none.toml: no such file"),
         (["--source", "sintetic:"], "did you mean synthetic:?"),
     ],
 )

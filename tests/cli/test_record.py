@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from tactile_rt.recording import read_description, read_packets, read_stream
+from tactile_rt.recording import Recording
 from tactile_rt.testing import FakeSerial
 
 pytest.importorskip("mcap")
@@ -32,7 +32,7 @@ def path(tmp_path):
 
 
 def samples(path):
-    return sum(map(len, read_stream(path)))
+    return sum(map(len, Recording(path)))
 
 
 def test_a_source_is_recorded_to_its_end(call, path):
@@ -40,7 +40,7 @@ def test_a_source_is_recorded_to_its_end(call, path):
     assert (code, err) == (0, "")
     assert out.startswith(f"{path}: 300 samples, ")
     assert samples(path) == 300
-    about = read_description(path)
+    about = Recording(path).description
     assert about.source == SOURCE
     assert about.session == {"who": "Ada", "why": "a=b"}
 
@@ -54,7 +54,7 @@ def test_a_device_s_packets_are_recorded_and_it_tells_how_it_goes(call, path):
     assert " packets, " in err
     assert " packets, " in out
     assert samples(path) > 500
-    assert sum(1 for _ in read_packets(path)) > 100
+    assert sum(1 for _ in Recording(path).packets()) > 100
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])

@@ -10,9 +10,8 @@ import pytest
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.loading import load_config
-from tactile_rt.recording import read_decisions, read_description, read_stream
-from tactile_rt.recording.mcap_file import McapFile
-from tactile_rt.recording.reader import read_raw
+from tactile_rt.recording import Recording
+from tactile_rt.recording.writer import McapFile
 from tactile_rt.testing import FakeSerial, small_spec
 
 pytest.importorskip("mcap")
@@ -69,11 +68,11 @@ def live(tmp_path_factory):
 
 def again(path, to, change=lambda raw: raw, **session):
     """The recording once more, with other messages or notes; a note of None is left out."""
-    about = read_description(path)
+    about = Recording(path).description
     notes = {k: v for k, v in {**about.session, **session}.items() if v is not None}
     with to.open("wb") as file:
         made = McapFile(file, replace(about, session=notes))
-        for _, raw in read_raw(path, *TOPICS):
+        for raw in Recording(path).raw(*TOPICS):
             for changed in [change(raw)]:
                 if changed is not None:
                     made.add(changed.topic, changed.data, changed.t_ns)
@@ -100,7 +99,7 @@ def spoil(nth, **fields):
 
 def test_it_decides_as_the_daemon_did_at_every_speed(call, live, tmp_path):
     path, _ = live
-    recorded = [d for d in read_decisions(path) if d["model"] == "left"]
+    recorded = [d for d in Recording(path).decisions() if d["model"] == "left"]
     assert len(recorded) >= 8
     timing = {"model_ms", "latency_ms", "late", "utc_ns"}
     printed = set()
@@ -127,7 +126,7 @@ def test_it_decides_as_the_daemon_did_at_every_speed(call, live, tmp_path):
 @pytest.mark.parametrize("further", [(), ("--redecode",)])
 def test_a_check_passes(name, further, call, live):
     path, model = live
-    n = sum(d["model"] == name for d in read_decisions(path))
+    n = sum(d["model"] == name for d in Recording(path).decisions())
     code, out, _ = call("replay", path, "--check", "--name", name, *further)
     assert code == 0
     assert out.startswith(f"{n} decisions of {name} are as recorded")
@@ -162,7 +161,7 @@ def test_a_check_names_the_first_difference(nth, fields, said, call, live, tmp_p
 def test_a_check_needs_the_model_that_decided(call, live, tmp_path):
     path, model = live
     other = tiny_model.write_model(tmp_path / "other.onnx", temperature=2.0)
-    (key,) = (k for k in read_description(path).session if k.endswith(".left"))
+    (key,) = (k for k in Recording(path).description.session if k.endswith(".left"))
     known = again(path, tmp_path / "known.mcap", **{key: f"{model} sha256:{'0' * 64}"})
     for arguments in (("--model", model), ("--model", other)):
         code, _, err = call("replay", known, "--check", "--name", "left", *arguments)
@@ -190,7 +189,7 @@ def test_rotated_files_are_one_stream(call, tmp_path):
     assert len(paths) > 1
     code, out, _ = call("replay", *paths[::-1], "--check")
     assert code == 0
-    n = sum(1 for path in paths for _ in read_decisions(path))
+    n = sum(1 for path in paths for _ in Recording(path).decisions())
     assert out.startswith(f"{n} decisions of left are as recorded")
     code, _, err = call("replay", paths[1], "--check")
     assert code == 1
@@ -215,7 +214,7 @@ def test_what_another_codec_makes_of_the_packets_is_told(call, tmp_path):
     columns = "A0.fx:N,A0.fy:N"
     with FakeSerial(values, "ascii_line", options={"columns": columns}) as fake:
         call("record", f"{fake.url}", path, "--seconds", "1.5")
-    n = sum(map(len, read_stream(path)))
+    n = sum(map(len, Recording(path)))
     assert n == 40
     model = tiny_model.write_model(tmp_path / "tiny.onnx")
 

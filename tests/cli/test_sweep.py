@@ -5,6 +5,7 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
+from tactile_rt.sim_backend.datasets import dataset
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 from tactile_rt.sweep_set import SweepManifest
 
@@ -29,6 +30,14 @@ def recipe(tmp_path):
     path = tmp_path / "tiny.toml"
     path.write_text(RECIPE)
     return path
+
+
+@pytest.fixture
+def here(monkeypatch):
+    """The work is done in this process: starting another takes longer than these sweeps."""
+    monkeypatch.setattr(
+        dataset, "run_processes", lambda work, names, processes: ((n, work(n)) for n in names)
+    )
 
 
 def made(folder):
@@ -65,12 +74,12 @@ def test_a_set_is_made_gone_on_with_described_and_checked(call, recipe, tmp_path
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--recipe", "tiny"), "no recipe 'tiny': there are default24,"),
-        (("--recipe", "none.toml"), "cannot read recipe none.toml"),
+        (("--recipe", "tiny"), "no recipe 'tiny'; there are default24,"),
+        (("--recipe", "none.toml"), "none.toml: no such file"),
         (("--objects", 2), "2 objects cannot be split with 4 for validation and 13 for test"),
         (("--sweeps", 0), "sweeps.draws must be at least 1, not 0"),
         (("--validation", 0), "objects.validation must be a whole number"),
-        (("--engine", "spark"), "no engine 'spark': there are processes, ray"),
+        (("--engine", "spark"), "no engine 'spark'; there are processes, ray"),
         (("--verify",), "has no SHA256SUMS"),
         (("--validation", "nan"), "objects.validation must be at most 100000, not nan"),
         (("--test", "inf"), "objects.test must be at most 100000, not inf"),
@@ -87,6 +96,7 @@ def test_a_mistake_is_one_line_and_leaves_nothing(call, tmp_path, monkeypatch, o
     assert not (tmp_path / "set").exists()
 
 
+@pytest.mark.usefixtures("here")
 def test_another_profile_of_a_set_goes_elsewhere(call, recipe, tmp_path):
     folder = tmp_path / "set"
     assert call("sweep", folder, "--recipe", recipe, "--split", "test", "--processes", 1)[0] == 0
@@ -95,6 +105,7 @@ def test_another_profile_of_a_set_goes_elsewhere(call, recipe, tmp_path):
     assert "holds another sweep set (other recipe.profile, " in err
 
 
+@pytest.mark.usefixtures("here")
 def test_sweeps_that_miss_are_told(call, recipe, tmp_path):
     recipe.write_text(RECIPE + "height_mm = 200\n")
     code, _, err = call("sweep", tmp_path / "set", "--recipe", recipe, "--processes", 1)

@@ -17,10 +17,10 @@ from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.metrics import exposition
+from tactile_rt.daemon.process import ExitCode
 from tactile_rt.daemon.publishers.foxglove import FoxgloveOptions, FoxglovePublisher
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions, ZenohPublisher
 from tactile_rt.daemon.publishers.zmq import ZmqOptions, ZmqPublisher
-from tactile_rt.daemon.runner import ExitCode
 from tests.helpers.published import (
     FORCES,
     View,

@@ -19,7 +19,7 @@ from tactile_rt.daemon.http import (
     listen,
     parse_head,
 )
-from tests.helpers.published import PATIENCE_S, until
+from tests.helpers.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 LIMITS = HttpLimits(connections=8, head_bytes=1000, head_s=PATIENCE_S, send_s=PATIENCE_S)
@@ -274,9 +274,7 @@ def test_what_is_no_request_is_refused(head):
 
 
 def test_headers_are_found_by_name_whatever_their_case_and_count():
-    head = (
-        b"GET /p?q?r HTTP/1.1\r\nHOST:\t a \r\nCookie: b=1\r\ncookie: c=2\r\nAccept: d\r\nAccept: e"
-    )
+    head = b"GET /p?q?r HTTP/1.1\r\nHOST:\t a \r\nCookie: b=1\r\ncookie: c=2\r\nX: d\r\nX: e"
     request = parse_head(head)
     assert (request.path, request.query) == ("/p", "q?r")
     assert request.headers == {"host": "a", "cookie": "b=1; c=2", "x": "d, e"}

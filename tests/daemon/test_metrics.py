@@ -18,7 +18,7 @@ from tactile_rt.daemon.messages import StateMessage
 from tactile_rt.daemon.metrics import Metrics, exposition
 from tactile_rt.stream import SourceError
 from tests.helpers.published import View, busy_snapshot, part, running
-from tests.helpers.waiting import until
+from tests.helpers.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
 
@@ -39,7 +39,7 @@ def served():
 
 
 def get(port, path, method="GET", **headers):
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     try:
         connection.request(method, path, headers={k.title(): v for k, v in headers.items()})
         answer = connection.getresponse()
@@ -50,7 +50,7 @@ def get(port, path, method="GET", **headers):
 
 def raw(port, data, finish=True):
     """What comes back for these bytes."""
-    with socket.create_connection(("127.0.0.1", port), timeout=20) as line:
+    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) as line:
         with contextlib.suppress(OSError):  # it may have hung up in the middle
             line.sendall(data)
             if finish:
@@ -192,7 +192,9 @@ def test_those_who_drip_or_stay_away_are_hung_up_on_and_do_not_hold_others_up(mo
     port = free_port()
     consumer = Metrics("metrics", MetricsConfig(port=port))
     with running(consumer, View(snapshot=busy_snapshot())):
-        slow = [socket.create_connection(("127.0.0.1", port), timeout=20) for _ in range(40)]
+        slow = [
+            socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) for _ in range(40)
+        ]
         for line in slow[::2]:
             with contextlib.suppress(OSError):
                 line.sendall(b"GET /sta")

@@ -12,11 +12,9 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.classifier import Classification
-from tactile_rt.daemon import mailbox as mailbox_module
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, LogConfig
 from tactile_rt.daemon.health import EDGES_S, LatencyMeter
-from tactile_rt.daemon.hub import Hub
 from tactile_rt.daemon.items import (
     Closed,
     Contact,
@@ -29,15 +27,14 @@ from tactile_rt.daemon.items import (
 )
 from tactile_rt.daemon.lock import AlreadyRunning, Locks, lock_keys
 from tactile_rt.daemon.log import Log
-from tactile_rt.daemon.mailbox import Mailbox
+from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.messages import encode, message_of, topic_of
 from tactile_rt.daemon.part import Part, reason_of
 from tactile_rt.stream import Chunk, ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec
-from tests.helpers.waiting import until
+from tests.helpers.waiting import PATIENCE_S, until
 
 SPEC = small_spec()
-PATIENCE_S = 20.0
 OFFSET_NS = 1_700_000_000_000_000_000
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
@@ -152,9 +149,12 @@ def test_whoever_waits_for_room_gets_it_from_the_reader_or_when_there_is_none():
 
 def test_every_item_has_a_class():
     opened = Opened("a", SPEC, "u", ArraySource(SPEC, []), 1, 2)
-    for item in (opened, Closed("a", "", 1), Contact("a", "m", "f", True, 1, 2), Control("x")):
-        assert mailbox_module._measure(item)[:2] == ("events", 1)
-    assert mailbox_module._measure(decision())[0] == "decisions"
+    others = (opened, Closed("a", "", 1), Contact("a", "m", "f", True, 1, 2), Control("x"), event())
+    items = (*others, samples(4), Packet("a", b"x", 0), decision())
+    box = Mailbox({type(item) for item in items}, 100, 1 << 20)
+    for item in items:
+        box.put(item)
+    assert box.state.waiting == {"samples": 4, "packets": 1, "decisions": 1, "events": len(others)}
 
 
 # hub

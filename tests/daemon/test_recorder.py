@@ -20,14 +20,7 @@ from tactile_rt.daemon.items import (
     Packet,
     SourceChunk,
 )
-from tactile_rt.recording import (
-    read_decisions,
-    read_description,
-    read_events,
-    read_packets,
-    read_stream,
-    recover,
-)
+from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
@@ -108,7 +101,7 @@ def files(folder):
 
 
 def same(path, chunks):
-    back = list(read_stream(path))
+    back = list(Recording(path))
     assert len(back) == len(chunks)
     for a, b in zip(back, chunks, strict=True):
         assert a.values.tobytes() == b.values.tobytes()
@@ -125,16 +118,17 @@ def test_all_that_happens_is_in_the_file(daemon, tmp_path):
     (path,) = files(tmp_path / "new")
     assert path.name.startswith("whiskers-20")
     same(path, chunks)
-    (told,) = read_decisions(path)
+    (told,) = Recording(path).decisions()
     assert (told["label"], told["step"], told["probabilities"]["mug"]) == ("mug", 1, 0.75)
-    (state,) = read_events(path)
+    (state,) = Recording(path).events()
     assert (state["part"], state["reason"]) == ("source.whiskers", "unplugged")
-    about = read_description(path)
+    about = Recording(path).description
     assert about.session["config"] == "version = 1\n"
     assert about.source == "synthetic:whiskers"
 
 
 def test_a_decision_about_the_last_samples_comes_after_the_end(daemon, tmp_path, monkeypatch):
+    monkeypatch.setattr("tactile_rt.daemon.recorder.LINGER_NS", 10**15)
     made = begun(daemon, tmp_path, min_free_mb=0)
     made.handle([opened(), samples(cut(VALUES, 1000.0)[0]), Closed("whiskers", "over", 0)])
     made.handle([decision()])
@@ -143,7 +137,7 @@ def test_a_decision_about_the_last_samples_comes_after_the_end(daemon, tmp_path,
     monkeypatch.setattr("tactile_rt.daemon.recorder.LINGER_NS", 0)
     look(made)
     assert is_finished(path)
-    assert len(list(read_decisions(path))) == 1
+    assert len(list(Recording(path).decisions())) == 1
     made.close()
 
 
@@ -190,7 +184,7 @@ def test_a_device_s_packets_decode_again_from_every_rotated_file(daemon, tmp_pat
         # samples that came with the description stand before, in every file
         assert back[-len(expected) :].tobytes() == expected.tobytes()
         assert len(back) < len(expected) + 100
-        assert any(packet for packet, _ in read_packets(path))
+        assert any(packet for packet, _ in Recording(path).packets())
 
 
 @pytest.mark.parametrize("config", [{"rotate_mb": 0.001}, {"rotate_s": 0.02}])
@@ -205,27 +199,27 @@ def test_files_are_rotated_by_size_and_time_and_nothing_is_lost_between(config, 
     made.close()
     paths = sorted(files(tmp_path), key=lambda p: (p.stat().st_mtime_ns, p.name))
     assert len(paths) > 1
-    back = sorted((c for path in paths for c in read_stream(path)), key=lambda c: c.seq[0])
+    back = sorted((c for path in paths for c in Recording(path)), key=lambda c: c.seq[0])
     assert np.concatenate([c.seq for c in back]).tolist() == list(range(90))
 
 
 def test_a_trigger_keeps_what_came_before_it_and_after(daemon, tmp_path):
-    made = begun(daemon, tmp_path, min_free_mb=0, mode="trigger", before_s=0.05, after_s=0.1)
+    made = begun(daemon, tmp_path, min_free_mb=0, mode="trigger", before_s=100, after_s=1000)
     chunks = cut(VALUES, 1000.0)
     made.handle([opened()])
     now = time.monotonic_ns()
-    early = [samples(c, at=now - 10**9) for c in chunks[:2]]  # too long before
+    early = [samples(c, at=now - 10**12) for c in chunks[:2]]  # too long before
     made.handle([*early, samples(chunks[2], at=now - 10**7)])
     look(made)
     assert files(tmp_path) == []
     made.handle([Contact("whiskers", "best", "mount", True, time.monotonic_ns(), UTC)])
     made.handle([samples(chunks[3])])
-    time.sleep(0.15)
+    made._tracks["whiskers"].until_ns = 1  # it is over
     look(made)
     made.handle([samples(chunks[4])])
     (path,) = files(tmp_path)
     same(path, chunks[2:4])
-    assert [e["type"] for e in read_events(path)] == ["contact"]
+    assert [e["type"] for e in Recording(path).events()] == ["contact"]
     made.handle([event("warning")])  # a fault is a trigger, too
     made.close()
     assert len(files(tmp_path)) == 2
@@ -239,7 +233,7 @@ def test_stop_and_start_by_hand(daemon, tmp_path):
     made.handle([Control("start"), samples(chunks[2])])
     made.close()
     paths = files(tmp_path)
-    assert [len(list(read_stream(p))) for p in paths] == [1, 1]
+    assert [len(list(Recording(p))) for p in paths] == [1, 1]
 
 
 def test_without_room_it_says_so_counts_and_goes_on_when_there_is(daemon, tmp_path, monkeypatch):
@@ -260,7 +254,7 @@ def test_without_room_it_says_so_counts_and_goes_on_when_there_is(daemon, tmp_pa
     made.handle([samples(chunks[2])])
     made.close()
     paths = sorted(files(tmp_path), key=lambda p: (p.stat().st_mtime_ns, p.name))
-    assert [c.seq[0] for p in paths for c in read_stream(p)] == [0, 18]
+    assert [c.seq[0] for p in paths for c in Recording(p)] == [0, 18]
 
 
 def test_what_a_killed_recorder_left_is_named_and_can_be_recovered(daemon, tmp_path):
@@ -277,3 +271,14 @@ def test_what_a_killed_recorder_left_is_named_and_can_be_recovered(daemon, tmp_p
     assert "tactile-rt recover" in reason
     assert level == "warning"
     same(recover(path), chunks)
+
+
+def test_what_one_left_who_was_killed_as_it_began_a_file_is_cleared_away(daemon, tmp_path):
+    old, new, other = (tmp_path / n for n in (".a.1.mcap.part", ".b.2.mcap.part", ".c.part"))
+    for path in (old, new, other):
+        path.write_bytes(b"")
+    for path in (old, other):
+        os.utime(path, (1e9, 1e9))
+    begun(daemon, tmp_path, min_free_mb=0).close()
+    assert sorted(tmp_path.iterdir()) == [new, other]
+    assert daemon.told == []

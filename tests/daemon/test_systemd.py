@@ -18,7 +18,7 @@ from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.loading import load_config
-from tactile_rt.daemon.runner import _serve
+from tactile_rt.daemon.process import _serve
 from tactile_rt.daemon.systemd import (
     Systemd,
     hanging,
@@ -29,8 +29,8 @@ from tactile_rt.daemon.systemd import (
 )
 from tactile_rt.stream import ConfigError, Source
 from tactile_rt.testing import small_spec
-from tests.helpers.published import PATIENCE_S, View, busy_snapshot, event, running
-from tests.helpers.waiting import until
+from tests.helpers.published import View, busy_snapshot, event, running
+from tests.helpers.waiting import PATIENCE_S, until
 
 SMALL = 'version = 1\n[[source]]\nname = "a"\nurl = "synthetic:2x2"\n'
 pytestmark = pytest.mark.usefixtures("no_thread_left")

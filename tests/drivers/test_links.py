@@ -12,6 +12,7 @@ import serial.rfc2217
 from tactile_rt.drivers.health import State
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import FakeSerial
+from tests.helpers.waiting import PATIENCE_S, until
 
 SAMPLES = 600
 
@@ -106,17 +107,13 @@ def served(path, protocol):
 def test_a_port_on_another_host_is_read_bit_for_bit_and_known_to_be_gone(scheme, protocol):
     values = np.random.default_rng(1).normal(size=(SAMPLES, 4, 6)).astype(np.float32) * 1e-3
     with FakeSerial(values) as fake, served(fake.port, protocol) as (port, hang_up):
-        url = f"serial:{scheme}://127.0.0.1:{port}?codec=native&start_s=15&stale_s=2"
+        url = f"serial:{scheme}://127.0.0.1:{port}?codec=native&start_s={PATIENCE_S:g}"
         with open_source(url) as source:
             got = []
             while sum(map(len, got)) < SAMPLES:
-                chunk = source.read(5.0)
+                chunk = source.read(PATIENCE_S)
                 assert chunk is not None, source.health
                 got.append(chunk)
             assert np.array_equal(np.concatenate([c.values for c in got]), values)
             hang_up()
-            for _ in range(100):
-                source.read(0.05)
-                if source.health.state == State.LOST:
-                    break
-            assert source.health.state == State.LOST
+            until(lambda: source.health.state == State.LOST, meanwhile=lambda: source.read(0.05))

@@ -169,8 +169,8 @@ class CodecContract:
 
     def test_commands_are_packets(self) -> None:
         codec = self.case.make()
-        for event in Command:
-            for step in codec.commands(event):
+        for command in Command:
+            for step in codec.commands(command):
                 assert isinstance(step.send, bytes if codec.wire == "serial" else Sequence)
                 assert step.timeout_s > 0 and step.pause_s >= 0
 

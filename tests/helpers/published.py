@@ -19,7 +19,6 @@ from tactile_rt.drivers.health import Health, State
 from tactile_rt.stream import ArraySpec, Chunk, SourceStats
 from tactile_rt.testing import small_spec
 
-PATIENCE_S = 30.0
 UTC = 1_700_000_000_000_000_000
 FORCES = ArraySpec(
     name="pair", elements=("B1", "C2"), grid=((0, 0), (1, 1)),

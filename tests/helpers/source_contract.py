@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from tactile_rt.stream import Chunk, EndOfStream, Source, SourceStats
+from tests.helpers.waiting import PATIENCE_S
 
 AT_ONCE_S = 0.5  # nobody sleeps that long by accident, and a busy machine is forgiven
-PATIENCE_S = 20.0
 
 
 @dataclass(frozen=True)
@@ -25,15 +25,19 @@ class Case:
     """One source under contract.
 
     Attributes:
-        open: opens it, in a `with`.
-        samples: how many it delivers before it ends; None when that is its own affair.
-        rate_tolerance: share by which the measured rate may be off the nominal one.
-        endless: whether it never ends by itself, as devices do not; it is closed after `samples`.
+        open: Opens the source, in a `with`.
+        samples: Number of samples before the end; None when that is the source's own affair.
+        rate_tolerance: Share by which the measured rate may be off the nominal one.
+        settling_s: Time that the stream as a whole may be too short, s: a device's clock is known
+            by prompt arrivals, and on a busy machine the first ones are not.
+        endless: Whether the source never ends by itself, as devices do not, and is to be closed
+            after `samples`.
     """
 
     open: Callable[[], AbstractContextManager[Source]]
     samples: int | None = None
     rate_tolerance: float = 1e-3
+    settling_s: float = 0.0
     endless: bool = False
 
 
@@ -103,9 +107,12 @@ class SourceContract:
 
     def test_time_runs_forward_at_the_nominal_rate(self, run: Run, case: Case) -> None:
         t = np.concatenate([c.t_ns for c in run.chunks])
-        assert (np.diff(t) > 0).all()
-        rate = (len(t) - 1) / (t[-1] - t[0]) * 1e9
-        assert rate == pytest.approx(run.source.spec.rate_hz, rel=case.rate_tolerance)
+        steps, nominal = np.diff(t), run.source.spec.rate_hz
+        assert (steps > 0).all()
+        assert 1e9 / np.median(steps) == pytest.approx(nominal, rel=case.rate_tolerance)
+        seconds = len(steps) / nominal
+        off = case.rate_tolerance * seconds + case.settling_s
+        assert (t[-1] - t[0]) * 1e-9 == pytest.approx(seconds, abs=off)
 
     def test_a_live_source_has_no_samples_from_the_future(self, run: Run) -> None:
         if run.source.live:
@@ -127,15 +134,17 @@ class SourceContract:
 
     def test_a_read_without_patience_returns_at_once(self, case: Case) -> None:
         with case.open() as source:
+            took = []
             for _ in range(20):
                 began = time.monotonic()
                 chunk = source.read(timeout=0)
-                assert time.monotonic() - began < AT_ONCE_S
+                took.append(time.monotonic() - began)
                 assert chunk is None or isinstance(chunk, Chunk)
+            assert sorted(took)[10] < AT_ONCE_S  # a busy machine may hold up some of them
 
     def test_closing_ends_it_and_may_be_repeated(self, case: Case) -> None:
         with case.open() as source:
-            assert source.read(5.0) is not None
+            assert source.read(PATIENCE_S) is not None
             source.close()
             source.close()
             for _ in range(2):

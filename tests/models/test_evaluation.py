@@ -10,11 +10,16 @@ pytest.importorskip("torch")
 from sklearn.metrics import roc_auc_score
 
 from tactile_rt.classifier.contact import CHANNEL_FLOOR, ContactDetector
-from tactile_rt.models import disturbances, evaluation, onsets
+from tactile_rt.models import evaluation, onsets
 from tactile_rt.models.datasets import RATED_NOISE, STEPS, SweepSet, channel_values, find_onsets
-from tactile_rt.models.disturbances import Disturbance
-from tactile_rt.models.evaluation import at_temperature, auroc, deciding_step
-from tactile_rt.models.intervals import accuracy, bootstrap
+from tactile_rt.models.evaluation import (
+    Disturbance,
+    accuracy,
+    at_temperature,
+    auroc,
+    bootstrap,
+    deciding_step,
+)
 from tactile_rt.stream import ArraySpec, ConfigError
 from tactile_rt.sweep_set import SweepManifest, Sweeps
 
@@ -175,7 +180,7 @@ def test_an_offset_after_the_tare_is_in_the_windows_and_not_in_the_baseline() ->
     values = sweeps(70)
     clean, there = seen_by(Disturbance(), values), seen_by(Disturbance(offset=0.5), values)
     added = (there[0] - clean[0]).astype(np.float64)
-    size = 0.5 * np.array([disturbances.OFFSET[u] for u in UNITS])
+    size = 0.5 * np.array([evaluation.OFFSET[u] for u in UNITS])
     assert np.allclose(np.abs(added), size, rtol=1e-2)
     assert np.ptp(np.sign(added), axis=(1, 2)).max() == 0, "constant within a sweep"
     assert 0.3 < (added > 0).mean() < 0.7

@@ -16,11 +16,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
 from tactile_rt.calibration import Calibration
-from tactile_rt.recording import Description, read_description, read_stream, recover
+from tactile_rt.recording import Description, Recording, recover
 from tactile_rt.recording.conversion import convert, outputs_of
 from tactile_rt.recording.layout import encode_samples
-from tactile_rt.recording.mcap_file import McapFile
-from tactile_rt.recording.reader import read_raw
+from tactile_rt.recording.writer import McapFile
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, ConfigError, RecordingError, concatenate
 from tactile_rt.testing import cut, small_spec
@@ -77,7 +76,7 @@ def write(path, chunks, about=None):
 
 
 def messages(path):
-    return {t: [(raw.t_ns, raw.data) for _, raw in read_raw(path, t)] for t in TOPICS}
+    return {t: [(raw.t_ns, raw.data) for raw in Recording(path).raw(t)] for t in TOPICS}
 
 
 @pytest.fixture
@@ -94,7 +93,7 @@ def test_what_goes_there_comes_back(form, path, tmp_path):
     n = sum(map(len, odd_chunks()))
     assert convert(path, there) == convert(there, back) == n
     assert messages(back) == messages(path)
-    assert read_description(back) == read_description(path)
+    assert Recording(back).description == Recording(path).description
     with open_source(f"replay:{path}?speed=0") as one, open_source(f"replay:{back}?speed=0") as two:
         assert [encode_samples(c) for c in one] == [encode_samples(c) for c in two]
 
@@ -131,7 +130,7 @@ def test_text_gives_back_every_number(tmp_path):
     path = write(tmp_path / "run.mcap", [chunk])
     convert(path, tmp_path / "x.csv")
     convert(tmp_path / "x.csv", tmp_path / "back.mcap")
-    (back,) = read_stream(tmp_path / "back.mcap")
+    (back,) = Recording(tmp_path / "back.mcap")
     assert back.values.tobytes() == bits.tobytes()
 
 
@@ -140,14 +139,14 @@ def test_a_recovered_recording_stays_one(path, tmp_path):
     mended = recover(path)
     convert(mended, tmp_path / "x.h5")
     convert(tmp_path / "x.h5", tmp_path / "back.mcap")
-    assert read_description(tmp_path / "back.mcap").recovered
+    assert Recording(tmp_path / "back.mcap").description.recovered
 
 
 def test_packets_stay_behind_and_that_is_said(tmp_path):
     path = write(tmp_path / "run.mcap", odd_chunks(), described(wire="serial"))
     convert(path, tmp_path / "x.npz")
     convert(tmp_path / "x.npz", tmp_path / "back.mcap")
-    assert read_description(tmp_path / "back.mcap").codec == "native"
+    assert Recording(tmp_path / "back.mcap").description.codec == "native"
     with pytest.raises(ConfigError, match="has no raw packets"):
         open_source(f"replay:{tmp_path / 'back.mcap'}?from=wire")
 
@@ -230,8 +229,8 @@ def test_arrays_of_one_s_own_become_a_recording(tmp_path):
     own = {name: getattr(whole, name) for name in ("seq", "t_ns", "values", "valid")}
     np.savez(tmp_path / "own.npz", **own, spec=SPEC.to_json())
     assert convert(tmp_path / "own.npz", tmp_path / "own.mcap") == 30
-    assert [len(c) for c in read_stream(tmp_path / "own.mcap")] == [9, 9, 9, 3]
-    assert read_description(tmp_path / "own.mcap").spec == SPEC
+    assert [len(c) for c in Recording(tmp_path / "own.mcap")] == [9, 9, 9, 3]
+    assert Recording(tmp_path / "own.mcap").description.spec == SPEC
     for name, wrong, said in (
         ("values", own["values"][:, :2], r"values is float32 \(30, 2, 2\), not .* \(30, 3, 2\)"),
         ("t_ns", own["t_ns"].astype(float), r"t_ns is float64 \(30,\), not int64"),

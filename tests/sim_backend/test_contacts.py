@@ -184,5 +184,5 @@ def test_damaged_contacts_are_told(made: Path, tmp_path: Path) -> None:
 
 
 def test_a_recipe_says_true_or_false() -> None:
-    with pytest.raises(ConfigError, match="contacts must be true or false"):
+    with pytest.raises(ConfigError, match="contacts: expected true or false, got 1"):
         recipe_from_dict({"contacts": 1}, "mine.toml")

@@ -14,19 +14,22 @@ from tactile_rt.sources.opening import open_source
 from tactile_rt.sweep_set import SweepManifest, write_object
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
 from tests.helpers.source_contract import Case, SourceContract
+from tests.helpers.waiting import PATIENCE_S
 
 SPEC = small_spec()
 CHUNKS = cut(np.random.default_rng(0).normal(size=(500, *SPEC.shape)), SPEC.rate_hz)
 SIM = "sim:mouse?objects=mug-1&sweeps=1&seed=1"
 
+LEARNT = {"rate_tolerance": 0.02, "settling_s": 0.1}  # the clock of a device
 TOUCHES = np.random.default_rng(1).normal(size=(500, 4, 6)) * 1e-3
 
 
 @contextmanager
 def device(make, **options):
     """What a driver delivers of an emulated device; a moment late, as its clock is learnt."""
-    with make(TOUCHES, pace="realtime", **options) as fake, open_source(fake.url) as source:
-        yield source
+    with make(TOUCHES, pace="realtime", **options) as fake:
+        with open_source(f"{fake.url}&start_s={PATIENCE_S:g}") as source:
+            yield source
 
 
 @functools.cache
@@ -63,7 +66,7 @@ def sweeps():
 
 
 def driver(make, **options):
-    return Case(lambda: device(make, **options), 500, rate_tolerance=0.02, endless=True)
+    return Case(lambda: device(make, **options), 500, **LEARNT, endless=True)
 
 
 CASES = {
@@ -75,10 +78,10 @@ CASES = {
     "array live": Case(lambda: ArraySource(SPEC, CHUNKS, live=True), 500),
     "synthetic fast": Case(lambda: open_source("synthetic:4x6?seconds=0.5&pace=fast"), 500),
     "synthetic realtime": Case(lambda: open_source("synthetic:4x6?seconds=0.5"), 500),
-    "replay samples": Case(lambda: replay("speed=1"), 500, rate_tolerance=0.02),
-    "replay samples fast": Case(lambda: replay("speed=0"), 500, rate_tolerance=0.02),
-    "replay wire": Case(lambda: replay("from=wire&speed=2"), 500, rate_tolerance=0.02),
-    "replay wire fast": Case(lambda: replay("from=wire&speed=0"), 500, rate_tolerance=0.02),
+    "replay samples": Case(lambda: replay("speed=1"), 500, **LEARNT),
+    "replay samples fast": Case(lambda: replay("speed=0"), 500, **LEARNT),
+    "replay wire": Case(lambda: replay("from=wire&speed=2"), 500, **LEARNT),
+    "replay wire fast": Case(lambda: replay("from=wire&speed=0"), 500, **LEARNT),
     "replay sweeps": Case(sweeps, 150),
     "sim fast": Case(lambda: open_source(f"{SIM}&pace=fast")),
     "sim whisking fast": Case(lambda: open_source("whisking:mouse?seconds=0.5&pace=fast"), 500),

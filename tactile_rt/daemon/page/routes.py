@@ -10,7 +10,6 @@ Who cannot keep up loses the oldest lines and nobody waits for them.
 """
 
 import asyncio
-from collections import deque
 from collections.abc import AsyncGenerator, Callable
 from importlib.resources import files
 from typing import Any
@@ -18,6 +17,7 @@ from urllib.parse import parse_qs
 
 import msgspec
 
+from tactile_rt.bounded_queue import BoundedQueue
 from tactile_rt.daemon.http import HttpLimits, Refused, Request, Response
 from tactile_rt.daemon.page.feed import Line
 from tactile_rt.daemon.page.guard import Guard
@@ -53,25 +53,24 @@ class PageClient:
 
     def __init__(self, source: str) -> None:
         self.source = source
-        self.dropped = 0
-        self._lines: deque[bytes] = deque()
+        self._lines = BoundedQueue[bytes](MAX_LINES)
         self._some = asyncio.Event()
+
+    @property
+    def dropped(self) -> int:
+        """How many lines went because there were too many."""
+        return self._lines.dropped["items"]
 
     def put(self, line: bytes) -> None:
         """One more."""
-        if len(self._lines) >= MAX_LINES:
-            self._lines.popleft()
-            self.dropped += 1
-        self._lines.append(line)
+        self._lines.put(line)
         self._some.set()
 
     async def take(self) -> bytes:
         """All that wait, as soon as there are any."""
         await self._some.wait()
         self._some.clear()
-        lines = b"".join(self._lines)
-        self._lines.clear()
-        return lines
+        return b"".join(self._lines.take(0))
 
 
 class PageRoutes:

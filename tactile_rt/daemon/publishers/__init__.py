@@ -1,1 +1,60 @@
-"""Publishers: consumers that send `messages` to others."""
+"""Publishers: consumers that send `messages` to others, each imported when it is asked for."""
+
+from importlib import import_module, metadata
+from typing import Any
+
+from tactile_rt.settings import no_such
+from tactile_rt.stream import ConfigError
+
+__all__ = ["PUBLISHERS", "load_class", "publisher_class"]
+
+# kind: (where the class is, extra that it needs)
+PUBLISHERS = {
+    "jsonl": (f"{__name__}.jsonl:JsonlPublisher", ""),
+    "zmq": (f"{__name__}.zmq:ZmqPublisher", "publish"),
+    "zenoh": (f"{__name__}.zenoh:ZenohPublisher", "publish"),
+    "foxglove": (f"{__name__}.foxglove:FoxglovePublisher", "publish"),
+}
+ENTRY_POINTS = "tactile_rt.publishers"  # of other packages
+
+
+def publisher_class(kind: str) -> Any:
+    """The class of a kind of publisher.
+
+    Raises:
+        ConfigError: no such kind, it cannot be loaded, or an extra is not installed.
+    """
+    if kind in PUBLISHERS:
+        where, extra = PUBLISHERS[kind]
+        return load_class(where, f"publisher {kind}", extra)
+    points = metadata.entry_points(group=ENTRY_POINTS)
+    for point in points.select(name=kind):
+        try:
+            return point.load()
+        except Exception as error:  # another package's code
+            raise ConfigError(f"publisher {kind} cannot be loaded: {error}") from None
+    raise ConfigError(no_such("publisher", kind, sorted({*PUBLISHERS, *points.names})))
+
+
+def load_class(where: str, what: str, extra: str) -> Any:
+    """A class of this package.
+
+    Args:
+        where: ``module:Class``.
+        what: it is, for messages.
+        extra: that it needs.
+
+    Raises:
+        ConfigError: the extra is not installed.
+    """
+    module, _, name = where.partition(":")
+    try:
+        return getattr(import_module(module), name)
+    except ModuleNotFoundError as error:
+        if error.name == module:
+            raise ConfigError(f"{what} is not in this release") from None
+        if (error.name or "").startswith("tactile_rt"):
+            raise
+        raise ConfigError(
+            f"{what} needs {error.name}, which is not installed: pip install 'tactile-rt[{extra}]'"
+        ) from None

@@ -41,11 +41,11 @@ class FoxgloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     """Options of ``kind = "foxglove"``.
 
     Attributes:
-        host: address to listen on. Foxglove's protocol knows no password.
-        port: of it; 0: a free one.
-        prefix: what all topics begin with.
-        rate_hz: pictures and values a second, at most.
-        m_per_n: length of the arrow of 1 N, m; 0: as the forces are.
+        host: The address to listen on. Foxglove's protocol knows no password.
+        port: The TCP port to listen on; 0: a free one.
+        prefix: The beginning of all topics.
+        rate_hz: The largest number of pictures and values a second, Hz.
+        m_per_n: The length of the arrow of a force of 1 N, m; 0: chosen after the largest force.
     """
 
     host: Annotated[str, msgspec.Meta(min_length=1, max_length=255)] = "127.0.0.1"

@@ -19,9 +19,9 @@ class JsonlOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Options of ``kind = "jsonl"``.
 
     Attributes:
-        file: appended to; empty: standard output.
-        samples: whether samples are published, too.
-        state_s: a ``state`` message so often, s; 0: none.
+        file: The file that lines are appended to; empty: standard output.
+        samples: Whether samples are published, too.
+        state_s: The time between two ``state`` messages, s; 0: none is sent.
     """
 
     file: str = ""

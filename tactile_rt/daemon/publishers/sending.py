@@ -27,10 +27,10 @@ class SenderOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Options that all of them have.
 
     Attributes:
-        prefix: what all topics begin with.
-        samples: whether samples are published, too.
-        state_s: ``state`` and all ``array`` messages are repeated so often, s, for those that come
-            late; 0: never.
+        prefix: The beginning of all topics.
+        samples: Whether samples are published, too.
+        state_s: The time after which ``state`` and all ``array`` messages are repeated, for those
+            that come late, s; 0: never.
     """
 
     prefix: Prefix = "tactile"

@@ -29,11 +29,11 @@ class ZenohOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_on
     """Options of ``kind = "zenoh"``.
 
     Attributes:
-        listen: endpoints at which peers may come: ``tcp/ADDRESS:PORT``; none: it does not listen.
-        connect: endpoints of peers or routers to go to; those that are away are tried again.
-        scouting: whether peers find each other by multicast, which the whole network hears.
-        config_file: Zenoh's own configuration (JSON5), for TLS, access control and the like; what
-            is said here comes on top of it.
+        listen: The endpoints at which peers may come, like ``tcp/ADDRESS:PORT``; empty: none may.
+        connect: The endpoints of peers or routers to go to; those that are away are tried again.
+        scouting: Whether peers find each other by multicast, which the whole network hears.
+        config_file: The file of Zenoh's own configuration (JSON5), for TLS, access control and the
+            like; what is said here comes on top of it.
     """
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)

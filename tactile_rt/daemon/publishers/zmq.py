@@ -26,9 +26,10 @@ class ZmqOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_only
     """Options of ``kind = "zmq"``.
 
     Attributes:
-        bind: endpoint to wait for subscribers at: ``tcp://ADDRESS:PORT`` (port ``*``: a free one)
-            or ``ipc://PATH``.
-        queue: messages that may wait for one subscriber before new ones are dropped for it.
+        bind: The endpoint to wait for subscribers at: ``tcp://ADDRESS:PORT`` (port ``*``: a free
+            one) or ``ipc://PATH``.
+        queue: The number of messages that may wait for one subscriber before new ones are dropped
+            for that one.
     """
 
     bind: str = "tcp://127.0.0.1:5556"

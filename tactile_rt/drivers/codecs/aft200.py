@@ -35,10 +35,10 @@ class Aft200Options:
     """Options of an AFT200.
 
     Attributes:
-        sensor: its number, first byte of the commands.
-        force_id: identifier of its force frames; torque has the next one.
-        rate_hz: to set, from 15.3 to 1000 Hz.
-        bias: whether it shall take its present load as zero at the start.
+        sensor: Number of the sensor, the first byte of each command.
+        force_id: CAN identifier of the force frames; the torque frames have the next one.
+        rate_hz: Sample rate that the sensor is set to, 15.3 to 1000 Hz.
+        bias: Whether the sensor takes its present load as zero at the start.
     """
 
     sensor: int = 1
@@ -96,8 +96,8 @@ class Aft200(CanCodec):
                     batch.valid.append((whole,))
         return batch.take((1, 6), t_ns)
 
-    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
-        if event != Command.START:  # how to stop it is not public
+    def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+        if command != Command.START:  # how to stop it is not public
             return ()
         steps = [self._command(PERIOD, *self._period_us.to_bytes(2, "big"))]
         if self._options.bias:

@@ -44,9 +44,10 @@ class AnySkinOptions:
     """Options of AnySkin.
 
     Attributes:
-        magnetometers: on the board: 5 on the 5X board, 1 on a single one.
-        temperature: whether to deliver each chip's temperature as a fourth channel.
-        rate_hz: how fast the board sends; its firmware runs as fast as its I2C bus lets it.
+        magnetometers: Number of magnetometers on the board: 5 on the 5X board, 1 on a single one.
+        temperature: Whether to deliver each chip's temperature (K) as a fourth channel.
+        rate_hz: Rate at which the board sends, Hz; the firmware runs as fast as the I2C bus lets
+            it.
     """
 
     magnetometers: int = 5
@@ -67,8 +68,9 @@ class AnySkin(SerialCodec):
     chips), anyskin/sensor.py (the host's side), visualizations/anyskin_viz.py (drawing).
 
     Attributes:
-        lock_confidence: how sure the place of the frames is: 0 while unknown, else 1 / (places at
-            which every frame so far could end). It reaches 1 once the bytes in question change.
+        lock_confidence: Certainty about the place of the frames: 0 while unknown, else 1 / (places
+            at which every frame so far could end). The value reaches 1 once the bytes in question
+            change.
     """
 
     Options = AnySkinOptions

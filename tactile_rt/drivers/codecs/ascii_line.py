@@ -37,14 +37,14 @@ class AsciiLineOptions:
     """Options of a board that prints numbers: either a file or the columns.
 
     Attributes:
-        mapping: TOML file, like docs/codecs/ascii_line.toml.
-        columns: the columns between commas, e.g. ``time:ms,A0.fx*0.5:mN,A0.fy*0.5:mN,-``; how they
+        mapping: Path of a TOML file, like docs/codecs/ascii_line.toml.
+        columns: The columns between commas, e.g. ``time:ms,A0.fx*0.5:mN,A0.fy*0.5:mN,-``; how they
             are written is told in `ascii_mapping`.
-        labels: whether numbers have names before them, ``x:1.5 y=2``.
-        rate_hz: how often the board prints; 0: as the file says, else 100 Hz.
-        start: what to send so that it begins (in a URL ``%0A`` is a line feed).
-        stop: what to send so that it ends.
-        poll: what to send for each sample; without it the board prints by itself.
+        labels: Whether numbers have names before them, ``x:1.5 y=2``.
+        rate_hz: Rate at which the board prints, Hz; 0 stands for the rate in the file, else 100 Hz.
+        start: Text to send so that the board begins (in a URL ``%0A`` is a line feed).
+        stop: Text to send so that the board ends.
+        poll: Text to send for each sample; without one the board prints by itself.
     """
 
     mapping: str = ""
@@ -69,7 +69,7 @@ class AsciiLine(SerialCodec):
     """Numbers printed in lines: capacitive skins, lab whiskers, sketches for a serial plotter.
 
     Args:
-        options: its columns among others.
+        options: The columns, and how the board is started and stopped.
 
     Raises:
         ConfigError: the file or a column is wrong.
@@ -142,9 +142,9 @@ class AsciiLine(SerialCodec):
         self.stats.intact += len(rows)
         return self._samples(np.array(rows), damaged, t_ns) if rows else None
 
-    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
+    def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         send = {Command.START: self._start, Command.STOP: self._stop, Command.POLL: self._poll}[
-            event
+            command
         ]
         return (Step(send),) if send else ()
 

@@ -12,13 +12,14 @@ SCALE is what a one on the wire stands for, in UNIT; what is stored is SI. Witho
 """
 
 import re
-import tomllib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import msgspec
 import numpy as np
 
+from tactile_rt.settings import convert, read_toml
 from tactile_rt.stream import ArraySpec, ConfigError
 
 __all__ = ["UNITS", "Column", "Element", "LineMapping", "array_of", "parse_column", "read_mapping"]
@@ -57,9 +58,10 @@ class Element(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Where one element is.
 
     Attributes:
-        grid: (row, column).
-        position: of its base in the mount frame, m.
-        orientation: unit quaternion (w, x, y, z) that turns its own frame into the mount frame.
+        grid: Place of the element on the grid, (row, column).
+        position: Position of the element's base in the mount frame, m.
+        orientation: Unit quaternion (w, x, y, z) that turns the element's own frame into the mount
+            frame.
     """
 
     grid: tuple[int, int] | None = None
@@ -71,17 +73,18 @@ class LineMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """What a board prints, key by key as in its TOML file; docs/codecs/ascii_line.toml is one.
 
     Attributes:
-        columns: of a line, in order, as the module's docstring says.
-        version: of this format.
-        name: of the array.
-        frame: name of the mount frame.
-        rate_hz: how often the board prints.
-        labels: whether numbers have names before them, ``x:1.5 y=2``.
-        start: what to send so that it begins.
-        stop: what to send so that it ends.
-        poll: what to send for each sample; without it the board prints by itself.
-        elements: where each is. Without a grid, those named like whiskers, A0 to Z99, get their row
-            and column, others stand in one row.
+        columns: The columns of a line, in order, as the module's docstring says.
+        version: Version of this file format.
+        name: Name of the array.
+        frame: Name of the mount frame.
+        rate_hz: Rate at which the board prints, Hz.
+        labels: Whether numbers have names before them, ``x:1.5 y=2``.
+        start: Text to send so that the board begins.
+        stop: Text to send so that the board ends.
+        poll: Text to send for each sample; without one the board prints by itself.
+        elements: The place of each element, by name. Elements without a grid get their row and
+            column from their names if all are named like whiskers, A0 to Z99; else they stand in
+            one row.
     """
 
     columns: tuple[str, ...]
@@ -101,11 +104,12 @@ class Column:
     """One column; what is measured is number x scale + offset in SI.
 
     Attributes:
-        kind: ``value``, ``count``, ``s`` (decimal time), ``ms``, ``us``, ``ns`` or ``-``.
-        bits: of a counter or a whole-numbered time.
-        element: whose value it is.
-        channel: which.
-        unit: SI.
+        kind: What the column is: ``value``, ``count``, ``s`` (decimal time), ``ms``, ``us``, ``ns``
+            or ``-``.
+        bits: Width of a counter or of a whole-numbered time, in bits.
+        element: Name of the element that was measured; empty for other columns.
+        channel: Name of the channel that was measured; empty for other columns.
+        unit: SI unit of the measured value.
     """
 
     kind: str
@@ -123,18 +127,7 @@ def read_mapping(path: str) -> LineMapping:
     Raises:
         ConfigError: it cannot be read or is none; names the file and the key or line.
     """
-    try:
-        with open(path, "rb") as file:
-            fields = tomllib.load(file)
-        mapping = msgspec.convert(fields, LineMapping)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: not a text file") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{path}: not TOML: {error}") from None
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{path}: {error}") from None
+    mapping: LineMapping = convert(read_toml(Path(path)), LineMapping)
     if mapping.version != VERSION:
         raise ConfigError(f"{path}: version {mapping.version}; this release reads {VERSION}")
     return mapping
@@ -144,8 +137,8 @@ def parse_column(word: str, where: str) -> Column:
     """One column from its word.
 
     Args:
-        word: as the module's docstring says.
-        where: it stands, for the message.
+        word: The column as a user writes it; see the module's docstring.
+        where: The place where the word stands, for the message.
 
     Raises:
         ConfigError: not of that form, an unknown unit, a scale that is none.
@@ -176,9 +169,9 @@ def array_of(mapping: LineMapping, columns: tuple[Column, ...], where: str) -> A
     """The array that the columns make up, elements and channels as they first come.
 
     Args:
-        mapping: for names and poses.
-        columns: parsed.
-        where: they stand, for messages.
+        mapping: Names and poses of the elements.
+        columns: The parsed columns of a line.
+        where: The place where the columns stand, for messages.
 
     Raises:
         ConfigError: a column is missing, doubled or of another unit, or a pose of no element.

@@ -44,11 +44,11 @@ class Ati485Options:
     """Options of an ATI sensor on RS-485.
 
     Attributes:
-        matrix: file of the sensor's calibration, 6 x 6 numbers: a row for each of fx, fy, fz (N per
-            count), mx, my, mz (N m per count), a column for each gauge. Without it the samples are
+        matrix: Path of the sensor's calibration, 6 x 6 numbers: a row for each of fx, fy, fz (N per
+            count), mx, my, mz (N m per count), a column for each gauge. Without one the samples are
             the gauges' counts.
-        slave: its Modbus address.
-        rate_hz: how often it sends; it does not tell.
+        slave: Modbus address of the sensor, 1 to 247.
+        rate_hz: Rate at which the sensor sends, Hz, which the wire does not tell.
     """
 
     matrix: str = ""
@@ -223,11 +223,11 @@ class Ati485(SerialCodec):
             self.stats.corrupt += frames
             self._damaged += frames
 
-    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
+    def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         jam = Step(JAM, pause_s=SILENCE_S)
-        if event == Command.START:  # it may be streaming, and then takes no request
+        if command == Command.START:  # it may be streaming, and then takes no request
             return jam, Step(self._request, self._answer, what="the request to stream")
-        return (jam,) if event == Command.STOP else ()
+        return (jam,) if command == Command.STOP else ()
 
     # the device's side
 

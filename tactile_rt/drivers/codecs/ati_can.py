@@ -44,11 +44,12 @@ class AtiCanOptions:
     """Options of a NETCANOEM board.
 
     Attributes:
-        base: upper seven bits of its identifiers.
-        calibration: which of its 16 calibrations to use; -1: the one it has.
-        rate_hz: at which it is asked.
-        force_n: full scale of an emulated transducer, N.
-        torque_nm: the same in N m.
+        base: The upper seven bits of the board's CAN identifiers.
+        calibration: Number of the calibration to use, of the board's 16, 0 to 15; -1 keeps the
+            active one.
+        rate_hz: Rate at which the board is asked for samples, Hz.
+        force_n: Full scale of an emulated transducer's forces, N.
+        torque_nm: Full scale of an emulated transducer's torques, N m.
     """
 
     base: int = 0x7F
@@ -198,10 +199,10 @@ class AtiCan(CanCodec):
             self._matrix = np.repeat(scale, 3)[:, None] * matrix
         return len(self._rows) <= 6
 
-    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
-        if event == Command.POLL:
+    def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+        if command == Command.POLL:
             return (Step((CanFrame(self._base | GAUGES_A),)),)
-        if event != Command.START:
+        if command != Command.START:
             return ()
         steps = [
             self._ask(COUNTS, b"", COUNTS, "its counts per unit"),

@@ -51,14 +51,15 @@ class BotaOptions:
     """Options of the Bota protocol.
 
     Attributes:
-        sinc: length of the sinc filter, 51 to 512; a sample takes 19.53125 us for each: 512 gives
-            100 Hz, 64 gives 800 Hz.
-        chop: chopping against offset drift.
-        fast: fast settling.
-        skip_fir: without the FIR filter, faster and noisier.
-        temperature_compensation: the device's own; the maker leaves it off.
-        temperature: add the device's temperature (K) as a seventh channel.
-        baud: bit/s; the device has 9600, 57600, 115200, 230400 and 460800.
+        sinc: Length of the sinc filter, 51 to 512; a sample takes 19.53125 us for each unit of
+            length: 512 gives 100 Hz, 64 gives 800 Hz.
+        chop: Whether the device chops its inputs, against offset drift.
+        fast: Whether the device's filters settle fast.
+        skip_fir: Whether the FIR filter is left out, which is faster and noisier.
+        temperature_compensation: Whether the device's own temperature compensation is on; the maker
+            leaves it off.
+        temperature: Whether to add the device's temperature (K) as a seventh channel.
+        baud: Speed of the line, bit/s: 9600, 57600, 115200, 230400 or 460800.
     """
 
     sinc: int = 512
@@ -140,12 +141,12 @@ class Bota(SerialCodec):
             status=frames["status"].astype(np.int64),
         )
 
-    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
+    def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         o = self._options
         configure = Step(b"C", b"r,0,C,0", what="the command to configure it")
-        if event == Command.STOP:
+        if command == Command.STOP:
             return (configure,)
-        if event != Command.START:
+        if command != Command.START:
             return ()
         line = f"c,{o.temperature_compensation:d},1,0,{BAUDS[o.baud]}"  # calibrated, binary
         filters = f"f,{o.sinc},{o.chop:d},{o.fast:d},{o.skip_fir:d}"

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
-from tactile_rt.drivers.codecs.dbc_layout import FramePart, Signal
-from tactile_rt.drivers.codecs.dbc_mapping import read_mapping
+from tactile_rt.drivers.codecs.dbc_mapping import FramePart, Signal, read_mapping
 from tactile_rt.drivers.codecs.framing import Rounds
 from tactile_rt.stream import Chunk, ConfigError
 
@@ -121,11 +120,11 @@ class CanDbc(CanCodec):
             if single:
                 numbers_so_far.append(number & (1 << single[0].length) - 1)
 
-    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+    def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
         return tuple(
             Step((frame,), answer, what=f"the {when} command {frame.id:#x}")
             for when, frame, answer in self._map.commands
-            if when == event
+            if when == command
         )
 
     def encode(self, chunk: Chunk) -> list[Sequence[CanFrame]]:

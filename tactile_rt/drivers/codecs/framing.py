@@ -75,7 +75,7 @@ class ByteBuffer:
     """Bytes that have come and are not yet taken.
 
     Attributes:
-        data: the bytes.
+        data: The bytes that have come and are not yet taken.
     """
 
     def __init__(self) -> None:
@@ -85,8 +85,8 @@ class ByteBuffer:
         """Drop all before the first `sync` (or what may become one); return how many bytes.
 
         Args:
-            sync: how a frame begins.
-            keep: do not look at so many bytes at the beginning.
+            sync: How a frame begins.
+            keep: How many bytes at the beginning are not looked at.
         """
         at = self.data.find(sync, keep)
         if at < 0:
@@ -111,15 +111,16 @@ class FrameFinder:
     How damage is counted is told at the head of this module.
 
     Args:
-        sync: how a frame begins.
-        size: its length, bytes.
-        good: whether so many bytes that begin with `sync` are an intact frame.
-        between: what else the device sends.
-        stats: where to count.
-        parts: whether frames come in parts of which one can be missing (a CAN bus): such a frame is
+        sync: How a frame begins.
+        size: Length of a frame, bytes.
+        good: Tells of `size` bytes that begin with `sync` whether they are an intact frame.
+        between: What else the device sends between frames.
+        stats: The account in which frames and bytes are counted.
+        parts: Whether frames come in parts of which one can be missing (a CAN bus): such a frame is
             incomplete, not corrupt, zeros may fill its last part, and the bytes beside frames are
             not counted.
-        head: how a frame usually begins, if that is more than `sync`: a short one is no evidence.
+        head: How a frame usually begins, if that is more than `sync`, since a short beginning is no
+            evidence.
     """
 
     def __init__(
@@ -251,7 +252,7 @@ class Rounds(Generic[T]):
     tells that a round was lost whole, or that two halves of two rounds were.
 
     Args:
-        parts: n.
+        parts: The number of parts, n.
     """
 
     def __init__(self, parts: int) -> None:
@@ -269,8 +270,8 @@ class Rounds(Generic[T]):
         """Take a part; return the rounds that it ends (none, one or two), None for parts not come.
 
         Args:
-            index: which part, from 0 to n - 1.
-            part: what came.
+            index: Which part has come, from 0 to n - 1.
+            part: What the frame carried.
         """
         # CAN may deliver a frame twice when its end is disturbed
         if self._n > 1 and self._newest == (index, part):

@@ -34,7 +34,7 @@ class Ft300Options:
     """Options of the Robotiq FT 300.
 
     Attributes:
-        slave: its Modbus address.
+        slave: Modbus address of the sensor, 1 to 247.
     """
 
     slave: int = 9
@@ -85,11 +85,11 @@ class Ft300(SerialCodec):
             np.array(damaged, np.int64),
         )
 
-    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
+    def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         jam = Step(b"\xff" * JAM, pause_s=SILENCE_S)
-        if event == Command.START:  # it may be streaming, and then takes no request
+        if command == Command.START:  # it may be streaming, and then takes no request
             return (jam, Step(self._request, self._echo, what="the request to stream"))
-        return (jam,) if event == Command.STOP else ()
+        return (jam,) if command == Command.STOP else ()
 
     def forget(self) -> None:
         self._finder.forget()

@@ -32,11 +32,12 @@ class Hx711WhiskerOptions:
     """Options of the strain-gauge whiskers.
 
     Attributes:
-        whiskers: how many are connected, 1 to 9.
-        reset: whether opening the port resets the board, as Arduinos do: it then waits to be told
-            the number of whiskers. Without (a bridge, ``dtr=false``) it may be running already.
-        indicator: whether to raise the board's recording pin while connected.
-        rate_hz: 80, or 10, by the converters' RATE pin.
+        whiskers: Number of whiskers that are connected, 1 to 9.
+        reset: Whether opening the port resets the board, as Arduinos do: the board then waits to be
+            told the number of whiskers. A board that is not reset (a bridge, ``dtr=false``) may be
+            running already.
+        indicator: Whether to raise the board's recording pin while connected.
+        rate_hz: Sample rate of the converters, 80 or 10 Hz, which their RATE pin selects.
     """
 
     whiskers: int = 9
@@ -59,7 +60,7 @@ class Hx711Whisker(SerialCodec):
     saturated is from the HX711 datasheet (output 800000 to 7FFFFF).
 
     Attributes:
-        recording: the device's side: whether the recording pin is up.
+        recording: Whether the recording pin is up; the state of an emulated device.
     """
 
     Options = Hx711WhiskerOptions
@@ -112,9 +113,9 @@ class Hx711Whisker(SerialCodec):
             del self._data[:-keep]
         return batch.take(self._shape, t_ns)
 
-    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
+    def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         tell = f"N={self._options.whiskers}\n".encode()
-        if event == Command.START:
+        if command == Command.START:
             begin: tuple[Step[bytes], ...] = (Step(tell),)
             if self._options.reset:
                 begin = (
@@ -122,7 +123,7 @@ class Hx711Whisker(SerialCodec):
                     Step(tell, b"OK", timeout_s=2.0, what="the number of whiskers"),
                 )
             return (*begin, Step(b"S")) if self._options.indicator else begin
-        return (Step(b"E"),) if event == Command.STOP and self._options.indicator else ()
+        return (Step(b"E"),) if command == Command.STOP and self._options.indicator else ()
 
     def forget(self) -> None:
         self._data.clear()

@@ -28,11 +28,12 @@ class IcubSkinOptions:
     """Options of one skin board; several boards are several sources, to be combined.
 
     Attributes:
-        board: its address, from 0 to 15.
-        triangles: those that are connected, as a list of numbers and ranges, e.g. ``0-6,9``.
-        firmware: ``new`` (configured by messages 4D and 50, sends when told to) or ``old``
-            (4C and 4E, sends at once).
-        period_ms: between samples.
+        board: Address of the board, from 0 to 15.
+        triangles: The triangles that are connected, as a list of numbers and ranges, e.g.
+            ``0-6,9``.
+        firmware: Generation of the board's firmware: ``new`` (configured by messages 4D and 50,
+            sends when told to) or ``old`` (4C and 4E, sends at once).
+        period_ms: Time between samples, 1 to 255 ms.
     """
 
     board: int = 1
@@ -143,10 +144,10 @@ class IcubSkin(CanCodec):
         batch.valid.append(valid)
         batch.status.append(status)
 
-    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+    def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
         options = self._options
         if options.firmware == "old":
-            if event != Command.START:
+            if command != Command.START:
                 return ()
             mask = sum(1 << n for n in self._numbers)
             # the makers' defaults but for the mask of triangles
@@ -154,9 +155,9 @@ class IcubSkin(CanCodec):
                 self._send(OLD_SETUP, 1, 1, 1, 0, 0x20, 0, 0),
                 self._send(OLD_SETUP_2, 2, 0x22, 0xF0, 0, *mask.to_bytes(2, "little"), 0x0A),
             )
-        if event == Command.STOP:
+        if command == Command.STOP:
             return (self._send(SET_TX_MODE, 1),)
-        if event == Command.START:
+        if command == Command.START:
             offset = OFFSET.to_bytes(2, "little")
             return (
                 # skin type 0: triangles with temperature compensation; counts at rest: 245

@@ -33,9 +33,9 @@ class Kwr75Options:
     """Options of the Kunwei KWR75.
 
     Attributes:
-        poll: whether to ask for each frame, as on an RS-485 bus, instead of streaming.
-        rate_hz: how often the device sends, or is asked (at most), per second.
-        newton: N per unit that the device sends. Some of its kin count in tens of N.
+        poll: Whether to ask for each frame, as on an RS-485 bus, instead of streaming.
+        rate_hz: Rate at which the device sends, or is asked (at most), Hz.
+        newton: Newtons in a unit that the device sends; some of its kin count in tens of N.
     """
 
     poll: bool = False
@@ -84,11 +84,11 @@ class Kwr75(SerialCodec):
             np.array(damaged, np.int64),
         )
 
-    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
+    def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         stop = Step(STOP, pause_s=SETTLE_S)
-        if event == Command.START:
+        if command == Command.START:
             return (stop,) if self.polls else (stop, Step(STREAM))
-        if event == Command.POLL:
+        if command == Command.POLL:
             return (Step(ONCE),) if self.polls else ()
         return (stop,)
 

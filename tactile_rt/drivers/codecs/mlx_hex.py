@@ -43,10 +43,10 @@ class MlxHexOptions:
     """Options of the MLX90393 whisker: how its chip is set, which the board does not say.
 
     Attributes:
-        gain: GAIN_SEL, 0 to 7.
-        resolution: RES, 0 to 3, the same for all axes.
-        hallconf: 12, as the chip comes, or 0.
-        rate_hz: how often it prints.
+        gain: The chip's setting GAIN_SEL, 0 to 7.
+        resolution: The chip's setting RES, 0 to 3, the same for all axes.
+        hallconf: The chip's setting HALLCONF: 12, as the chip comes, or 0.
+        rate_hz: Rate at which the board prints lines, Hz.
     """
 
     gain: int = 7

@@ -52,10 +52,12 @@ class NativeOptions:
     """Options of the native protocol.
 
     Attributes:
-        format: ``float32`` or ``int16``: what an emulated device sends. A host takes both.
+        format: Number format that an emulated device sends, ``float32`` or ``int16``. A host takes
+            both.
         array: JSON file of an array (`tactile-rt describe` writes one) for devices that do not
             describe themselves.
-        range_n, range_nm: largest force (N) and moment (N m) of an emulated device's int16.
+        range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
+            can tell.
     """
 
     format: str = "float32"
@@ -152,14 +154,14 @@ class NativeSerial(SerialCodec):
             valid &= finite.all(axis=2)
         return Samples(values, valid, *np.array(rows, np.int64).T)
 
-    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
-        if event == Command.START:
+    def commands(self, command: Command) -> tuple[Step[bytes], ...]:
+        if command == Command.START:
             ask = Step(
                 frame(MessageType.DESCRIBE), _reply(MessageType.DESCRIPTION), what="its description"
             )
             start = Step(frame(MessageType.START))
             return (start,) if self.spec and not self._described else (ask, start)
-        return (Step(frame(MessageType.STOP)),) if event == Command.STOP else ()
+        return (Step(frame(MessageType.STOP)),) if command == Command.STOP else ()
 
     def whisk(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> Step[bytes]:
         """The command that sets an active array's whisking."""

@@ -60,12 +60,14 @@ class NativeCanOptions:
     """Options of the native protocol over CAN.
 
     Attributes:
-        base: the first of its five identifiers (11 bits).
-        fd: whether commands, and what an emulated device sends, are CAN FD frames. A host takes
+        base: The first of the device's five identifiers, of 11 bits.
+        fd: Whether commands, and what an emulated device sends, are CAN FD frames. A host takes
             samples in both.
-        format: ``float32`` or ``int16``: what an emulated device sends. A host takes both.
+        format: Number format that an emulated device sends, ``float32`` or ``int16``. A host takes
+            both.
         array: JSON file of an array for devices that do not describe themselves.
-        range_n, range_nm: largest force (N) and moment (N m) of an emulated device's int16.
+        range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
+            can tell.
     """
 
     base: int = 0x100
@@ -155,12 +157,12 @@ class NativeCan(CanCodec):
         else:
             self._described, self.spec = found, found.spec
 
-    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
-        if event == Command.START:
+    def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+        if command == Command.START:
             ask = self._command(MessageType.DESCRIBE, "its description", 2.0)
             start = self._command(MessageType.START, "the answer to START", 1.0)
             return (start,) if self.spec and not self._described else (ask, start)
-        if event == Command.STOP:
+        if command == Command.STOP:
             return (Step((self._frame(COMMAND, bytes((MessageType.STOP,))),)),)
         return ()
 

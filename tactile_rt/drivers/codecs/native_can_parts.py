@@ -29,8 +29,8 @@ def sample_parts(head: bytes, body: bytes) -> list[bytes] | None:
     """The data of the frames after the header; None if there would be too many.
 
     Args:
-        head: of the sample.
-        body: validity bits and values.
+        head: The header of the sample, as `head_of` packs it.
+        body: Validity bits and values of the sample, packed.
     """
     size = 62 if head[7] & LONG else 6
     body += crc16_xmodem(head + body).to_bytes(CHECK, "little")
@@ -44,7 +44,7 @@ class SampleParts:
     """Samples out of headers and parts, of the newest sample only.
 
     Args:
-        stats: where to count.
+        stats: The account in which frames are counted.
     """
 
     def __init__(self, stats: WireStats) -> None:
@@ -195,9 +195,9 @@ def cut_description(kind: int, text: bytes, size: int) -> list[bytes]:
     """The data of the frames that carry a description.
 
     Args:
-        kind: type of the message.
-        text: JSON.
-        size: of a frame's data.
+        kind: Type of the message.
+        text: The description as JSON.
+        size: The most data that a frame carries, bytes.
     """
     whole = len(text).to_bytes(2, "little") + text + zlib.crc32(text).to_bytes(4, "little")
     starts = range(0, len(whole), size - PIECE.size)

@@ -63,7 +63,7 @@ class DeviceDescription:
     """What a native device says of itself.
 
     Attributes:
-        spec: the array.
+        spec: The array that the device is.
         scale: SI units per count of int16, by channel.
     """
 
@@ -74,7 +74,13 @@ class DeviceDescription:
     def of(
         cls, spec: ArraySpec, range_n: float = RANGE_N, range_nm: float = RANGE_NM
     ) -> "DeviceDescription":
-        """With scales for these largest forces and moments, and +-pi rad."""
+        """A description with scales for these largest forces and moments, and +-pi rad.
+
+        Args:
+            spec: The array that the device is.
+            range_n: Largest force that an int16 can tell, N.
+            range_nm: Largest moment that an int16 can tell, N m.
+        """
         full = {"N": range_n, "N m": range_nm, "rad": RANGE_RAD}
         return cls(spec, tuple(full.get(unit, 1.0) / 32767 for unit in spec.units))
 

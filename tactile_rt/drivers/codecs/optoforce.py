@@ -52,11 +52,12 @@ class OptoForceOptions:
     """Options of the OptoForce protocol.
 
     Attributes:
-        model: ``3d``, ``4x3d`` (four sensors on one board) or ``6d``.
-        rate_hz: 1000, 333, 100, 30 or 10.
-        filter_hz: cut-off of the device's low-pass filter, 500, 150, 50, 15, 5 or 1.5; 0: none.
-        zero: let the device take its present load for zero when it is started.
-        counts: of the sensor's sensitivity report, counts per N (and per N m), by channel and
+        model: What is connected: ``3d``, ``4x3d`` (four sensors on one board) or ``6d``.
+        rate_hz: Sample rate that the device is set to: 1000, 333, 100, 30 or 10 Hz.
+        filter_hz: Cut-off of the device's low-pass filter: 500, 150, 50, 15, 5 or 1.5 Hz; 0 for
+            none.
+        zero: Whether the device takes its present load for zero when it is started.
+        counts: The counts per N (and per N m) of the sensor's sensitivity report, by channel and
             separated by commas, for all sensors or for each in turn. Empty: the values are counts.
     """
 
@@ -198,10 +199,10 @@ class OptoForceSerial(SerialCodec):
     def feed(self, packet: bytes, t_ns: int) -> Samples | None:
         return self._messages.decode(*self._messages.finder.find(packet), t_ns)
 
-    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
-        if event == Command.START:
+    def commands(self, command: Command) -> tuple[Step[bytes], ...]:
+        if command == Command.START:
             return (Step(_settings(self._options), _summed(ANSWER + b"\0"), what="its settings"),)
-        return (Step(_settings(self._options, stop=True)),) if event == Command.STOP else ()
+        return (Step(_settings(self._options, stop=True)),) if command == Command.STOP else ()
 
     def forget(self) -> None:
         self._messages.finder.forget()
@@ -220,8 +221,8 @@ class OptoForceCanOptions(OptoForceOptions):
     """Options of the OptoForce protocol on a CAN bus, besides those of the serial one.
 
     Attributes:
-        device_id: identifier of the frames that the device sends.
-        host_id: identifier of the frames that it takes.
+        device_id: CAN identifier of the frames that the device sends.
+        host_id: CAN identifier of the frames that the device takes.
     """
 
     device_id: str = "0x100"
@@ -265,11 +266,11 @@ class OptoForceCan(CanCodec):
         self.stats.skipped += len(packet) - len(mine)
         return self._messages.decode(*self._messages.finder.find(b"".join(mine)), t_ns)
 
-    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
-        if event == Command.START:
+    def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+        if command == Command.START:
             settings = self._frames(self._host_id, _settings(self._options), fill=True)
             return (Step(settings, self._id, what="its settings"),)
-        if event == Command.STOP:
+        if command == Command.STOP:
             settings = self._frames(self._host_id, _settings(self._options, stop=True), fill=True)
             return (Step(settings),)
         return ()

@@ -47,11 +47,12 @@ class Tsf85Options:
     """Options of the Robotiq TSF-85.
 
     Attributes:
-        signals: ``taxels`` (28 of each finger) or ``fingers`` (each one's dynamic taxel and motion
-            sensor): which of what the device sends become samples.
-        fingers: how many are plugged in, 1 or 2.
-        period_ms: time between samples, 1 to 255.
-        times: whether the firmware sends its time. Older ones do not: then no sample comes.
+        signals: The signals that become samples: ``taxels`` (28 of each finger) or ``fingers``
+            (each one's dynamic taxel and motion sensor).
+        fingers: Number of fingertips that are plugged in, 1 or 2.
+        period_ms: Time between samples, 1 to 255 ms.
+        times: Whether the firmware sends its time. Older ones do not: with them no sample comes
+            unless this is false.
     """
 
     signals: str = "taxels"
@@ -162,11 +163,11 @@ class Tsf85(SerialCodec):
             ticks = int.from_bytes(self._set[TIME, 0], "big")
             batch.ticks.append(ticks % 2**self.tick_bits)
 
-    def commands(self, event: Command) -> tuple[Step[bytes], ...]:
+    def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         stop = Step(_packet(SEND, b"\0"), pause_s=SETTLE_S)
-        if event == Command.START:
+        if command == Command.START:
             return stop, Step(_packet(SEND, bytes((self._options.period_ms,))))
-        return (stop,) if event == Command.STOP else ()
+        return (stop,) if command == Command.STOP else ()
 
     # the device's side
 

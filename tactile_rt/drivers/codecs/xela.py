@@ -25,9 +25,9 @@ class XelaOptions:
     """Options of a uSkin patch.
 
     Attributes:
-        board: number of the controller board, from 1.
-        first_id: identifier of the first taxel; the others follow it.
-        rate_hz: at which it sends.
+        board: Number of the controller board, from 1.
+        first_id: CAN identifier of the first taxel; the others follow in order.
+        rate_hz: Rate at which the patch sends samples, Hz.
     """
 
     board: int = 1
@@ -105,8 +105,8 @@ class Xela(CanCodec):
         batch.values.append(np.frombuffer(raw, ">u2"))
         batch.valid.append(valid)
 
-    def commands(self, event: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
-        if event == Command.START:  # how to stop it is not public: it stops without power
+    def commands(self, command: Command) -> tuple[Step[Sequence[CanFrame]], ...]:
+        if command == Command.START:  # how to stop it is not public: it stops without power
             return (Step((CanFrame(CONTROL_ID | self._board, START),)),)
         return ()
 

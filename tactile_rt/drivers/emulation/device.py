@@ -5,6 +5,7 @@ with EmulatedSerial(source, "native") as device, open_source(device.url) as driv
     device.unplug()
 """
 
+from pathlib import Path
 from types import TracebackType
 from typing import Any, ClassVar, Self
 from urllib.parse import quote, urlencode
@@ -59,7 +60,7 @@ class EmulatedDevice:
 
     @property
     def url(self) -> str:
-        """For `open_source`."""
+        """What `open_source` opens: the line, the codec and its options."""
         query = urlencode({"codec": self._name, **self._options})
         return f"{quote(self.emulator.address, safe=':/')}?{query}"
 
@@ -109,7 +110,12 @@ class EmulatedSerial(EmulatedDevice):
     wire = "serial"
 
     def __init__(
-        self, source: Source, codec: str = "native", *, link: str | None = None, **further: Any
+        self,
+        source: Source,
+        codec: str = "native",
+        *,
+        link: str | Path | None = None,
+        **further: Any,
     ) -> None:
         super().__init__(source, codec, SerialEndpoint(link), **further)
 
@@ -119,7 +125,7 @@ class EmulatedCan(EmulatedDevice):
 
     Args:
         bus: ``INTERFACE:CHANNEL``, e.g. ``virtual:test``; None: slcan.
-        fd: Whether to open that bus for CAN FD.
+        fd: Whether to open that bus for CAN FD; None: if the codec's own option says so.
 
     The other arguments are those of `EmulatedSerial`.
     """
@@ -132,9 +138,12 @@ class EmulatedCan(EmulatedDevice):
         codec: str = "native",
         *,
         bus: str | None = None,
-        fd: bool = False,
-        link: str | None = None,
+        fd: bool | None = None,
+        link: str | Path | None = None,
+        options: dict[str, str] | None = None,
         **further: Any,
     ) -> None:
+        if fd is None:
+            fd = (options or {}).get("fd", "").lower() in ("1", "true")
         endpoint = SlcanEndpoint(link) if bus is None else BusEndpoint(bus, fd)
-        super().__init__(source, codec, endpoint, **further)
+        super().__init__(source, codec, endpoint, options=options, **further)

@@ -37,23 +37,27 @@ class Emulator:
     numbered. A polled device sends the newest sample. The source stays the caller's to close.
 
     Args:
-        codec: what it speaks. Its `spec` is the source's if it has none; else see `fit`.
-        source: what it measures.
-        endpoint: where it is plugged in.
-        faults: what goes wrong; the schedule is used up.
-        log: whether to keep a record of each sample (17 bytes), or only counts.
+        codec: The codec that the device speaks. Without a `spec` it takes that of the source; else
+            see `fit`. It also remembers what hosts have commanded.
+        source: What the device measures.
+        endpoint: The line that the device is plugged into.
+        faults: What goes wrong; the schedule is used up.
+        log: What was done to each sample: a record of each (17 bytes) if asked for, else counts
+            only.
         pace: ``realtime`` sends samples when they are due (a live source has its own pace);
             ``fast`` as soon as the host takes them.
-        seconds: how long the source's stream is, if known, else where to stop; s of its time. The
-            schedule keeps the end quiet. Not needed for a source that is not live.
-        start_count: the counter's first value, e.g. just before it wraps.
-        start_tick: the clock's.
-        drift_ppm: how much faster than true its clock runs.
-        settle_s: a device that sends unasked begins so long after a host has come.
+        seconds: How long the source's stream is, if known, else where to stop; s of the source's
+            time. The schedule keeps the end quiet. Not needed for a source that is not live.
+        start_count: First value of the device's counter, e.g. just before it wraps.
+        start_tick: First value of the device's clock, in ticks.
+        drift_ppm: How much faster than true the device's clock runs, parts per million.
+        settle_s: How long after a host has come a device begins that sends unasked, s.
 
     Attributes:
-        log: what was done to each sample.
-        codec: with what hosts have commanded.
+        log: What was done to each sample: a record of each (17 bytes) if asked for, else counts
+            only.
+        codec: The codec that the device speaks. Without a `spec` it takes that of the source; else
+            see `fit`. It also remembers what hosts have commanded.
 
     Raises:
         ConfigError: codec and endpoint are of different wires, or a fault cannot happen there.
@@ -182,7 +186,8 @@ class Emulator:
         """Plug it in again, under the same link.
 
         Args:
-            restart: it had no power meanwhile: it counts from 0, and waits to be started.
+            restart: Whether the device had no power meanwhile: then it counts from 0, and waits to
+                be started.
         """
         with self._state:
             self.endpoint.plug()

@@ -29,8 +29,8 @@ class Endpoint(abc.ABC, Generic[Packet]):
     """The device's end of a line.
 
     Attributes:
-        wire: ``serial`` or ``can``.
-        address: what a host opens, the beginning of a source's URL; known once plugged in.
+        wire: What the line is: ``serial`` or ``can``.
+        address: What a host opens, the beginning of a source's URL; known once plugged in.
     """
 
     wire: ClassVar[str]
@@ -62,8 +62,8 @@ class Endpoint(abc.ABC, Generic[Packet]):
         """Send, at once or as the host reads; False: nobody hears, or there is no room.
 
         Args:
-            packet: what to send.
-            answer: to a command: there is always room for it.
+            packet: The packet to send.
+            answer: Whether this answers a command: there is always room for that.
         """
 
     @abc.abstractmethod
@@ -114,8 +114,8 @@ class SerialEndpoint(_PtyEndpoint[bytes]):
     """A serial port: a pty.
 
     Args:
-        link: a name under which it appears, besides /dev/pts/N.
-        fifo_bytes: what it holds for a host that does not read.
+        link: A name under which the port appears, besides /dev/pts/N.
+        fifo_bytes: How many bytes the port holds for a host that does not read.
     """
 
     wire = "serial"
@@ -141,9 +141,10 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
     """A device on a CAN bus with an slcan adapter on a pty: frames come once the channel is open.
 
     Args:
-        link: a name under which it appears, besides /dev/pts/N.
-        bitrate: of the bus; a host that chooses another one hears nothing; None: any.
-        fifo_bytes: what it holds for a host that does not read.
+        link: A name under which the port appears, besides /dev/pts/N.
+        bitrate: Speed of the bus, bit/s; a host that chooses another one hears nothing. None
+            accepts any.
+        fifo_bytes: How many bytes the port holds for a host that does not read.
     """
 
     wire = "can"
@@ -195,8 +196,8 @@ class BusEndpoint(Endpoint[Sequence[CanFrame]]):
 
     Args:
         name: ``INTERFACE:CHANNEL``, e.g. ``virtual:test``.
-        fd: whether to open it for CAN FD.
-        bitrate: of the bus, where the interface sets it.
+        fd: Whether to open the bus for CAN FD.
+        bitrate: Speed of the bus, bit/s, where the interface sets it.
 
     Raises:
         ConfigError: not such a name.

@@ -17,7 +17,6 @@ what was done, sample by sample. The first and the last half second are undistur
 lost beside a restart of the counter, where no receiver could count it.
 """
 
-import difflib
 import heapq
 import math
 import random
@@ -27,13 +26,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Packet
+from tactile_rt.settings import convert, no_such, read_toml
 from tactile_rt.stream import ConfigError
 
 __all__ = [
@@ -80,12 +80,16 @@ class Fault:
     """One kind of fault, and when.
 
     Attributes:
-        kind: one of `KINDS`. ``stall``: nothing is sent for a while, then all at once.
-            ``sequence_reset``: the device's counter and clock start again, as after a restart.
-        rate: how often, per second in the mean, at random times; or
-        at_s: when, in seconds of the stream.
-        duration_s: how long, of ``stall``, ``unplug`` and ``clock_drift`` (0: to the end).
-        amount: how much, see `KINDS`; None: its default.
+        kind: Name of a kind in `KINDS`. With ``stall`` nothing is sent for a while, then all at
+            once; with ``sequence_reset`` the device's counter and clock start again, as after a
+            restart.
+        rate: Mean number of times per second that the fault happens, at random; 0 if `at_s` is
+            given.
+        at_s: Time at which the fault happens, once, in seconds of the stream; None if `rate` is
+            given.
+        duration_s: Length of the fault, s, for ``stall``, ``unplug`` and ``clock_drift`` (0: to the
+            end).
+        amount: Size of the fault, in the unit that `KINDS` tells; None for the default of its kind.
 
     Raises:
         ConfigError: which field, and what it can be.
@@ -99,9 +103,7 @@ class Fault:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            near = difflib.get_close_matches(self.kind, KINDS, 1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(KINDS)}"
-            raise ConfigError(f"no fault kind {self.kind!r}; {hint}")
+            raise ConfigError(no_such("fault kind", self.kind, KINDS))
         kind = KINDS[self.kind]
         for name in ("rate", "duration_s"):
             if not 0 <= getattr(self, name) < math.inf:
@@ -136,12 +138,12 @@ class FaultSchedule:
     """Which fault hits which sample; the same seed and times give the same faults.
 
     Args:
-        faults: what may happen.
-        seed: of the random times and of `random`.
+        faults: The faults that may happen.
+        seed: Seed of the random times and of `random`.
 
     Attributes:
-        faults: what may happen.
-        random: for whoever carries the faults out.
+        faults: The faults that may happen.
+        random: Random numbers for whoever carries the faults out.
     """
 
     def __init__(self, faults: tuple[Fault, ...] | list[Fault], seed: int = 0) -> None:
@@ -164,8 +166,8 @@ class FaultSchedule:
         sample come one after the other. ``clock_drift`` is returned once, when it begins.
 
         Args:
-            t_s: seconds since the first sample.
-            quiet: whether the stream is about to end: nothing happens any more.
+            t_s: Time since the first sample, s.
+            quiet: Whether the stream is about to end, so that nothing happens any more.
         """
         if quiet or t_s < QUIET_S:
             return None
@@ -218,8 +220,8 @@ class DeviceLog:
     """What a device did with each of its samples.
 
     Attributes:
-        counts: samples by fate.
-        duplicated: packets sent beyond one per sample.
+        counts: Number of samples by fate.
+        duplicated: Number of packets that were sent beyond one per sample.
     """
 
     def __init__(self, kept: bool = True) -> None:
@@ -288,7 +290,7 @@ def damaged(packet: Packet, fault: Fault, draw: random.Random) -> tuple[Packet, 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
     seed: int = 0
-    fault: list[dict[str, Any]] = []
+    fault: tuple[Fault, ...] = ()
 
 
 def read_faults(path: Path | str) -> FaultSchedule:
@@ -298,33 +300,7 @@ def read_faults(path: Path | str) -> FaultSchedule:
         ConfigError: one line that names the file, the fault, the key, and what to do.
     """
     path = Path(path)
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
-    try:
-        file = msgspec.toml.decode(text, type=_File)
-    except msgspec.MsgspecError as error:
-        raise ConfigError(f"{path}: {error}; it has seed and [[fault]] tables") from None
+    file: _File = convert(read_toml(path), _File)
     if not file.fault:
         raise ConfigError(f"{path}: has no [[fault]] tables; give at least one")
-    return FaultSchedule(
-        [_fault(f"{path}, fault {n}", fields) for n, fields in enumerate(file.fault, 1)], file.seed
-    )
-
-
-def _fault(where: str, fields: dict[str, Any]) -> Fault:
-    known = Fault.__dataclass_fields__
-    for name in fields:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, 1)
-            hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
-            raise ConfigError(f"{where}: unknown key {name!r}; {hint}")
-    try:
-        return msgspec.convert(fields, Fault)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{where}: {error}") from None
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
+    return FaultSchedule(file.fault, file.seed)

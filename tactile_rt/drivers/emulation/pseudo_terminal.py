@@ -25,14 +25,15 @@ class Pty:
     host has not read when it closes the port is gone, as with a real port.
 
     Args:
-        link: a symbolic link to it, which comes and goes with it; None: none.
-        fifo_bytes: how much it holds for a host that does not read, beyond the kernel's 18 kB.
+        link: A symbolic link that comes and goes with the terminal; None for none.
+        fifo_bytes: How many bytes are held for a host that does not read, beyond the kernel's 18
+            kB.
 
     Attributes:
-        path: of the terminal, once plugged in.
-        heard: whether a host has it open.
-        queued: bytes written and not yet passed on.
-        lock: held wherever its state is used.
+        path: Path of the terminal, once plugged in.
+        heard: Whether a host has the terminal open.
+        queued: Number of bytes written and not yet passed on.
+        lock: The lock that is held wherever the terminal's state is used.
     """
 
     def __init__(self, link: str | Path | None, fifo_bytes: int) -> None:
@@ -107,8 +108,8 @@ class Pty:
         """Queue all of these bytes, or none: nobody has it open, or there is no room.
 
         Args:
-            data: what to send.
-            answer: to a command: it may take as much room again.
+            data: The bytes to send.
+            answer: Whether this answers a command, which may take as much room again.
         """
         with self.lock:
             room = self.fifo_bytes * (2 if answer else 1)

@@ -25,16 +25,17 @@ class Transmitter:
     """Samples to packets to an endpoint, with faults on the way; in one thread at a time.
 
     Args:
-        codec: what it speaks.
-        endpoint: where to.
-        faults: what goes wrong; None: nothing.
-        log: where to write down what becomes of each sample.
-        clock: the device's.
-        start_count: the device's counter's first value.
+        codec: The codec that the device speaks.
+        endpoint: The line that the packets go to.
+        faults: What goes wrong; None for nothing.
+        log: The record of what becomes of each sample.
+        clock: The clock of the device.
+        start_count: First value of the device's counter.
 
     Attributes:
-        end_ns: when the stream ends, on the source's clock; nothing goes wrong just before.
-        away: whether a fault has it pulled out.
+        end_ns: Time at which the stream ends, on the source's clock, ns; nothing goes wrong just
+            before.
+        away: Whether a fault has the device pulled out.
     """
 
     def __init__(
@@ -171,9 +172,9 @@ class EmulatedClock:
     """The device's clock: the source's time to device time, with drift, jumps and restarts.
 
     Args:
-        start_ns: what it shows when the first sample is taken.
-        drift_ppm: how much faster than true it runs.
-        wrap_ns: what it can show on the wire.
+        start_ns: Device time when the first sample is taken, ns.
+        drift_ppm: How much faster than true the clock runs, parts per million.
+        wrap_ns: Device time at which the clock wraps on the wire, ns.
     """
 
     def __init__(self, start_ns: int, drift_ppm: float, wrap_ns: int) -> None:

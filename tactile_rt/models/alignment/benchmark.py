@@ -26,10 +26,11 @@ class Frozen:
     """An RDM and how far it can be relied on.
 
     Attributes:
-        rdm: (15,), of the mean over trials.
-        reliability: Spearman-Brown corrected mean split-half correlation.
-        factor: K; a model's r_xy times it is its score. NaN if the RDM is too noisy to score on.
-        units: that it was made from.
+        rdm: (15,) The dissimilarities of the 15 pairs of stimuli, from the mean over trials.
+        reliability: The mean split-half correlation of the RDM, corrected by Spearman-Brown.
+        factor: The factor K by which a model's r_xy is multiplied to give its score; NaN if the RDM
+            is too noisy to score on.
+        units: The number of units that the RDM was made from.
     """
 
     rdm: Floats
@@ -43,12 +44,12 @@ class Target:
     """What models are compared to: an animal, or all of them pooled.
 
     Attributes:
-        name: of the animal.
-        chosen: as the protocol has it; for strict, of reliable units only.
-        unfiltered: the same without its filter.
-        reliable: enough to count in a mean over animals.
-        trials: that were used; for paper-code rows of the padded array.
-        sha256: of the rates that it was made from.
+        name: The name of the animal, or of the pool of all animals.
+        chosen: The RDM that the protocol scores on; for strict, it is made of reliable units only.
+        unfiltered: The RDM of all units, without the protocol's filter.
+        reliable: Whether the target is reliable enough to count in a mean over animals.
+        trials: The number of trials that were used; for paper-code, the rows of the padded array.
+        sha256: The SHA-256 sum of the rates that the target was made from, hex.
     """
 
     name: str
@@ -64,9 +65,11 @@ class Consistency:
     """How well animals predict each other.
 
     Attributes:
-        animals: their names.
-        pooled: (animal,), score of all other animals' units pooled against each; NaN where none.
-        pairwise: (animal, animal), score of a row's animal against a column's; NaN on the diagonal.
+        animals: The names of the animals, in the order of the axes.
+        pooled: (animal,) The score of all other animals' units pooled against each animal; NaN
+            where there is none.
+        pairwise: (animal, animal) The score of a row's animal against a column's; NaN on the
+            diagonal.
     """
 
     animals: tuple[str, ...]
@@ -94,14 +97,14 @@ class Benchmark:
     """A frozen benchmark.
 
     Attributes:
-        protocol: ``strict`` or ``paper-code``.
-        targets: the animals.
-        pooled: all animals as one target, which paper-code scores on as well; else None.
-        a2a: animal-to-animal consistency.
-        bootstraps, seed: of the splits.
-        sources: names of the files that were read.
-        notes: what was left out, and why.
-        stimuli: names along the stimulus axis.
+        protocol: The name of the protocol, ``strict`` or ``paper-code``.
+        targets: The animals that models are compared to.
+        pooled: All animals as one target, which paper-code scores on as well; None under strict.
+        a2a: The animal-to-animal consistency, which a model cannot be expected to exceed.
+        bootstraps, seed: Number and seed of the random splits of the trials.
+        sources: The names of the files that were read.
+        notes: Remarks on what was left out and why, a line each.
+        stimuli: The names of the stimuli along the stimulus axis.
     """
 
     protocol: str

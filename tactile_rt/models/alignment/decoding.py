@@ -30,9 +30,11 @@ class Decoded:
     """Accuracies, each beside the mean over relabelled stimuli and the share that reaches it.
 
     Attributes:
-        shape, distance: share of held-out stimuli that are right; NaN where nothing is decoded.
-        shape_chance, distance_chance: means over all relabellings of the stimuli.
-        shape_p, distance_p: shares of relabellings that are right as often.
+        shape, distance: Shares of held-out stimuli whose shape or distance is decoded rightly, 0 to
+            1; NaN where nothing is decoded.
+        shape_chance, distance_chance: Mean accuracies over all relabellings of the stimuli, 0 to 1.
+        shape_p, distance_p: Shares of relabellings that are right at least as often as the true
+            labels, 0 to 1.
     """
 
     shape: float

@@ -27,11 +27,12 @@ class LayerFidelity:
     """One layer in both models.
 
     Attributes:
-        layer: its name; `OUTPUT` is what the model decides with.
-        pearson: of the two RDMs; NaN if one has none.
-        difference: largest between the two (6, unit) responses, as a share of the reference's
-            largest where that is above 1; infinite for another number of units.
-        kept: whether both are within the bars of the precision.
+        layer: The name of the layer; `OUTPUT` is what the model decides with.
+        pearson: The correlation of the two RDMs of the layer; NaN if one has none.
+        difference: The largest difference between the two (6, unit) responses, as a share of the
+            reference's largest response where that is above 1; infinite for another number of
+            units.
+        kept: Whether both figures are within the bars of the precision.
     """
 
     layer: str

@@ -45,9 +45,9 @@ class Check:
     """One test and how it went.
 
     Attributes:
-        name: of the test.
-        code: `PASS`, `FAIL` or `INCONCLUSIVE`.
-        why: in a line, with the figures.
+        name: The name of the test, as a report prints it.
+        code: The outcome of the test: `PASS`, `FAIL` or `INCONCLUSIVE`.
+        why: The reason for the outcome, in a line with the figures.
     """
 
     name: str

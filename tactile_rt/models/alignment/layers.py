@@ -18,15 +18,15 @@ class Layers:
     """What a model's layers do while an array whisks the six stimuli.
 
     Attributes:
-        name: of the model.
-        traces: by layer, (6, step, unit) float32.
-        first: by layer, the first step that input can reach.
-        logits: (6, step, class) float32: the model's output.
-        parameters: numbers that the model is made of.
-        precision: ``fp32``, ``int8``, ...
-        sha256: of the file; empty for a network in memory.
-        network: its configuration, as far as it is known.
-        notes: what could not be had, and why.
+        name: The name of the model, as a report prints it.
+        traces: The responses of each layer, by name: (6, step, unit) float32.
+        first: The first step that input can reach, by the name of the layer.
+        logits: (6, step, class) The model's output, float32.
+        parameters: The count of numbers that the model is made of.
+        precision: The number format of the weights, such as ``fp32`` or ``int8``.
+        sha256: The SHA-256 sum of the model's file, hex; empty for a network in memory.
+        network: The configuration of the network, as far as it is known.
+        notes: Remarks on what could not be had and why, a line each.
     """
 
     name: str

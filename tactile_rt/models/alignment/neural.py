@@ -20,10 +20,10 @@ class NeuralSession:
     """One recording of one animal.
 
     Attributes:
-        animal: whose.
-        name: of the session.
-        rates: (trial, unit), spikes per second, in the order of the trials.
-        stimulus: (trial,), index into `STIMULI`.
+        animal: The name of the animal that was recorded.
+        name: The name of the session.
+        rates: (trial, unit) Firing rates in spikes per second, in the order of the trials.
+        stimulus: (trial,) The stimulus of each trial, as an index into `STIMULI`.
     """
 
     animal: str

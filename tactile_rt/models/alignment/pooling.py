@@ -21,9 +21,9 @@ class Moments:
     """Sums over units of responses to six stimuli.
 
     Attributes:
-        units: how many.
-        sums: (..., 6).
-        products: (..., 6, 6).
+        units: The number of units that the sums run over.
+        sums: (..., 6) The sum over units of the response to each stimulus.
+        products: (..., 6, 6) The sum over units of the products of the responses to two stimuli.
     """
 
     units: int

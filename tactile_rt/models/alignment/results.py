@@ -37,10 +37,11 @@ class AlignmentControl(msgspec.Struct, frozen=True):
     """What a score is compared with: raw sensor input, or an untrained network.
 
     Attributes:
-        name: of it.
-        layers: names.
-        corrected: (layer, target) noise-corrected correlations.
-        score, sem, p: as a model's.
+        name: The name of the control, as a report prints it.
+        layers: The names of the layers that were scored.
+        corrected: (layer, target) Correlations corrected for noise.
+        score, sem, p: Score, standard error and p value of the control, as `scoring.Score` has a
+            model's.
     """
 
     name: str
@@ -55,10 +56,11 @@ class ModelResult(msgspec.Struct, frozen=True):
     """Everything that is shown of a model; fields as in `scoring.Score` and `layers.Layers`.
 
     Attributes:
-        rdms: (layer, 15).
-        units: by layer.
-        performance: accuracy on the task, 0 to 1, and where from; None if it is not known.
-        untrained: its network before training, where there is one.
+        rdms: (layer, 15) The dissimilarities of the 15 pairs of stimuli in each layer.
+        units: (layer,) The number of units in each layer.
+        performance: The accuracy on the task, 0 to 1; None if no accuracy is known.
+        performance_of: The words that say what that accuracy was measured on.
+        untrained: The network before its training as a control, where there is one.
     """
 
     name: str
@@ -104,9 +106,9 @@ class Results(msgspec.Struct, frozen=True):
     """One file of scores.
 
     Attributes:
-        stimuli, pairs: names along the RDMs' axes.
-        input: file name and sha256 of the stimuli's loads.
-        raw: the control: the sensors themselves.
+        stimuli, pairs: Names along the axes of the RDMs: six stimuli, fifteen pairs.
+        input: The file name and the SHA-256 sum of the stimuli's loads.
+        raw: The control that no model is needed for: the readings of the sensors themselves.
     """
 
     benchmark: BenchmarkResult

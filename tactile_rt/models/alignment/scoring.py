@@ -27,21 +27,23 @@ class Score:
     """How well a model's layers fit a benchmark's targets.
 
     Attributes:
-        protocol: of the benchmark.
-        layers: names.
-        targets: names; for paper-code the pooled animals are the last.
-        r: (layer, target), correlations before the correction for noise.
-        corrected: (layer, target), after it; NaN where a layer has no RDM or a target is too noisy.
-        unfiltered: (layer, target), the same without the protocol's filter.
-        reliable: (target,), whether it counts in the score.
-        chosen: for strict, per target the layer that is best on all other animals, "" where none;
-            for paper-code the one layer of the score.
-        per_target: (target,), the chosen layer's corrected score; NaN for unreliable targets.
-        score: strict: mean of `per_target`; paper-code: highest of `corrected`.
-        sem: of it, over targets.
-        null: (720,), the score for every relabelling of the stimuli, choices of layers made anew.
-        p: share of `null` that reaches the score.
-        null_95: 95th percentile of `null`.
+        protocol: The name of the protocol of the benchmark.
+        layers: The names of the layers, in the order of the layer axis.
+        targets: The names of the targets; for paper-code the pooled animals are the last.
+        r: (layer, target) Correlations before the correction for noise.
+        corrected: (layer, target) Correlations after the correction for noise; NaN where a layer
+            has no RDM or a target is too noisy.
+        unfiltered: (layer, target) Corrected correlations without the protocol's filter of units.
+        reliable: (target,) Whether each target counts in the score.
+        chosen: The names of the chosen layers: for strict, per target the layer that is best on all
+            other animals, "" where there is none; for paper-code, the one layer of the score.
+        per_target: (target,) The chosen layer's corrected correlation; NaN for unreliable targets.
+        score: The score: for strict, the mean of `per_target`; for paper-code, the highest of
+            `corrected`.
+        sem: The standard error of the score over targets.
+        null: (720,) The score for every relabelling of the stimuli, choices of layers made anew.
+        p: The share of `null` that reaches the score, at least 1/720.
+        null_95: The 95th percentile of `null`, which chance alone exceeds once in twenty times.
     """
 
     protocol: str

@@ -33,10 +33,10 @@ class Permutations:
     """A statistic among those of all relabelled stimuli.
 
     Attributes:
-        statistic: of the stimuli as they are; NaN if it cannot be made.
-        null: (720,) of all relabellings, the identity first.
-        p: share of relabellings that reach the statistic; at least 1/720.
-        percentile_95: of the null.
+        statistic: The statistic of the stimuli as they are; NaN if there is none.
+        null: (720,) The statistics of all relabellings, the identity first.
+        p: The share of relabellings that reach the statistic, at least 1/720.
+        percentile_95: The 95th percentile of the null distribution.
     """
 
     statistic: float

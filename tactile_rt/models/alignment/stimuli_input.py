@@ -27,12 +27,13 @@ class StimuliInput:
     """Loads of the six stimuli, in the order of `STIMULI`.
 
     Attributes:
-        samples: (6, step, sub-step, element, channel) float32, N and N m.
-        sigma: (6, element, channel) float32: noise at rest, the smallest that is assumed of a
-            sensor; the tare is zero, for the whiskers rest before they whisk.
-        elements, channels, units: names along the last axes.
-        name: of the file.
-        sha256: of the samples.
+        samples: (6, step, sub-step, element, channel) The loads while the array whisks each
+            stimulus, float32, N and N m.
+        sigma: (6, element, channel) The noise at rest, float32, N and N m: the smallest that is
+            assumed of a sensor. The tare is zero, for the whiskers rest before they whisk.
+        elements, channels, units: Names along the last two axes, and the unit of each channel.
+        name: The name of the file that the loads were read from.
+        sha256: The SHA-256 sum of the samples, hex.
     """
 
     samples: NDArray[np.float32]

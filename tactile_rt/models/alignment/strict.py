@@ -46,8 +46,8 @@ class _Pool:
     """Units of an animal, or of several.
 
     Attributes:
-        full: moments of the means over all scoring trials.
-        halves: of both half-means of every bootstrap, (bootstrap, 2, ...).
+        full: The moments of the mean responses over all scoring trials.
+        halves: (bootstrap, 2, ...) The moments of both half-means of every bootstrap.
     """
 
     full: Moments

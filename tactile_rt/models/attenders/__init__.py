@@ -4,9 +4,10 @@ Every attender maps features `(batch, step, feature)` to the same shape, causall
 `step` that gives the same one by one.
 """
 
+from torch import Tensor, nn
+
 from tactile_rt.models.attenders.gpt import BLOCK, GPT, HEADS, LAYERS, MAX_STEPS, TOKENS
 from tactile_rt.models.attenders.mamba import MambaAttender
-from tactile_rt.models.attenders.none import NoAttender
 
 __all__ = [
     "BLOCK",
@@ -18,3 +19,20 @@ __all__ = [
     "MambaAttender",
     "NoAttender",
 ]
+
+
+class NoAttender(nn.Module):
+    """Each step on its own."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        """features (batch, step, feature), as they are"""
+        return features
+
+    def initial_state(self, batch: int) -> dict[str, Tensor]:
+        return {}
+
+    def step(
+        self, features: Tensor, index: Tensor, state: dict[str, Tensor]
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """features (batch, feature), as they are, {}"""
+        return features, {}

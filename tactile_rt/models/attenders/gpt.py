@@ -32,18 +32,18 @@ class TransformerBlock(nn.Module):
 
     def heads(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Queries, keys and values of tokens (batch, token, width), (batch, head, token, ·)."""
-        qkv = self.qkv(self.norm1(x)).unflatten(-1, (3, HEADS, -1))
-        q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)
+        qkv = self.qkv(self.norm1(x)).unflatten(-1, (3, HEADS, -1))  # (batch, token, 3, head, ·)
+        q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)  # (batch, head, token, ·) each
         return q, k, v
 
     def merge(self, x: Tensor, attended: Tensor) -> Tensor:
         """The rest of the layer, from attended (batch, head, token, ·)."""
-        x = x + self._drop(self.proj(attended.transpose(1, 2).flatten(2)))
-        hidden = F.gelu(self.mlp_in(self.norm2(x)), approximate="tanh")
+        x = x + self._drop(self.proj(attended.transpose(1, 2).flatten(2)))  # (batch, token, width)
+        hidden = F.gelu(self.mlp_in(self.norm2(x)), approximate="tanh")  # (batch, token, 4 width)
         return x + self._drop(self.mlp_out(hidden))
 
     def forward(self, x: Tensor) -> Tensor:
-        """All tokens at once, each attending to itself and those before it."""
+        """All tokens (batch, token, width) at once, each attending to itself and those before."""
         q, k, v = self.heads(x)
         dropout = self.dropout if self.training else 0.0
         return self.merge(
@@ -92,12 +92,17 @@ class GPT(nn.Module):
                     nn.init.zeros_(module.bias)
 
     def forward(self, features: Tensor) -> Tensor:
-        """features (batch, step, inputs) -> (batch, step, width)"""
+        """features (batch, step, inputs) -> (batch, step, width)
+
+        Raises:
+            ValueError: more steps than `max_steps`.
+        """
         steps = features.shape[1]
         if steps > self.max_steps:
             raise ValueError(f"{steps} steps, but this attender ends at {self.max_steps}")
+        # (batch, step, token of the step, width)
         x = self._embed(features) + self.positions[: TOKENS * steps].unflatten(0, (steps, TOKENS))
-        x = F.dropout(x.flatten(1, 2), self.dropout, self.training)
+        x = F.dropout(x.flatten(1, 2), self.dropout, self.training)  # (batch, token, width)
         for block in self.blocks:
             x = block(x)
         out: Tensor = self.project_out(self.norm(x[:, TOKENS - 1 :: TOKENS]))
@@ -125,11 +130,12 @@ class GPT(nn.Module):
         query = TOKENS * index[:, None] + torch.arange(TOKENS, device=index.device)
         seen = (token <= query[:, :, None])[:, None]  # (batch, 1, query, token)
         positions = self.positions[: TOKENS * self.max_steps].unflatten(0, (-1, TOKENS))
-        x = self._embed(features) + positions[index]
+        x = self._embed(features) + positions[index]  # (batch, token of the step, width)
         keys, values = [], []
         for layer, block in enumerate(self.blocks):
             assert isinstance(block, TransformerBlock)
-            q, k, v = block.heads(x)
+            q, k, v = block.heads(x)  # (batch, head, token of the step, width / head)
+            # (batch, head, step, token of the step, width / head)
             keys.append(torch.where(here, k[:, :, None], state["gpt_k"][:, layer]))
             values.append(torch.where(here, v[:, :, None], state["gpt_v"][:, layer]))
             attended = F.scaled_dot_product_attention(

@@ -8,19 +8,23 @@ channel d and state n
 
 where dt, B and C are read off x itself: so what is kept and what is forgotten is chosen by what
 is felt. The output is y silu(z), projected back.
+
+The scan over a window is written out with its gradient. Time leads inside it, so that a step is one
+contiguous block: the recurrence is a loop of products into buffers that already hold what they add
+to, and everything else is done for all steps at once.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
-from tactile_rt.models.attenders.scan import selective_scan
-
-__all__ = ["MambaAttender", "MambaBlock", "MambaStack"]
+__all__ = ["MambaAttender", "MambaBlock", "MambaStack", "selective_scan"]
 
 LAYERS = 4
 STATES = 16
@@ -59,14 +63,14 @@ class MambaBlock(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """All steps at once, from a zero state."""
-        x, gate = self.in_proj(features).chunk(2, dim=-1)
+        x, gate = self.in_proj(features).chunk(2, dim=-1)  # (batch, step, inner) each
         steps = x.shape[1]
         padded = F.pad(x, (0, 0, TAPS - 1, 0))
         conv = self.conv_bias + sum(
             padded[:, k : k + steps] * self.conv_weight[:, k] for k in range(TAPS)
         )
         x = F.silu(conv)
-        y = selective_scan(*self._select(x))
+        y = selective_scan(*self._select(x))  # (batch, step, inner)
         return self._out(y, x, gate)
 
     def step(self, features: Tensor, taps: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -75,15 +79,15 @@ class MambaBlock(nn.Module):
         features (batch, width), taps (batch, TAPS - 1, inner): the last x, oldest first,
         h (batch, inner, STATES) -> the output and the new taps and h
         """
-        x, gate = self.in_proj(features).chunk(2, dim=-1)
-        taps = torch.cat([taps, x[:, None]], dim=1)
-        x = F.silu(self.conv_bias + (taps * self.conv_weight.t()).sum(1))
-        dt, signal, a, b, c = self._select(x)
+        x, gate = self.in_proj(features).chunk(2, dim=-1)  # (batch, inner) each
+        taps = torch.cat([taps, x[:, None]], dim=1)  # (batch, TAPS, inner)
+        x = F.silu(self.conv_bias + (taps * self.conv_weight.t()).sum(1))  # (batch, inner)
+        dt, signal, a, b, c = self._select(x)  # a (inner, STATES); b, c (batch, STATES)
         h = torch.exp(dt[..., None] * a) * h + (dt * signal)[..., None] * b[:, None]
         return self._out((h * c[:, None]).sum(-1), x, gate), taps[:, 1:], h
 
     def _select(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """What `selective_scan` takes, of x (..., inner)."""
+        """What `selective_scan` takes, of x (..., inner): dt, x, a, b and c."""
         dt, b, c = self.x_proj(x).split([self.rank, STATES, STATES], dim=-1)
         dt = F.softplus(self.dt_proj(dt))
         # In the parameters' type whatever autocast says: the state is a long product.
@@ -152,3 +156,45 @@ class MambaAttender(MambaStack):
 
     def __init__(self, width: int) -> None:
         super().__init__(width, "mamba")
+
+
+def selective_scan(dt: Tensor, x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """y_t = h_t c_t with h_t = exp(dt_t a) h_{t-1} + dt_t x_t b_t, from h = 0.
+
+    dt, x (batch, step, channel); a (channel, state); b, c (batch, step, state)
+    -> (batch, step, channel). All real, of one type.
+    """
+    steps_first = [part.transpose(0, 1).contiguous() for part in (dt, dt * x, b, c)]
+    with torch.autocast(x.device.type, enabled=False):
+        y: Tensor = _Scan.apply(*steps_first, a)  # type: ignore[no-untyped-call]
+    return y.transpose(0, 1)
+
+
+class _Scan(torch.autograd.Function):
+    """(step, batch, ·) throughout; u is dt x."""
+
+    @staticmethod
+    def forward(ctx: Any, dt: Tensor, u: Tensor, b: Tensor, c: Tensor, a: Tensor) -> Tensor:
+        keep = torch.mul(dt[..., None], a).exp_()  # (step, batch, channel, state)
+        h = u[..., None] * b[..., None, :]  # the same
+        for t in range(1, len(h)):
+            h[t].addcmul_(keep[t], h[t - 1])
+        ctx.save_for_backward(dt, u, a, b, c, keep, h)
+        return torch.matmul(h, c[..., None])[..., 0]
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
+        dt, u, a, b, c, keep, h = ctx.saved_tensors
+        to_c = torch.matmul(grad[..., None, :], h)[..., 0, :]
+        to_h = grad[..., None] * c[..., None, :]
+        for t in range(len(h) - 1, 0, -1):
+            to_h[t - 1].addcmul_(keep[t], to_h[t])
+        to_u = torch.matmul(to_h, b[..., None])[..., 0]
+        to_b = torch.matmul(u[..., None, :], to_h)[..., 0, :]
+        # keep_t multiplied h_{t-1}: the gradient of its exponent dt a
+        exponent = to_h[1:].mul_(keep[1:]).mul_(h[:-1])
+        to_dt = torch.zeros_like(dt)
+        to_dt[1:] = (exponent * a).sum(-1)
+        to_a = exponent.mul_(dt[1:, ..., None]).sum((0, 1))
+        return to_dt, to_u, to_b, to_c, to_a

@@ -45,10 +45,10 @@ class Cell(nn.Module):
     """What all cells share: one convolution to `gates` maps, and the norm of each.
 
     Attributes:
-        gates: maps that `conv` makes.
-        norms: maps that the layer norm, where used, is for.
-        states: names of the state's tensors, each shaped like x.
-        epsilon: of the layer norm.
+        gates: The number of maps that `conv` makes, one per gate.
+        norms: The number of maps that the layer norm, where used, normalises.
+        states: The names of the state's tensors, each shaped like x.
+        epsilon: The layer norm's epsilon, which is added to the variance.
     """
 
     gates: ClassVar[int]

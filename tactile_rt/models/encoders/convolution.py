@@ -26,6 +26,7 @@ class Convolution(nn.Module):
         nn.init.kaiming_normal_(self.weight, nonlinearity="relu")
 
     def forward(self, *maps: Tensor) -> Tensor:
+        """maps (row, column, lane, channel) each -> (row, column, lane, output)"""
         return convolve(self.weight, self.bias, *maps)
 
 

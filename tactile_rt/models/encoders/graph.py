@@ -46,11 +46,14 @@ class Node:
     """One area: what it reads -> convolution -> cell -> ReLU.
 
     Attributes:
-        name: an identifier.
-        channels: of its output.
-        reads: edges, in the order of their channels; the first is concatenated.
-        kind: "valid" or "same", 2 x 2 convolutions of maps; "dense" reads every site.
-        cell: one of `CELLS`, or "none". A dense node has none or time decay.
+        name: The name of the node, an identifier.
+        channels: The number of channels of the node's output.
+        reads: The edges that the node reads, in the order of their channels; the first is
+            concatenated.
+        kind: The kind of the node: "valid" or "same", 2 x 2 convolutions of maps; "dense" reads
+            every site.
+        cell: The name of the recurrent cell: one of `CELLS`, or "none". A dense node has none or
+            time decay.
     """
 
     name: str

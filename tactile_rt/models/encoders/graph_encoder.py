@@ -31,6 +31,7 @@ class Fusion(nn.Module):
         self.gates = nn.ModuleList(nn.Linear(2 * base, 1) if g else nn.Identity() for g in gated)
 
     def forward(self, base: Tensor, maps: Sequence[Tensor]) -> Tensor:
+        """base (row, column, lane, channel), maps of other channels each -> as base"""
         out = base
         for project, gate, m in zip(self.projections, self.gates, maps, strict=True):
             added = project(m)
@@ -49,8 +50,9 @@ class GraphEncoder(nn.Module):
         graph: what to build; its channel counts are final (see `Graph.scaled`).
 
     Attributes:
-        features: channels of the graph's readout.
-        lag: the first `lag` steps of a window cannot depend on any frame.
+        features: The number of channels of the graph's readout.
+        lag: The number of steps that a frame takes to reach the readout: the first `lag` steps of a
+            window cannot depend on any frame.
     """
 
     def __init__(self, graph: Graph) -> None:
@@ -91,7 +93,7 @@ class GraphEncoder(nn.Module):
         self.features = channels[graph.readout]
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Zeros: each node's cell state and, where a node hears it, its output `_h`."""
+        """Zeros: each node's cell state and, where a node hears it, its output, ``NAME_h``."""
         zeros = next(self.parameters()).new_zeros
         state = {}
         for node in self.graph.nodes:

@@ -18,48 +18,43 @@ channels = 512
 reads = ["conv1", { source = "whisker_angle", fusion = "gate" }]
 """
 
-from __future__ import annotations
-
-import tomllib
-from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
+from tactile_rt.settings import SettingNode, convert, parse_toml, read_toml
 from tactile_rt.stream import ConfigError
 
 __all__ = ["parse_graph", "read_graph"]
+
+
+class _Input(msgspec.Struct):
+    channels: int
+    rows: int = Input.rows
+    columns: int = Input.columns
+
+
+class _Node(msgspec.Struct):
+    channels: int
+    reads: tuple[str | Edge, ...]
+    kind: str = Node.kind
+    cell: str = Node.cell
+
+
+class _File(msgspec.Struct):
+    inputs: dict[str, _Input] = {}
+    nodes: dict[str, _Node] = {}
+    readout: str = ""
 
 
 def parse_graph(text: str, where: str = "graph") -> Graph:
     """A graph from TOML, as in the module's docstring.
 
     Raises:
-        ConfigError: naming `where`, the field and what is wrong.
+        ConfigError: naming `where`, the line, the key and what is wrong.
     """
-    try:
-        raw = tomllib.loads(text)
-        _known(raw, {"inputs", "nodes", "readout"}, "")
-        inputs = [{"name": k, **_table(v, Input, k)} for k, v in _named(raw, "inputs")]
-        nodes = [{"name": k, **_table(v, Node, k)} for k, v in _named(raw, "nodes")]
-        for node in nodes:
-            reads = node.get("reads")
-            if isinstance(reads, list):
-                node["reads"] = [
-                    {"source": edge} if isinstance(edge, str) else _table(edge, Edge, node["name"])
-                    for edge in reads
-                ]
-        # The graph itself is built afterwards: msgspec would wrap the constructor's own errors.
-        return Graph(
-            msgspec.convert(inputs, tuple[Input, ...]),
-            msgspec.convert(nodes, tuple[Node, ...]),
-            msgspec.convert(raw.get("readout", ""), str),
-        )
-    except (tomllib.TOMLDecodeError, msgspec.ValidationError, ConfigError) as error:
-        raise ConfigError(f"{where}: {error}") from None
+    return _graph(parse_toml(text, where))
 
 
 def read_graph(path: Path) -> Graph:
@@ -68,28 +63,20 @@ def read_graph(path: Path) -> Graph:
     Raises:
         ConfigError: as `parse_graph`; or the file cannot be read.
     """
+    return _graph(read_toml(path))
+
+
+def _graph(tree: SettingNode) -> Graph:
+    file: _File = convert(tree, _File)
+    for table in ("inputs", "nodes"):
+        if not getattr(file, table):
+            raise ConfigError(f"{tree.where}: {table} must be tables, [{table}.NAME]")
+    inputs = [Input(name, **msgspec.structs.asdict(i)) for name, i in file.inputs.items()]
+    nodes = []
+    for name, node in file.nodes.items():
+        reads = tuple(Edge(edge) if isinstance(edge, str) else edge for edge in node.reads)
+        nodes.append(Node(name, node.channels, reads, node.kind, node.cell))
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as text ({error})") from None
-    return parse_graph(text, str(path))
-
-
-def _named(raw: Mapping[str, Any], key: str) -> list[tuple[str, Any]]:
-    table = raw.get(key)
-    if not isinstance(table, dict) or not table:
-        raise ConfigError(f"{key} must be tables, [{key}.NAME]")
-    return list(table.items())
-
-
-def _table(value: Any, kind: type[Any], name: str) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ConfigError(f"{name}: expected a table, not {value!r}")
-    _known(value, {field.name for field in fields(kind)} - {"name"}, f"{name}: ")
-    return dict(value)
-
-
-def _known(table: Mapping[str, Any], known: set[str], where: str) -> None:
-    for key in table:
-        if key not in known:
-            raise ConfigError(f"{where}unknown field {key!r}; there are {', '.join(sorted(known))}")
+        return Graph(tuple(inputs), tuple(nodes), file.readout)
+    except ConfigError as error:  # how its parts fit together
+        raise ConfigError(f"{tree.where}: {error}") from None

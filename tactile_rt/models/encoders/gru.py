@@ -27,7 +27,7 @@ class GRUEncoder(nn.Module):
         self.gru = nn.GRU(FRAME, self.features, LAYERS, batch_first=True)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """All steps at once, from a zero state."""
+        """All steps at once, from a zero state: (batch, step, feature)."""
         features: Tensor = self.gru(frames.flatten(2))[0]
         return features
 
@@ -39,10 +39,10 @@ class GRUEncoder(nn.Module):
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """One step. frame (batch, 30, 5, 7) -> features (batch, feature), the new state."""
-        x, new = frame.flatten(1), []
+        x, new = frame.flatten(1), []  # (batch, 30 * 5 * 7)
         for layer, h in enumerate(state["gru_h"].unbind(1)):
             w_ih, w_hh, b_ih, b_hh = self.gru.all_weights[layer]
-            r_x, z_x, n_x = F.linear(x, w_ih, b_ih).chunk(3, dim=-1)
+            r_x, z_x, n_x = F.linear(x, w_ih, b_ih).chunk(3, dim=-1)  # (batch, feature) each
             r_h, z_h, n_h = F.linear(h, w_hh, b_hh).chunk(3, dim=-1)
             r, z = torch.sigmoid(r_x + r_h), torch.sigmoid(z_x + z_h)
             x = (1 - z) * torch.tanh(n_x + r * n_h) + z * h

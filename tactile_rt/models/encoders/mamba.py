@@ -25,7 +25,7 @@ class MambaEncoder(nn.Module):
         self.stack = MambaStack(self.features, "encoder")
 
     def forward(self, frames: Tensor) -> Tensor:
-        """All steps at once, from a zero state."""
+        """All steps at once, from a zero state: (batch, step, feature)."""
         features: Tensor = self.stack(self.embed(frames.flatten(2)))
         return features
 

@@ -63,7 +63,7 @@ class ConvNorm(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x (frame, site in * inputs) -> (frame, site out * outputs)"""
-        y = F.linear(x, self.matrix())
+        y = F.linear(x, self.matrix())  # (frame, site out * outputs)
         y = self.norm(y.view(-1, len(self.weight)))  # statistics over frames and sites
         out: Tensor = y.view(len(x), -1)
         return out
@@ -97,6 +97,7 @@ class ResidualBlock(nn.Module):
         self.shortcut = None if same else ConvNorm(inputs, outputs, 1, stride, shape)
 
     def forward(self, x: Tensor) -> Tensor:
+        """x (frame, site in * inputs) -> (frame, site out * outputs)"""
         short = x if self.shortcut is None else self.shortcut(x)
         out: Tensor = F.relu(short + self.second(F.relu(self.first(x))))
         return out
@@ -123,6 +124,7 @@ class ResNet18Encoder(nn.Module):
         self.fc = nn.Linear(inputs, self.features)
 
     def forward(self, frames: Tensor) -> Tensor:
+        """frames (batch, step, 30, 5, 7) -> features (batch, step, feature)"""
         features: Tensor = self._encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
         return features
 
@@ -141,7 +143,7 @@ class ResNet18Encoder(nn.Module):
 
     def _encode(self, frames: Tensor) -> Tensor:
         """frames (frame, 30, 5, 7) -> (frame, feature)"""
-        x = maximum(F.relu(self.stem(sites_first(frames))), self.stem.shape)
+        x = maximum(F.relu(self.stem(sites_first(frames))), self.stem.shape)  # (frame, site * c)
         for block in self.blocks:
             x = block(x)
         features: Tensor = self.fc(x)

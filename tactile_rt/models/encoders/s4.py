@@ -101,6 +101,7 @@ def kernels(blocks: Sequence[S4Block], steps: int) -> Tensor:
     def joined(name: str) -> Tensor:
         return torch.cat([getattr(block, name) for block in blocks])
 
+    # log_dt (block * channel,); p, b, c (block * channel, 2, state / 2)
     log_dt, p, b, c = (joined(name) for name in ("log_dt", "P", "B", "C"))
     conjugate = p.new_tensor([1.0, -1.0])[:, None]
     dt = torch.exp(log_dt)[:, None]
@@ -127,6 +128,7 @@ def kernels(blocks: Sequence[S4Block], steps: int) -> Tensor:
             value=-1.0,
         )
         states.append(x)
+    # (step, block * channel, 2, state / 2) -> (block * channel, step)
     taps = torch.einsum("kcpn,cpn->ck", torch.stack(states), 2 * conjugate * c)
     taps = torch.cat([taps[:, :1] + joined("D")[:, None], taps[:, 1:]], 1)
     out: Tensor = taps.unflatten(0, (len(blocks), -1))
@@ -151,8 +153,8 @@ class S4Encoder(nn.Module):
         self.out = nn.Linear(self.features, self.features)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """All steps at once, from a zero state."""
-        x = self.embed(frames.flatten(2))
+        """All steps at once, from a zero state: (batch, step, feature)."""
+        x = self.embed(frames.flatten(2))  # (batch, step, channel)
         for block, kernel in zip(self.blocks, self.kernels(frames.shape[1]), strict=True):
             x = block(x, kernel)
         features: Tensor = self.out(x)
@@ -183,9 +185,10 @@ class S4Encoder(nn.Module):
         self, frame: Tensor, kernels: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """`step` with the kernels (layer, channel, tap) given."""
-        x, inputs = self.embed(frame.flatten(1)), []
+        x, inputs = self.embed(frame.flatten(1)), []  # (batch, channel)
         for layer, block in enumerate(self.blocks):
             assert isinstance(block, S4Block)
+            # (batch, tap, channel), newest first
             inputs.append(torch.cat([x[:, None], state["s4_inputs"][:, layer, :-1]], 1))
             x = block.merge(x, (inputs[-1] * kernels[layer].t()).sum(1))
         return self.out(x), {"s4_inputs": torch.stack(inputs, 1)}

@@ -26,7 +26,7 @@ EDGES = {
 
 
 def zhuang_graph(cell: str = "intersection-ln") -> Graph:
-    """The paper's graph with one of `CELLS` on every map.
+    """The paper's graph with one of `cells.CELLS` on every map.
 
     Time decay, the original, is on fc7 and fc8 too; gated cells are not.
     """

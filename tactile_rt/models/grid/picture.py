@@ -7,9 +7,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
+from tactile_rt.models.evaluation import Interval
 from tactile_rt.models.grid.plan import SUPERVISED, SVM
 from tactile_rt.models.grid.results import GridResults, Row
-from tactile_rt.models.intervals import Interval
 
 __all__ = ["draw_grid"]
 

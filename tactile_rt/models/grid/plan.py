@@ -6,7 +6,6 @@ updates = 600
 encoder = "zhuang-gru"
 """
 
-import tomllib
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import msgspec
 
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.training import TrainingConfig
+from tactile_rt.settings import convert, make_node, parse_toml, read_toml
 from tactile_rt.stream import ConfigError
 
 __all__ = [
@@ -36,12 +36,13 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One network and how it learns.
 
     Attributes:
-        encoder, attender: as in `EADConfig`.
-        objective: "supervised", or a self-supervised one, whose features a linear probe reads.
-        augmentation: of the views of a self-supervised objective.
-        masking: share of the steps of a view that is blanked.
-        width: of this network; 0: the grid's.
-        options: further fields of `TrainingConfig`, for this cell alone.
+        encoder, attender: Names of the encoder and the attender, as in `EADConfig`.
+        objective: The objective, "supervised", or a self-supervised one, whose features a linear
+            probe reads.
+        augmentation: The augmentation that makes the views of a self-supervised objective.
+        masking: The share of the steps of a view that is blanked, 0 to 1.
+        width: The width of this network; 0 takes the grid's.
+        options: Further fields of `TrainingConfig`, for this cell alone.
     """
 
     encoder: str
@@ -97,9 +98,9 @@ class Task(msgspec.Struct, frozen=True):
     """One thing to do: a cell with a seed, a network's random initialisation, or the SVM.
 
     Attributes:
-        name: of the cell, "random NETWORK" or "svm".
-        seed: of weights, windows and noise.
-        cell: None for the SVM.
+        name: The name of the cell, "random NETWORK" or "svm".
+        seed: The seed of the weights, the windows and the noise.
+        cell: The cell to train; None for the support vector machine.
     """
 
     name: str
@@ -121,16 +122,16 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole grid.
 
     Attributes:
-        data: the sweep set.
-        cells: in the order in which they are trained.
-        width: of every network that has none of its own.
-        updates, batch: the budget of every cell.
-        seeds: how many; all cells are trained with the first before any with the second.
-        sweeps: of each object that are used.
-        supervised, self_supervised: fields of `TrainingConfig` for cells of either kind.
-        probe: fields of `ProbeConfig`.
-        svm: fit a support vector machine too.
-        questions: what the report answers.
+        data: The folder of the sweep set.
+        cells: The cells, in the order in which they are trained.
+        width: The width of every network that has none of its own.
+        updates, batch: The budget of every cell: updates, and sweeps per update.
+        seeds: The number of seeds; all cells are trained with the first before any with the second.
+        sweeps: The number of sweeps of each object that are used, by split.
+        supervised, self_supervised: Fields of `TrainingConfig` for cells of either kind.
+        probe: Fields of `ProbeConfig` for cells whose features a probe reads.
+        svm: Whether a support vector machine is fitted too.
+        questions: The questions that the report answers.
     """
 
     data: str
@@ -169,10 +170,9 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             **common,
             **cell.options,
         }
-        try:
-            return TrainingConfig(**options)
-        except TypeError as error:
-            raise ConfigError(f"cell {cell.name!r}: {error}") from None
+        convert(make_node(options, f"cell {cell.name!r}", 0, Path()), TrainingConfig)
+        # As it is written: whole numbers stay whole in what is stored of a run.
+        return TrainingConfig(**options)
 
     def tasks(self) -> list[Task]:
         """Everything to do, the first seed of all first."""
@@ -200,31 +200,27 @@ def read_grid(name: str | Path) -> Grid:
     Raises:
         ConfigError: there is none, or it is not such a file.
     """
-    path = Path(name)
-    try:
-        if str(name) in shipped_grids():
-            text = (SHIPPED / f"{name}.toml").read_text()
-        else:
-            text = path.read_text()
-    except FileNotFoundError:
+    if str(name) in shipped_grids():
+        nodes = parse_toml((SHIPPED / f"{name}.toml").read_text(), str(name))
+    elif Path(name).exists():
+        nodes = read_toml(Path(name))
+    else:
         raise ConfigError(
             f"no grid {name}: name a TOML file, or one of {', '.join(shipped_grids())}"
-        ) from None
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{name} is not a text file: {error}") from None
-    try:
-        grid = msgspec.convert(tomllib.loads(text), Grid)
-    except (tomllib.TOMLDecodeError, msgspec.ValidationError) as error:
-        raise ConfigError(f"{name}: {error}") from None
+        )
+    grid: Grid = convert(nodes, Grid)
     names = [cell.name for cell in grid.cells]
     for cell in grid.cells:
         if names.count(cell.name) > 1:
             raise ConfigError(f"{name}: two cells are {cell.name!r}")
         try:
             config = grid.config(Task(cell.name, 0, cell), Path(grid.data))
-            EADConfig(2, cell.encoder, cell.attender, config.decoder, config.width)
+            try:
+                EADConfig(2, cell.encoder, cell.attender, config.decoder, config.width)
+            except ConfigError as error:
+                raise ConfigError(f"cell {cell.name!r}: {error}") from None
         except ConfigError as error:
-            raise ConfigError(f"{name}: cell {cell.name!r}: {error}") from None
+            raise ConfigError(f"{name}: {error}") from None
     known = {task.name for task in grid.tasks()}
     for question in grid.questions:
         for one in (name for pair in question.pairs for name in (pair.better, pair.than)):

@@ -1,19 +1,33 @@
-"""A grid's tasks over processes: a task that is done is not done again, whenever it was killed."""
+"""Do a grid: its sweeps once, then its tasks over processes.
+
+All cells share one sweep set, a part of the grid's own. A task that is done is not done again,
+whenever the grid was killed.
+"""
 
 import multiprocessing
 import os
 import queue
 import signal
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from tactile_rt.models.grid.plan import Grid, Task
-from tactile_rt.models.grid.subset import write_subset
+from tactile_rt.models.grid.plan import Grid, SweepCounts, Task
 from tactile_rt.models.grid.work import SUBSET, Outcome, Workbench, read_outcome
 from tactile_rt.stream import TactileError
+from tactile_rt.sweep_set import (
+    SET_VERSION,
+    SPLITS,
+    SweepManifest,
+    has_object,
+    read_object,
+    read_skipped,
+    write_object,
+    write_skipped,
+)
 
-__all__ = ["run_grid"]
+__all__ = ["run_grid", "write_subset"]
 
 PATIENCE_S = 1.0
 
@@ -75,6 +89,40 @@ def run_grid(
         for worker in workers:
             worker.terminate()
             worker.join()
+
+
+def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
+    """Write, or go on writing, the first sweeps of every object of a set.
+
+    Args:
+        source: a sweep set.
+        folder: where the smaller one goes.
+        sweeps: how many of each object, by split.
+
+    Raises:
+        RecordingError: the source cannot be read.
+        ConfigError: the folder holds another set.
+    """
+    manifest = SweepManifest.read(source)
+    taken = {split: getattr(sweeps, split) for split in SPLITS}
+    recipe = {key: value for key, value in manifest.recipe.items() if key != "contacts"}
+    smaller = replace(
+        manifest,
+        split={split: manifest.split[split] for split in SPLITS},
+        recipe={**recipe, "taken": taken, "from": str(source)},
+        version=SET_VERSION,
+    )
+    smaller.write(folder)
+    skipped = read_skipped(source)
+    if skipped:
+        write_skipped(folder, {k: v for k, v in skipped.items() if k in smaller.names()})
+    for split, count in taken.items():
+        for name in smaller.split[split]:
+            if name in skipped or has_object(folder, name):
+                continue
+            values, parameters = read_object(source, name)
+            few = slice(count or None)
+            write_object(folder, name, values[few], {k: v[few] for k, v in parameters.items()})
 
 
 def _next(outcomes: Any, workers: list[Any]) -> Any:

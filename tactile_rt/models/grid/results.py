@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from tactile_rt.files import write_whole
 from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.evaluation import Interval, accuracy
 from tactile_rt.models.grid.plan import RANDOM, SVM, Grid
 from tactile_rt.models.grid.work import SUBSET, Outcome, read_outcome
-from tactile_rt.models.intervals import Interval, accuracy
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Answer", "GridResults", "Row", "gather", "put_into", "table", "write_results"]
@@ -26,15 +26,15 @@ class Row:
     """A cell over its seeds, beside its network's random initialisation.
 
     Attributes:
-        name: of the cell, or "svm".
-        network, learning: of the cell; empty for the SVM.
-        seeds: that are done.
-        top1, top5, noisy: accuracies on the test sweeps; `noisy` at the rated noise. None where
-            there is none.
-        random: top-1 of a linear probe on the untrained network.
-        parameters: of the network.
-        seconds: mean CPU time.
-        failed: why seeds are missing; empty if none did.
+        name: The name of the cell, or "svm".
+        network, learning: Names of the network and of how the cell learns; empty for the SVM.
+        seeds: The number of seeds that are done.
+        top1, top5, noisy: Accuracies on the test sweeps, 0 to 1; `noisy` is top-1 at the rated
+            noise. None where there is no figure.
+        random: The top-1 accuracy of a linear probe on the untrained network, 0 to 1.
+        parameters: The number of parameters of the network.
+        seconds: The mean CPU time of a seed, s.
+        failed: The reason why seeds are missing; empty if none failed.
     """
 
     name: str

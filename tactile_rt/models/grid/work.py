@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from tactile_rt.files import write_whole
 from tactile_rt.models.data_checks import check_sets, check_split
 from tactile_rt.models.datasets import STEPS, SweepSet, windows
-from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.ead import count_parameters
-from tactile_rt.models.evaluation import Step, hits
+from tactile_rt.models.evaluation import CLEAN, Disturbance, Step, hits
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.models.svm import fit_svm
@@ -41,13 +40,13 @@ class Outcome(msgspec.Struct, frozen=True):
     """What a task found.
 
     Attributes:
-        name, seed: of the task.
-        key: of the settings that it depends on; another key is another experiment.
-        top1, top5, noisy: a 0 or 1 per test sweep: right, among the first five, right at the
-            rated noise.
-        parameters: of encoder, attender and decoder.
-        seconds: of CPU time, all included.
-        failed: why there is no figure; empty if there is one.
+        name, seed: Name and seed of the task.
+        key: The settings that the outcome depends on, as JSON; another key is another experiment.
+        top1, top5, noisy: Hits as text, a 0 or 1 per test sweep: right, among the first five, right
+            at the rated noise.
+        parameters: The number of parameters of encoder, attender and decoder.
+        seconds: The CPU time that the task took, all included, s.
+        failed: The reason why there is no figure; empty if there is one.
     """
 
     name: str

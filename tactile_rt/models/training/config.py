@@ -29,24 +29,33 @@ class TrainingConfig:
     """What to train and how; the defaults are the shipped model's recipe.
 
     Attributes:
-        data: the sweep set's folder.
-        encoder, attender, decoder, width, readout, dropout, graph: the network, as in `EADConfig`.
-        objective: "supervised", or self-supervised: "simclr", "simsiam", "autoencoder".
-        loss: of the supervised objective: "anytime" (half of it on the last step, half on all
-            steps that can know anything) or "last" (the paper's: the last step alone).
-        augmentation: as in `augmentation.build`; self-supervised views differ by it alone.
-        masking: share of the steps of a window that are blanked.
-        optimizer, schedule: as in `optimizers`.
-        learning_rate: the peak.
-        warmup: share of all updates in which the rate rises; 10 of the paper's 100 epochs are 0.1.
-        drop_every: share of all updates between tenfold drops of the schedule "step"; StepLR(30)
-            of 100 epochs is 0.3.
-        epochs: passes over the training split.
-        updates: if positive, stop after exactly as many, whatever `epochs` says.
-        batch: sweeps per update, of all devices together.
-        clip_norm: largest norm of the gradient; 0: no clipping.
-        precision: "bf16" (mixed) or "fp32".
-        seed: of the weights, windows, noise and augmentation.
+        data: The sweep set's folder.
+        encoder, attender, decoder, width, readout, dropout, graph: Fields of the network, as in
+            `EADConfig`.
+        objective: The objective: "supervised", or self-supervised "simclr", "simsiam",
+            "autoencoder".
+        loss: The loss of the supervised objective: "anytime" (half of it on the last step, half on
+            all steps that can know anything) or "last" (the paper's: the last step alone).
+        augmentation: The augmentation, a name that `augmentation.build` takes; self-supervised
+            views differ by this alone.
+        masking: The share of the steps of a window that is blanked, from 0 to less than 1.
+        optimizer, schedule: Names of the optimizer and of the schedule of its rate, as in
+            `optimizers`.
+        learning_rate: The peak of the learning rate.
+        weight_decay: The weight decay of the optimizer.
+        warmup: The share of all updates in which the rate rises; 10 of the paper's 100 epochs are
+            0.1.
+        drop_every: The share of all updates between tenfold drops of the schedule "step";
+            StepLR(30) of 100 epochs is 0.3.
+        epochs: The number of passes over the training split.
+        updates: The number of updates to stop after, whatever `epochs` says; 0 leaves it to
+            `epochs`.
+        batch: The number of sweeps per update, of all devices together.
+        label_smoothing: The share of a label that is spread evenly over all classes.
+        clip_norm: The largest norm of the gradient, to which a larger one is scaled; 0 clips
+            nothing.
+        precision: The number format of the products, "bf16" (mixed) or "fp32".
+        seed: The seed of the weights, the windows, the noise and the augmentation.
 
     Raises:
         ConfigError: a value that cannot be.

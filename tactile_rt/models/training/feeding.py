@@ -43,9 +43,10 @@ class Batch:
     """What an update needs.
 
     Attributes:
-        views: one or two batches of loads, as `InputStage` takes them, each drawn by itself.
-        labels: (batch,).
-        index: which of the epoch's batches it is.
+        views: The loads, one or two batches of them, as `InputStage` takes them, each drawn by
+            itself.
+        labels: (batch,) The index of the category of each window.
+        index: The index of the batch among the epoch's, counted from 0.
     """
 
     views: list[Loads]

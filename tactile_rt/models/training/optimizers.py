@@ -77,7 +77,7 @@ class LARS(torch.optim.Optimizer):
 
 
 def parameter_groups(model: nn.Module, learning_rate: float, weight_decay: float) -> list[Any]:
-    """Groups of the parameters that are trained, by what their `_optim` asks for."""
+    """Groups of the parameters that are trained, by what their ``_optim`` asks for."""
     groups: dict[tuple[float, float], list[nn.Parameter]] = {}
     for parameter in model.parameters():
         if parameter.requires_grad:

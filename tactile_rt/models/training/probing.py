@@ -32,14 +32,14 @@ class ProbeConfig:
     """The paper's probe, but for `standardise`.
 
     Attributes:
-        data: sweep set; empty: what the network was trained on.
-        epochs, batch, learning_rate, momentum: of SGD.
-        drop_epochs: epochs between tenfold drops of the rate (StepLR).
-        standardise: fit on features of zero mean and unit variance, folded into the layer
-            afterwards; the paper does not, and features that are small then hardly train.
-        readout: "last" fits on the last step (the paper), "mean" on the mean of all steps that can
-            know anything: the only fair one for a network without memory.
-        seed: of the layer, the windows and their order.
+        data: The folder of the sweep set; empty takes the one that the network was trained on.
+        epochs, batch, learning_rate, momentum: Settings of stochastic gradient descent.
+        drop_epochs: The number of epochs between tenfold drops of the rate (StepLR).
+        standardise: Whether to fit on features of zero mean and unit variance, folded into the
+            layer afterwards; the paper does not, and features that are small then hardly train.
+        readout: The steps to fit on: "last" takes the last step (the paper), "mean" the mean of all
+            steps that can know anything, which is the only fair one for a network without memory.
+        seed: The seed of the layer, the windows and their order.
     """
 
     data: str = ""

@@ -10,10 +10,9 @@ objective = "simclr"
 learning_rate = [0.1, 0.01, 0.001, 0.0001]
 """
 
-import difflib
-import tomllib
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields as fields_of
+from dataclasses import replace
 from importlib import resources
 from itertools import product
 from pathlib import Path
@@ -22,20 +21,21 @@ from typing import Any
 import msgspec
 
 from tactile_rt.models.training.config import TrainingConfig
+from tactile_rt.settings import convert, hint, make_node, no_such, parse_toml, read_toml
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Recipe", "load_recipe", "read_recipe", "shipped_recipes"]
 
-KEYS = tuple(f.name for f in fields(TrainingConfig) if f.name != "data")
+KEYS = tuple(f.name for f in fields_of(TrainingConfig) if f.name != "data")
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A recipe file.
 
     Attributes:
-        about: what it is, in a line.
-        train: fields of `TrainingConfig`.
-        search: for some of them, all values that are to be tried.
+        about: Description of the recipe, in a line.
+        train: Fields of `TrainingConfig`, by their names.
+        search: Lists of all values that are to be tried, by the names of their fields.
     """
 
     about: str = ""
@@ -48,10 +48,9 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         Raises:
             ConfigError: a value that cannot be.
         """
-        try:
-            return msgspec.convert({**self.train, **overrides, "data": data}, TrainingConfig)
-        except msgspec.ValidationError as error:
-            raise ConfigError(_told(error)) from None
+        asked = {**self.train, **overrides, "data": data}
+        made: TrainingConfig = convert(make_node(asked, "training", 0, Path()), TrainingConfig)
+        return made
 
     def searched(self) -> Iterator[dict[str, Any]]:
         """Every combination of the values to be tried."""
@@ -75,33 +74,25 @@ def load_recipe(name: str) -> Recipe:
         ConfigError: there is none, or it is damaged; the message names the key.
     """
     if name.endswith(".toml"):
-        try:
-            text = Path(name).read_text()
-        except OSError as error:
-            raise ConfigError(f"{name}: {error.strerror}") from None
-        except UnicodeDecodeError:
-            raise ConfigError(f"{name} is not TOML: it is no text") from None
+        nodes = read_toml(Path(name))
     elif name in (known := shipped_recipes()):
-        text = (resources.files("tactile_rt.models") / "recipes" / f"{name}.toml").read_text()
+        shipped = resources.files("tactile_rt.models") / "recipes" / f"{name}.toml"
+        nodes = parse_toml(shipped.read_text(), name)
     else:
-        raise ConfigError(f"no recipe {name!r}; {_nearest(name, known)}")
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{name} is not TOML: {error}") from None
-    _check_keys(name, "", raw, Recipe.__struct_fields__)
-    try:
-        recipe = msgspec.convert(raw, Recipe)
-        for table, keys in (("train", recipe.train), ("search", recipe.search)):
-            _check_keys(name, f"{table}.", keys, KEYS)
-        for values in recipe.searched():  # the first is not the only one that must be possible
-            recipe.config("", **values)
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{name}: {_told(error)}") from None
-    except ConfigError as error:
-        raise ConfigError(
-            str(error) if str(error).startswith(name) else f"{name}: {error}"
-        ) from None
+        raise ConfigError(no_such("recipe", name, known))
+    recipe: Recipe = convert(nodes, Recipe)
+    empty = replace(nodes, value={})
+    train, search = (nodes.value.get(table, empty) for table in ("train", "search"))
+    for what, table in (("train", train), ("search", search)):
+        for key, node in table.value.items():
+            if key not in KEYS:
+                raise ConfigError(f"{node.where}: {what} has no key {key!r}; {hint(key, KEYS)}")
+    # The first of the values to be tried is not the only one that must be possible.
+    for values in product(*(node.value for node in search.value.values())):
+        fields = {**train.value, **dict(zip(search.value, values, strict=True))}
+        fields["data"] = make_node("", nodes.file, 0, nodes.folder)
+        tree = replace(nodes, value={"train": replace(train, value=fields)})
+        convert(tree, TrainingConfig, ["train"])
     return recipe
 
 
@@ -117,20 +108,3 @@ def read_recipe(name: str, data: str, **overrides: Any) -> TrainingConfig:
         ConfigError: there is none, it is damaged, or a value cannot be.
     """
     return load_recipe(name).config(data, **overrides)
-
-
-def _check_keys(name: str, table: str, given: Any, known: tuple[str, ...]) -> None:
-    for key in given:
-        if key not in known:
-            raise ConfigError(f"{name} has no key {table}{key}; {_nearest(key, known)}")
-
-
-def _nearest(name: str, known: tuple[str, ...]) -> str:
-    near = difflib.get_close_matches(name, known, 1)
-    return f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
-
-
-def _told(error: msgspec.ValidationError) -> str:
-    # "Expected `int`, got `str` - at `$.batch`" -> the key first, as everywhere else
-    what, _, where = str(error).partition(" - at `$.")
-    return f"{where.rstrip('`')}: {what.lower()}" if where else what

@@ -19,16 +19,22 @@ or, for several animals in one world, ``[[animal]]`` tables with ``array = "rat-
 or a file) and a ``mount`` of their own.
 """
 
-import csv
-import difflib
-import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from tactile_rt.settings import (
+    SettingNode,
+    check_columns,
+    convert,
+    hint,
+    named,
+    read_csv,
+    read_toml,
+)
 from tactile_rt.sim_backend.arrays.species import species_array
 from tactile_rt.sim_backend.arrays.whisker_array import (
     HEAD_FILES,
@@ -100,58 +106,22 @@ def read_animals(path: Path) -> tuple[WhiskerArray, ...]:
     Raises:
         ConfigError: one line that names the file, the line or whisker, the column, and what to do.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{path}: is not UTF-8 text; save it as UTF-8") from None
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     if path.suffix.lower() == ".csv":
-        whiskers = _csv_whiskers(path, text)
+        whiskers = _csv_whiskers(path)
         return (WhiskerArray(path.stem, whiskers, centred_mount(whiskers)),)
-    return _toml_animals(path, text)
+    return _toml_animals(path)
 
 
-def _csv_whiskers(path: Path, text: str) -> tuple[Whisker, ...]:
-    lines = [
-        (number, [cell.strip() for cell in next(csv.reader([line]))])
-        for number, line in enumerate(text.splitlines(), start=1)
-        if line.strip(" ,") and not line.startswith("#")  # spreadsheets keep empty rows as commas
-    ]
-    if not lines:
-        raise ConfigError(f"{path}: is empty; its first line names the columns")
-    (number, header), *rows = lines
-    where = f"{path}, line {number}"
-    if len(header) == 1 and ";" in header[0]:
-        raise ConfigError(f"{where}: columns are separated by semicolons; use commas")
-    _known(where, header)
-    for column in REQUIRED:
-        if column not in header:
-            raise ConfigError(f"{where}: no column {column}; add it")
-    if len(set(header)) < len(header):
-        twice = next(c for i, c in enumerate(header) if c in header[:i])
-        raise ConfigError(f"{where}: column {twice} is there twice; remove one")
-    whiskers = []
-    for number, cells in rows:
-        where = f"{path}, line {number}"
-        if len(cells) != len(header):
-            raise ConfigError(f"{where}: {len(cells)} values for {len(header)} columns")
-        values = dict(zip(header, cells, strict=True))
-        whiskers.append((where, _whisker(where, values)))
+def _csv_whiskers(path: Path) -> tuple[Whisker, ...]:
+    table = read_csv(path)
+    check_columns(table, COLUMNS, REQUIRED)
+    whiskers = [(row.where, _whisker(row.where, row.plain())) for row in table.rows]
     return _distinct(path, whiskers)
 
 
-def _toml_animals(path: Path, text: str) -> tuple[WhiskerArray, ...]:
-    try:
-        file = msgspec.toml.decode(text, type=_File)
-    except msgspec.MsgspecError as error:
-        message = str(error)
-        if unknown := re.search(r"unknown field `(.*?)`", message):
-            fields = [f for struct in (_File, _Mount, _Animal) for f in struct.__struct_fields__]
-            message += _hint(unknown[1], fields)
-        raise ConfigError(f"{path}: {message}") from None
+def _toml_animals(path: Path) -> tuple[WhiskerArray, ...]:
+    nodes = read_toml(path)
+    file: _File = convert(nodes, _File)
     if bool(file.animal) == bool(file.whisker):
         raise ConfigError(f"{path}: needs [[whisker]] tables or [[animal]] tables, one of the two")
     if file.animal:
@@ -161,13 +131,15 @@ def _toml_animals(path: Path, text: str) -> tuple[WhiskerArray, ...]:
                 f"mount and defaults belong in the file of an array"
             )
         return place([_animal(path, animal) for animal in file.animal])
-    _known(f"{path}, defaults", file.defaults)
+    if file.defaults:
+        _check_columns(nodes, ["defaults"])
     whiskers = []
-    for number, values in enumerate(file.whisker, start=1):
-        where = f"{path}, whisker {number}"
+    for number, values in enumerate(file.whisker):
+        at: list[str | int] = ["whisker", number]
+        _check_columns(nodes, at)
+        where = f"{nodes.at(at).where}: {named(at)}"
         if isinstance(values.get("whisker"), str):
             where += f" ({values['whisker']})"
-        _known(where, values)
         whiskers.append((where, _whisker(where, file.defaults | values)))
     made = _distinct(path, whiskers)
     mount = _mount(path, file.mount) if file.mount else centred_mount(made)
@@ -220,16 +192,14 @@ def _distinct(path: Path, whiskers: list[tuple[str, Whisker]]) -> tuple[Whisker,
         for key in (f"whisker {w.name}", cell):
             if key in first:
                 raise ConfigError(f"{where}: {key} is taken already ({first[key]}); change one")
-            first[key] = where.removeprefix(f"{path}, ")
+            first[key] = f"line {where.removeprefix(f'{path}:')}"
     return tuple(w for _, w in whiskers)
 
 
-def _known(where: str, given: Iterable[str]) -> None:
-    for column in given:
-        if column not in COLUMNS:
-            raise ConfigError(f"{where}: unknown column {column!r}{_hint(column, COLUMNS)}")
-
-
-def _hint(name: str, known: Iterable[str]) -> str:
-    near = difflib.get_close_matches(name, list(known), 1)
-    return f"; did you mean {near[0]}?" if near else f"; there are {', '.join(known)}"
+def _check_columns(nodes: SettingNode, path: list[str | int]) -> None:
+    """Refuse a key of a table that is no column."""
+    for key, node in nodes.at(path).value.items():
+        if key not in COLUMNS:
+            raise ConfigError(
+                f"{node.where}: {named(path)} has no key {key!r}; {hint(key, COLUMNS)}"
+            )

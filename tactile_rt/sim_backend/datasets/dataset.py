@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.settings import no_such
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, contact_distances
 from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
 from tactile_rt.sim_backend.datasets.inventory import write_sums, written_sum
 from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove_leftovers
 from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObjects, choose_objects
-from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
 from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
@@ -107,7 +107,7 @@ def make_sweeps(
         TactileError: an object kills every process that tries to make it.
     """
     if engine not in ENGINES:
-        raise ConfigError(misnamed("engine", engine, ENGINES))
+        raise ConfigError(no_such("engine", engine, ENGINES))
     manifest = describe_set(recipe)
     names = manifest.names(splits)  # which refuses unknown ones before anything is written
     _refuse_strays(folder, manifest)

@@ -1,15 +1,23 @@
 """Recipes from files: a user's own in TOML, those that ship, and those that a set was made by."""
 
-import math
-import tomllib
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
+
+from tactile_rt.settings import (
+    SettingNode,
+    convert,
+    make_node,
+    no_such,
+    parse_toml,
+    read_toml,
+    refusal,
+)
 from tactile_rt.sim_backend.arrays.files import load_animals
-from tactile_rt.sim_backend.datasets.recipe_tables import Table, misnamed
 from tactile_rt.sim_backend.datasets.recipes import (
     PARAMETERS,
     SHAPES,
@@ -35,6 +43,49 @@ __all__ = [
 
 DEFAULT_RECIPE = "default24"
 
+Text = Annotated[str, msgspec.Meta(min_length=1)]
+
+
+class _Objects(msgspec.Struct):
+    source: Text = msgspec.field(name="from", default=SHAPES)
+    categories: tuple[str, ...] = ()
+    withheld: tuple[str, ...] = ()
+    per_category: int | None = None
+    validation: float | None = None
+    test: float | None = None
+    per_withheld: int = 0
+
+
+class _Range(msgspec.Struct):
+    between: tuple[float, ...] | None = None
+    each: tuple[float, ...] | None = None
+
+
+class _Sweeps(msgspec.Struct):
+    size_mm: float | _Range | None = None
+    speed_mm_s: float | _Range | None = None
+    yaw_deg: float | _Range | None = None
+    height_mm: float | _Range | None = None
+    distance_mm: float | _Range | None = None
+    gap_mm: float | _Range | None = None
+    draws: int = 1
+    held_out_draws: int = 0
+
+
+class _File(msgspec.Struct):
+    name: Text = SweepRecipe.name
+    array: Text = SweepRecipe.array
+    profile: Text = SweepRecipe.profile
+    seed: int = SweepRecipe.seed
+    period_ms: float = SweepRecipe.period_ms
+    lead_ms: float = SweepRecipe.lead_ms
+    length_ms: float = SweepRecipe.length_ms
+    contacts: bool = False
+    objects: _Objects = msgspec.field(default_factory=_Objects)
+    sweeps: _Sweeps = msgspec.field(default_factory=_Sweeps)
+    sensor: SensorModel = msgspec.field(default_factory=SensorModel)
+    randomisation: Randomisation = msgspec.field(default_factory=Randomisation)
+
 
 def shipped_recipes() -> tuple[str, ...]:
     """Names of the recipes that ship with the package."""
@@ -51,25 +102,12 @@ def read_recipe(name: str) -> SweepRecipe:
         ConfigError: no such recipe, or something in it is wrong.
     """
     if Path(name).suffix == ".toml":
-        path = Path(name)
-        try:
-            text = path.read_text(encoding="utf-8")
-        except OSError as error:
-            raise ConfigError(f"cannot read recipe {path}: {error.strerror}") from None
-        except UnicodeDecodeError:
-            raise ConfigError(f"{path} is not a recipe: not UTF-8 text") from None
-    elif name in shipped_recipes():
-        shipped = resources.files(__package__) / "recipes" / f"{name}.toml"
-        text = shipped.read_text(encoding="utf-8")
-    else:
-        raise ConfigError(
-            misnamed("recipe", name, shipped_recipes()) + ", and files that end in .toml"
-        )
-    try:
-        raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{name} is not TOML: {error}") from None
-    return recipe_from_dict(raw, name)
+        return _recipe(read_toml(Path(name)))
+    if name not in shipped_recipes():
+        known = no_such("recipe", name, shipped_recipes())
+        raise ConfigError(f"{known} (or give a file that ends in .toml)")
+    shipped = resources.files(__package__) / "recipes" / f"{name}.toml"
+    return _recipe(parse_toml(shipped.read_text(encoding="utf-8"), name))
 
 
 def recipe_of_set(recipe: dict[str, Any], categories: Sequence[str]) -> SweepRecipe:
@@ -112,47 +150,56 @@ def recipe_from_dict(raw: dict[str, Any], where: str = "recipe") -> SweepRecipe:
         ConfigError: a key is unknown or of the wrong kind, or a value out of range: one line
             that says which, where.
     """
-    top = Table(where, raw)
-    objects, sweeps = top.table("objects"), top.table("sweeps")
-    source, array = objects.text("from", SHAPES), top.text("array", SweepRecipe.array)
+    return _recipe(make_node(raw, where, 0, Path()))
+
+
+def _recipe(nodes: SettingNode) -> SweepRecipe:
+    file: _File = convert(nodes, _File)
+    objects, array = file.objects, file.array
+    for key in ("categories", "withheld"):
+        names = getattr(objects, key)
+        if len(set(names)) < len(names):
+            twice = next(n for i, n in enumerate(names) if n in names[:i])
+            raise refusal(nodes, ["objects", key], f"{twice!r} is there twice; remove one")
     array = _absolute(array) if Path(array).suffix else array
     usual = {name: getattr(SweepChoice, name) for name in PARAMETERS}
-    if "distance_mm" not in sweeps:
+    if file.sweeps.distance_mm is None:
         with suppress(ConfigError):  # of an array that is not there: told when it is needed
             usual["distance_mm"] = usual_distance(load_animals(array))
-    all_of_it = source != SHAPES  # a folder's own counts; the published split is 8 : 1 : 1
-    recipe: dict[str, Any] = {
-        "name": top.text("name", SweepRecipe.name),
-        "array": array,
-        "profile": top.text("profile", SweepRecipe.profile),
-        "seed": top.whole("seed", SweepRecipe.seed),
-        "period_ms": top.number("period_ms", SweepRecipe.period_ms),
-        "lead_ms": top.number("lead_ms", SweepRecipe.lead_ms),
-        "length_ms": top.number("length_ms", SweepRecipe.length_ms),
-        "contacts": top.flag("contacts"),
-        "objects": ObjectChoice(
-            source=_absolute(source) if source != SHAPES else source,
-            categories=objects.names("categories"),
-            withheld=objects.names("withheld"),
-            per_category=objects.whole("per_category", 0 if all_of_it else 60),
-            validation=objects.number("validation", 0.1 if all_of_it else 4),
-            test=objects.number("test", 0.1 if all_of_it else 12),
-            per_withheld=objects.whole("per_withheld", 0),
-        ),
-        "sweeps": SweepChoice(
-            **{n: _choice(sweeps, n, usual[n]) for n in PARAMETERS},
-            draws=sweeps.whole("draws", 1),
-            held_out_draws=sweeps.whole("held_out_draws", 0),
-        ),
-        "sensor": top.table("sensor").filled(SensorModel),
-        "randomisation": top.table("randomisation").filled(Randomisation),
-    }
-    for table in (objects, sweeps, top):
-        table.refuse_others()
+    all_of_it = objects.source != SHAPES  # a folder's own counts; the published split is 8 : 1 : 1
+
+    def counted(given: float | None, of_a_folder: float, of_shapes: float) -> float:
+        return (of_a_folder if all_of_it else of_shapes) if given is None else given
+
     try:
-        return SweepRecipe(**recipe)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from None
+        return SweepRecipe(
+            name=file.name,
+            array=array,
+            profile=file.profile,
+            seed=file.seed,
+            period_ms=file.period_ms,
+            lead_ms=file.lead_ms,
+            length_ms=file.length_ms,
+            contacts=file.contacts,
+            objects=ObjectChoice(
+                source=_absolute(objects.source) if all_of_it else SHAPES,
+                categories=objects.categories,
+                withheld=objects.withheld,
+                per_category=int(counted(objects.per_category, 0, 60)),
+                validation=counted(objects.validation, 0.1, 4),
+                test=counted(objects.test, 0.1, 12),
+                per_withheld=objects.per_withheld,
+            ),
+            sweeps=SweepChoice(
+                **{n: _choice(nodes, n, file.sweeps, usual[n]) for n in PARAMETERS},
+                draws=file.sweeps.draws,
+                held_out_draws=file.sweeps.held_out_draws,
+            ),
+            sensor=file.sensor,
+            randomisation=file.randomisation,
+        )
+    except ConfigError as error:  # how its parts fit together
+        raise ConfigError(f"{nodes.where}: {error}") from None
 
 
 def _absolute(path: str) -> str:
@@ -160,21 +207,15 @@ def _absolute(path: str) -> str:
     return str(Path(path).expanduser().absolute())
 
 
-def _choice(table: Table, name: str, default: Choice) -> Choice:
-    raw = table.take(name)
-    if raw is None:
-        return default
-    if isinstance(raw, dict):
-        inner = Table(table.where, raw, f"{table.prefix}{name}.")
-        between, each = inner.numbers("between"), inner.numbers("each")
-        inner.refuse_others()
-        if len(between or ()) == 2 and each is None:
-            assert between is not None
-            return Between(*between)
-        if each and between is None:
-            return Each(each)
-    elif not isinstance(raw, bool) and isinstance(raw, int | float) and math.isfinite(raw):
-        return float(raw)
-    raise table.wrong(
-        name, raw, "a number, { between = [low, high] } or { each = [a number, ...] }"
-    )
+def _choice(nodes: SettingNode, name: str, sweeps: _Sweeps, usual: Choice) -> Choice:
+    written: float | _Range | None = getattr(sweeps, name)
+    if not isinstance(written, _Range):
+        return usual if written is None else written
+    if len(written.between or ()) == 2 and written.each is None:
+        assert written.between is not None
+        return Between(*written.between)
+    if written.each and written.between is None:
+        return Each(written.each)
+    found = nodes.at(["sweeps", name]).plain()
+    wanted = "a number, { between = [low, high] } or { each = [a number, ...] }"
+    raise refusal(nodes, ["sweeps", name], f"expected {wanted}, got {found!r:.60}")

@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
+from tactile_rt.settings import no_such
 from tactile_rt.sim_backend.datasets.recipes import SHAPES, ObjectChoice
 from tactile_rt.sim_backend.objects import catalogue as shapes
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
@@ -188,4 +188,4 @@ def _count(wanted: float, of: int) -> int:
 def _check(names: Sequence[str], known: Sequence[str]) -> None:
     for name in names:
         if name not in known:
-            raise ConfigError(misnamed("category", name, known))
+            raise ConfigError(no_such("category", name, known))

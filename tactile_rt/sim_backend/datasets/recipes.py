@@ -30,7 +30,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_rt.sim_backend.datasets.recipe_tables import misnamed
+from tactile_rt.settings import no_such
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep
@@ -305,7 +305,7 @@ def _written(choice: Choice) -> Any:
 
 def _check_recipe(recipe: SweepRecipe) -> None:
     if recipe.profile not in PROFILES:
-        raise ConfigError(misnamed("profile", recipe.profile, tuple(PROFILES)))
+        raise ConfigError(no_such("profile", recipe.profile, tuple(PROFILES)))
     if recipe.seed < 0:
         raise ConfigError(f"seed must be 0 or more, not {recipe.seed}")
     if recipe.period_ms < SAMPLE_MS:

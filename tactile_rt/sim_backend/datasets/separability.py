@@ -43,8 +43,8 @@ class Features:
     """What a machine sees of some sweeps.
 
     Attributes:
-        values: (sweep, feature).
-        categories: (sweep,) names.
+        values: The (sweep, feature) features, see `window_features`.
+        categories: The (sweep,) names of the categories.
     """
 
     values: NDArray[np.float32]
@@ -56,12 +56,12 @@ class Separability:
     """How well classes are told apart, on objects that were not trained on.
 
     Attributes:
-        classes: how many at a time.
-        subsets: how many choices of so many classes were tried.
-        accuracy: mean over these, each the mean over its classes; 0 to 1.
-        spread: standard deviation over these.
-        chance: what guessing gives.
-        of: the classes, where there was one choice.
+        classes: The number of classes at a time.
+        subsets: The number of choices of so many classes that were tried.
+        accuracy: The mean accuracy over these choices, each the mean over its classes; 0 to 1.
+        spread: The standard deviation of the accuracy over these choices.
+        chance: The accuracy that guessing gives; 0 to 1.
+        of: The names of the classes, where there was one choice.
     """
 
     classes: int

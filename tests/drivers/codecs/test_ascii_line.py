@@ -248,18 +248,21 @@ def test_bad_columns_are_named(columns: str, message: str) -> None:
 
 
 BAD_FILES = [
-    ("columns = [", "not TOML: "),
-    ("rate_hz = 5.0", "Object missing required field `columns`"),
-    ('columns = ["A0.fx"]\nrate = 5.0', "Object contains unknown field `rate`"),
-    ('columns = ["A0.fx"]\nrate_hz = "fast"', "Expected `float`, got `str` - at `$.rate_hz`"),
-    ('columns = ["A0.fx"]\nrate_hz = -1.0', "array 'ascii_line': rate_hz must be positive"),
-    ('columns = ["A0.fx", "A0:fy"]', "columns[1]: 'A0:fy' is no column"),
-    ('columns = ["A0.fx"]\nversion = 2', "version 2; this release reads 1"),
-    ('columns = ["A0.fx"]\n[elements.B1]', "no column is of elements.B1"),
-    ('columns = ["A0.fx"]\n[elements.A0]\ngrid = [0]', "Expected `array` of length 2"),
+    ("columns = [", "1: not TOML: "),
+    ("rate_hz = 5.0", " needs a key 'columns'"),
+    ('columns = ["A0.fx"]\nrate = 5.0', "2: the file has no key 'rate'; did you mean rate_hz?"),
+    ('columns = ["A0.fx"]\nrate_hz = "fast"', "2: rate_hz: expected a number, got 'fast'"),
+    ('columns = ["A0.fx"]\nrate_hz = -1.0', " array 'ascii_line': rate_hz must be positive"),
+    ('columns = ["A0.fx", "A0:fy"]', " columns[1]: 'A0:fy' is no column"),
+    ('columns = ["A0.fx"]\nversion = 2', " version 2; this release reads 1"),
+    ('columns = ["A0.fx"]\n[elements.B1]', " no column is of elements.B1"),
+    (
+        'columns = ["A0.fx"]\n[elements.A0]\ngrid = [0]',
+        "3: elements.A0.grid: expected a list of 2 whole numbers, got",
+    ),
     (
         'columns = ["A0.fx", "A1.fx"]\n[elements.A1]\ngrid = [0, 0]',
-        "array 'ascii_line': grid repeat",
+        " array 'ascii_line': grid repeat",
     ),
 ]
 
@@ -270,7 +273,7 @@ def test_bad_files_are_named(tmp_path: Path, text: str, message: str) -> None:
     path.write_text(text)
     with pytest.raises(ConfigError) as error:
         AsciiLine(AsciiLineOptions(mapping=str(path)))
-    assert str(error.value).startswith(f"{path}: {message}") and "\n" not in str(error.value)
+    assert str(error.value).startswith(f"{path}:{message}") and "\n" not in str(error.value)
 
 
 def test_other_mistakes_are_named(tmp_path: Path) -> None:
@@ -280,9 +283,9 @@ def test_other_mistakes_are_named(tmp_path: Path) -> None:
         AsciiLineOptions(mapping="a.toml", columns="A0.fx")
     with pytest.raises(ConfigError, match="rate_hz must be positive, not -1"):
         AsciiLineOptions(columns="A0.fx", rate_hz=-1.0)
-    with pytest.raises(ConfigError, match=r"none\.toml: No such file"):
+    with pytest.raises(ConfigError, match=r"none\.toml: no such file"):
         AsciiLine(AsciiLineOptions(mapping=str(tmp_path / "none.toml")))
     binary = tmp_path / "binary.toml"
     binary.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match=r"binary\.toml: not a text file"):
+    with pytest.raises(ConfigError, match=r"binary\.toml:1: not UTF-8 text"):
         AsciiLine(AsciiLineOptions(mapping=str(binary)))

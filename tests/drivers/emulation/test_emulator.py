@@ -24,10 +24,9 @@ from tactile_rt.drivers.slcan import SlcanDecoder, encode, opening
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
 from tactile_rt.testing.fixtures import fake_can, fake_serial  # noqa: F401
-from tests.helpers.waiting import until
+from tests.helpers.waiting import PATIENCE_S, until
 
 SPEC = small_spec(4)
-PATIENCE_S = 20.0  # a test that waits so long has failed
 
 
 @pytest.fixture(autouse=True)
@@ -74,8 +73,10 @@ class Host:
 
     def read_all(self, device: Emulator) -> None:
         end = time.monotonic() + PATIENCE_S
-        while self.read(0.1) or not device.done:
+        over = False
+        while self.read(0.1) or not over:
             assert time.monotonic() < end
+            over = device.done  # from then on, what is left can be read at once
         self.close()
 
     def __getattr__(self, name: str) -> np.ndarray:
@@ -132,10 +133,10 @@ def test_it_waits_for_its_host_and_stops_when_told() -> None:
             host.read(PATIENCE_S)
         os.write(host.fd, host.codec.commands(Command.STOP)[0].send)
         until(lambda: not device.codec.streaming)
-        while host.read(0.2):
-            pass
         sent = device.log.sent
-        assert sent < 5000 and len(host.count) == sent
+        until(lambda: len(host.count) >= sent, meanwhile=lambda: host.read(0.1))
+        assert not host.read(0.2)
+        assert sent < 5000 and len(host.count) == sent == device.log.sent
         os.write(host.fd, host.codec.commands(Command.START)[-1].send)
         host.read_all(device)
     assert host.count.tolist() == list(range(5000)), "the counter stands still meanwhile"
@@ -265,12 +266,11 @@ def test_unplugged_it_is_gone_and_replugged_it_is_there_under_its_name(tmp_path:
 def test_a_schedule_unplugs_and_replugs(tmp_path: Path) -> None:
     faults = FaultSchedule([Fault("unplug", at_s=0.6, duration_s=0.3)])
     link = tmp_path / "port"
-    options = {"pace": "realtime", "faults": faults, "endpoint": SerialEndpoint(link)}
-    with native(1500, **options) as device:
+    with native(1500, faults=faults, endpoint=SerialEndpoint(link)) as device:
         host = Host(str(link))
-        end = time.monotonic() + PATIENCE_S
-        while host.read(1.0):
-            assert time.monotonic() < end
+        until(lambda: device.log.counts[Fate.UNHEARD], meanwhile=lambda: host.read(0.1))
+        while host.read(0.0):
+            pass  # what had come before
         until(link.is_symlink)
         again = Host(str(link), host.codec, start=False)
         again.read_all(device)
@@ -306,14 +306,18 @@ def test_slcan_sends_nothing_before_the_channel_is_open() -> None:
         host, decoder = NativeCan(NativeCanOptions()), SlcanDecoder()
         asked = b"".join(encode(step.send) for step in host.commands(Command.START))
         os.write(fd, asked)
-        time.sleep(0.05)
-        while select.select([fd], [], [], 0.1)[0]:
+        while decoder.bells < 2:  # two frames while closed: two errors
+            assert select.select([fd], [], [], PATIENCE_S)[0]
             decoder.feed(os.read(fd, 65_536))
-        assert decoder.bells == 2 and device.log.sent == 0  # two frames while closed: two errors
+        assert not select.select([fd], [], [], 0.1)[0]
+        assert decoder.bells == 2 and device.log.sent == 0
         os.write(fd, b"".join(opening(1_000_000)) + asked)
         samples = []
-        while select.select([fd], [], [], 0.3)[0] or not device.done:
-            samples.append(host.feed(decoder.feed(os.read(fd, 65_536)), 0))
+        over = False
+        while (ready := select.select([fd], [], [], 0.1)[0]) or not over:
+            if ready:
+                samples.append(host.feed(decoder.feed(os.read(fd, 65_536)), 0))
+            over = device.done
         os.close(fd)
     counts = np.concatenate([s.count for s in samples if s is not None])
     values = np.concatenate([s.values for s in samples if s is not None])

@@ -50,21 +50,24 @@ def test_a_schedule_is_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('kind = "bitflip"\nrate = 1', "fault 1: no fault kind 'bitflip'; did you mean bit_flip?"),
+        (
+            'kind = "bitflip"\nrate = 1',
+            "faults.toml:1: fault[0]: no fault kind 'bitflip'; did you mean bit_flip?",
+        ),
         ('kind = "xyz"\nrate = 1', "there are bit_flip, truncate"),
-        ('kind = "drop"\nrat = 1', "unknown key 'rat'; did you mean rate?"),
+        ('kind = "drop"\nrat = 1', ":3: fault[0] has no key 'rat'; did you mean rate?"),
         ('kind = "drop"', "either rate, per second, or at_s"),
         ('kind = "drop"\nrate = 1\nat_s = 2', "either rate, per second, or at_s"),
         ('kind = "drop"\nrate = -1', "rate must be 0 or more, not -1"),
-        ('kind = "drop"\nrate = "often"', "Expected `float`, got `str` - at `$.rate`"),
+        ('kind = "drop"\nrate = "often"', ":3: fault[0].rate: expected a number, got 'often'"),
         ('kind = "drop"\nat_s = 0.2', "at_s must be 0.5 or more"),
         ('kind = "drop"\nat_s = 2\nduration_s = 1', "duration_s: drop has none"),
         ('kind = "stall"\nat_s = 2', "duration_s must be more than 0 for stall"),
         ('kind = "stall"\nat_s = 2\nduration_s = 1\namount = 2', "amount: stall has none"),
         ('kind = "truncate"\nat_s = 2\namount = 0', "amount must be a whole number of bytes"),
         ('kind = "truncate"\nat_s = 2\namount = 1.5', "amount must be a whole number of bytes"),
-        ('kind = "clock_jump"\nat_s = 2\namount = nan', "amount must be a number"),
-        ("rate = 1", "missing required field `kind`"),
+        ('kind = "clock_jump"\nat_s = 2\namount = nan', "fault[0].amount: nan is no quantity"),
+        ("rate = 1", "fault[0]: needs a key 'kind'"),
         ("kind = ", "Invalid value"),
     ],
 )
@@ -81,10 +84,10 @@ def test_a_mistake_is_one_line_that_names_file_and_key(
 
 
 def test_so_is_a_file_that_is_none(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="No such file"):
+    with pytest.raises(ConfigError, match="no such file"):
         read_faults(tmp_path / "none.toml")
     (tmp_path / "a.toml").write_text("[[faults]]\n")
-    with pytest.raises(ConfigError, match=r"unknown field `faults`; it has seed and \[\[fault\]\]"):
+    with pytest.raises(ConfigError, match="the file has no key 'faults'; did you mean fault"):
         read_faults(tmp_path / "a.toml")
     (tmp_path / "b.toml").write_text("seed = 1\n")
     with pytest.raises(ConfigError, match="give at least one"):

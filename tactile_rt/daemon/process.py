@@ -1,0 +1,141 @@
+"""The daemon as a process's only work: signals, exit codes, one instance.
+
+A process is a daemon from its first line on. Until it can obey a signal it has to import for a good
+part of a second; so `note_signals` comes first, before anything heavy, and `run_daemon` looks at
+what was noted before it starts anything. That is why this module imports next to nothing itself.
+"""
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from enum import IntEnum
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from types import FrameType
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tactile_rt.daemon.daemon import Daemon
+
+__all__ = ["ExitCode", "leave", "note_signals", "run_daemon"]
+
+SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+OVER = 0  # no signal has this number
+TURN_S = 0.25  # how often the main loop tells that it goes on
+SWITCH_S = 0.001  # how long a thread that computes may keep those waiting that acquire
+
+Calls = SimpleQueue[int]  # what a signal handler may put into
+
+_noted: Calls = SimpleQueue()  # before anybody ran a daemon
+
+
+class ExitCode(IntEnum):
+    """What the process tells at its end.
+
+    After `CONFIG` and `RUNNING` nothing has been started, and to start again changes nothing.
+    """
+
+    STOPPED = 0  # by a signal, or all streams were over; everything is closed
+    CONFIG = 2  # the configuration is wrong
+    RUNNING = 3  # another process has the configuration, or a device
+    ABANDONED = 4  # stopped, but a part did not end in time and may not have written everything
+
+
+def note_signals() -> None:
+    """From now on let no signal end the process but through `run_daemon`, which obeys those that
+    have come by then; for good, so that none ends it while Python winds down, either."""
+    for number in SIGNALS:
+        signal.signal(number, lambda number, frame: _noted.put(number))
+
+
+def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = None) -> ExitCode:
+    """Run until SIGTERM or SIGINT, until all streams are over, or for so many seconds.
+
+    SIGHUP reads the configuration again.
+
+    Raises:
+        ConfigError: The configuration is wrong.
+        AlreadyRunning: Another process has it, or a device.
+    """
+    # Signals, and the end of all streams.
+    calls: Calls = SimpleQueue()
+
+    def note(number: int, frame: FrameType | None) -> None:
+        calls.put(number)
+
+    before = [signal.signal(number, note) for number in SIGNALS]
+    switch = sys.getswitchinterval()
+    try:
+        if _asked_to_end(_noted):
+            return ExitCode.STOPPED
+        # Late, as all this takes its time.
+        from tactile_rt.daemon.checks import check_config
+        from tactile_rt.daemon.daemon import Daemon
+        from tactile_rt.daemon.loading import load_config
+        from tactile_rt.daemon.lock import Locks
+
+        loaded = load_config(path, sets)
+        check_config(loaded)
+        if _asked_to_end(calls):
+            return ExitCode.STOPPED
+        sys.setswitchinterval(SWITCH_S)
+        daemon = Daemon(loaded, locks=Locks(), freeze=True, on_over=lambda: calls.put(OVER))
+        try:
+            daemon.start()
+            _serve(daemon, path, sets, calls, seconds)
+        finally:
+            late = daemon.stop()
+    finally:
+        sys.setswitchinterval(switch)
+        for number, handler in zip(SIGNALS, before, strict=True):
+            signal.signal(number, handler)
+    return ExitCode.ABANDONED if late else ExitCode.STOPPED
+
+
+def _asked_to_end(calls: Calls) -> bool:
+    """Whether any signal but SIGHUP has come. One that has is left for later: between the file's
+    last line and now it may have been written anew."""
+    numbers = [calls.get_nowait() for _ in range(calls.qsize())]
+    if any(number != signal.SIGHUP for number in numbers):
+        return True
+    for number in numbers[:1]:
+        calls.put(number)
+    return False
+
+
+def _serve(
+    daemon: "Daemon", path: Path, sets: Sequence[str], calls: Calls, seconds: float | None
+) -> None:
+    from tactile_rt.daemon.checks import check_config
+    from tactile_rt.daemon.loading import load_config
+    from tactile_rt.stream import TactileError
+
+    end = None if seconds is None else time.monotonic() + seconds
+    while True:
+        daemon.turned("main")
+        left = TURN_S if end is None else min(TURN_S, end - time.monotonic())
+        if left < 0:
+            return
+        try:
+            number = calls.get(timeout=left)
+        except Empty:
+            continue
+        if number != signal.SIGHUP:
+            return
+        daemon.report("daemon", "reloading", "")
+        try:
+            loaded = load_config(path, sets)
+            check_config(loaded)
+            daemon.reload(loaded)
+        except TactileError as error:
+            daemon.report("daemon", "refused", f"the old configuration goes on: {error}", "error")
+
+
+def leave(code: ExitCode) -> None:
+    """End the process; past threads that hang, which would otherwise keep it."""
+    if code == ExitCode.ABANDONED:
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)

@@ -1,0 +1,206 @@
+"""The soak itself, for a moment, with faults that leave nothing out; and what it reckons with."""
+
+import itertools
+import resource
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx", reason="needs onnx: pip install 'tactile-rt[train]'")
+pytest.importorskip("mcap", reason="needs mcap: pip install 'tactile-rt[record]'")
+pytest.importorskip("zenoh", reason="needs zenoh: pip install 'tactile-rt[publish]'")
+
+from bench.daemon import chaos
+from bench.daemon.accounts import RecordedSamples, account
+from bench.daemon.disk import disk_full
+from bench.daemon.latencies import latencies
+from bench.daemon.models import finger_array, whisker_array, write_wide_model
+from bench.daemon.soak import soak_records
+from bench.daemon.soak_rig import soak
+from bench.emulated import KINDS, Played, fault_beat
+from tactile_rt.classifier.classifier import Classifier
+from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.daemon.config import RecorderConfig
+from tactile_rt.daemon.health import Snapshot
+from tactile_rt.daemon.items import Opened, SourceChunk
+from tactile_rt.daemon.recorder import Recorder
+from tactile_rt.drivers.emulation.faults import Fate
+from tactile_rt.recording import Recording, recover
+from tactile_rt.recording.reader import is_finished
+from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource
+from tactile_rt.stream import Chunk
+from tactile_rt.testing import ArraySource, cut, small_spec
+
+MS = 1_000_000
+MUST = ("unbalanced", "unexplained", "miscounted", "queues_unbalanced", "queues_dropped",
+        "decisions_lost", "parts_broken", "unfinished", "tracebacks")  # fmt: skip
+
+
+@pytest.mark.slow
+def test_under_faults_every_sample_is_delivered_or_counted():
+    result = soak(10.0, every_s=0.45, first_s=1.5)
+    struck = {kind for played in result.played.values() for kind, _, _ in played.faults}
+    assert struck == {"can_error", *(fault.kind for fault in KINDS)}
+    fates = np.concatenate([played.fate for played in result.played.values()])
+    assert {Fate.CORRUPTED, Fate.DROPPED, Fate.UNHEARD, Fate.DUPLICATED} <= set(fates.tolist())
+    records = soak_records(result)
+    wrong = [(r.name, r.value, r.anchor, r.how) for r in records
+             if r.name.endswith(MUST) and r.value != 0]  # fmt: skip
+    assert wrong == []
+    assert result.code == 0
+    assert all(len(heard.t_ns) > 20 for heard in result.heard.values())
+    pulled = sum(kind == "unplug" for p in result.played.values() for kind, _, _ in p.faults)
+    assert sum("device:lost" in line for line in result.log.splitlines()) == pulled
+
+
+@pytest.mark.slow
+def test_what_is_disturbed_loses_no_sample(monkeypatch):
+    """What is told too often depends on who else uses the machine; `bench daemon` counts it."""
+    monkeypatch.setattr(chaos, "disk_full", lambda times: [])  # below
+    records = {r.name.removeprefix("daemon.chaos."): r for r in chaos.chaos(quick=True)}
+    for name in ("whiskers_lost", "finger_lost", "exit_code"):
+        assert records[name].value == 0, records[name]
+    assert {f"{kind}_recovery" for kind in chaos.KINDS} <= set(records)
+
+
+@pytest.mark.slow
+def test_what_a_full_disk_did_not_take_is_counted_to_the_sample():
+    records = {r.name.removeprefix("daemon.chaos.disk_full_"): r for r in disk_full(2)}
+    for name in ("acquisition_lost", "uncounted", "told_wrongly", "exit_code"):
+        assert records[name].value == 0, records[name]
+
+
+class Watching:
+    """What a recorder sees of the daemon."""
+
+    def __init__(self):
+        self.told = []
+
+    def snapshot(self):
+        return Snapshot("0", 1, "robot.toml", 1, 1, 0, 0, "running")
+
+    def streams(self):
+        return {}
+
+    def config_text(self):
+        return "version = 1\n"
+
+    def report(self, part, state, reason, level="info"):
+        self.told.append(reason)
+
+
+def test_what_was_added_to_a_file_that_cannot_grow_counts_as_lost(tmp_path):
+    spec, sent = small_spec(30), 200
+    recorder = Recorder("recorder", RecorderConfig(folder=str(tmp_path / "a"), min_free_mb=0))
+    view = Watching()
+    recorder.open(view)
+    recorder.handle([Opened("a", spec, "synthetic:", ArraySource(spec, []), 1, 1)])
+    values = np.random.default_rng(0).normal(size=(sent, *spec.shape))
+    chunks = cut(values, spec.rate_hz, samples=1, start_ns=2)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    for n, chunk in enumerate(chunks):
+        recorder._flush_at = 0.0 if n % 10 == 9 else np.inf  # every tenth is followed by a flush
+        if n == 100:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+        try:
+            recorder.handle([SourceChunk("a", spec, chunk, int(chunk.t_ns[0]), 1)])
+        finally:
+            if n == 120:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    recorder.close()
+    lost = recorder.details()["lost_samples"]
+    found = []
+    for k, path in enumerate(sorted((tmp_path / "a").glob("*.mcap"))):
+        whole = path if is_finished(path) else recover(path, tmp_path / f"{k}.mcap")
+        found += [int(number) for chunk in Recording(whole) for number in chunk.seq]
+    assert 0 < lost < sent
+    assert len(found) == len(set(found)) == sent - lost
+    assert sum("File too large" in reason for reason in view.told) == len(view.told)
+
+
+def played(fate, **changed):
+    n = len(fate)
+    return Played(**{
+        "fate": np.array(fate, np.uint8), "at_ns": 1 + MS * np.arange(n, dtype=np.int64),
+        "duplicated": 0, "faults": (), **changed,
+    })  # fmt: skip
+
+
+def counts(**changed):
+    none = dict.fromkeys(("delivered", "corrupt", "missing", "dropped", "duplicates"), 0)
+    return none | changed
+
+
+S, D, C, U = Fate.SENT, Fate.DROPPED, Fate.CORRUPTED, Fate.UNHEARD
+
+
+@pytest.mark.parametrize(
+    ("fate", "stats", "seq", "found"),
+    [
+        ([S, S, D, C, S], counts(delivered=3, corrupt=1, missing=1), [0, 1, 4], (0, 0, 0)),
+        # what was sent last before the plug was pulled may be lost with it
+        ([S, S, S, U, S], counts(delivered=3, missing=2), [0, 1, 4], (0, 0, 0)),
+        # who opens a port throws away what is there
+        ([S, U, S, S], counts(delivered=2, missing=2), [0, 3], (0, 0, 0)),
+        # without that it is lost without a reason, though the sum is right
+        ([S, S, S, D, S], counts(delivered=3, missing=2), [0, 1, 4], (0, 1, 0)),
+        # neither counted nor delivered
+        ([S, S, S, S, S], counts(delivered=4), [0, 1, 2, 4], (1, 1, 1)),
+        # came, and is not recorded
+        ([S, S, S], counts(delivered=3), [0, 1], (0, 1, 2)),
+        # recorded twice, or never sent
+        ([S, S, D], counts(delivered=3), [0, 1, 1], (0, 1, 1)),
+        ([S, S, D], counts(delivered=3), [0, 1, 2], (0, 1, 0)),
+        # counted as the wrong cause
+        ([S, C, S], counts(delivered=2, missing=1), [0, 2], (0, 0, 1)),
+    ],
+)
+def test_an_account_tells_what_does_not_add_up(fate, stats, seq, found):
+    got = account("serial", played(fate), stats, np.array(seq, np.int64))
+    assert (got.unbalanced, got.unexplained, got.miscounted) == found
+
+
+def test_copies_that_were_on_the_line_when_the_plug_was_pulled_are_explained():
+    fate = [S, Fate.DUPLICATED, S, U, S, Fate.DUPLICATED, S]
+    stats = counts(delivered=4, missing=3, duplicates=2)
+    got = account("serial", played(fate, duplicated=4), stats, np.array([0, 4, 5, 6]))
+    assert (got.unbalanced, got.unexplained, got.miscounted) == (0, 0, 0)
+    got = account("serial", played(fate, duplicated=4), counts(**stats) | {"duplicates": 1},
+                  np.array([0, 4, 5, 6]))  # fmt: skip
+    assert (got.unbalanced, got.miscounted) == (3, 3)
+
+
+def test_a_latency_begins_with_the_write_of_the_sample_that_completes_the_step():
+    n = 8000
+    one = played([S] * n, faults=(("drop", 5.0, 0.5),))
+    seq = np.delete(np.arange(n, dtype=np.int64), 4109)  # lost: the next one completes the step
+    recorded = RecordedSamples(seq, 1 + 1000 + MS * seq)  # by its clock 1 us after it was written
+    t_ns = np.array([500, 4000, 4100, 5200, 7000], np.int64) * MS
+    at_ns = t_ns + np.array([10, 10, 12, 13, 14]) * MS + 1
+    found = latencies(9 * MS, recorded, {"a": one}, "a", t_ns, at_ns)
+    assert found.quiet.tolist() == [1, 2, 5]  # not what came before all had begun
+    assert found.faulty.tolist() == [4]
+    assert {k: v.tolist() for k, v in found.kinds.items()} == {"drop": [4.0]}
+
+
+def test_faults_come_one_after_the_other_and_leave_the_end_alone():
+    beat = fault_beat("slcan", 60.0, 4.0, 3.0)
+    assert [f.at_s for f in beat] == [4.0 + 3 * k for k in range(18)]
+    assert all(a.at_s + a.duration_s < b.at_s for a, b in itertools.pairwise(beat))
+    assert len({f.kind for f in beat}) == len(KINDS) + 1
+
+
+def test_the_model_for_more_whiskers_decides_as_the_shipped_one_on_those_it_knows(tmp_path):
+    wide, narrow = whisker_array(), finger_array(1000.0)
+    write_wide_model(tmp_path / "wide.onnx", wide)
+    a, b = Classifier(tmp_path / "wide.onnx", wide), Classifier(shipped_model(), narrow)
+    decided = []
+    for chunk in SyntheticSource("35x6", SyntheticOptions(1000.0, 2.6, pace="fast")):
+        if chunk.t_ns[0] < 6e8:
+            continue  # the bump that is there from the start
+        mine = a.push(chunk)
+        known = Chunk(chunk.seq, chunk.t_ns, chunk.values[:, :30].copy(), chunk.valid[:, :30])
+        decided += list(zip(mine, b.push(known), strict=True))
+    assert len(decided) == 22
+    assert all(np.array_equal(x.probabilities, y.probabilities) for x, y in decided)

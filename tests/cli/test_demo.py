@@ -1,0 +1,78 @@
+"""`tactile-rt demo`: what it prints, what its view shows, how it keeps the score."""
+
+import io
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from tactile_rt.classifier.classifier import Classification
+from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.stream import Chunk
+
+pytest.importorskip("mujoco")
+
+from tactile_rt.cli.demo import Demonstration, draw, watch
+
+
+def test_demo_without_a_terminal_prints_a_line_per_object(call):
+    code, out, err = call("demo", "--fast", "--sweeps", "2")
+    first, second, summary = out.splitlines()
+    assert (code, err) == (0, "")
+    for line in (first, second):
+        assert line.endswith(("right", "WRONG"))
+    assert " of 2 right (" in summary
+    assert summary.endswith(" x real time; 0 dropped")
+    assert call("demo", "--fast", "--sweeps", "2", "--plain")[1].startswith(f"{first}\n{second}\n")
+
+
+def test_view_fits_a_terminal_and_says_what_it_shows():
+    screen = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, record=True)
+    with Demonstration(shipped_model(), sweeps=1, seed=0, fast=True) as demo:
+        screen.print(draw(demo))  # before the first sample
+        before = screen.export_text().splitlines()
+        watch(demo, screen)
+        screen.export_text()
+        screen.print(draw(demo))
+    after = screen.export_text().splitlines()
+    for lines in (before, after):
+        assert len(lines) == 22
+        assert max(map(len, lines)) <= 80
+    text = "\n".join(after)
+    (outcome,) = demo.outcomes
+    assert f"({outcome.name})" in text
+    assert "22/22" in text
+    assert ("✓ RIGHT" if outcome.right else "✗ WRONG") in text
+    assert f"{demo.right} of 1 right" in text
+    assert text.count("▀▀▀▀") == 30  # whiskers
+
+
+def decision(onset_ns, t_ns, label, final=True):
+    return Classification(
+        onset_ns, t_ns, 22, final, label, ("mug", "car"), np.array([0.5, 0.5], np.float32), 1e-3
+    )
+
+
+def test_only_the_first_episode_of_each_pass_is_scored():
+    demo = Demonstration(shipped_model(), sweeps=1, seed=0, fast=True)
+    demo._source.passes = [
+        SimpleNamespace(start_ns=100 * i, name=f"mug-{i}", category="mug") for i in range(6)
+    ]
+    decisions = [
+        decision(110, 130, "car", final=False),  # pass 0 brought no decision
+        decision(110, 150, "mug"),
+        decision(160, 190, "car"),  # the same object again: does not count
+        decision(210, 310, "mug"),  # ends while the next object is on its way
+        decision(340, 390, "car"),
+    ]
+    sample = Chunk(
+        np.zeros(1, np.int64),
+        np.zeros(1, np.int64),
+        np.zeros((1, 1, 1), np.float32),
+        np.ones((1, 1), bool),
+    )
+    demo._session = [(sample, [d]) for d in decisions]
+    settled = [outcome.said for outcomes in demo.run() for outcome in outcomes]
+    assert settled == [None, "mug", "mug", "car", None, None]
+    assert demo.right == 2

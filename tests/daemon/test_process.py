@@ -1,0 +1,306 @@
+"""`tactile-rt run robot.toml` as a process: signals and exit codes; `tactile-rt config`."""
+
+import contextlib
+import json
+import os
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import termios
+import time
+
+import pytest
+
+from tactile_rt.cli import main
+from tactile_rt.daemon.config import EXAMPLE
+from tactile_rt.daemon.process import SIGNALS
+from tests.helpers.waiting import PATIENCE_S, until
+
+RUN = [sys.executable, "-c", "from tactile_rt.cli import main; main()"]
+# Sends itself a signal when it imports for the nth time since it is the daemon; 0: at each time.
+SIGNALLED = """
+import os, signal, sys
+at, number, seen = int(sys.argv.pop(1)), int(sys.argv.pop(1)), 0
+def hook(event, arguments):
+    global seen
+    if event == "import" and signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        seen += 1
+        if at in (0, seen):
+            os.kill(os.getpid(), number)
+sys.addaudithook(hook)
+from tactile_rt.cli import main
+try:
+    main()
+finally:
+    print(seen)
+"""
+SMALL = """version = 1
+[[source]]
+name = "a"
+url = "synthetic:2x2"
+[[publisher]]
+kind = "jsonl"
+options = { file = "out.jsonl" }
+"""
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    (tmp_path / "robot.toml").write_text(SMALL)
+    return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def handlers_as_before():
+    """A process that is to be a daemon notes signals to its end; this one goes on."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+@pytest.fixture
+def started(folder):
+    """Start a daemon, and come back when it runs."""
+    processes = []
+
+    def start(*arguments, until=("source.a", "running")):
+        process = subprocess.Popen(
+            [*RUN, "run", str(folder / "robot.toml"), *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        )
+        processes.append(process)
+        await_told(folder, *until)
+        return process
+
+    yield start
+    for process in processes:
+        process.kill()
+        with process:
+            pass
+
+
+def told(folder):
+    file = folder / "out.jsonl"
+    lines = file.read_text().splitlines() if file.exists() else []
+    return [m for m in map(json.loads, lines) if m["type"] == "health"]
+
+
+def await_told(folder, part, state):
+    until(lambda: any((m["part"], m["state"]) == (part, state) for m in told(folder)))
+
+
+def ended(process):
+    """(exit code, log)"""
+    _, log = process.communicate(timeout=PATIENCE_S)
+    return process.returncode, log
+
+
+def call(monkeypatch, capsys, *arguments):
+    monkeypatch.setattr(sys, "argv", ["tactile-rt", *map(str, arguments)])
+    with pytest.raises(SystemExit) as left:
+        main()
+    return left.value.code or 0, *capsys.readouterr()
+
+
+def test_signals_reload_and_stop_and_a_second_one_is_refused(folder, started, monkeypatch, capsys):
+    first = started()
+    code, out, err = call(monkeypatch, capsys, "run", folder / "robot.toml")
+    assert code == 3 and out == ""
+    assert f"robot.toml is in use by process {first.pid} " in err
+    (folder / "robot.toml").write_text(SMALL.replace("2x2", "2by2"))
+    first.send_signal(signal.SIGHUP)
+    await_told(folder, "daemon", "refused")
+    (folder / "robot.toml").write_text(SMALL + '[[source]]\nname = "b"\nurl = "synthetic:1x1"\n')
+    first.send_signal(signal.SIGHUP)
+    await_told(folder, "source.b", "running")
+    first.send_signal(signal.SIGTERM)
+    code, log = ended(first)
+    assert code == 0, log
+    refused = next(m for m in told(folder) if m["state"] == "refused")
+    assert refused["level"] == "error"
+    assert "robot.toml:4: source[0].url: synthetic:2by2 is not a size" in refused["reason"]
+    states = [(m["part"], m["state"]) for m in told(folder)]
+    assert states.count(("source.a", "running")) == 1  # it went on undisturbed
+    assert ("source.b", "stopped") in states
+    assert "Traceback" not in log and "daemon stopping" in log
+
+
+def signalled(folder, at, number, seconds):
+    """A process that is signalled while it starts."""
+    return subprocess.Popen(
+        [sys.executable, "-c", SIGNALLED, str(at), str(int(number)), "run",
+         str(folder / "robot.toml"), "--seconds", str(seconds)],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )  # fmt: skip
+
+
+def test_a_signal_at_any_moment_of_the_start_ends_it_in_order(folder):
+    """The moments are those at which something is imported: most of the first second."""
+    imports = int(signalled(folder, -1, signal.SIGTERM, 0.1).communicate(timeout=PATIENCE_S)[0])
+    assert imports > 200  # else they are noted too late
+    for number, moments in ((signal.SIGTERM, 6), (signal.SIGINT, 3)):
+        for at in (1 + imports * k // moments for k in range(moments)):
+            code, log = ended(signalled(folder, at, number, PATIENCE_S))
+            assert code == 0 and "Traceback" not in log, (number, at, code, log)
+
+
+def test_a_reload_asked_for_at_every_moment_of_the_start_ends_nothing(folder):
+    process = signalled(folder, 0, signal.SIGHUP, 1.0)
+    code, log = ended(process)
+    assert code == 0 and "Traceback" not in log and "source.a running" in log, (code, log)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", SIGNALS)
+def test_a_signal_at_any_time_of_the_first_second_does_what_it_should(folder, number):
+    """By the clock, from the moment at which the process takes signals."""
+    for ms in range(0, 1000, 40):
+        with subprocess.Popen(
+            [*RUN, "run", str(folder / "robot.toml")], stderr=subprocess.PIPE, text=True,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        ) as process:  # fmt: skip
+            until(lambda one=process: takes(one, signal.SIGTERM))
+            time.sleep(ms / 1000)
+            process.send_signal(number)
+            if number == signal.SIGHUP:
+                await_told(folder, "source.a", "running")
+                process.send_signal(signal.SIGTERM)
+            code, log = ended(process)
+            assert code == 0 and "Traceback" not in log, (ms, code, log)
+        (folder / "out.jsonl").unlink(missing_ok=True)
+
+
+def takes(process, number):
+    """Whether a process has a handler for a signal."""
+    with open(f"/proc/{process.pid}/status") as file:
+        (mask,) = (int(line.split()[1], 16) for line in file if line.startswith("SigCgt"))
+    return bool(mask >> (number - 1) & 1)
+
+
+def test_a_stream_that_is_over_and_a_time_that_is_up_end_it(folder, monkeypatch, capfd):
+    (folder / "robot.toml").write_text(SMALL.replace('options = { file = "out.jsonl" }', ""))
+    code, out, err = call(
+        monkeypatch, capfd, "run", folder / "robot.toml",
+        "--set", "source.a.url=synthetic:2x2?seconds=1&pace=fast",
+        "--set", "publisher.jsonl.options.samples=true",
+    )  # fmt: skip
+    assert code == 0, err
+    messages = [json.loads(line) for line in out.splitlines()]
+    assert sum(len(m["seq"]) for m in messages if m["type"] == "samples") == 1000
+    assert messages[-1]["state"] == "stopped" or messages[-1]["type"] == "health"
+    code, out, err = call(monkeypatch, capfd, "run", folder / "robot.toml", "--seconds", "0.5")
+    assert code == 0 and "source.a stopped" in err
+
+
+@contextlib.contextmanager
+def silent_line(kind):
+    """A URL of a device that is asked to begin, and never sends; whether it has been asked."""
+    with contextlib.ExitStack() as open_now:
+        if kind in ("serial", "can:slcan"):
+            master, slave = os.openpty()
+            for handle in (master, slave):
+                open_now.callback(os.close, handle)
+            # Somebody has it open, or the port has settings of its own.
+            yield (
+                f"{kind}:{os.ttyname(slave)}",
+                lambda: termios.tcgetattr(slave)[4] != termios.B38400,
+            )
+            return
+        if kind == "can:virtual":
+            yield "can:virtual:tactile-silent", lambda: True
+            return
+        peer = open_now.enter_context(socket.create_server(("127.0.0.1", 0), backlog=0))
+        url = f"serial:socket://127.0.0.1:{peer.getsockname()[1]}"
+        if kind == "socket":
+            peer.settimeout(PATIENCE_S)
+            yield url, lambda: bool(open_now.enter_context(peer.accept()[0]))
+            return
+        # Nobody takes what knocks: its queue is full, and whoever comes now waits to be let in.
+        for _ in range(2):
+            knocks = open_now.enter_context(socket.socket())
+            knocks.setblocking(False)
+            knocks.connect_ex(peer.getsockname())
+        yield url, lambda: True
+
+
+@pytest.mark.parametrize("kind", ["serial", "can:slcan", "can:virtual", "socket", "not let in"])
+def test_a_device_that_never_sends_keeps_nothing_from_stopping(folder, started, kind):
+    with silent_line(kind) as (url, asked):
+        option = f"source.a.url={url}?codec=native&start_s=60"
+        process = started("--set", option, until=("daemon", "starting"))
+        until(asked)
+        process.send_signal(signal.SIGTERM)
+        code, log = ended(process)
+    assert code == 0, log  # 4: something did not end within 2 s
+    assert "source.a stopped" in log and "abandoned" not in log and "Traceback" not in log
+
+
+def test_what_hangs_at_the_end_is_left_behind(folder, started):
+    """Nobody reads its output: the pipe is full, and writing to it never returns."""
+    (folder / "robot.toml").write_text(
+        SMALL + '[[publisher]]\nkind = "jsonl"\nname = "piped"\noptions = { samples = true }\n'
+    )
+    process = started("--set", "source.a.url=synthetic:35x6", "--set", "limits.stall_s=0.5")
+    await_told(folder, "publisher.piped", "stalled")
+    process.send_signal(signal.SIGINT)
+    assert process.wait(PATIENCE_S) == 4
+    log = process.stderr.read()
+    assert "error publisher.piped abandoned: it did not end in time" in log
+    assert "source.a stopped" in log
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["run"], "run needs a configuration (robot.toml, --set with it) or --source URL"),
+        (["run", "--source", "synthetic:", "--set", "a=1"], "run needs a configuration"),
+        (["run", "robot.toml", "--source", "synthetic:"], "robot.toml says what to run"),
+        (["run", "gone.toml"], "gone.toml: no such file"),
+        (["run", "robot.toml", "--set", "page.port=0"], "page.port: expected a whole number >= 1"),
+        (["config", "check", "robot.toml", "--set", "sorce=1"], "did you mean source?"),
+        (["config", "example", "robot.toml"], "robot.toml is there already"),
+        (["config", "example", "gone/robot.toml"], "no folder gone to write"),
+    ],
+)
+def test_a_users_mistake_is_one_line(folder, monkeypatch, capsys, arguments, message):
+    monkeypatch.chdir(folder)
+    code, out, err = call(monkeypatch, capsys, *arguments)
+    assert code == 2 and out == "" and message in err and err.count("\n") == 1
+
+
+def test_config_commands(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert call(monkeypatch, capsys, "config", "check", "robot.toml") == (
+        0, "robot.toml: 1 source, 0 models, 1 publisher: all right\n", "",
+    )  # fmt: skip
+    _, shown, _ = call(
+        monkeypatch, capsys, "config", "show", "robot.toml", "--set", "log.level=error"
+    )
+    assert 'level = "error"' in shown and f"{folder}/out.jsonl" in shown
+    assert call(monkeypatch, capsys, "config", "example")[1] == EXAMPLE
+    assert call(monkeypatch, capsys, "config", "example", "new.toml")[0] == 0
+    assert call(monkeypatch, capsys, "config", "check", "new.toml")[0] == 0
+    _, said, _ = call(monkeypatch, capsys, "config", "example", "rö bot.toml")
+    assert said.endswith("run it with: tactile-rt run 'rö bot.toml'\n")
+    assert shlex.split(said.partition("with: ")[2]) == ["tactile-rt", "run", "rö bot.toml"]
+
+
+def test_the_daemon_reaches_nothing_that_a_robot_does_not_have():
+    code = (
+        "import sys, tactile_rt.daemon.daemon, tactile_rt.daemon.checks, "
+        "tactile_rt.daemon.publishers.jsonl\n"
+        "print({'torch', 'mujoco', 'trimesh', 'scipy', 'matplotlib'} & set(sys.modules))"
+    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "set()\n"

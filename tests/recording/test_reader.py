@@ -1,0 +1,142 @@
+"""What is read is what was written, or named."""
+
+import json
+import time
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_rt.recording import Recording, recover
+from tactile_rt.sources.opening import open_source
+from tactile_rt.stream import ConfigError, RecordingError, concatenate
+from tactile_rt.testing import cut
+from tests.helpers.recordings import SPEC, all_parts, noise, odd_chunks, write
+
+pytest.importorskip("mcap")
+
+
+def test_chunks_come_back_bit_for_bit(path, no_thread_left):
+    chunks = odd_chunks()
+    write(path, chunks)
+    back = list(Recording(path))
+    assert all_parts(back) == all_parts(chunks)
+    assert [c.values.dtype for c in back] == [np.float32] * len(chunks)
+    assert back[0].values.flags.writeable  # its reader's own
+
+
+def test_a_description_comes_back(path):
+    before = time.time_ns() - time.monotonic_ns()
+    write(path, odd_chunks(), session={"who": "Ada", "why": "a test"}, url="array:x")
+    about = Recording(path).description
+    assert about.spec == SPEC
+    assert about.session == {"who": "Ada", "why": "a test"}
+    assert (about.source, about.wire, about.codec) == ("array:x", "", "")
+    assert abs(about.utc_offset_ns - before) < 1e9
+
+
+def foreign(path):
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        other = Writer(file)
+        other.start()
+        channel = other.register_channel("x", "json", 0)
+        other.add_message(channel, 1, b"{}", 1)
+        other.finish()
+
+
+def newer(path):
+    from mcap.writer import Writer
+
+    with path.open("wb") as file:
+        other = Writer(file)
+        other.start()
+        other.add_metadata("tactile_rt", {"version": "2"})
+        other.finish()
+
+
+@pytest.mark.parametrize(
+    ("make", "kind", "said"),
+    [
+        (lambda p: None, ConfigError, "no recording .*run.mcap|No such file"),
+        (lambda p: p.mkdir(), ConfigError, "cannot be read: Is a directory"),
+        (lambda p: p.write_bytes(b""), RecordingError, "not an MCAP file"),
+        (lambda p: p.write_text("seq,t_ns\n"), RecordingError, "not an MCAP file"),
+        (foreign, RecordingError, "no recording of tactile-rt"),
+        (newer, RecordingError, "of version '2'; this release reads 1"),
+    ],
+    ids=["missing", "folder", "empty", "text", "another's mcap", "newer"],
+)
+def test_what_is_no_recording_is_named(make, kind, said, path):
+    make(path)
+    for read in (Recording, lambda p: list(Recording(p)), recover):
+        with pytest.raises(kind, match=said) as caught:
+            read(path)
+        assert "\n" not in str(caught.value)
+        assert str(path) in str(caught.value)
+
+
+def test_readers_may_stop_early(path):
+    write(path, cut(noise(100), 1000.0))
+    with closing(Recording(path).chunks()) as chunks:
+        next(chunks)
+    with open_source(f"replay:{path}") as source:
+        source.read()
+
+
+# of a release before
+
+DATA = Path(__file__).parent / "data"
+
+
+def test_a_device_s_recording_made_before_is_read():
+    values = np.random.default_rng(15).normal(size=(40, 2, 3)).astype(np.float32)
+    recording = Recording(DATA / "device.mcap")
+    about = recording.description
+    assert (about.source, about.wire, about.codec) == (
+        "serial:/dev/ttyACM0?codec=native", "serial", "native",
+    )  # fmt: skip
+    assert about.session == {"who": "Ada"}
+    assert recording.spec.channels == ("fx", "fy", "fz")
+    whole = concatenate(list(recording))
+    assert whole.values.tobytes() == values.tobytes()
+    assert [h["state"] for h in recording.health()][-1] == "closed"
+    assert next(recording.packets())[0] is None
+    with open_source(f"replay:{recording.path}?from=wire&speed=0") as source:
+        assert concatenate(list(source)).values.tobytes() == values.tobytes()
+
+
+@pytest.mark.parametrize(("name", "samples"), [("daemon", 40), ("cut", 30)])
+def test_a_daemon_s_recording_made_before_is_read_or_recovered(name, samples, tmp_path):
+    values = np.random.default_rng(16).normal(size=(40, *SPEC.shape)).astype(np.float32)
+    path = DATA / f"{name}.mcap"
+    if name == "cut":
+        with pytest.raises(RecordingError, match="cut short"):
+            Recording(path)
+        path = recover(path, tmp_path / "whole.mcap")
+    recording = Recording(path)
+    assert concatenate(list(recording)).values.tobytes() == values[:samples].tobytes()
+    assert recording.description.session["daemon_source"] == "left"
+    assert recording.description.recovered is (name == "cut")
+    assert [d["step"] for d in recording.decisions()] == [1, 2, 3, 4][: samples // 10]
+    (event,) = recording.events()
+    assert event["reason"] == "unplugged"
+    raw = list(recording.raw("decisions", "events"))
+    assert [r.topic for r in raw].count("events") == 1
+    assert json.loads(raw[0].data) == next(recording.decisions())
+
+
+def test_a_recording_is_read_as_often_as_one_likes(path):
+    chunks = cut(noise(40), 1000.0)
+    write(path, chunks)
+    recording = Recording(str(path))
+    for again in (recording, recording, recording.chunks()):
+        assert all_parts(again) == all_parts(chunks)
+    assert list(recording.packets()) == list(recording.events()) == list(recording.raw()) == []
+    with path.open("r+b") as file:  # damaged by now
+        file.seek(path.stat().st_size // 3)
+        file.write(bytes(50))
+    with pytest.raises(RecordingError, match=r"run\.mcap is damaged"):
+        list(recording)

@@ -1,0 +1,113 @@
+"""Of a recording that was cut or damaged, all that is whole comes back."""
+
+import re
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tactile_rt.recording import Description, Recording, recover
+from tactile_rt.recording.layout import (
+    encode_samples,
+)
+from tactile_rt.recording.writer import McapFile
+from tactile_rt.stream import RecordingError
+from tactile_rt.testing import cut
+from tests.helpers.recordings import SPEC, all_parts, noise, write
+
+pytest.importorskip("mcap")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A recording in many pieces: its bytes, its chunks, and where each piece ends in it."""
+    from mcap.reader import make_reader
+
+    path = tmp_path_factory.mktemp("whole") / "run.mcap"
+    chunks = cut(noise(120), 1000.0, samples=5)
+    with path.open("wb") as file:
+        made = McapFile(file, Description(SPEC, 1_700_000_000 * 10**9, session={"a": "b"}))
+        for i, chunk in enumerate(chunks, 1):
+            made.add("samples", encode_samples(chunk), int(chunk.t_ns[-1]))
+            if i % 3 == 0:
+                made.flush()
+        made.finish()
+    with path.open("rb") as file:
+        pieces = make_reader(file).get_summary().chunk_indexes
+    ends = [p.chunk_start_offset + p.chunk_length for p in pieces]
+    assert len(ends) == 8
+    return path.read_bytes(), chunks, ends
+
+
+def cut_short(whole, tmp_path, at):
+    data, chunks, ends = whole
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(data[:at])
+    with pytest.raises(RecordingError, match=re.escape(str(path))):
+        list(Recording(path))
+    kept = 3 * sum(end <= at for end in ends)
+    try:
+        back = recover(path, tmp_path / "out.mcap", force=True)
+    except RecordingError as error:
+        assert kept == 0
+        assert str(path) in str(error)
+        assert list(tmp_path.iterdir()) == [path]  # nothing half-written
+        return False
+    assert all_parts(Recording(back)) == all_parts(chunks[:kept])
+    assert Recording(back).description.spec == SPEC
+    assert Recording(back).description.session == {"a": "b"}
+    back.unlink()
+    return True
+
+
+def test_cut_anywhere_all_that_is_whole_is_recovered(whole, tmp_path):
+    data, _, ends = whole
+    near = {at + d for at in ends for d in (-1, 0, 1)}
+    places = near | {0, 1, 8, 9, len(data) - 1, *range(0, len(data), 97)}
+    made = [cut_short(whole, tmp_path, at) for at in sorted(places)]
+    assert made == sorted(made)  # more of a file never gives less
+    assert sum(made) > 100
+
+
+@settings(max_examples=150)
+@given(at=st.floats(0, 1, exclude_max=True), damage=st.binary(min_size=1, max_size=9))
+def test_damaged_anywhere_nothing_is_misread(whole, tmp_path_factory, at, damage):
+    data, chunks, _ = whole
+    path = tmp_path_factory.getbasetemp() / "damaged.mcap"
+    begin = int(at * len(data))
+    path.write_bytes(data[:begin] + damage + data[begin + len(damage) :])
+    back = []
+    try:
+        back += Recording(path)
+    except RecordingError as error:
+        assert str(path) in str(error)
+    else:
+        assert len(back) == len(chunks)
+    assert all_parts(back) == all_parts(chunks[: len(back)])
+    try:
+        out = recover(path, path.with_name("mended.mcap"), force=True)
+    except RecordingError as error:
+        assert str(path) in str(error)
+        return
+    known = all_parts(chunks)
+    order = [known.index(p) for p in all_parts(Recording(out))]
+    assert order == sorted(order)
+
+
+def test_a_piece_damaged_in_the_middle_is_left_out(whole, tmp_path):
+    data, chunks, ends = whole
+    path = tmp_path / "damaged.mcap"
+    spoilt = bytearray(data)
+    spoilt[ends[3] - 20] ^= 0xFF
+    path.write_bytes(spoilt)
+    back = []
+    with pytest.raises(RecordingError, match="is damaged"):
+        back += Recording(path)
+    kept = all_parts(Recording(recover(path)))
+    assert kept == all_parts(chunks[:9] + chunks[12:])
+
+
+def test_a_whole_recording_needs_no_recovery(path):
+    write(path, cut(noise(10), 1000.0))
+    assert recover(path) == path
+    assert list(path.parent.iterdir()) == [path]

@@ -1,0 +1,532 @@
+"""Arrays by name and from files: mirror images, several animals, heads, mistakes."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("trimesh")
+
+import mujoco
+import trimesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from tactile_rt.sim_backend.arrays import head as head_module
+from tactile_rt.sim_backend.arrays.files import load_animals, load_array, read_animals
+from tactile_rt.sim_backend.arrays.head import HEAD_BIT, add_head
+from tactile_rt.sim_backend.arrays.species import mouse_whiskers, rat_whiskers
+from tactile_rt.sim_backend.arrays.whisker_array import (
+    MOUNT,
+    Mount,
+    WhiskerArray,
+    both_sides,
+    mirrored,
+    place,
+)
+from tactile_rt.sim_backend.arrays.whiskers import Whisker
+from tactile_rt.sim_backend.world import (
+    CHANNELS,
+    PROFILES,
+    WHISKER_BIT,
+    add_whiskers,
+    array_spec,
+    empty_world,
+    quaternion,
+    read_base_loads,
+    set_damping,
+)
+from tactile_rt.sources.opening import open_source
+from tactile_rt.stream import ConfigError
+from tests.helpers.source_tree import ROOT
+
+Floats = NDArray[np.float64]
+MIRROR = np.diag([-1.0, 1.0, 1.0])
+FLIPS = np.array([1, 1, -1, -1, -1, 1])  # of fx fy fz mx my mz under reflection
+EXAMPLES = ROOT / "docs" / "arrays"
+NAMES = ("mouse", "mouse-left", "mouse-both", "rat", "rat-left", "rat-both")
+SIDE = {"mouse": 30, "rat": 30, "left": 30, "both": 60}
+
+
+def points(whisker: Whisker, mount: Mount, n: int = 9) -> Floats:
+    """(n, 3) in the world, mm."""
+    line = whisker.centreline(np.linspace(0, whisker.length, n))
+    in_head = np.array(whisker.base) + line @ whisker.orientation.T
+    return np.asarray(np.array(mount.position) + in_head @ mount.rotation.T)
+
+
+# By name
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_name_is_an_array_that_a_stream_can_describe(name: str) -> None:
+    array = load_array(name)
+    assert array.name == (name if "-" in name else f"{name}-right")
+    spec = array_spec(array.whiskers, array.name)
+    assert spec.shape == (60 if name.endswith("both") else 30, 6)
+    assert spec.grid_shape == ((5, 14) if name.endswith("both") else (5, 7))
+    assert load_array(name) == array and hash(array) == hash(load_array(name))
+    assert load_animals(name) == (array,)
+
+
+def test_the_right_side_is_the_measured_one() -> None:
+    assert load_array("mouse") == load_array("mouse-right")
+    assert load_array("mouse").whiskers == mouse_whiskers()
+    assert load_array("mouse").mount == MOUNT
+    assert load_array("rat").whiskers == rat_whiskers()
+
+
+@pytest.mark.parametrize("name", ["cat", "mouse-top", "", "mouse-", "mouse.cvs"])
+def test_an_unknown_array_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError, match=r"no simulated array .*(mouse|rat).*\.csv or \.toml"):
+        load_array(name)
+
+
+def test_the_rat_stands_where_the_mouse_stands() -> None:
+    middles = [
+        np.mean([points(w, a.mount, 2)[0] for w in a.whiskers], axis=0)
+        for a in (load_array("mouse"), load_array("rat"))
+    ]
+    np.testing.assert_allclose(*middles, atol=1e-12)
+    assert load_array("rat").mount.roll_pitch_yaw == MOUNT.roll_pitch_yaw
+
+
+# The other side
+
+
+@pytest.mark.parametrize("animal", ["mouse", "rat"])
+def test_a_mirrored_whisker_is_the_reflected_curve(animal: str) -> None:
+    for right in load_array(animal).whiskers:
+        left = mirrored(right)
+        here = Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        np.testing.assert_allclose(points(left, here), points(right, here) @ MIRROR, atol=1e-12)
+        turn = left.orientation
+        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(turn) == pytest.approx(1)
+        assert left.curvature > 0  # y still points to the concave side
+        assert mirrored(left) == right
+
+
+def test_the_left_side_alone_is_the_right_one_in_a_mirror() -> None:
+    right, left = load_array("rat"), load_array("rat-left")
+    for r, w in zip(right.whiskers, left.whiskers, strict=True):
+        assert (w.name, w.row, w.column) == (r.name, r.row, r.column)
+        np.testing.assert_allclose(
+            points(w, left.mount), points(r, right.mount) @ MIRROR, atol=1e-12
+        )
+
+
+def test_reflected_pushes_give_reflected_loads() -> None:
+    """Statics: the load at the base of a force on the tip, in each whisker's own frame."""
+    rng = np.random.default_rng(2)
+    for right in mouse_whiskers():
+        force = rng.normal(size=3)
+        loads = []
+        for w, push in ((right, force), (mirrored(right), MIRROR @ force)):
+            tip = w.orientation @ w.centreline(np.array([w.length]))[0]
+            loads.append(
+                np.concatenate([push @ w.orientation, np.cross(tip, push) @ w.orientation])
+            )
+        np.testing.assert_allclose(loads[1], FLIPS * loads[0], atol=1e-12)
+
+
+def test_a_reflected_push_in_the_simulator_gives_reflected_loads() -> None:
+    right = next(w for w in mouse_whiskers() if w.name == "B1")
+    loads = []
+    for whisker, mount, force in (
+        (right, MOUNT, np.array([0.02, -0.03, 0.01])),
+        (mirrored(right), MOUNT.mirrored(), np.array([-0.02, -0.03, 0.01])),
+    ):
+        world = empty_world(PROFILES["dataset"])
+        add_whiskers(world, (whisker,), PROFILES["dataset"], mount)
+        model = world.compile()
+        set_damping(model)
+        data = mujoco.MjData(model)
+        data.xfrc_applied[-1, :3] = force  # mN, on the last link
+        felt = []
+        for _ in range(60):
+            mujoco.mj_step(model, data)
+            felt.append(read_base_loads(data.sensordata)[0].copy())
+        loads.append(np.array(felt))
+    size = np.abs(loads[0]).max(axis=0)
+    assert (size > 0).all()
+    np.testing.assert_allclose(loads[1] / size, FLIPS * loads[0] / size, atol=1e-5)
+
+
+def test_both_sides_make_a_face() -> None:
+    both = {w.name: w for w in load_array("mouse-both").whiskers}
+    assert {n[:2] for n in both} == {"L.", "R."}
+    assert load_array("mouse-both").mount == MOUNT
+    for w in mouse_whiskers():
+        right, left = both[f"R.{w.name}"], both[f"L.{w.name}"]
+        assert (right.row, right.column) == (w.row, w.column)
+        assert (left.row, left.column) == (w.row, 13 - w.column)
+        assert replace(left, name=w.name, column=w.column) == mirrored(w)
+    # face to face with the animal its right is at one's left; the nose is in the middle
+    for row in range(5):
+        along = sorted((w for w in both.values() if w.row == row), key=lambda w: w.column)
+        rostral = [w.base[1] for w in along]
+        half = len(rostral) // 2
+        assert rostral[:half] == sorted(rostral[:half])
+        assert rostral[half:] == rostral[:half][::-1]
+    assert all((w.column < 7) == (w.base[0] > 0) for w in both.values())
+
+
+# Several animals
+
+
+def test_animals_in_one_world_have_names_and_cells_of_their_own() -> None:
+    there = Mount((0.0, 60.0, 0.0), (0.0, 0.0, np.pi))
+    first, second = place([load_array("mouse-both"), load_array("rat")], [MOUNT, there])
+    assert (first.name, second.name) == ("1.mouse-both", "2.rat-right")
+    assert first.whiskers[0].name == "1.R.A0" and second.whiskers[0].name == "2.A0"
+    assert (first.mount, second.mount) == (MOUNT, there)
+    spec = array_spec(first.whiskers + second.whiskers, "two")
+    assert spec.shape == (90, 6) and spec.grid_shape == (10, 14)
+    assert second.whiskers[0].row == 5 and second.whiskers[0].base == rat_whiskers()[0].base
+    alone = load_array("rat")
+    assert place([alone]) == (alone,)
+
+
+def test_animals_are_not_put_in_the_same_place() -> None:
+    mouse = load_array("mouse")
+    with pytest.raises(ConfigError, match=r"animal 2 \(mouse-right\) stands in another"):
+        place([mouse, mouse])
+    with pytest.raises(ConfigError, match="1 mounts for 2 animals"):
+        place([mouse, mouse], [MOUNT])
+    with pytest.raises(ConfigError, match="must be finite"):
+        Mount((0.0, np.nan, 0.0), (0.0, 0.0, 0.0))
+
+
+def test_an_array_holds_each_whisker_once() -> None:
+    a0, a1 = mouse_whiskers()[:2]
+    with pytest.raises(ConfigError, match="A0 and A0 have the same name"):
+        WhiskerArray("x", (a0, a0))
+    with pytest.raises(ConfigError, match="A0 and A1 have the same cell of the grid"):
+        WhiskerArray("x", (a0, replace(a1, column=0)))
+    with pytest.raises(ConfigError, match="has no whiskers"):
+        WhiskerArray("x", ())
+
+
+# Files
+
+
+def test_the_example_is_the_same_array_in_both_formats() -> None:
+    toml, table = (load_array(str(EXAMPLES / f"robot.{kind}")) for kind in ("toml", "csv"))
+    assert toml == table
+    assert (toml.name, len(toml.whiskers), toml.head) == ("robot", 8, None)
+    assert {(w.row, w.column) for w in toml.whiskers} == {(r, c) for r in (0, 1) for c in range(4)}
+    for w in toml.whiskers:
+        assert (w.curvature, w.base_radius, w.tip_radius) == (0.0, 0.06, 0.06)
+        assert (w.young_modulus, w.density_base, w.density_tip) == (2.9e9, 1130, 1130)
+        assert (w.damping_ratio, w.friction) == (0.05, 0.3)
+        assert points(w, toml.mount)[-1][0] > 12  # they reach out along x, where objects pass
+    lengths = {w.name: w.length for w in toml.whiskers}
+    assert lengths == {f"{r}{c}": 24 - 3 * c for r in "AB" for c in range(4)}
+    middle = np.mean([points(w, toml.mount)[0] for w in toml.whiskers], axis=0)
+    np.testing.assert_allclose(middle, 0, atol=1e-12)
+
+
+def test_the_mouses_own_table_is_the_mouse() -> None:
+    table = Path(head_module.__file__).parent / "data" / "mouse.csv"
+    assert load_array(str(table)).whiskers == mouse_whiskers()
+
+
+HEADER = (
+    "whisker,row,col,arc_length_mm,curvature_a_per_mm,base_x_mm,base_y_mm,base_z_mm,"
+    "base_theta_rad,base_phi_rad,base_zeta_rad,base_radius_mm"
+)
+LINE = "A0,1,0,40,0,0,1,2,1.5,0.1,0,0.2"
+OTHER = "A1,1,1,30,-0.01,0,5,2,1.5,0.1,0,0.2"
+WHISKERS = """
+[[whisker]]
+whisker = "A0"
+row = 1
+col = 0
+arc_length_mm = 40
+[[whisker]]
+whisker = "A1"
+row = 1
+col = 1
+arc_length_mm = 30
+"""
+DEFAULTS = """
+[defaults]
+curvature_a_per_mm = 0
+base_x_mm = 0
+base_y_mm = 1
+base_z_mm = 2.5
+base_theta_rad = 1.5
+base_phi_rad = 0
+base_zeta_rad = 0
+base_radius_mm = 0.2
+"""
+
+
+def write(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_a_table_as_a_spreadsheet_writes_it(tmp_path: Path) -> None:
+    text = f"\ufeff# mine\r\n{HEADER}\r\n\r\n {LINE} \r\n# one more\r\n{OTHER}\r\n,,,,,,,,,,,\r\n"
+    array = load_array(str(write(tmp_path, "mine.CSV", text)))
+    assert [w.name for w in array.whiskers] == ["A0", "A1"] and array.name == "mine"
+    assert array.whiskers[1].curvature == -0.01 and array.whiskers[0].tip_radius == 0.2
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "a.csv: is empty"),
+        ("# nothing\n", "a.csv: is empty"),
+        (HEADER, "a.csv: has no whiskers"),
+        (HEADER.replace(",", ";"), "a.csv:1: columns are separated by semicolons; use commas"),
+        (HEADER.replace(",col", ""), "a.csv:1: no column col; add it"),
+        (HEADER.replace("_length", "_lenght"), "no column 'arc_lenght_mm'; did you mean arc_"),
+        (HEADER + ",colour", "a.csv:1: no column 'colour'"),
+        (HEADER + ",row", "a.csv:1: column 'row' is there twice"),
+        (f"{HEADER}\n{LINE},3", "a.csv:2: 13 values for 12 columns"),
+        (f"{HEADER}\nA0,1", "a.csv:2: 2 values for 12 columns"),
+        (f"#\n{HEADER}\n{LINE.replace('40', 'x')}", "a.csv:3: arc_length_mm is not a number: 'x'"),
+        (f"{HEADER}\n{LINE.replace('40', 'nan')}", "a.csv:2: arc_length_mm is not a finite number"),
+        (f"{HEADER}\n{LINE.replace('40', '')}", "a.csv:2: no arc_length_mm; give it a value"),
+        (
+            f"{HEADER}\n{LINE.replace('40', '-4')}",
+            "a.csv:2: whisker A0: arc_length_mm must be posi",
+        ),
+        (f"{HEADER}\n{LINE}\n\n{LINE}", r"a.csv:4: whisker A0 is taken already \(line 2\)"),
+        (f"{HEADER}\n{LINE}\nB{LINE}", r"a.csv:3: row 1, col 0 is taken already \(line 2\)"),
+        (f"{HEADER}\n{LINE.replace('A0', 'A 0')}", "a.csv:2: whisker 'A 0': a name is"),
+        (f'{HEADER}\n"{LINE}', "a.csv:2: 1 values for 12 columns"),
+    ],
+)
+def test_a_mistake_in_a_table_is_one_line(tmp_path: Path, text: str, said: str) -> None:
+    path = write(tmp_path, "a.csv", text)
+    with pytest.raises(ConfigError, match=said) as caught:
+        load_array(str(path))
+    assert "\n" not in str(caught.value) and str(caught.value).startswith(str(path))
+
+
+def test_a_toml_array_has_a_mount_a_head_and_defaults(tmp_path: Path) -> None:
+    write(tmp_path, "skull.stl", "solid\nendsolid\n")
+    top = (
+        'name = "bot"\nhead = "skull.stl"\n'
+        "mount = { position_mm = [1, 2, 3.5], roll_pitch_yaw_rad = [0, 0.1, 0] }\n"
+    )
+    text = top + DEFAULTS + WHISKERS.replace("= 30", "= 30\nfriction = 0.1\nbase_y_mm = 9")
+    array = load_array(str(write(tmp_path, "a.toml", text)))
+    assert (array.name, array.head) == ("bot", tmp_path / "skull.stl")
+    assert array.mount == Mount((1.0, 2.0, 3.5), (0.0, 0.1, 0.0))
+    a0, a1 = array.whiskers
+    assert (a0.base, a0.friction) == ((0.0, 1.0, 2.5), 0.5)
+    assert (a1.base, a1.friction) == ((0.0, 9.0, 2.5), 0.1)
+    plain = load_array(str(write(tmp_path, "b.toml", DEFAULTS + WHISKERS)))
+    assert (plain.name, plain.head) == ("b", None)
+    assert plain.mount.position == (0.0, -1.0, -2.5)  # its middle at the origin
+    two = load_array(str(write(tmp_path, "c.toml", "mirror = true\n" + DEFAULTS + WHISKERS)))
+    assert two == both_sides(replace(plain, name="c"), "c")
+    assert [w.column for w in two.whiskers] == [0, 1, 3, 2]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("name = \n", r"a.toml:1: not TOML"),
+        ("", r"needs \[\[whisker\]\] tables or"),
+        (DEFAULTS, r"needs \[\[whisker\]\] tables or"),
+        ("naem = 'x'" + DEFAULTS + WHISKERS, "the file has no key 'naem'; did you mean name?"),
+        ("[mount]\nposition = [0,0,0]" + DEFAULTS + WHISKERS, "did you mean position_mm?"),
+        (
+            "[mount]\nposition_mm = [0,0]" + DEFAULTS + WHISKERS,
+            r"a.toml:2: mount.position_mm: expected a list of 3 numbers",
+        ),
+        (
+            "[mount]\nposition_mm = [0,0,nan]" + DEFAULTS + WHISKERS,
+            r"a.toml:2: mount.position_mm\[2\]: nan is no quantity",
+        ),
+        ("name = 3" + DEFAULTS + WHISKERS, r"name: expected text, got 3"),
+        ("head = 'x.glb'" + DEFAULTS + WHISKERS, "head 'x.glb' must be one of .obj, .ply, .stl"),
+        ("head = 'x.stl'" + DEFAULTS + WHISKERS, "head 'x.stl': no such file"),
+        (DEFAULTS + "densty = 3\n" + WHISKERS, "a.toml:11: defaults has no key 'densty'"),
+        (DEFAULTS + WHISKERS + "frction = 3", r"a.toml:22: whisker\[1\] has no key .* friction\?"),
+        (WHISKERS, r"whisker\[0\] \(A0\): no curvature_a_per_mm"),
+        (DEFAULTS + WHISKERS.replace('"A1"', "1"), r"whisker\[1\]: whisker is a name, in quotes"),
+        (
+            DEFAULTS + WHISKERS.replace('"A1"', '"A0"'),
+            r"\[1\] \(A0\): whisker A0 is .* \(line 12: whisker",
+        ),
+        (DEFAULTS + WHISKERS.replace("col = 1", "col = 0"), "row 1, col 0 is taken already"),
+        (
+            DEFAULTS + WHISKERS.replace("30", "[30]"),
+            r"whisker\[1\] \(A1\): arc_length_mm is not a finite",
+        ),
+        (DEFAULTS + "tip_radius_mm = 1\n" + WHISKERS, "tip_radius_mm 1 exceeds base_radius_mm 0.2"),
+        ("[[animal]]\narray = 'mouse'\n" + WHISKERS, "tables, one of the two"),
+        ("name = 'x'\n[[animal]]\narray = 'mouse'", "there is nothing else"),
+        ("[[animal]]\narray = 'a.toml'", "another file, not this one"),
+        ("[[animal]]\narray = 'muose'", "did you mean mouse?"),
+        ("[[animal]]\narray = 'no.csv'", "no.csv: no such file"),
+        ("[[animal]]\narray = 'rat'\n[[animal]]\narray = 'rat'", "animal 2 .* stands in another"),
+    ],
+)
+def test_a_mistake_in_a_toml_file_is_one_line(tmp_path: Path, text: str, said: str) -> None:
+    path = write(tmp_path, "a.toml", text)
+    with pytest.raises(ConfigError, match=said) as caught:
+        load_animals(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_toml_file_places_several_animals(tmp_path: Path) -> None:
+    write(tmp_path, "bot.csv", f"{HEADER}\n{LINE}\n")
+    text = """
+    [[animal]]
+    array = "rat-both"
+    [[animal]]
+    array = "bot.csv"
+    mount = { position_mm = [80, 0, 0] }
+    """
+    path = str(write(tmp_path, "world.toml", text))
+    rat, bot = load_animals(path)
+    assert (rat.name, bot.name, bot.whiskers[0].name) == ("1.rat-both", "2.bot", "2.A0")
+    assert rat.mount == load_array("rat-both").mount
+    assert bot.mount.position == (80, 0, 0) and bot.whiskers[0].row == 5
+    with pytest.raises(ConfigError, match="holds 2 animals where one array is wanted"):
+        load_array(path)
+
+
+def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00a")
+    (tmp_path / "folder.toml").mkdir()
+    for name, said in (
+        ("none.csv", "no such file"),
+        ("bytes.csv", "1: not UTF-8 text"),
+        ("folder.toml", "cannot be read"),
+    ):
+        with pytest.raises(ConfigError, match=f"{name}:.*{said}"):
+            load_array(str(tmp_path / name))
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    text=st.text(max_size=12), cell=st.integers(0, 7 * 18), kind=st.sampled_from(["csv", "toml"])
+)
+def test_no_file_is_worse_than_a_config_error(
+    tmp_path_factory: pytest.TempPathFactory, text: str, cell: int, kind: str
+) -> None:
+    cut = "," if kind == "csv" else " "
+    parts = (EXAMPLES / f"robot.{kind}").read_text().split(cut)
+    parts[cell % len(parts)] = text
+    path = tmp_path_factory.getbasetemp() / f"any.{kind}"
+    path.write_text(cut.join(parts), encoding="utf-8")
+    try:
+        assert read_animals(path)[0].whiskers
+    except ConfigError as error:
+        assert len(str(error).splitlines()) == 1
+
+
+def test_arrays_come_without_a_simulator() -> None:
+    code = (
+        "import sys; from tactile_rt.sim_backend.arrays.files import load_array;"
+        f"load_array({str(EXAMPLES / 'robot.toml')!r}); load_array('rat-both');"
+        "sys.exit(bool({'mujoco', 'trimesh', 'torch'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# Heads
+
+
+def skull(folder: Path, name: str = "skull.stl", scale: float = 1.0, cut: bool = False) -> Path:
+    """A box from (1, 2, 3) to (11, 22, 33) mm, or all but one of its triangles."""
+    mesh = trimesh.creation.box(bounds=[[1, 2, 3], [11, 22, 33]])
+    mesh.apply_scale(scale)
+    if cut:
+        mesh.update_faces(np.arange(len(mesh.faces)) > 0)
+    mesh.export(folder / name)
+    return folder / name
+
+
+@pytest.mark.parametrize("name", ["skull.stl", "skull.obj", "skull.ply"])
+@pytest.mark.parametrize("cut", [False, True])
+def test_a_head_is_drawn_where_its_file_has_it(tmp_path: Path, name: str, cut: bool) -> None:
+    world = mujoco.MjSpec()
+    turn = Mount((5.0, 0.0, -7.0), (0.3, -0.2, 0.9))
+    body = world.worldbody.add_body(name="head", pos=turn.position, quat=quaternion(turn.rotation))
+    add_head(world, body, skull(tmp_path, name, cut=cut))
+    model = world.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    seen = data.geom_xpos[0] + model.mesh_vert @ data.geom_xmat[0].reshape(3, 3).T
+    seen = (seen - turn.position) @ turn.rotation  # back into the head's frame
+    np.testing.assert_allclose(seen.min(axis=0), [1, 2, 3], atol=1e-5)
+    np.testing.assert_allclose(seen.max(axis=0), [11, 22, 33], atol=1e-5)
+    assert model.geom_contype[0] == model.geom_conaffinity[0] == 0
+    assert model.body_mass.sum() == 0
+
+
+@pytest.mark.parametrize(("collide", "contacts"), [(False, False), (True, True)])
+def test_a_head_is_felt_only_if_asked(tmp_path: Path, collide: bool, contacts: bool) -> None:
+    world = mujoco.MjSpec()
+    body = world.worldbody.add_body(name="head")
+    add_head(world, body, skull(tmp_path), collide=collide)
+    other = world.worldbody.add_body(pos=(0.5, 12, 18))
+    other.add_freejoint()
+    other.add_geom(size=(1, 0, 0), contype=WHISKER_BIT, conaffinity=0)
+    model = world.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    assert (data.ncon > 0) == contacts
+    assert head_module.WHISKER_BIT == WHISKER_BIT
+    assert collide == (HEAD_BIT in model.geom_contype)
+
+
+def test_a_head_that_cannot_be_used_is_named(tmp_path: Path) -> None:
+    write(tmp_path, "text.stl", "not a mesh")
+    write(tmp_path, "empty.obj", "# nothing\n")
+    write(tmp_path, "void.stl", "")
+    skull(tmp_path, "metres.stl", 1e-3)
+    for name, said in (
+        ("none.stl", "no such file"),
+        ("skull.glb", "a head is one of .obj, .ply, .stl"),
+        ("text.stl", "cannot be read|no triangles"),
+        ("empty.obj", "cannot be read|no triangles"),
+        ("void.stl", "cannot be read|no triangles"),
+        ("metres.stl", "is 0.03 mm large; export it in mm"),
+    ):
+        world = mujoco.MjSpec()
+        with pytest.raises(ConfigError, match=f"{name}: .*({said})") as caught:
+            add_head(world, world.worldbody.add_body(name="head"), tmp_path / name)
+        assert "\n" not in str(caught.value)
+
+
+# Streams
+
+
+@pytest.mark.parametrize("name", ["rat", str(EXAMPLES / "robot.toml")])
+def test_a_stream_of_any_array(name: str) -> None:
+    with open_source(f"sim:{name}?objects=bottle-3&pace=fast&sweeps=1&seed=4") as source:
+        array = load_array(name)
+        assert source.spec == array_spec(array.whiskers, array.name)
+        assert source.spec.channels == CHANNELS
+        felt = np.zeros(source.spec.shape[0], dtype=bool)
+        for _ in range(150):
+            chunk = source.read()
+            assert chunk is not None and np.isfinite(chunk.values).all()
+            felt |= (np.abs(chunk.values[..., :3]) > 1e-6).any(axis=(0, 2))
+            assert np.abs(chunk.values[..., :3]).max() < 1  # N: bent, not jammed
+        assert felt.any()
+
+
+@pytest.mark.parametrize("profile", PROFILES)
+@pytest.mark.parametrize("name", [*NAMES, str(EXAMPLES / "robot.toml")])
+def test_links_are_adapted_to_the_whiskers(name: str, profile: str) -> None:
+    p = PROFILES[profile]
+    for w in load_array(name).whiskers:
+        assert p.links(w) == max(p.least_links, round(w.length * p.links_per_mm))

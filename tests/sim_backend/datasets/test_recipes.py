@@ -1,0 +1,399 @@
+import sys
+import tomllib
+from dataclasses import fields, replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+pytest.importorskip("mujoco")
+pytest.importorskip("trimesh")
+
+from tactile_rt.sim_backend.datasets.dataset import describe_set
+from tactile_rt.sim_backend.datasets.recipe_files import (
+    read_recipe,
+    recipe_from_dict,
+    recipe_of_set,
+    shipped_recipes,
+)
+from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
+from tactile_rt.sim_backend.datasets.recipes import (
+    Between,
+    Each,
+    ObjectChoice,
+    SweepChoice,
+    SweepRecipe,
+)
+from tactile_rt.sim_backend.objects import catalogue as objects
+from tactile_rt.sim_backend.sweep import Sweep
+from tactile_rt.stream import ConfigError
+from tactile_rt.sweep_set import WITHHELD
+
+
+def write(path: Path, text: str) -> str:
+    path.write_text(text)
+    return str(path)
+
+
+# The ones that ship
+
+
+def test_the_default_set_has_the_size_that_training_needs() -> None:
+    recipe = read_recipe("default24")
+    manifest = describe_set(recipe)
+    assert len(manifest.categories) == 24
+    assert set(manifest.categories) == set(objects.CATEGORIES)
+    assert set(manifest.withheld) == set(objects.WITHHELD)
+    assert not set(manifest.categories) & set(manifest.withheld)
+    counts = {split: len(names) for split, names in manifest.split.items()}
+    assert counts == {"train": 24 * 44, "validation": 24 * 4, "test": 24 * 13, WITHHELD: 4 * 12}
+    assert len(recipe.sweeps) == 12
+    assert (recipe.period_ns, recipe.lead, recipe.samples) == (9_000_000, 24, 164)
+    assert recipe.profile == "realtime"
+
+
+def test_default24_draws_from_the_stated_ranges() -> None:
+    recipe = read_recipe("default24")
+    drawn = [recipe.sweeps.draw(recipe.rng(f"mug-{i}", k), k) for i in range(40) for k in range(12)]
+    ranges = {
+        "speed_mm_s": (28, 40),
+        "yaw_deg": (0, 360),
+        "height_mm": (-8, 4),
+        "distance_mm": (5.5, 8),
+        "gap_mm": (0.5, 4),
+    }
+    for name, (low, high) in ranges.items():
+        values = np.array([getattr(s, name) for s in drawn])
+        assert low <= values.min() < low + 0.05 * (high - low), name
+        assert high >= values.max() > high - 0.05 * (high - low), name
+        assert np.histogram(values, bins=8, range=(low, high))[0].min() > 30, name
+    assert {s.size_mm for s in drawn} == {40.0}
+
+
+def test_the_papers_sets_have_its_combinations() -> None:
+    """Chung et al. (2025), appendix A1."""
+    low = read_recipe("paper-lowvar-highfi")
+    assert (low.profile, len(low.sweeps)) == ("dataset", 16)
+    drawn = [low.sweeps.draw(low.rng("mug-0", i), i) for i in range(16)]
+    grid = {(s.height_mm, s.yaw_deg, s.distance_mm) for s in drawn}
+    assert grid == {(h, y, d) for h in (-5, 0) for y in (0, 30, 90, 120) for d in (5, 8)}
+    assert {(s.speed_mm_s, s.size_mm) for s in drawn} == {(30, 40)}
+
+    high = read_recipe("paper-highvar-lowfi")
+    assert (high.profile, len(high.sweeps)) == ("realtime", (24 + 2) * 12)
+    drawn = [high.sweeps.draw(high.rng("mug-0", i), i) for i in range(312)]
+    held_out = [high.sweeps.draw_index(i) >= high.sweeps.draws for i in range(312)]
+    for height in (-3, 0, 3):
+        here = [out for s, out in zip(drawn, held_out, strict=True) if s.height_mm == height]
+        assert (len(here), sum(here)) == (104, 8)
+    assert {s.distance_mm for s in drawn} == {5}
+    assert 30 <= min(s.speed_mm_s for s in drawn) < 32 < 58 < max(s.speed_mm_s for s in drawn) <= 60
+    assert 20 <= min(s.size_mm for s in drawn) < 22 < 58 < max(s.size_mm for s in drawn) <= 60
+    assert len({s.yaw_deg for s in drawn}) == 312
+
+
+@pytest.mark.parametrize("name", shipped_recipes())
+def test_a_shipped_recipe_is_called_what_its_file_is_called(name: str) -> None:
+    recipe = read_recipe(name)
+    assert recipe.name == name
+    assert recipe_from_dict(recipe.to_dict()) == recipe
+    assert all(side for side in describe_set(recipe).split.values())
+
+
+# Draws
+
+
+def test_every_parameter_of_a_sweep_can_be_chosen() -> None:
+    chosen = {f.name for f in fields(SweepChoice)} - {"draws", "held_out_draws"}
+    assert chosen == {f.name for f in fields(Sweep)}
+    assert all(getattr(SweepChoice, name) == getattr(Sweep, name) for name in chosen)
+
+
+def test_a_sweep_is_drawn_from_seed_object_and_index_alone() -> None:
+    recipe = read_recipe("default24")
+
+    def draw(recipe: SweepRecipe, name: str, index: int) -> Sweep:
+        return recipe.sweeps.draw(recipe.rng(name, index), index)
+
+    first = draw(recipe, "mug-3", 7)
+    assert draw(replace(recipe, profile="accurate"), "mug-3", 7) == first, "paired sets"
+    fewer = replace(recipe, sweeps=replace(recipe.sweeps, draws=8))
+    assert draw(fewer, "mug-3", 7) == first, "a larger set begins with the smaller one's sweeps"
+    others = [
+        draw(recipe, "mug-3", 6),
+        draw(recipe, "mug-4", 7),
+        draw(recipe, "bowl-3", 7),
+        draw(replace(recipe, seed=1), "mug-3", 7),
+    ]
+    assert len({s.yaw_deg for s in [first, *others]}) == 5
+
+
+def test_the_draw_of_a_known_sweep_never_changes() -> None:
+    """What a stored set says of itself must stay true in every later release."""
+    recipe = read_recipe("default24")
+    assert recipe.key("mug-3", 7) == [0, 688124435, 7]
+    sweep = recipe.sweeps.draw(recipe.rng("mug-3", 7), 7)
+    assert round(sweep.yaw_deg, 6) == 300.180777
+
+
+def test_what_may_be_added_to_a_sweep_has_random_numbers_of_its_own() -> None:
+    recipe = SweepRecipe()
+    streams = [recipe.rng("mug-0", 0, k).random() for k in range(3)]
+    assert len(set(streams)) == 3
+
+
+@given(
+    st.lists(st.floats(-100, 100), min_size=1, max_size=4, unique=True),
+    st.lists(st.floats(1, 100), min_size=1, max_size=3, unique=True),
+    st.integers(1, 5),
+    st.integers(0, 3),
+)
+def test_a_grid_has_every_combination_as_often_as_draws(heights, sizes, draws, held_out) -> None:
+    choice = SweepChoice(
+        height_mm=Each(tuple(heights)),
+        size_mm=Each(tuple(sizes)),
+        yaw_deg=Between(0, 360),
+        draws=draws,
+        held_out_draws=held_out,
+    )
+    each = draws + held_out
+    assert len(choice) == len(heights) * len(sizes) * each
+    rng = np.random.default_rng(0)
+    found = [choice.draw(rng, i) for i in range(len(choice))]
+    pairs = [(s.height_mm, s.size_mm) for s in found]
+    assert all(pairs.count((h, s)) == each for h in heights for s in sizes)
+    marked = [choice.draw_index(i) for i in range(len(choice))]
+    assert sorted(marked) == sorted(list(range(each)) * (len(choice) // each))
+
+
+# A user's own
+
+
+def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "mine.toml",
+        """
+        name = "mine"
+        array = "rat"
+        period_ms = 1
+        lead_ms = 30
+        length_ms = 500
+        [objects]
+        categories = ["mug", "bowl"]
+        withheld = ["goblet"]
+        per_category = 5
+        validation = 1
+        test = 2
+        per_withheld = 3
+        [sweeps]
+        draws = 2
+        speed_mm_s = { each = [30, 35.5] }
+        yaw_deg = { between = [-10, 10] }
+        [sensor]
+        noise_force = 1e-5
+        [randomisation]
+        friction = 0.2
+        """,
+    )
+    recipe = read_recipe(path)
+    assert recipe.objects == ObjectChoice(
+        categories=("mug", "bowl"),
+        withheld=("goblet",),
+        per_category=5,
+        validation=1,
+        test=2,
+        per_withheld=3,
+    )
+    assert recipe.sweeps.speed_mm_s == Each((30.0, 35.5))
+    assert recipe.sweeps.yaw_deg == Between(-10.0, 10.0)
+    assert recipe.sensor.noise_force == 1e-5
+    assert recipe.randomisation.friction == 0.2
+    assert (recipe.lead, recipe.samples) == (30, 500)
+    manifest = describe_set(recipe)
+    assert manifest.spec.name == "rat-right"
+    assert manifest.categories == ("mug", "bowl")
+    assert manifest.split == {
+        "train": ("mug-0", "bowl-0", "mug-1", "bowl-1"),
+        "validation": ("mug-2", "bowl-2"),
+        "test": ("mug-3", "bowl-3", "mug-4", "bowl-4"),
+        "withheld": ("goblet-0", "goblet-1", "goblet-2"),
+    }
+    assert recipe_of_set(manifest.recipe, manifest.categories) == recipe
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (
+            "sead = 1",
+            r":1: the file has no key 'sead'; did you mean seed\?",
+        ),
+        ("[sweeps]\nspeed = 3", r":2: sweeps has no key 'speed'; did you mean speed_mm_s\?"),
+        ("[objects]\ncategorys = []", r"objects has no key 'categorys'; did you mean categories\?"),
+        (
+            "[sweeps]\nyaw_deg = { betwen = [0, 1] }",
+            r"sweeps.yaw_deg has no key 'betwen'; did you mean between\?",
+        ),
+        ("[sensor]\nnoise = 1", r"sensor has no key 'noise'; did you mean noise_"),
+        ("[sensor]\nnoise_force = -1", r"sensor: noise_force must be 0 or more, not -1"),
+        ("[randomisation]\nfriction = 2", r"randomisation: friction is relative"),
+        ("seed = 1.5", "seed: expected a whole number, got 1.5"),
+        ("seed = true", "seed: expected a whole number, got True"),
+        ("seed = -1", "seed must be 0 or more, not -1"),
+        ("name = 3", "name: expected text, got 3"),
+        ("period_ms = 'nine'", "period_ms: expected a number, got 'nine' .in milliseconds"),
+        ("period_ms = 0.5", "period_ms must be 1 or more, the simulator's own, not 0.5"),
+        ("lead_ms = 2000", r"length_ms \(1476\) must exceed lead_ms \(2000\)"),
+        ("profile = 'realtim'", r"no profile 'realtim'; did you mean realtime\?"),
+        ("objects = 60", "objects is a table of keys, not 60"),
+        (
+            "[sweeps]\nyaw_deg = [0, 90]",
+            r":2: sweeps.yaw_deg: expected a number or a table, got \[0, 90\]",
+        ),
+        ("[sweeps]\nyaw_deg = { between = [0] }", r"sweeps.yaw_deg: expected a number, \{ between"),
+        ("[sweeps]\nyaw_deg = { each = [] }", r"sweeps.yaw_deg: expected a number, \{ between"),
+        ("[sweeps]\nyaw_deg = { each = [nan] }", r"sweeps.yaw_deg.each\[0\]: nan is no quantity"),
+        ("[sweeps]\nyaw_deg = inf", "sweeps.yaw_deg: inf is no quantity"),
+        ("[sweeps]\nyaw_deg = { between = [9, 1] }", "between has its lower end first, not 9, 1"),
+        ("[sweeps]\nsize_mm = 1e300", "sweeps.size_mm must be within [+]-10000, not 1e[+]300"),
+        ("[sweeps]\nheight_mm = { between = [-2e4, 0] }", "must be within [+]-10000, not -20000"),
+        ("length_ms = 1e12", "length_ms must be at most 600000, not 1e[+]12"),
+        ("[objects]\nper_category = 1000000000", "per_category must be at most 100000, not 1e"),
+        ("[sweeps]\nsize_mm = 0", "sweeps.size_mm must be positive, not 0"),
+        (
+            "[sweeps]\nspeed_mm_s = { each = [30, -3] }",
+            "sweeps.speed_mm_s must be positive, not -3",
+        ),
+        ("[sweeps]\ngap_mm = { between = [-1, 1] }", "sweeps.gap_mm must be 0 or more, not -1"),
+        ("[sweeps]\ndraws = 0", "sweeps.draws must be at least 1, not 0"),
+        ("[sweeps]\nheld_out_draws = -1", "sweeps.held_out_draws must be 0 or more"),
+        ("[objects]\ncategories = 'mug'", "objects.categories: expected a list, got 'mug'"),
+        ("[objects]\ncategories = ['a', 'a']", "objects.categories: 'a' is there twice"),
+        ("[objects]\ncategories = ['mug']\nwithheld = ['mug']", "'mug' is also one of the cat"),
+        ("[objects]\ntest = 0.5", "objects.test must be a whole number, at least 1, not 0.5"),
+        ("[objects]\nvalidation = 0", "objects.validation must be a whole number, at least 1"),
+        ("\nseed = = 1", r"mine.toml:2: not TOML: "),
+    ],
+)
+def test_a_mistake_is_one_line_with_file_key_and_remedy(tmp_path, text, complaint) -> None:
+    path = write(tmp_path / "mine.toml", text)
+    with pytest.raises(ConfigError, match=complaint) as refused:
+        read_recipe(path)
+    assert str(refused.value).startswith(path)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("[objects]\ncategories = ['mugs']", r"no category 'mugs'; did you mean mug\?"),
+        ("[objects]\nwithheld = ['goblets']", r"no category 'goblets'; did you mean goblet"),
+        ("[objects]\nper_category = 16", "16 objects cannot be split with 4 .* and 12 for test"),
+        ("array = 'moose'", "no simulated array 'moose': did you mean mouse"),
+    ],
+)
+def test_what_does_not_exist_is_found_when_the_set_is_described(tmp_path, text, complaint) -> None:
+    recipe = read_recipe(write(tmp_path / "mine.toml", text))
+    with pytest.raises(ConfigError, match=complaint):
+        describe_set(recipe)
+
+
+# A folder of meshes
+
+
+class FakeFolder:
+    """What `object_sets.open_objects` gives for a folder of two categories, one object broken."""
+
+    def __init__(self, sizes: dict[str, int]) -> None:
+        self.categories = {f"{c}/{i:x}": c for c, n in sizes.items() for i in range(n)}
+        self.names = tuple(self.categories)
+        self.skipped = {"cup/broken": "no volume"}
+
+    def load(self, name: str) -> str:
+        return f"the mesh of {name}"
+
+
+@pytest.fixture
+def folder(monkeypatch: pytest.MonkeyPatch):
+    def use(sizes: dict[str, int]) -> None:
+        module = SimpleNamespace(open_objects=lambda path: FakeFolder(sizes))
+        monkeypatch.setitem(sys.modules, "tactile_rt.sim_backend.objects.object_sets", module)
+
+    return use
+
+
+def test_meshes_are_split_eight_to_one_to_one_by_object(folder) -> None:
+    folder({"cup": 40, "chair": 21, "train": 5})
+    recipe = recipe_from_dict({"objects": {"from": "meshes", "withheld": ["train"]}})
+    objects = choose_objects(recipe.objects)
+    assert objects.categories == ("chair", "cup")
+    counts = {split: len(names) for split, names in objects.split.items()}
+    assert counts == {"train": 32 + 17, "validation": 4 + 2, "test": 4 + 2, "withheld": 5}
+    names = [name for side in objects.split.values() for name in side]
+    assert len(names) == len(set(names)) == 66
+    assert not any("/" in name for name in names), "a name is a file's name"
+    assert all(objects.category_of[name] == name.split("-")[0] for name in names)
+    assert objects.load("cup-1f") == "the mesh of cup/1f"
+    assert objects.skipped == {"cup/broken": "no volume"}
+    held_out = set(objects.split["test"])
+    folder({"cup": 40, "chair": 21, "train": 5, "lamp": 30})
+    assert held_out < set(choose_objects(recipe.objects).split["test"])
+
+
+def test_fewer_of_a_folder_and_too_few(folder) -> None:
+    folder({"cup": 40, "chair": 2})
+    some = {"from": "meshes", "categories": ["cup"], "per_category": 10, "validation": 2, "test": 3}
+    split = choose_objects(recipe_from_dict({"objects": some}).objects).split
+    assert [len(names) for names in split.values()] == [5, 2, 3]
+    with pytest.raises(ConfigError, match=r"meshes: chair has 2 objects, too few to hold out 1"):
+        _ = choose_objects(recipe_from_dict({"objects": {"from": "meshes"}}).objects).split
+    wrong = recipe_from_dict({"objects": {"from": "meshes", "categories": ["cups"]}})
+    with pytest.raises(ConfigError, match=r"no category 'cups'; did you mean cup\?"):
+        _ = choose_objects(wrong.objects).split
+
+
+def test_a_folder_names_each_object_once(folder, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder({"a": 3, "a-b": 3})
+    monkeypatch.setattr(FakeFolder, "names", ("a/b", "a-b"), raising=False)
+    monkeypatch.setattr(FakeFolder, "__init__", lambda self, sizes: None)
+    with pytest.raises(ConfigError, match="two objects differ by / and - alone"):
+        _ = choose_objects(ObjectChoice(source="meshes")).split
+
+
+def test_no_such_recipe(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no recipe 'default42'; did you mean default24\?"):
+        read_recipe("default42")
+    with pytest.raises(ConfigError, match=r"none\.toml: no such file"):
+        read_recipe(str(tmp_path / "none.toml"))
+    (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match=r"bytes\.toml:1: not UTF-8 text"):
+        read_recipe(str(tmp_path / "bytes.toml"))
+
+
+def test_a_recipe_of_version_1_comes_to_the_same_objects() -> None:
+    old = {"objects": 60, "validation": 4, "test": 10, "sweeps": 8, "profile": "dataset", "seed": 3}
+    recipe = recipe_of_set(old, read_recipe("mouse12").objects.categories)
+    assert recipe == replace(read_recipe("mouse12"), profile="dataset", seed=3)
+
+
+def test_a_stored_recipe_can_be_written_as_toml_again() -> None:
+    """It has only what TOML knows: no null."""
+    raw = read_recipe("paper-highvar-lowfi").to_dict()
+    assert None not in raw.values()
+    assert tomllib.loads("a = { each = [1.0] }")["a"].keys() == {"each"}
+    assert raw["sweeps"]["height_mm"] == {"each": [-3.0, 0.0, 3.0]}
+
+
+def test_without_a_distance_it_is_that_of_the_array(tmp_path: Path) -> None:
+    """Recipes that name one keep it: millimetres are millimetres."""
+
+    def distance(text: str) -> object:
+        return read_recipe(write(tmp_path / "mine.toml", text)).sweeps.distance_mm
+
+    assert distance("") == 6.5
+    assert distance("array = 'rat'") == 8.75
+    assert distance("array = 'rat'\n[sweeps]\ndistance_mm = 6.5") == 6.5
+    assert distance("array = 'rat'\n[sweeps]\nyaw_deg = 3") == 8.75

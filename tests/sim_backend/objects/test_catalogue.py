@@ -1,0 +1,298 @@
+import functools
+import os
+import subprocess
+import sys
+import zlib
+
+import numpy as np
+import pytest
+
+pytest.importorskip("trimesh")
+
+from tactile_rt.sim_backend.objects.catalogue import (
+    CATEGORIES,
+    WITHHELD,
+    TactileObject,
+    load_object,
+    make_object,
+)
+from tactile_rt.sim_backend.objects.solids import bar, box, normalised, rod, wall
+from tactile_rt.stream import ConfigError
+from tests.helpers.source_tree import ROOT
+
+KINDS = CATEGORIES + WITHHELD
+INDICES = (0, 1, 2, 3, 17, 1000)
+# corners of instance 17, see `digest`
+GOLDEN = {
+    "beehive": 1536081327,
+    "birdcage": 2649613695,
+    "bottle": 3043000262,
+    "bowl": 1939618908,
+    "cactus": 1583569730,
+    "car": 3072276019,
+    "castle": 2795257816,
+    "chair": 1553187143,
+    "dumbbell": 1224340781,
+    "gear": 1706378425,
+    "grapes": 1986311934,
+    "hourglass": 878662480,
+    "house": 4063130710,
+    "jack": 2999354546,
+    "ladder": 417698551,
+    "lamp": 2102001367,
+    "mug": 782511131,
+    "mushroom": 1649591086,
+    "pagoda": 3548658227,
+    "plane": 4104205935,
+    "pumpkin": 4014450080,
+    "snowman": 298180363,
+    "spring": 150304655,
+    "table": 1115701192,
+    "goblet": 3539172797,
+    "stool": 4172743264,
+    "teapot": 992711460,
+    "truck": 830049534,
+}
+MANY = 14  # instances drawn where one in a few takes a rare option
+
+
+@functools.cache
+def drawn(category: str, index: int) -> TactileObject:
+    """make_object, drawn once for all tests that look at it."""
+    return make_object(category, index)
+
+
+def inside(thing: TactileObject, point: tuple[float, float, float]) -> bool:
+    """Whether the point is in any of the convex pieces: behind all faces of one."""
+    return any(
+        bool((((point - p.triangles[:, 0]) * p.face_normals).sum(axis=1) <= 1e-9).all())
+        for p in thing.pieces
+    )
+
+
+def digest(thing: TactileObject) -> int:
+    """A number for all the corners, to 1e-6 of the size."""
+    corners = np.vstack([p.vertices for p in thing.pieces])
+    return zlib.crc32((np.round(corners * 1e6) + 0.0).astype(np.int64).tobytes())
+
+
+def extents(thing: TactileObject) -> np.ndarray:
+    """(2, 3) lowest and highest corner of the bounding box."""
+    bounds = np.array([p.bounds for p in thing.pieces])
+    return np.array([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
+
+
+def test_two_dozen_categories_and_four_withheld_each_in_order() -> None:
+    assert (len(CATEGORIES), len(WITHHELD), len(set(KINDS))) == (24, 4, 28)
+    assert list(CATEGORIES) == sorted(CATEGORIES)
+    assert list(WITHHELD) == sorted(WITHHELD)
+
+
+def test_a_name_stands_for_the_same_corners_for_good() -> None:
+    # recordings and models go by these names
+    assert {c: digest(drawn(c, 17)) for c in GOLDEN} == GOLDEN
+
+
+@pytest.mark.parametrize("category", KINDS)
+def test_pieces_are_solid_convex_and_few(category: str) -> None:
+    for index in range(MANY):
+        thing = drawn(category, index)
+        assert len(thing.pieces) <= 24
+        for piece in thing.pieces:
+            assert piece.is_convex, thing.name
+            assert piece.is_watertight and piece.is_winding_consistent, thing.name
+            assert piece.volume > 1e-5, thing.name
+            assert len(piece.vertices) <= 48, thing.name
+            across = piece.vertices @ piece.face_normals.T
+            assert np.ptp(across, axis=0).min() >= 0.02, f"{thing.name} has a sliver"
+
+
+def test_an_object_costs_a_dozen_pieces_on_average() -> None:
+    counts = [len(drawn(c, i).pieces) for c in KINDS for i in INDICES]
+    assert np.mean(counts) <= 13
+
+
+@pytest.mark.parametrize("category", KINDS)
+def test_it_is_centred_with_largest_extent_one(category: str) -> None:
+    for index in INDICES:
+        thing = drawn(category, index)
+        assert (thing.name, thing.category) == (f"{category}-{index}", category)
+        low, high = extents(thing)
+        np.testing.assert_allclose(low + high, 0, atol=1e-9)
+        assert (high - low).max() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("category", KINDS)
+def test_its_pieces_hang_together(category: str) -> None:
+    for index in range(MANY):
+        pieces = drawn(category, index).pieces
+        boxes = np.array([p.bounds for p in pieces])
+        reached, todo = {0}, [0]
+        while todo:  # bounding boxes that overlap: necessary, and what a misplaced part breaks
+            low, high = boxes[todo.pop()]
+            near = ((boxes[:, 0] <= high + 1e-9) & (boxes[:, 1] >= low - 1e-9)).all(axis=1)
+            new = set(np.flatnonzero(near).tolist()) - reached
+            reached |= new
+            todo += new
+        assert len(reached) == len(pieces), f"{category}-{index} is in parts"
+
+
+@pytest.mark.parametrize("category", KINDS)
+def test_much_of_it_is_where_whiskers_reach(category: str) -> None:
+    heights = np.linspace(-0.25, 0.25, 21)
+    for index in range(MANY):
+        bounds = np.array([p.bounds[:, 2] for p in drawn(category, index).pieces])
+        met = ((bounds[:, :1] <= heights) & (heights <= bounds[:, 1:])).any(axis=0)
+        assert met.mean() >= 0.3, f"{category}-{index}"
+        assert met[8:13].any(), f"{category}-{index} is missed at its middle height"
+
+
+@pytest.mark.parametrize("category", KINDS)
+def test_no_two_instances_are_equal(category: str) -> None:
+    shapes = [drawn(category, i) for i in range(MANY)]
+    assert len({digest(s) for s in shapes}) == MANY
+    # and not by a hair, nor by little on the whole: sides of the bounding box, surface
+    figures = [[*np.ptp(extents(s), axis=0), sum(p.area for p in s.pieces)] for s in shapes]
+    apart = np.abs(np.array(figures)[:, None] - np.array(figures)).max(axis=2)
+    assert apart[~np.eye(MANY, dtype=bool)].min() > 0.003
+    assert np.median(apart) > 0.05
+
+
+def test_the_same_in_another_process() -> None:
+    wanted = [digest(make_object(c, 5)) for c in KINDS]
+    code = (
+        "from tests.sim_backend.objects.test_catalogue import KINDS, digest, make_object\n"
+        "print([digest(make_object(c, 5)) for c in KINDS])"
+    )
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    got = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": path, "PYTHONHASHSEED": "12345"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert got.stdout.strip() == str(wanted)
+
+
+def test_drawing_one_leaves_the_next_unchanged() -> None:
+    before = digest(make_object("mug", 3))
+    make_object("mug", 4)
+    np.random.default_rng(0).random()
+    assert digest(make_object("mug", 3)) == before
+
+
+@pytest.mark.parametrize("index", INDICES)
+def test_hollows_stay_hollow(index: int) -> None:
+    assert not inside(drawn("bowl", index), (0, 0, 0.1))
+    assert inside(drawn("bowl", index), (0, 0, -0.5 * extent_z("bowl", index) + 0.01))
+    mug = drawn("mug", index)
+    axis = (extents(mug)[0, 0] + mug.pieces[0].extents[0] / 2 + 0.05, 0.0)
+    for z in (-0.2, 0.0, 0.2):
+        assert not inside(mug, (*axis, z))
+    assert inside(mug, (*axis, extents(mug)[0, 2] + 0.02)), "the mug has no floor"
+    gear = drawn("gear", index)
+    assert not inside(gear, (0, 0, 0)) and inside(gear, (0.3, 0, 0))
+
+
+def extent_z(category: str, index: int) -> float:
+    """Height of an instance."""
+    low, high = extents(drawn(category, index))
+    return float(high[2] - low[2])
+
+
+@pytest.mark.parametrize("index", INDICES)
+def test_waists_cages_and_rims_leave_air_where_they_should(index: int) -> None:
+    glass, cage, cap = (drawn(c, index) for c in ("hourglass", "birdcage", "mushroom"))
+    assert inside(glass, (0, 0, 0)) and not inside(glass, (0.12, 0, 0))
+    assert inside(glass, (0.12, 0, 0.4)) and inside(glass, (0.12, 0, -0.4))
+    assert not inside(cage, (0, 0, 0)) and inside(cage, (0, 0, -0.49))
+    bottom = extents(cap)[0, 2]
+    assert inside(cap, (0, 0, bottom + 0.1)) and not inside(cap, (0.42, 0, bottom + 0.1))
+    assert inside(cap, (0.42, 0, bottom + extent_z("mushroom", index) * 0.55))
+
+
+@pytest.mark.parametrize("index", INDICES)
+def test_a_spring_is_a_coil_of_air(index: int) -> None:
+    spring = drawn("spring", index)
+    assert not any(inside(spring, (0, 0, z)) for z in np.linspace(-0.45, 0.45, 10))
+    radius = 0.5 * np.ptp(extents(spring)[:, 0])
+    angles = np.linspace(0, 2 * np.pi, 9)[:-1]
+    for a in angles:  # up the side of the coil, wire and gap in turn
+        column = [
+            any(inside(spring, (r * np.cos(a), r * np.sin(a), z)) for r in radius - 0.02 * k)
+            for z in np.linspace(-0.45, 0.45, 46)
+            for k in [np.arange(2, 7)]
+        ]
+        assert (np.diff(np.array(column, int)) == 1).sum() >= 2
+
+
+@pytest.mark.parametrize("index", INDICES)
+def test_there_is_air_under_tables_chairs_and_shades(index: int) -> None:
+    assert not inside(drawn("table", index), (0, 0, -0.1))
+    assert not inside(drawn("chair", index), (0, 0, -0.25))
+    shade = drawn("lamp", index)
+    assert not inside(shade, (0.12, 0, 0.2))
+    assert inside(shade, (0, 0, -0.2)), "the pole is missing"
+
+
+def test_there_is_a_gap_behind_the_handle() -> None:
+    for index in INDICES:
+        mug = drawn("mug", index)
+        row = [inside(mug, (x, 0, 0.02)) for x in np.arange(0.5, -0.5, -0.004)]
+        # from outside: handle, gap, wall, cavity, wall
+        assert (np.diff(np.array(row, int)) == 1).sum() >= 2
+
+
+def test_load_object_takes_a_name_with_or_without_an_index() -> None:
+    assert load_object("mug-17").name == "mug-17"
+    assert load_object("mug").name == "mug-0"
+    assert digest(load_object("mug")) == digest(make_object("mug", 0))
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        ("mugg", r"did you mean 'mug'\?.*bottle, bowl.*goblet.*withheld.*\.glb"),
+        ("Table-3", r"'Table' \(did you mean 'table'\?\)"),
+        ("goblett", r"did you mean 'goblet'\?"),
+        ("qqq", r"no object called 'qqq'; there are beehive, birdcage"),
+        ("mug--3", "no object called 'mug-'"),
+        ("", "no object called ''"),
+        ("cup.step", r"cup\.step.*'\.step'.*\.obj, \.stl, \.ply, \.glb"),
+        ("nowhere/cup.stl", "no such file"),
+    ],
+)
+def test_what_cannot_be_loaded_is_said_in_one_line(target: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as caught:
+        load_object(target)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_index_below_zero_is_refused() -> None:
+    with pytest.raises(ConfigError, match="0 or more"):
+        make_object("mug", -1)
+
+
+def test_normalised_keeps_proportions() -> None:
+    big = normalised([box((10, 0, 0), (4, 2, 1)), box((12.5, 0, 0), (1, 2, 1))])
+    np.testing.assert_allclose([p.extents for p in big], [[0.8, 0.4, 0.2], [0.2, 0.4, 0.2]])
+    assert [p.bounds[0, 0] for p in big] == pytest.approx([-0.5, 0.3])
+
+
+def test_a_bar_keeps_its_sides_level() -> None:
+    flat = bar((0, 0, 0), (0, 2, 0), width=0.1, height=0.3)
+    np.testing.assert_allclose(flat.extents, [0.1, 2, 0.3], atol=1e-12)
+    steep = bar((0, 0, 0), (0, 0, 2), width=0.1, height=0.3)
+    np.testing.assert_allclose(steep.extents, [0.1, 0.3, 2], atol=1e-12)
+
+
+def test_volumes_of_the_building_blocks() -> None:
+    assert rod((0, 0, 0), (1, 1, 1), 0.1, sides=48).volume == pytest.approx(
+        np.pi * 0.01 * np.sqrt(3), rel=0.01
+    )
+    staves = wall([(0.5, 0), (0.5, 1)], 0.1)
+    assert len(staves) == 8
+    outer = 24 / 2 * 0.5**2 * np.sin(2 * np.pi / 24)
+    inner = 8 / 2 * 0.4**2 * np.sin(2 * np.pi / 8)
+    assert sum(s.volume for s in staves) == pytest.approx(outer - inner)

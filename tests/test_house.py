@@ -1,0 +1,305 @@
+"""The house is in order: nobody imports in a circle, every name is given once, every word leads
+somewhere.
+
+The linter of imports sees neither a circle through functions nor an import by a string, so both are
+followed here. Tables of plug-ins, of which each entry is imported when it is asked for, are meant
+to point upward and do not count.
+"""
+
+import ast
+import builtins
+import re
+from collections import defaultdict
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+
+import pytest
+
+from tests.helpers.source_tree import (
+    ROOT,
+    SourceModule,
+    attribute_entries,
+    circles,
+    collapsed,
+    members,
+    modules,
+    names_in_ticks,
+    parameters,
+    product,
+    why_a_fragment,
+)
+
+# What is loaded by its name when it is asked for: sources, codecs, publishers, encoders, commands,
+# rigs, and what `from tactile_rt import ...` gives.
+TABLES = {
+    "tactile_rt",
+    "tactile_rt.cli",
+    "tactile_rt.cli.bench",
+    "tactile_rt.daemon.publishers",
+    "tactile_rt.drivers.codec",
+    "tactile_rt.models",
+    "tactile_rt.models.ead",
+    "tactile_rt.sources.opening",
+}
+ROOMS = sorted({m.room for m in product()} - {""})
+# Names that are not ours: of ONNX operators, and what the usage of commands calls their arguments.
+OPERATORS = {"Gemm", "MatMulInteger", "MatMulNBits", "Scan", "ScatterND"}
+FILES = re.compile(r"[\w-]+\.(csv|json|md|onnx|pt|toml|zip)")
+
+
+@cache
+def arrows() -> list[tuple[str, str]]:
+    """Who imports whom among the shipped modules."""
+    ours = {m.name for m in product()}
+    return [
+        (module.name, imported.module)
+        for module in product()
+        for imported in module.imports
+        if imported.module in ours and not (imported.by_name and module.name in TABLES)
+    ]
+
+
+def test_what_is_imported_by_name_is_known() -> None:
+    """Else no circle through it would be seen."""
+    unknown = {
+        f"{module.name}:{imported.line}"
+        for module in product()
+        for imported in module.imports
+        if imported.by_name and "*" in imported.module and module.name not in TABLES
+        if imported.module.startswith(("tactile_rt", "*"))
+    }
+    assert unknown == set()
+    assert set(modules()) >= TABLES, "a table that is none any more"
+
+
+def test_no_modules_import_each_other() -> None:
+    assert circles(collapsed(arrows())) == []
+
+
+def test_no_rooms_import_each_other() -> None:
+    rooms = ((modules()[a].room, modules()[b].room) for a, b in arrows())
+    assert circles(collapsed((a, b) for a, b in rooms if a and b)) == []
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_no_parts_of_a_room_import_each_other(room: str) -> None:
+    """At every level: the modules and folders that lie in one folder."""
+    for folder in product():
+        if folder.room != room or folder.path.name != "__init__.py":
+            continue
+        inside = f"{folder.name}."
+        parts = (
+            (a.removeprefix(inside).partition(".")[0], b.removeprefix(inside).partition(".")[0])
+            for a, b in arrows()
+            if a.startswith(inside) and b.startswith(inside)
+        )
+        assert circles(collapsed(parts)) == []
+
+
+def test_circles_are_found() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a", "d"}, "d": set()}) == [["a", "b", "c"]]
+    assert circles({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+    assert circles({"a": {"a"}}) == [["a"]]
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_what_is_shipped_needs_neither_face_nor_fakes_nor_rigs(room: str) -> None:
+    wrong = [
+        f"{module.name}:{imported.line} imports {imported.name or imported.module}"
+        for module in product()
+        if module.room == room and room != "testing"
+        for imported in module.imports
+        if not (imported.by_name and module.name in TABLES)
+        if imported.module == "tactile_rt"
+        or imported.module.startswith("tactile_rt.testing")
+        or imported.module.partition(".")[0] in ("tests", "bench")
+    ]
+    assert wrong == []
+
+
+def test_no_two_public_classes_share_a_name() -> None:
+    where = defaultdict(list)
+    for module in modules().values():
+        for name in module.classes:
+            if not name.startswith("_"):
+                where[name].append(module.name)
+    assert {name: places for name, places in where.items() if len(places) > 1} == {}
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_attribute_is_explained_by_words_that_stand_alone(room: str) -> None:
+    wrong = [
+        f"{module.name}.{node.name}.{name} {why}: {text}"
+        for module in product()
+        if module.room == room
+        for node, _, said in module.documented
+        if isinstance(node, ast.ClassDef)
+        for name, text in attribute_entries(said)
+        if (why := why_a_fragment(text))
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_a_fragment_is_known_from_a_sentence() -> None:
+    whole = "The TCP port that the page listens on, 1 to 65535."
+    said = f"""A page.
+
+Attributes:
+    port: {whole}
+    host: of it.
+    a, b: Two
+        lines.
+"""
+    assert list(attribute_entries(said)) == [
+        ("port", whole),
+        ("host", "of it."),
+        ("a, b", "Two lines."),
+    ]
+    assert why_a_fragment(whole) == ""
+    for text in (
+        "of it.",
+        "Of the page, if any.",
+        "Port.",
+        "The port of the page",
+        "What it said to us.",
+    ):
+        assert why_a_fragment(text), text
+
+
+# names in back-ticks
+
+
+@cache
+def known_classes() -> dict[str, list[tuple[SourceModule, ast.ClassDef]]]:
+    """All classes, those in classes and functions, too, and where they are."""
+    found = defaultdict(list)
+    for module in product():
+        for node, _ in module.nodes:
+            if isinstance(node, ast.ClassDef):
+                found[node.name].append((module, node))
+    return dict(found)
+
+
+@cache
+def known_words() -> set[str]:
+    """Every name that the package defines or takes anywhere."""
+    words: set[str] = set()
+    for module in product():
+        words |= module.names | set(module.name.split("."))
+        for node, _ in module.nodes:
+            if isinstance(node, ast.Name):
+                words.add(node.id)
+            elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+                words.add(node.attr)
+            elif isinstance(node, ast.arg):
+                words.add(node.arg)
+            elif isinstance(node, ast.ClassDef):
+                words |= members(node)
+    return words
+
+
+def names_of(module: SourceModule, node: ast.ClassDef) -> set[str]:
+    """What a class has of its own: members, attributes, parameters of its constructor."""
+    made = [n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"]
+    return members(node).union(module.own_attributes.get(node, ()), *map(parameters, made))
+
+
+def has_member(name: str, member: str) -> bool:
+    """Whether a class, or one that it is made from, has a member; true where one is not ours."""
+    for module, node in known_classes()[name]:
+        if member in names_of(module, node):
+            return True
+        for base in node.bases:
+            above = ast.unparse(base).partition("[")[0].rpartition(".")[2]
+            if above in known_classes():
+                if above != name and has_member(above, member):
+                    return True
+            elif above not in (
+                "Generic",
+                "Protocol",
+                "ABC",
+                "Enum",
+                "StrEnum",
+                "IntEnum",
+                "Struct",
+            ):
+                return True
+    return False
+
+
+def resolves(name: str, module: SourceModule, node: ast.AST, owner: ast.ClassDef | None) -> bool:
+    """Whether a name in a docstring leads somewhere, read where it stands."""
+    head, _, rest = name.partition(".")
+    own = parameters(node)
+    for inside in (owner, node):
+        if isinstance(inside, ast.ClassDef):
+            own |= names_of(module, inside)
+    near = module.names | own
+    if not rest:
+        if name in near or hasattr(builtins, name) or name in OPERATORS:
+            return True
+        return name in (known_classes() if name[0].isupper() else known_words())
+    if FILES.fullmatch(name):
+        return True
+    if name.endswith(".py"):
+        return any(m.path.name == name for m in modules().values())
+    if head in known_classes():
+        return has_member(head, rest.partition(".")[0])
+    values = all(part in known_words() for part in name.split("."))
+    if head in own or head == "self":  # a value: its class is not followed
+        return values
+    if any(f".{m.name}".endswith(f".{name}") for m in product()):
+        return True
+    place, _, last = name.rpartition(".")
+    if any(last in m.names for m in product() if f".{m.name}".endswith(f".{place}")):
+        return True
+    if any(head in m.name.split(".") for m in product()):
+        return False
+    if find_spec(head) is not None:
+        return hasattr(import_module(place), last)
+    return values
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_names_in_back_ticks_lead_somewhere(room: str) -> None:
+    wrong = [
+        f"{module.name}: `{name}` in the docstring of {getattr(node, 'name', 'the module')}"
+        for module in product()
+        if module.room == room
+        for node, owner, said in module.documented
+        for name in names_in_ticks(said)
+        if re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", name)
+        if not resolves(name, module, node, owner)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_a_name_that_leads_nowhere_is_found() -> None:
+    stream = modules()["tactile_rt.stream"]
+    for name in (
+        "Chunk",
+        "ArraySpec.elements",
+        "ConfigError",
+        "stream.Chunk",
+        "numpy.load",
+        "list",
+    ):
+        assert resolves(name, stream, stream.tree, None), name
+    for name in ("Chnk", "ArraySpec.lements", "stream.Chnk", "strem.Chunk", "numpy.lod", "chnk"):
+        assert not resolves(name, stream, stream.tree, None), name
+
+
+# tests mirror the tree
+
+
+def test_every_test_lies_where_its_subject_does() -> None:
+    folders = {m.path.parent.relative_to(ROOT) for m in modules().values()}
+    mirrored = {f.relative_to("tactile_rt") if f.parts[0] == "tactile_rt" else f for f in folders}
+    tests = ROOT / "tests"
+    astray = {
+        str(path.relative_to(tests))
+        for path in tests.rglob("test_*.py")
+        if path.parent.relative_to(tests) not in mirrored
+    }
+    assert astray == set()
