@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from tactile_rt.classifier.model_file import load_model, shipped_model
     from tactile_rt.classifier.session import Session
     from tactile_rt.drivers.codec import Codec
+    from tactile_rt.recording.reader import Recording
     from tactile_rt.sources.opening import open_source
     from tactile_rt.stream import (
         ArraySpec,
@@ -45,6 +46,7 @@ __all__ = [
     "ConfigError",
     "EndOfStream",
     "ModelError",
+    "Recording",
     "RecordingError",
     "Session",
     "Source",
@@ -64,6 +66,7 @@ _WHERE = {
     "Classification": "tactile_rt.classifier.classifier",
     "Classifier": "tactile_rt.classifier.classifier",
     "Codec": "tactile_rt.drivers.codec",
+    "Recording": "tactile_rt.recording.reader",
     "Session": "tactile_rt.classifier.session",
     "fuse": "tactile_rt.classifier.classifier",
     "load_model": "tactile_rt.classifier.model_file",
