@@ -155,8 +155,8 @@ class BoundedQueue(Generic[T]):
 
     def wait_for_room(self, timeout: float | None = None) -> None:
         """Wait until at most half of it is full, nobody takes from it, or the time is over."""
-        with self._lock:
-            if not self._has_room():
+        if not self._has_room():  # a look without the lock: who puts much is not held up by it
+            with self._lock:
                 self._wait(self._has_room, timeout)
 
     def close(self, drop: bool = False) -> None:
