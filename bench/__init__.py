@@ -1,1 +1,11 @@
-"""Rigs and scripts that make the project's figures and pictures. They run from a checkout only."""
+"""What makes the project's figures and pictures. It runs from a checkout and is in no wheel.
+
+sim drivers models inference daemon align   an area each: `tactile-rt bench AREA` has `area` run
+checks      programs that fail if an answer is no: export, wheel, aarch64, a run of days
+pictures    scripts that redraw the pictures and tables of `docs/`
+speed       whether this checkout is as fast as another
+emulated    the emulated arrays of all rigs
+processes   a function in a process of its own
+
+Everything is started from the checkout's root, e.g. ``python -m bench.checks.wheel``.
+"""

@@ -37,10 +37,10 @@ class QueueState:
     """What became of all that was put into a queue, by kind: put = taken + dropped + waiting.
 
     Attributes:
-        waiting: How many of each kind wait now.
-        put: How many of each kind were put so far.
-        taken: How many of each kind the reader took so far.
-        dropped: How many of each kind were dropped so far.
+        waiting: The number of each kind that waits now.
+        put: The number of each kind that was put so far.
+        taken: The number of each kind that the reader took so far.
+        dropped: The number of each kind that was dropped so far.
         waiting_bytes: The size of all that waits now, bytes.
     """
 
@@ -155,8 +155,8 @@ class BoundedQueue(Generic[T]):
 
     def wait_for_room(self, timeout: float | None = None) -> None:
         """Wait until at most half of it is full, nobody takes from it, or the time is over."""
-        with self._lock:
-            if not self._has_room():
+        if not self._has_room():  # a look without the lock: who puts much is not held up by it
+            with self._lock:
                 self._wait(self._has_room, timeout)
 
     def close(self, drop: bool = False) -> None:

@@ -61,7 +61,9 @@ def record(
         leaving(seconds),
     ):  # fmt: skip
         _copy(opened, writer)
-    files = f"{output.with_stem(f'{output.stem}-*')} ({writer.files} files)" if rotated else output
+    files = (
+        f"{output.with_stem(f'{output.stem}-*')} ({writer.files} of them)" if rotated else output
+    )
     typer.echo(f"{files}: {_told(opened, writer)}")
 
 

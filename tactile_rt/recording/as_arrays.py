@@ -60,9 +60,9 @@ class Told:
 
     Attributes:
         chunk_samples: The number of samples of each chunk.
-        chunk_log_ns: When each chunk was recorded, host monotonic time, ns.
+        chunk_log_ns: The host monotonic time at which each chunk was recorded, ns.
         texts: The messages of each topic, JSON.
-        log_ns: When each message of a topic was recorded, host monotonic time, ns.
+        log_ns: The host monotonic time at which each message of a topic was recorded, ns.
     """
 
     def __init__(self) -> None:

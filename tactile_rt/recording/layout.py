@@ -110,7 +110,7 @@ class Raw:
     Attributes:
         topic: The name of its channel, e.g. ``samples``.
         t_ns: The time under which it was recorded, host monotonic time, ns.
-        data: The encoded message.
+        data: The bytes of the encoded message.
     """
 
     topic: str

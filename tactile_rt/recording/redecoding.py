@@ -27,9 +27,10 @@ class Redecoded:
         equal: The number of samples of both whose values and validity are the same, bit for bit.
         differing: The number of samples of both whose values or validity are not the same.
         validity: The number of differing samples in which an element is valid in one of both alone.
-        largest: (channel, unit, largest difference where both are valid) of channels that differ.
+        largest: Each channel that differs, its unit, and the largest difference where both samples
+            are valid.
         time_ns: The largest difference between the two times of one sample, ns.
-        array: Where the arrays differ, in words; values then are not compared.
+        array: The differences between the two arrays, in words; values then are not compared.
     """
 
     recorded: int

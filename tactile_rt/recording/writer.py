@@ -138,7 +138,7 @@ class RecordingWriter:
 
     Attributes:
         path: The path of the file.
-        begun_ns: When the file was begun, host monotonic time, ns.
+        begun_ns: The host monotonic time at which the file was begun, ns.
         stats: The counts so far; `dropped_samples` and `dropped_packets` are the caller's to keep.
 
     Raises:

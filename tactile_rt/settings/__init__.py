@@ -22,6 +22,7 @@ from tactile_rt.settings.tree import (
     merge,
     named,
     parse_toml,
+    read_text,
     read_toml,
 )
 from tactile_rt.settings.written import (
@@ -49,6 +50,7 @@ __all__ = [
     "parse_options",
     "parse_toml",
     "read_csv",
+    "read_text",
     "read_toml",
     "refusal",
     "set_key",

@@ -53,7 +53,7 @@ def convert(
 
     Args:
         root: the whole tree, for where things are.
-        kind: `msgspec.Struct`, dataclass, or what else msgspec converts to.
+        kind: A msgspec struct, a dataclass, or what else msgspec converts to.
         path: of what is converted; empty: all of it.
         top: the type of the whole tree, to tell a table that stands in another one's place; by
             default `kind` if the path is empty.
@@ -303,7 +303,7 @@ def _said(error: Exception, node: SettingNode, kind: Any, path: Sequence[str | i
 
 
 def _described(kind: Any) -> str:
-    """What text is that must match a pattern: `msgspec.Meta` says so."""
+    """What text is that must match a pattern: the note of its type says so."""
     for note in typing.get_args(kind)[1:] if typing.get_origin(kind) is Annotated else ():
         if isinstance(note, msgspec.Meta) and note.description:
             return note.description

@@ -65,7 +65,7 @@ def test_a_set_cannot_be_made_in_or_under_a_file(refused, a_file):
     [
         (("--seed", -1), "seed must be 0 or more"),
         (("--split", "train,tests"), "no split 'tests': there are train, validation, test"),
-        (("--profile", "fast"), "no profile 'fast': there are realtime"),
+        (("--profile", "fast"), "no profile 'fast'; there are realtime"),
     ],
 )
 def test_an_impossible_set_is_refused_before_anything_is_written(refused, tmp_path, options, said):
@@ -145,7 +145,7 @@ def torch():
         (("--width", 1e6), "width is 1000000.0, must be a positive multiple of 1/32, at most 4"),
         (("--attender", "lstm"), "attender is 'lstm', not one of gpt, mamba, none"),
         (("--seed", -1), "seed must be 0 to 4294967295"),
-        (("--learning-rate", "nan"), "learning_rate must be positive, not nan"),
+        (("--learning-rate", "nan"), "learning_rate: nan is no quantity"),
     ],
 )
 def test_options_that_cannot_be_trained_with_leave_no_run(

@@ -9,16 +9,16 @@ import json
 from importlib.util import find_spec
 
 import pytest
-from tactile_rt.recording.sweep_replay import SweepOptions
 
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.drivers.codec import CODECS, codec_class
 from tactile_rt.drivers.opening import CanOptions, SerialOptions
-from tactile_rt.recording.replay import ReplayOptions
+from tactile_rt.recording.replay import ReplayOptions, SweepOptions
 from tactile_rt.sources.opening import open_source
 from tactile_rt.sources.synthetic import SyntheticOptions
 from tactile_rt.stream import TactileError
+from tactile_rt.testing import small_spec
 from tests.helpers.tiny_sweeps import write_tiny_set
 
 SMALL = 'version = 1\n[[source]]\nname = "a"\nurl = {}\n'
@@ -226,6 +226,8 @@ def test_so_is_what_is_wrong_with_a_file_that_it_names(alike, tmp_path):
     }
     for name, written in heads.items():
         (tmp_path / f"{name}.toml").write_text(written)
+    array = tmp_path / "array.json"
+    array.write_text(small_spec().to_json().replace("1000.0", '"fast"'))
     mapping, cell = tmp_path / "mapping.toml", tmp_path / "cell.toml"
     mapping.write_text('columns = ["A0.fx"]\nrate_hz = "fast"\n')
     cell.write_text("version = 1\ndevice = 7\n")
@@ -242,6 +244,8 @@ def test_so_is_what_is_wrong_with_a_file_that_it_names(alike, tmp_path):
         )
     ]  # fmt: skip
     assert any(":2: rate_hz: expected a number, got 'fast'" in s for s in said)
+    found = alike(f"{SERIAL}native&array={array}")
+    assert found == f"{array}: rate_hz: expected a number, got 'fast' (in hertz)"
 
 
 def test_so_is_a_recording_with_wrong_options(alike, call, tmp_path):

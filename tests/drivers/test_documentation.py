@@ -15,7 +15,9 @@ from tactile_rt.drivers.opening import CanOptions, SerialOptions
 from tactile_rt.sources.combined import _File
 from tests.helpers.codec_contract import CodecCase, CodecContract
 
-GUIDE = (Path(__file__).parents[2] / "docs" / "drivers.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[2]
+GUIDE = (ROOT / "docs" / "drivers.md").read_text(encoding="utf-8")
+NUMBERS = {2: "two", 16: "sixteen", 18: "eighteen"}
 
 
 def block(language: str, word: str) -> str:
@@ -58,3 +60,13 @@ def test_the_combined_arrays_are_combined() -> None:
 )
 def test_every_name_is_in_the_guide(names: set[str]) -> None:
     assert not {name for name in names if f"`{name}`" not in GUIDE}
+
+
+def test_the_front_page_counts_the_codecs() -> None:
+    page = (ROOT / "README.md").read_text("utf-8")
+    names = [name for _, name in CODECS]
+    protocols = set(names)
+    both = [name for name in protocols if names.count(name) > 1]
+    said = f"{NUMBERS[len(protocols)].capitalize()} protocols are spoken, {NUMBERS[len(both)]} of"
+    assert said in page
+    assert f"by {NUMBERS[len(names)]} codecs" in page

@@ -92,7 +92,7 @@ def test_a_file_combines_urls(tmp_path):
         ('name = "a"\nrate_hz = 1\nsource = []', "no \\[\\[source\\]\\]"),
         (
             'name = "a"\nrate_hz = 1\nsource = [{name="x", url="y", pose=1}]',
-            r":3: source\[0\] has no key 'pose'; did you mean position\?",
+            r":3: source\[0\] has no key 'pose'; there are name, url, pos",
         ),
         ("name = ", ":1: not TOML: Invalid value"),
         ('name = "a"\nrate_hz = 0', ":2: rate_hz: expected a number > 0"),

@@ -1,13 +1,15 @@
 """What the native protocol says on every line: see docs/native-protocol.md."""
 
 from dataclasses import dataclass
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.settings import convert, make_node, read_text
+from tactile_rt.stream import SPEC_VERSION, ArraySpec, ConfigError
 
 __all__ = [
     "FORMATS",
@@ -128,14 +130,22 @@ def read_array(path: str) -> ArraySpec | None:
     """
     if not path:
         return None
+    text = read_text(Path(path))
     try:
-        with open(path, encoding="utf-8") as file:
-            return ArraySpec.from_json(file.read())
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise ConfigError(f"{path}: {why}") from None
+        return ArraySpec.from_json(text)
     except ConfigError as error:
+        _explain(text, path)
         raise ConfigError(f"{path}: {error}") from None
+
+
+def _explain(text: str, path: str) -> None:
+    """Raise what is wrong with the array in words, if it is a key or its value."""
+    try:
+        fields = msgspec.json.decode(text, type=dict[str, Any])
+    except msgspec.MsgspecError:
+        raise ConfigError(f"{path}: not JSON, as `tactile-rt describe` writes it") from None
+    if fields.pop("version", None) == SPEC_VERSION:
+        convert(make_node(fields, path, 0, Path()), ArraySpec)
 
 
 def check_ranges(*ranges: float) -> None:
