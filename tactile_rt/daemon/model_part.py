@@ -15,7 +15,7 @@ from tactile_rt.daemon.health import LatencyMeter, ModelState
 from tactile_rt.daemon.items import Contact, Decision, Item, Opened, SourceChunk
 from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.part import Part, Report
-from tactile_rt.daemon.source_part import device_of
+from tactile_rt.drivers.device_source import device_of
 from tactile_rt.stream import NS_PER_S, ConfigError, Source, TactileError, concatenate
 
 __all__ = ["ModelPart", "file_stamp", "model_path"]

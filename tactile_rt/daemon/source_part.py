@@ -12,12 +12,12 @@ from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
-from tactile_rt.drivers.device_source import DeviceSource
+from tactile_rt.drivers.device_source import DeviceSource, device_of
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ArraySpec, EndOfStream, Source, SourceStats
 
-__all__ = ["SourcePart", "device_of"]
+__all__ = ["SourcePart"]
 
 POLL_S = 0.1  # how soon it notices that it should stop
 LOOK_NS = 50_000_000  # between two looks at a device's health
@@ -196,13 +196,6 @@ class SourcePart(Part):
         for box in self._hub.wanted(SourceChunk):
             self._busy_ns = time.monotonic_ns()
             box.wait_for_room(min(1.0, self.limits.stall_s / 2))
-
-
-def device_of(source: Source) -> DeviceSource | None:
-    """The device behind a source, if there is one."""
-    while isinstance(source, CalibratedSource):
-        source = source.source
-    return source if isinstance(source, DeviceSource) else None
 
 
 def _told(health: Health, before: tuple[Any, ...]) -> str:

@@ -11,13 +11,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from tactile_rt.calibration.correction import CalibratedSource
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, Step
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.drivers.links import Link
 from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, EndOfStream, Source, SourceError
 
-__all__ = ["DeviceOptions", "DeviceSource", "Tap"]
+__all__ = ["DeviceOptions", "DeviceSource", "Tap", "device_of"]
 
 # Called with each packet as it came and its arrival (host time, ns), and with None whenever the
 # line has been opened. It must be quick: the device is not read meanwhile.
@@ -353,3 +354,10 @@ class DeviceSource(Source):
         if state != self._state:
             self._since = time.monotonic_ns()
         self._state, self._reason = state, reason
+
+
+def device_of(source: Source) -> DeviceSource | None:
+    """The device behind a source, if there is one."""
+    while isinstance(source, CalibratedSource):
+        source = source.source
+    return source if isinstance(source, DeviceSource) else None

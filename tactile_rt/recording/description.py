@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from tactile_rt.calibration import CalibratedSource, Calibration
-from tactile_rt.drivers.device_source import DeviceSource
+from tactile_rt.drivers.device_source import device_of
 from tactile_rt.stream import ArraySpec, ConfigError, RecordingError, Source
 
 __all__ = [
@@ -19,7 +19,6 @@ __all__ = [
     "SUMMARY",
     "Description",
     "describe",
-    "device_of",
     "seal",
     "unseal",
     "utc_offset_ns",
@@ -135,13 +134,6 @@ def utc_offset_ns() -> int:
     before = time.monotonic_ns()
     utc = time.time_ns()
     return utc - (before + time.monotonic_ns()) // 2
-
-
-def device_of(source: Source) -> DeviceSource | None:
-    """The device behind a source, if there is one."""
-    while isinstance(source, CalibratedSource):
-        source = source.source
-    return source if isinstance(source, DeviceSource) else None
 
 
 def describe(

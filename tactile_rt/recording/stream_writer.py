@@ -14,7 +14,8 @@ from types import TracebackType
 from typing import Any, Self
 
 from tactile_rt.bounded_queue import BoundedQueue
-from tactile_rt.recording.description import describe, device_of
+from tactile_rt.drivers.device_source import device_of
+from tactile_rt.recording.description import describe
 from tactile_rt.recording.layout import (
     SAMPLES,
     WIRE,

@@ -24,13 +24,13 @@ from typing import Any, BinaryIO
 
 import msgspec
 
+from tactile_rt.drivers.device_source import device_of
 from tactile_rt.drivers.health import Health
 from tactile_rt.recording.description import (
     METADATA,
     SESSION,
     SUMMARY,
     Description,
-    device_of,
     seal,
     utc_offset_ns,
 )
