@@ -2,10 +2,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# As many processes as cores; each takes the next tests from whoever has most left. `pytest` alone
-# runs the same tests in one process.
+# As many processes as cores, each taking the next file: what a file's tests share is made once.
+# `pytest` alone runs the same tests in one process.
 PYTEST := $(BIN)/python -m pytest
-PARALLEL := -n logical --maxprocesses 8 --dist worksteal
+PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test check check-export bench fuzz format clean
 

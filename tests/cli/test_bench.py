@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from bench.drivers import fuzzing, losses, unplugging
+from bench.inference import area as inference
 from tactile_rt.cli import bench
 from tactile_rt.evidence import roofline
 from tactile_rt.evidence.records import Record
@@ -63,6 +64,7 @@ def test_a_folder_that_is_not_there_is_named_before_measuring(call, tmp_path):
 
 def test_inference_loses_no_sample_uncounted(call, tmp_path, monkeypatch):
     monkeypatch.setattr(roofline, "WEIGHTS", (512, 512))  # in cache, for a test
+    monkeypatch.setattr(inference, "window_speed", lambda quick: [])  # it exports: a slow test
     code, out, _ = call("bench", "inference", "--quick", "--json", tmp_path / "figures.json")
     figures = {r["name"]: r for r in json.loads((tmp_path / "figures.json").read_text())}
     assert code == 0

@@ -15,8 +15,9 @@ from tests.helpers.waiting import until
 
 
 def tries(folder: Path, name: str) -> list[int]:
-    """The process of every try."""
-    return [int(pid) for pid in (folder / name).read_text().split()]
+    """The process of every try; none yet where the file is not there, or still empty."""
+    file = folder / name
+    return [int(pid) for pid in file.read_text().split()] if file.exists() else []
 
 
 def alive(pid: int) -> bool:
@@ -56,7 +57,7 @@ def test_what_a_dead_process_was_at_is_tried_again(tmp_path: Path) -> None:
 def test_a_users_mistake_is_raised_as_it_was_and_stops_everyone(tmp_path: Path) -> None:
     run = run_processes(FrailWork(tmp_path), ["sleeps-60", "a", "refuses-x", "b"], 2)
     assert next(run) == ("a", None)
-    until((tmp_path / "sleeps-60").exists)
+    until(lambda: tries(tmp_path, "sleeps-60"))
     with pytest.raises(ConfigError, match="refuses-x cannot be"):
         list(run)
     assert not (tmp_path / "b").exists()
@@ -66,7 +67,7 @@ def test_a_users_mistake_is_raised_as_it_was_and_stops_everyone(tmp_path: Path) 
 def test_closing_the_iterator_kills_the_processes(tmp_path: Path) -> None:
     run = run_processes(FrailWork(tmp_path), ["a", "sleeps-60"], 2)
     assert next(run) == ("a", None)
-    until((tmp_path / "sleeps-60").exists)
+    until(lambda: tries(tmp_path, "sleeps-60"))
     run.close()
     assert not alive(tries(tmp_path, "sleeps-60")[0])
 
@@ -83,7 +84,7 @@ def test_no_process_outlives_a_parent_that_was_killed(tmp_path: Path) -> None:
         """)
     (tmp_path / "main.py").write_text(program)
     parent = subprocess.Popen([sys.executable, tmp_path / "main.py"])
-    until(lambda: (tmp_path / "sleeps-60").exists() and tries(tmp_path, "sleeps-60"))
+    until(lambda: tries(tmp_path, "sleeps-60"))
     (worker,) = tries(tmp_path, "sleeps-60")
     assert alive(worker)
     parent.kill()
