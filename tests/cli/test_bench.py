@@ -62,8 +62,11 @@ def test_a_folder_that_is_not_there_is_named_before_measuring(call, tmp_path):
     assert f"no folder {tmp_path / 'not'}" in err
 
 
-def test_inference_loses_no_sample_uncounted(call, tmp_path, monkeypatch):
+@pytest.mark.parametrize("windows", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_inference_loses_no_sample_uncounted(call, tmp_path, monkeypatch, windows):
     monkeypatch.setattr(roofline, "WEIGHTS", (512, 512))  # in cache, for a test
+    if not windows:  # they are traced for half a minute
+        monkeypatch.setattr(inference, "window_speed", lambda quick: [])
     monkeypatch.setattr(inference, "window_speed", lambda quick: [])  # it exports: a slow test
     code, out, _ = call("bench", "inference", "--quick", "--json", tmp_path / "figures.json")
     figures = {r["name"]: r for r in json.loads((tmp_path / "figures.json").read_text())}
