@@ -9,13 +9,14 @@ sim:mouse?friction=0.3&young_modulus=0.2&angles_deg=3&mount_mm=0.5
 
 import abc
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
 
 from tactile_rt.sim_backend.arrays.files import load_animals
-from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, load_object
+from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, promised_object
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation, usual_distance
@@ -161,7 +162,7 @@ class SimSource(PacedSource):
         self._animals = load_animals(array or "mouse")
         super().__init__(world_spec(self._animals), options.pace)
         self._options = options
-        self._objects = _objects(options) or [load_object(name) for name in CATEGORIES]
+        self._objects = _objects(options) or [promised_object(name) for name in CATEGORIES]
         self._rng = np.random.default_rng(options.seed)
         # Of its own, so that the objects are the same with and without.
         self._array_rng = np.random.default_rng([options.seed, 1])
@@ -223,7 +224,7 @@ class SimSource(PacedSource):
         if not self._order:
             order = self._rng.permutation(len(self._objects))
             self._order = [int(i) for i in order for _ in range(self._options.repeat)]
-        target = self._objects[self._order.pop(0)]
+        target = self._objects[self._order.pop(0)]()
         draw, profile = self._options.randomisation.draw, PROFILES[self._options.profile]
         animals = tuple(draw(self._array_rng, animal) for animal in self._animals)
         sweep, self._simulation = draw_simulation(
@@ -235,6 +236,6 @@ class SimSource(PacedSource):
         self.passes.append(Pass(now, target.name, target.category, sweep))
 
 
-def _objects(options: SimOptions) -> list[TactileObject]:
-    """The objects that the options name; none: all categories are meant."""
-    return [load_object(name) for name in options.objects.split(",") if name]
+def _objects(options: SimOptions) -> list[Callable[[], TactileObject]]:
+    """The objects that the options name, each made when it comes by; none: all categories."""
+    return [promised_object(name) for name in options.objects.split(",") if name]

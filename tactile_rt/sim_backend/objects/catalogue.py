@@ -7,6 +7,7 @@ import difflib
 import re
 import zlib
 from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,14 @@ from tactile_rt.sim_backend.objects.shapes import furniture, outdoors, tools, ve
 from tactile_rt.sim_backend.objects.solids import TactileObject, normalised
 from tactile_rt.stream import ConfigError
 
-__all__ = ["CATEGORIES", "WITHHELD", "TactileObject", "load_object", "make_object"]
+__all__ = [
+    "CATEGORIES",
+    "WITHHELD",
+    "TactileObject",
+    "load_object",
+    "make_object",
+    "promised_object",
+]
 
 _Builder = Callable[[np.random.Generator], list[trimesh.Trimesh]]
 
@@ -64,6 +72,31 @@ WITHHELD: tuple[str, ...] = tuple(sorted(_UNKNOWN))  # never trained: what is ne
 
 def make_object(category: str, index: int) -> TactileObject:
     """Instance `index` (0 or more) of a category: the same one every time, everywhere."""
+    _check(category, index)
+    rng = np.random.default_rng([zlib.crc32(category.encode()), index])
+    return TactileObject(f"{category}-{index}", category, normalised(_BUILDERS[category](rng)))
+
+
+def load_object(target: str) -> TactileObject:
+    """The object named "mug-17" or "mug" (the same as "mug-0"), or the one in a mesh file."""
+    return promised_object(target)()
+
+
+def promised_object(target: str) -> Callable[[], TactileObject]:
+    """What gives the object that `load_object` would, made when it is first asked for.
+
+    That a name means nothing, or that a mesh cannot be used, is told at once: a mesh is read here.
+    """
+    if Path(target).suffix or "/" in target or "\\" in target:
+        mesh = load_mesh(Path(target))
+        return lambda: mesh
+    match = re.fullmatch(r"(.+)-(\d+)", target)
+    category, index = (match[1], int(match[2])) if match else (target, 0)
+    _check(category, index)
+    return cache(partial(make_object, category, index))
+
+
+def _check(category: str, index: int) -> None:
     if category not in _BUILDERS:
         near = difflib.get_close_matches(category, _BUILDERS, n=1, cutoff=0.3)
         hint = f" (did you mean {near[0]!r}?)" if near else ""
@@ -75,13 +108,3 @@ def make_object(category: str, index: int) -> TactileObject:
     if index < 0:
         raise ConfigError(f"object {category}-{index}: the index must be 0 or more")
     # crc32 because hash() of a string differs from one process to the next
-    rng = np.random.default_rng([zlib.crc32(category.encode()), index])
-    return TactileObject(f"{category}-{index}", category, normalised(_BUILDERS[category](rng)))
-
-
-def load_object(target: str) -> TactileObject:
-    """The object named "mug-17" or "mug" (the same as "mug-0"), or the one in a mesh file."""
-    if Path(target).suffix or "/" in target or "\\" in target:
-        return load_mesh(Path(target))
-    match = re.fullmatch(r"(.+)-(\d+)", target)
-    return make_object(match[1], int(match[2])) if match else make_object(target, 0)
