@@ -223,7 +223,7 @@ def tiny_model(torch, tmp_path, sweep_set):
     from tactile_rt.sweep_set import SweepManifest
 
     spec = SweepManifest.read(sweep_set).spec
-    network = EADConfig(classes=12, attender="none", width=1 / 32)
+    network = EADConfig(classes=12, encoder="gru", attender="none", width=1 / 16)  # soon traced
     saved = {
         "model": TactileClassifier(spec, network).state_dict(),
         "network": msgspec.to_builtins(network),
