@@ -115,7 +115,7 @@ def test_a_device_that_is_unplugged_comes_again(tmp_path, no_thread_left):
         unheard = int(np.isin(np.asarray(log.fate), (Fate.UNHEARD, Fate.OVERFLOWED)).sum())
         assert unheard > 0
         assert stats.missing >= unheard  # and what was on its way
-    assert len(os.listdir("/proc/self/fd")) <= before
+    until(lambda: len(os.listdir("/proc/self/fd")) <= before)  # other libraries' come and go
 
 
 def test_without_reconnection_a_lost_line_breaks_the_source(tmp_path):

@@ -35,7 +35,8 @@ def nothing_left(no_thread_left: None) -> Iterator[None]:
     """Fail a test that leaves a descriptor behind, or a thread."""
     before = len(os.listdir("/proc/self/fd"))
     yield
-    assert len(os.listdir("/proc/self/fd")) == before
+    # what other files started in this process (Zenoh has threads of its own) may come and go
+    until(lambda: len(os.listdir("/proc/self/fd")) <= before)
 
 
 def signal(n: int, seed: int = 0) -> np.ndarray:
