@@ -69,7 +69,7 @@ def consumers(quick: bool) -> list[Record]:
                 left = SEGMENT_S - passed % SEGMENT_S
                 pause = ways[int(passed / SEGMENT_S) % len(ways)][1]
                 time.sleep(min(pause, left))
-        waiting = session._queue.state().waiting["samples"]
+        waiting = session._queue.state.waiting["samples"]
         (sent,) = device.ask("stop")
     stats, seq = source.stats, np.array(source.seq)
     at = np.array(source.at_ns)
