@@ -111,7 +111,7 @@ class Session:
                 self._ending = error
                 self._queue.close()
                 return
-            if chunk is not None and not self._stopping:
+            if chunk is not None:
                 self._queue.put(chunk)
 
 
