@@ -78,7 +78,7 @@ class Session:
         try:
             while not self._stopping:
                 chunk = self.source.read()
-                if chunk is not None:
+                if chunk is not None and not self._stopping:
                     yield chunk
         except EndOfStream:
             pass
@@ -111,7 +111,7 @@ class Session:
                 self._ending = error
                 self._queue.close()
                 return
-            if chunk is not None:
+            if chunk is not None and not self._stopping:
                 self._queue.put(chunk)
 
 
