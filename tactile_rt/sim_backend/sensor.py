@@ -1,7 +1,7 @@
 """What a real sensor makes of the loads that the physics gives: imperfections of one's choice.
 
-    gain and cross-talk -> bias, drift, noise -> dead whiskers -> saturation -> quantisation
-    -> drops, latency and jitter of the time stamps
+    gain and cross-talk -> bandwidth -> hysteresis -> bias, drift, flicker and white noise
+    -> dead whiskers -> quantisation -> saturation -> drops, latency and jitter of the time stamps
 
 Everything is off by default, and what is off changes nothing. Each effect has a random generator
 of its own, so that switching one on leaves the draws of the others as they were.
@@ -21,10 +21,16 @@ __all__ = ["Sensor", "SensorModel"]
 # Cross-talk between forces and moments needs a length to be a fraction: 10 mm, the ratio of the
 # published clipping limits of 10 mN m and 1 N (Chung et al. 2025).
 FULL_SCALE = {"N": 1.0, "N m": 1e-2}
-EFFECTS = ("gain", "crosstalk", "bias", "drift", "noise", "dead", "jitter", "drop")
+EFFECTS = ("gain", "crosstalk", "bias", "drift", "noise", "dead", "jitter", "drop", "flicker")
 # What leaves the values as they are.
 NOT_VALUES = ("drift_time_s", "latency_ms", "jitter_ms", "drop_probability")
 NS_PER_MS = 1_000_000
+# Flicker noise is the sum of processes that forget in times from about the sample's period to this,
+# two a decade: its density is A^2 / f within some per cent from a tenth of a millihertz on.
+SLOWEST_S, PER_DECADE = 1e4, 2
+# A delay is remembered for so many samples as it is periods long, squared: then it hardly ever
+# shrinks by a period from one sample to the next, which would turn the two round.
+JITTER_MEMORY = 30.0
 LARGEST = 1e6  # of any value: beyond it time stamps and single precision overflow
 
 
@@ -34,7 +40,7 @@ class SensorModel:
 
     Forces are in N, moments in N m, and apply to the channels of that unit; channels of other
     units see only what concerns whole samples (time stamps, drops) or all channels (gain,
-    ``crosstalk_elements``, dead).
+    ``crosstalk_elements``, bandwidth, dead).
 
     Attributes:
         gain: The calibration error: relative standard deviation of every channel's constant gain.
@@ -47,17 +53,24 @@ class SensorModel:
             m.
         drift_time_s: The time constant of the drift, s.
         noise_force, noise_moment: The white noise: standard deviation per sample, N and N m.
+        flicker_force, flicker_moment: The 1/f noise: square root of its one-sided spectral density
+            at 1 Hz, N and N m per root of a hertz. Its Allan deviation is 1.18 of that at every
+            averaging time.
+        bandwidth_hz: The corner frequency of a first-order low-pass on every channel, Hz.
+        hysteresis_force, hysteresis_moment: Half the width of the loop between loading and
+            unloading, N and N m: a reading follows its load only once that has moved so far.
         dead_probability: The probability of each element to be dead, drawn once. A dead element
             reads its bias (0 without one) for ever; its ``valid`` stays True, because a robot does
             not know.
-        range_force, range_moment: The largest reading of either sign, where the sensor saturates, N
-            and N m.
         resolution_force, resolution_moment: The quantisation step, N and N m; readings round to the
-            nearest, after saturation.
+            nearest.
+        range_force, range_moment: The largest reading of either sign, where the sensor saturates, N
+            and N m; also of rounded readings.
         latency_ms: The time from the sample to its time stamp, which is that of the host's receipt,
             ms.
         jitter_ms: The mean (and standard deviation) of a further, exponentially distributed delay
-            of each time stamp, ms; a sample is never received before its predecessor.
+            of each time stamp, ms. Delays of neighbours are alike where they are long against the
+            sample's period, as in a queue: a sample is never received before its predecessor.
         drop_probability: The probability of each sample to be dropped, independently; dropped
             samples leave gaps in ``seq``.
 
@@ -79,6 +92,11 @@ class SensorModel:
     drift_time_s: float = 60.0
     noise_force: float = 0.0
     noise_moment: float = 0.0
+    flicker_force: float = 0.0
+    flicker_moment: float = 0.0
+    bandwidth_hz: float = 0.0
+    hysteresis_force: float = 0.0
+    hysteresis_moment: float = 0.0
     dead_probability: float = 0.0
     range_force: float = 0.0
     range_moment: float = 0.0
@@ -138,6 +156,15 @@ class Sensor:
         self._mix += gain[..., None] * np.eye(spec.shape[1])
         self._neighbours = _neighbours(spec)
         self._noise = per_channel(model.noise_force, model.noise_moment)
+        self._flicker = per_channel(model.flicker_force, model.flicker_moment)
+        # A process that forgets in T has the density 4 v T / (1 + (2 pi f T)^2); their sum over T
+        # in steps of a factor r is v / (f ln r).
+        self._flicker *= math.sqrt(math.log(10) / PER_DECADE)
+        self._hysteresis = per_channel(model.hysteresis_force, model.hysteresis_moment)
+        self._period_s = 1.0 / spec.rate_hz
+        decades = math.log10(SLOWEST_S / (self._period_s / math.pi))
+        powers = np.arange(0, decades * PER_DECADE) / PER_DECADE
+        self._forgets_s = self._period_s / math.pi * 10.0**powers
         self._drift = per_channel(model.drift_force, model.drift_moment)
         self._range = per_channel(model.range_force, model.range_moment)
         self._range[self._range == 0] = np.inf
@@ -147,20 +174,26 @@ class Sensor:
         self.dead = self._rng["dead"].random(len(spec.elements)) < model.dead_probability
         self.saturated = 0
         self.dropped = 0
-        self._wander: NDArray[np.float64] | None = None  # drift of the last sample, its spread 1
-        self._taken_ns = 0  # when that sample was taken
+        # of the last sample: when it was taken, drift and flicker of spread 1, load behind the
+        # low-pass, reading behind the hysteresis, and what its delay is drawn from
+        self._taken_ns: int | None = None
+        self._wander: NDArray[np.float64] | None = None
+        self._flickers = np.zeros(0)
+        self._passed: NDArray[np.float64] | None = None
+        self._followed: NDArray[np.float64] | None = None
+        self._hurry: float | None = None
         self._received = 0  # samples received so far
         self._latest_ns = np.int64(np.iinfo(np.int64).min)  # time stamps less their sample's count
 
     def push(self, chunk: Chunk) -> Chunk | None:
         """Take true samples, return those that the host receives, or None when all are dropped."""
-        values = self._readings(chunk) if self._alters else chunk.values
+        since = self._since_s(chunk.t_ns)
+        values = self._readings(chunk, since) if self._alters else chunk.values
         t_ns = chunk.t_ns
         if self._model.latency_ms or self._model.jitter_ms:
             delay = np.full(len(chunk), float(self._model.latency_ms))
             if self._model.jitter_ms:
-                late = self._rng["jitter"].standard_exponential(len(chunk))
-                delay += self._model.jitter_ms * late
+                delay += self._model.jitter_ms * self._lateness(since)
             t_ns = t_ns + np.rint(delay * NS_PER_MS).astype(np.int64)
         seq, valid = chunk.seq, chunk.valid
         if self._model.drop_probability:
@@ -175,21 +208,36 @@ class Sensor:
             return chunk
         return Chunk(seq, t_ns, values, valid)
 
-    def _readings(self, chunk: Chunk) -> NDArray[np.float32]:
+    def _since_s(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """(n,) time since the sample before, s; infinite before the first."""
+        before = t_ns[0] if self._taken_ns is None else self._taken_ns
+        since = np.maximum(np.diff(t_ns, prepend=before), 0) / NS_PER_S
+        if self._taken_ns is None:
+            since[0] = np.inf
+        self._taken_ns = int(t_ns[-1])
+        return since
+
+    def _readings(self, chunk: Chunk, since: NDArray[np.float64]) -> NDArray[np.float32]:
         """(n, element, channel) what the sensor reads."""
         trusted = chunk.valid[..., None] & ~self.dead[:, None]
         values = self._mixed(np.where(trusted, chunk.values, 0.0).astype(np.float64))
+        if self._model.bandwidth_hz:
+            self._low_pass(values, since)
+        if self._hysteresis.any():
+            self._follow(values)
         values += self.bias
         if self._drift.any():
-            values += self._drift * self._wandering(chunk.t_ns)
+            values += self._drift * self._wandering(since)
+        if self._flicker.any():
+            values += self._flicker * self._flickering(since)
         if self._noise.any():
             values += self._noise * self._rng["noise"].standard_normal(values.shape)
         values[:, self.dead] = self.bias[self.dead]
+        on = self._resolution > 0
+        values[..., on] = np.rint(values[..., on] / self._resolution[on]) * self._resolution[on]
         beyond = np.abs(values) > self._range
         self.saturated += int(beyond.sum())
         values = np.where(beyond, np.copysign(self._range, values), values)
-        on = self._resolution > 0
-        values[..., on] = np.rint(values[..., on] / self._resolution[on]) * self._resolution[on]
         return values.astype(np.float32)
 
     def _mixed(self, loads: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -204,16 +252,57 @@ class Sensor:
                 values += self._model.crosstalk_elements * beside[:, neighbour]
         return values
 
-    def _wandering(self, t_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _low_pass(self, values: NDArray[np.float64], since: NDArray[np.float64]) -> None:
+        """Let each sample go towards its load by what a first-order low-pass lets through."""
+        keeps = np.exp(-2 * np.pi * self._model.bandwidth_hz * since)
+        for i in range(len(values)):
+            if self._passed is not None:
+                values[i] += keeps[i] * (self._passed - values[i])
+            self._passed = values[i].copy()
+
+    def _follow(self, values: NDArray[np.float64]) -> None:
+        """Drag each reading behind its load, with play (Prandtl's operator)."""
+        followed = np.zeros_like(values[0]) if self._followed is None else self._followed
+        for i in range(len(values)):
+            followed = np.clip(followed, values[i] - self._hysteresis, values[i] + self._hysteresis)
+            values[i] = followed
+        self._followed = followed
+
+    def _wandering(self, since: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n, element, channel) drift of unit spread: an Ornstein-Uhlenbeck process, exactly."""
-        steps = self._rng["drift"].standard_normal((len(t_ns), *self.bias.shape))
-        for i, t in enumerate(t_ns.tolist()):
+        steps = self._rng["drift"].standard_normal((len(since), *self.bias.shape))
+        keeps = np.exp(-since / self._model.drift_time_s)
+        for i, keep in enumerate(keeps.tolist()):
             if self._wander is not None:
-                passed = max(t - self._taken_ns, 0) / NS_PER_S
-                keeps = math.exp(-passed / self._model.drift_time_s)
-                steps[i] = keeps * self._wander + math.sqrt(1 - keeps**2) * steps[i]
-            self._wander, self._taken_ns = steps[i], t
+                steps[i] = keep * self._wander + math.sqrt(1 - keep**2) * steps[i]
+            self._wander = steps[i]
         return steps
+
+    def _flickering(self, since: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n, element, channel) sum of processes of unit spread that forget in different times."""
+        total = np.empty((len(since), *self.bias.shape))
+        shape = (len(self._forgets_s), *self.bias.shape)
+        for i, passed in enumerate(since.tolist()):
+            keep = np.exp(-passed / self._forgets_s)[:, None, None]
+            fresh = self._rng["flicker"].standard_normal(shape)
+            if len(self._flickers):
+                fresh = keep * self._flickers + np.sqrt(1 - keep**2) * fresh
+            self._flickers = fresh
+            total[i] = fresh.sum(axis=0)
+        return total
+
+    def _lateness(self, since: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n,) delays of unit mean, exponentially distributed, in which neighbours are alike."""
+        draws = self._rng["jitter"].standard_normal(len(since))
+        jitter_s = self._model.jitter_ms * 1e-3
+        forgets_s = JITTER_MEMORY * jitter_s**2 / self._period_s
+        for i, passed in enumerate(since.tolist()):
+            if self._hurry is not None and forgets_s > self._period_s:
+                keep = math.exp(-passed / forgets_s)
+                draws[i] = keep * self._hurry + math.sqrt(1 - keep**2) * draws[i]
+            self._hurry = float(draws[i])
+        # from a normal to an exponential distribution, by the share that lies above
+        return -np.log(0.5 * np.array([math.erfc(x / math.sqrt(2)) for x in draws]))
 
     def _in_order(self, t_ns: NDArray[np.int64]) -> NDArray[np.int64]:
         """Hold every time stamp back to a nanosecond after its predecessor's."""

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.signal import welch
 
 from tactile_rt.sim_backend.sensor import FULL_SCALE, Sensor, SensorModel
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError, concatenate
@@ -25,6 +26,11 @@ EVERYTHING = SensorModel(
     drift_time_s=0.5,
     noise_force=1e-5,
     noise_moment=5e-8,
+    flicker_force=1e-5,
+    flicker_moment=5e-8,
+    bandwidth_hz=100.0,
+    hysteresis_force=2e-6,
+    hysteresis_moment=2e-8,
     dead_probability=0.2,
     range_force=2e-4,
     range_moment=2e-6,
@@ -170,6 +176,7 @@ def test_switching_an_effect_on_leaves_the_draws_of_the_others_alone() -> None:
 def test_channels_of_other_units_have_no_force_or_moment_errors() -> None:
     chunk = busy(200)
     only = replace(EVERYTHING, gain=0, crosstalk_elements=0, dead_probability=0, drop_probability=0)
+    only = replace(only, bandwidth_hz=0)
     received = sensed(only, chunk)
     np.testing.assert_array_equal(received.values[..., OTHER], chunk.values[..., OTHER])
 
@@ -318,11 +325,86 @@ def test_quantisation_rounds_to_the_nearest_step() -> None:
     np.testing.assert_array_equal(force_only[0, :, 3], values[0, :, 3].astype(np.float32))
 
 
-def test_noise_comes_before_saturation_and_saturation_before_quantisation() -> None:
-    model = SensorModel(noise_force=1.0, bias_force=2.0, range_force=1.6, resolution_force=0.5)
+def test_no_reading_is_beyond_the_range_rounded_or_not() -> None:
+    model = SensorModel(noise_force=1.0, bias_force=2.0, range_force=0.5, resolution_force=0.6)
     force = sensed(model, rest(500)).values[..., FORCE]
-    assert np.isin(force, np.arange(-3, 4) * 0.5).all()  # 1.6 rounds to 1.5
-    assert (np.abs(force) == 1.5).mean() > 0.5
+    assert set(np.unique(force)) == {-0.5, 0.0, 0.5}
+
+
+def test_flicker_has_the_density_and_the_allan_deviation_it_should() -> None:
+    """A^2 / f over three decades; an Allan deviation of A sqrt(2 ln 2) at every averaging time."""
+    spec = grid_spec(2, 2)
+    wanted = 1e-5
+    n, rate = 60_000, 1e9 / PERIOD_NS
+    still = stream(np.zeros((n, *spec.shape)))
+    out = Sensor(SensorModel(flicker_force=wanted), spec, seed=4).push(still)
+    assert out is not None
+    force = out.values[..., FORCE].reshape(n, -1).astype(np.float64)
+    f, density = welch(force, rate, nperseg=n // 6, axis=0)
+    for low, high in ((0.3, 3), (3, 30), (30, 0.2 * rate)):
+        band = (f > low) & (f < high)
+        found = (density[band].mean(axis=1) * f[band]).mean()
+        assert found == pytest.approx(wanted**2, rel=0.2), (low, high)
+    for samples in (4, 40, 400):
+        means = force[: n // samples * samples].reshape(-1, samples, force.shape[1]).mean(axis=1)
+        allan = np.sqrt(np.mean(np.diff(means, axis=0) ** 2) / 2)
+        assert allan == pytest.approx(wanted * np.sqrt(2 * np.log(2)), rel=0.15), samples
+    assert not out.values[..., MOMENT].any()
+
+
+def test_drift_averages_as_its_process_does() -> None:
+    """Allan variance of an Ornstein-Uhlenbeck process in closed form."""
+    spec, n = grid_spec(2, 2), 60_000
+    time_s, spread = 0.5, 1e-5
+    out = Sensor(SensorModel(drift_force=spread, drift_time_s=time_s), spec, seed=1).push(
+        stream(np.zeros((n, *spec.shape)))
+    )
+    assert out is not None
+    force = out.values[..., FORCE].reshape(n, -1).astype(np.float64)
+    for samples in (10, 100, 1000):
+        x = samples * PERIOD_NS * 1e-9 / time_s
+        wanted = spread**2 / x**2 * (2 * x - 3 + 4 * np.exp(-x) - np.exp(-2 * x))
+        means = force[: n // samples * samples].reshape(-1, samples, force.shape[1]).mean(axis=1)
+        assert np.mean(np.diff(means, axis=0) ** 2) / 2 == pytest.approx(wanted, rel=0.2), samples
+
+
+def test_a_bandwidth_damps_and_delays_as_a_first_order_low_pass() -> None:
+    corner, n = 5.0, 4000
+    t = np.arange(n) * PERIOD_NS * 1e-9
+    for hertz in (0.5, 5.0, 10.0):
+        values = np.zeros((n, *SPEC.shape))
+        values[:, 0, 0] = np.sin(2 * np.pi * hertz * t)
+        out = sensed(SensorModel(bandwidth_hz=corner), stream(values)).values[:, 0, 0]
+        late = slice(n // 2, None)
+        gain = 2 * np.mean(out[late] * np.exp(-2j * np.pi * hertz * t[late])) * 1j
+        # the load of a sample is held from the sample before on: a step of the exact filter
+        z = np.exp(2j * np.pi * hertz * PERIOD_NS * 1e-9)
+        keep = np.exp(-2 * np.pi * corner * PERIOD_NS * 1e-9)
+        assert gain == pytest.approx((1 - keep) / (1 - keep / z), abs=0.02)
+    step = np.zeros((n, *SPEC.shape))
+    step[10:] = SCALE
+    out = sensed(SensorModel(bandwidth_hz=corner), stream(step)).values
+    expected = 1 - np.exp(-2 * np.pi * corner * PERIOD_NS * 1e-9 * np.arange(1, 51))
+    np.testing.assert_allclose(out[10:60, 1, 3] / SCALE[3], expected, rtol=1e-5)
+
+
+def test_hysteresis_is_a_loop_of_the_stated_width_at_every_rate() -> None:
+    half = 2e-5
+    for n in (200, 2000):
+        there_and_back = 1e-4 * np.sin(np.linspace(0, 4 * np.pi, n))
+        values = np.zeros((n, *SPEC.shape))
+        values[:, 0, 0] = there_and_back
+        out = sensed(SensorModel(hysteresis_force=half), stream(values)).values[:, 0, 0]
+        second = slice(n // 2, None)
+        load, reading = there_and_back[second], out[second]
+        rising = np.gradient(load) > 0
+        assert abs(reading - load).max() <= half * (1 + 1e-5)
+        up = np.interp(0.0, load[rising], reading[rising])
+        down = np.interp(0.0, load[~rising][::-1], reading[~rising][::-1])
+        assert down - up == pytest.approx(2 * half, rel=0.05)
+    small = np.zeros((50, *SPEC.shape))
+    small[:, 0, 0] = half * 0.99 * np.sin(np.arange(50))
+    assert not sensed(SensorModel(hysteresis_force=half), stream(small)).values.any()
 
 
 def test_dead_elements_read_their_bias_for_ever_and_look_valid() -> None:
@@ -381,26 +463,21 @@ def test_small_jitter_is_an_exponential_delay() -> None:
     assert np.abs(np.corrcoef(delay[1:], delay[:-1])[0, 1]) < 0.05
 
 
-def test_jitter_longer_than_the_period_never_turns_samples_round() -> None:
-    chunk = rest(2000)
-    out = sensed(SensorModel(jitter_ms=5.0), chunk)
-    assert (np.diff(out.t_ns) > 0).all()
-    assert (out.t_ns >= chunk.t_ns).all()
-    # Each is as late as its own delay or waits for its predecessor, to the nanosecond.
-    own = np.rint(5e6 * _delays(2000)).astype(np.int64) + chunk.t_ns
-    latest = 0
-    for received, due in zip(out.t_ns.tolist(), own.tolist(), strict=True):
-        latest = max(due, latest + 1)
-        assert abs(received - latest) <= 1
-
-
-def _delays(n: int) -> NDArray[np.float64]:
-    """Delays of unit mean, read off a stream so sparse that no sample waits for another."""
-    sparse = stream(np.zeros((n, *SPEC.shape)), 10**12)
-    delays: NDArray[np.float64] = (
-        sensed(SensorModel(jitter_ms=1e3), sparse).t_ns - sparse.t_ns
-    ) * 1e-9
-    return delays
+@pytest.mark.parametrize("jitter_ms", [0.5, 1.0, 1.5, 5.0, 20.0])
+def test_jitter_of_any_length_keeps_its_mean_and_the_order(jitter_ms: float) -> None:
+    """At a kilohertz, where most samples would overtake each other if each were late by itself."""
+    n = 400_000 if jitter_ms > 4 else 60_000
+    spec = replace(grid_spec(1, 1), rate_hz=1000.0)
+    chunk = stream(np.zeros((n, *spec.shape)), 1_000_000)
+    out = Sensor(SensorModel(latency_ms=2.0, jitter_ms=jitter_ms), spec, seed=3).push(chunk)
+    assert out is not None
+    gaps = np.diff(out.t_ns)
+    assert (gaps > 0).all()
+    assert (gaps == 1).mean() < 0.01, "nothing piles up"
+    delay = (out.t_ns - chunk.t_ns) * 1e-6 - 2.0
+    assert delay.min() >= 0
+    assert delay.mean() == pytest.approx(jitter_ms, rel=0.15 if jitter_ms > 4 else 0.05)
+    assert delay.std() == pytest.approx(jitter_ms, rel=0.25 if jitter_ms > 4 else 0.1)
 
 
 def test_dropped_samples_leave_gaps_and_are_counted() -> None:
