@@ -27,6 +27,11 @@ __all__ = ["write_card"]
 
 EXAMPLES = 12
 FAINTEST_N = 1e-6
+PAPER = (
+    "The recipe follows the published generator (Chung et al. 2025): 312 sweeps of an object with "
+    "high variation, 288 of them to train on, 16 with low. The table of the paper has totals of "
+    "208 x 9,981 and 32 x 9,881 sweeps, which neither its text nor its code comes to."
+)
 
 
 def write_card(folder: Path, fit: Fit) -> Card:
@@ -66,6 +71,7 @@ def _text(name: str, manifest: SweepManifest, card: Card) -> str:
         f"{period_ms:g} ms. Recipe `{recipe.get('name', 'unnamed')}`, profile "
         f"`{recipe.get('profile', 'unknown')}`, seed {recipe.get('seed', 'unknown')}; made with "
         f"{versions or 'versions that were not noted'}. `manifest.json` has all that made it.",
+        PAPER if str(recipe.get("name", "")).startswith("paper-") else "",
         "## Categories",
         _counts(manifest, card),
         _skipped(card),

@@ -46,7 +46,8 @@ __all__ = ["describe_set", "fingerprint", "finished_objects", "make_sweeps", "si
 
 # Of a sweep's parameters; the others are numbers.
 KINDS: dict[str, type] = {"draw": np.int64, "touches": np.bool_, "unstable": np.bool_}
-RANDOMISATION, SENSOR = 1, 2  # streams of random numbers beside that of the sweep's parameters
+# streams of random numbers beside that of the sweep's parameters
+RANDOMISATION, SENSOR, SHARED = 1, 2, 3
 LOOKS = 3  # for contacts in each stored sample's period
 SPARE = 2  # stored samples simulated beyond the last, which the resampler's kernel needs
 DRAWS = 20  # tries to draw parameters with which an object meets the array at all
@@ -237,7 +238,8 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
     draws = recipe.rng(target.name, index, RANDOMISATION)
     animals = tuple(recipe.randomisation.draw(draws, animal) for animal in ideal)
     for _ in range(1 if recipe.sweeps.keeps_misses else DRAWS):
-        sweep = recipe.sweeps.draw(rng, index)
+        shared = recipe.rng(target.name, recipe.sweeps.draw_index(index), SHARED)
+        sweep = recipe.sweeps.draw(rng, index, shared)
         simulation = SweepSimulation(animals, target, sweep, profile)
         made = _with_lead(recipe, simulation) if simulation.touches else None
         if made is not None:

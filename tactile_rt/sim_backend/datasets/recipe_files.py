@@ -59,6 +59,8 @@ class _Objects(msgspec.Struct):
 class _Range(msgspec.Struct):
     between: tuple[float, ...] | None = None
     each: tuple[float, ...] | None = None
+    once: bool = False
+    plus: tuple[float, ...] = ()
 
 
 class _Sweeps(msgspec.Struct):
@@ -68,6 +70,12 @@ class _Sweeps(msgspec.Struct):
     height_mm: float | _Range | None = None
     distance_mm: float | _Range | None = None
     gap_mm: float | _Range | None = None
+    roll_deg: float | _Range | None = None
+    pitch_deg: float | _Range | None = None
+    heading_deg: float | _Range | None = None
+    climb_deg: float | _Range | None = None
+    ramp_ms: float | _Range | None = None
+    head_moves: float | _Range | None = None
     draws: int = 1
     held_out_draws: int = 0
 
@@ -213,9 +221,13 @@ def _choice(nodes: SettingNode, name: str, sweeps: _Sweeps, usual: Choice) -> Ch
         return usual if written is None else written
     if len(written.between or ()) == 2 and written.each is None:
         assert written.between is not None
-        return Between(*written.between)
-    if written.each and written.between is None:
+        low, high = written.between
+        return Between(low, high, written.once, written.plus)
+    if written.each and written.between is None and not (written.once or written.plus):
         return Each(written.each)
     found = nodes.at(["sweeps", name]).plain()
-    wanted = "a number, { between = [low, high] } or { each = [a number, ...] }"
+    wanted = (
+        "a number, { between = [low, high] } (with once = true or plus = [a number, ...]) "
+        "or { each = [a number, ...] }"
+    )
     raise refusal(nodes, ["sweeps", name], f"expected {wanted}, got {found!r:.60}")

@@ -16,7 +16,8 @@
     height_mm = { each = [-5, 0] }
     distance_mm = 6.5         # left out, in proportion to how far the array's whiskers reach
     speed_mm_s = { between = [28, 40] }
-    size_mm = 40
+    yaw_deg = { between = [0, 89], plus = [0, 90] }    # two sweeps: a quarter turn further
+    size_mm = { between = [20, 60], once = true }      # the same for all combinations of a draw
 
 Every sweep is drawn from (seed, object, sweep index) alone, so that any one of them can be made
 again by itself, and a set at another profile holds the very same sweeps (but for the few that
@@ -57,10 +58,18 @@ LONGEST_MS = 600_000.0
 
 @dataclass(frozen=True)
 class Between:
-    """Drawn evenly from an interval, afresh for every sweep."""
+    """Drawn evenly from an interval.
+
+    Attributes:
+        low, high: The ends of the interval.
+        once: Whether all combinations of a draw share one value; else every sweep has its own.
+        plus: Every one of these values is added, with every one of the other parameters'.
+    """
 
     low: float
     high: float
+    once: bool = False
+    plus: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -131,6 +140,12 @@ class SweepChoice:
     height_mm: Choice = -2.0
     distance_mm: Choice = 6.5
     gap_mm: Choice = 2.0
+    roll_deg: Choice = 0.0
+    pitch_deg: Choice = 0.0
+    heading_deg: Choice = 0.0
+    climb_deg: Choice = 0.0
+    ramp_ms: Choice = 0.0
+    head_moves: Choice = 0.0
     draws: int = 1
     held_out_draws: int = 0
 
@@ -142,7 +157,7 @@ class SweepChoice:
             raise ConfigError(f"sweeps.held_out_draws must be 0 or more, not {self.held_out_draws}")
         for name in PARAMETERS:
             choice = getattr(self, name)
-            if isinstance(choice, Between) and choice.low > choice.high:
+            if isinstance(choice, Between) and not choice.low <= choice.high:
                 raise ConfigError(
                     f"sweeps.{name}: between has its lower end first, not {choice.low:g}, "
                     f"{choice.high:g}"
@@ -155,10 +170,14 @@ class SweepChoice:
             for value in ends:
                 if not abs(value) <= LARGEST:
                     raise ConfigError(f"sweeps.{name} must be within +-{LARGEST:g}, not {value:g}")
+                try:
+                    Sweep(**{name: value})
+                except ConfigError as error:
+                    raise ConfigError(f"sweeps.{error}") from None
 
     def combinations(self) -> list[dict[str, float]]:
-        """The `Each` values, in every combination; the last parameter varies fastest."""
-        each = {n: c.values for n in PARAMETERS if isinstance(c := getattr(self, n), Each)}
+        """The `Each` and `plus` values, in every combination; the last varies fastest."""
+        each = {n: _each(getattr(self, n)) for n in PARAMETERS if _each(getattr(self, n))}
         return [dict(zip(each, values, strict=True)) for values in product(*each.values())]
 
     def __len__(self) -> int:
@@ -167,19 +186,27 @@ class SweepChoice:
     @property
     def keeps_misses(self) -> bool:
         """Whether a sweep that misses the array stays: all combinations are to be there."""
-        return any(isinstance(getattr(self, n), Each) for n in PARAMETERS)
+        return any(_each(getattr(self, n)) for n in PARAMETERS)
 
     def draw_index(self, index: int) -> int:
         """Which draw of its combination sweep `index` of an object is, from 0."""
         return index % (self.draws + self.held_out_draws)
 
-    def draw(self, rng: np.random.Generator, index: int) -> Sweep:
-        """Draw the parameters of sweep `index`."""
+    def draw(self, rng: np.random.Generator, index: int, shared: np.random.Generator) -> Sweep:
+        """Draw the parameters of sweep `index`.
+
+        Args:
+            rng: of this sweep.
+            index: of the object's sweeps.
+            shared: in the same state for all sweeps of a draw, see `Between.once`.
+        """
         values = self.combinations()[index // (self.draws + self.held_out_draws)]
         for name in PARAMETERS:
             choice = getattr(self, name)
             if isinstance(choice, Between):
-                values[name] = float(rng.uniform(choice.low, choice.high))
+                source = shared if choice.once else rng
+                drawn = float(source.uniform(choice.low, choice.high))
+                values[name] = drawn + (values[name] if choice.plus else 0.0)
             elif not isinstance(choice, Each):
                 values[name] = float(choice)
         return Sweep(**values)
@@ -188,10 +215,18 @@ class SweepChoice:
 PARAMETERS = tuple(f.name for f in fields(SweepChoice) if not f.name.endswith("draws"))
 
 
+def _each(choice: Choice) -> tuple[float, ...]:
+    """What of a choice is combined with the other parameters' values."""
+    if isinstance(choice, Between):
+        return choice.plus
+    return choice.values if isinstance(choice, Each) else ()
+
+
 def _ends(choice: Choice) -> tuple[float, ...]:
     """What may be drawn, or the ends of it."""
     if isinstance(choice, Between):
-        return choice.low, choice.high
+        more = choice.plus or (0.0,)
+        return choice.low + min(more), choice.high + max(more)
     return choice.values if isinstance(choice, Each) else (choice,)
 
 
@@ -299,7 +334,9 @@ def _differing_from_default(settings: SensorModel | Randomisation) -> dict[str, 
 
 def _written(choice: Choice) -> Any:
     if isinstance(choice, Between):
-        return {"between": [choice.low, choice.high]}
+        written: dict[str, Any] = {"between": [choice.low, choice.high]}
+        written |= {"once": True} if choice.once else {}
+        return written | ({"plus": list(choice.plus)} if choice.plus else {})
     return {"each": list(choice.values)} if isinstance(choice, Each) else choice
 
 

@@ -226,7 +226,10 @@ def test_a_point_of_a_grid_that_misses_stays_and_a_draw_is_repeated() -> None:
     half = replace(beyond, sweeps=SweepChoice(distance_mm=Between(-20, 60), draws=6))
     draws = [simulate_sweep(half, target, i) for i in range(6)]
     assert all(d.parameters["touches"] for d in draws)
-    firsts = [half.sweeps.draw(half.rng("mug-0", i), i).distance_mm for i in range(6)]
+    firsts = [
+        half.sweeps.draw(half.rng("mug-0", i), i, half.rng("mug-0", i)).distance_mm
+        for i in range(6)
+    ]
     kept = [d.parameters["distance_mm"] for d in draws]
     assert any(a != b for a, b in zip(firsts, kept, strict=True)), "one was drawn again"
     assert any(a == b for a, b in zip(firsts, kept, strict=True))

@@ -57,7 +57,7 @@ def test_the_default_set_has_the_size_that_training_needs() -> None:
 
 def test_default24_draws_from_the_stated_ranges() -> None:
     recipe = read_recipe("default24")
-    drawn = [recipe.sweeps.draw(recipe.rng(f"mug-{i}", k), k) for i in range(40) for k in range(12)]
+    drawn = [drawn_of(recipe, k, f"mug-{i}") for i in range(40) for k in range(12)]
     ranges = {
         "speed_mm_s": (28, 40),
         "yaw_deg": (0, 360),
@@ -77,22 +77,37 @@ def test_the_papers_sets_have_its_combinations() -> None:
     """Chung et al. (2025), appendix A1."""
     low = read_recipe("paper-lowvar-highfi")
     assert (low.profile, len(low.sweeps)) == ("dataset", 16)
-    drawn = [low.sweeps.draw(low.rng("mug-0", i), i) for i in range(16)]
+    drawn = [drawn_of(low, i) for i in range(16)]
     grid = {(s.height_mm, s.yaw_deg, s.distance_mm) for s in drawn}
     assert grid == {(h, y, d) for h in (-5, 0) for y in (0, 30, 90, 120) for d in (5, 8)}
     assert {(s.speed_mm_s, s.size_mm) for s in drawn} == {(30, 40)}
 
     high = read_recipe("paper-highvar-lowfi")
     assert (high.profile, len(high.sweeps)) == ("realtime", (24 + 2) * 12)
-    drawn = [high.sweeps.draw(high.rng("mug-0", i), i) for i in range(312)]
-    held_out = [high.sweeps.draw_index(i) >= high.sweeps.draws for i in range(312)]
-    for height in (-3, 0, 3):
-        here = [out for s, out in zip(drawn, held_out, strict=True) if s.height_mm == height]
-        assert (len(here), sum(here)) == (104, 8)
+    drawn = [drawn_of(high, i) for i in range(312)]
+    groups: dict[int, list[Sweep]] = {}
+    for i, sweep in enumerate(drawn):
+        groups.setdefault(high.sweeps.draw_index(i), []).append(sweep)
+    assert len(groups) == 26 and high.sweeps.draws == 24
+    for group in groups.values():
+        assert len({(s.speed_mm_s, s.size_mm) for s in group}) == 1, "once per group"
+        first = min(s.yaw_deg for s in group)
+        assert 0 <= first <= 89
+        wanted = {(h, first + turn) for h in (-3, 0, 3) for turn in (0, 90, 180, 270)}
+        assert {(s.height_mm, s.yaw_deg) for s in group} == wanted
     assert {s.distance_mm for s in drawn} == {5}
-    assert 30 <= min(s.speed_mm_s for s in drawn) < 32 < 58 < max(s.speed_mm_s for s in drawn) <= 60
-    assert 20 <= min(s.size_mm for s in drawn) < 22 < 58 < max(s.size_mm for s in drawn) <= 60
-    assert len({s.yaw_deg for s in drawn}) == 312
+    for low_end, high_end, values in (
+        (30, 60, {s.speed_mm_s for s in drawn}),
+        (20, 60, {s.size_mm for s in drawn}),
+    ):
+        assert len(values) == 26 and low_end <= min(values) and max(values) <= high_end
+        assert max(values) - min(values) > 0.7 * (high_end - low_end)
+
+
+def drawn_of(recipe: SweepRecipe, index: int, name: str = "mug-0") -> Sweep:
+    """As `make_sweep` draws it."""
+    shared = recipe.rng(name, recipe.sweeps.draw_index(index), 3)
+    return recipe.sweeps.draw(recipe.rng(name, index), index, shared)
 
 
 @pytest.mark.parametrize("name", shipped_recipes())
@@ -116,7 +131,7 @@ def test_a_sweep_is_drawn_from_seed_object_and_index_alone() -> None:
     recipe = read_recipe("default24")
 
     def draw(recipe: SweepRecipe, name: str, index: int) -> Sweep:
-        return recipe.sweeps.draw(recipe.rng(name, index), index)
+        return drawn_of(recipe, index, name)
 
     first = draw(recipe, "mug-3", 7)
     assert draw(replace(recipe, profile="accurate"), "mug-3", 7) == first, "paired sets"
@@ -135,7 +150,7 @@ def test_the_draw_of_a_known_sweep_never_changes() -> None:
     """What a stored set says of itself must stay true in every later release."""
     recipe = read_recipe("default24")
     assert recipe.key("mug-3", 7) == [0, 688124435, 7]
-    sweep = recipe.sweeps.draw(recipe.rng("mug-3", 7), 7)
+    sweep = drawn_of(recipe, 7, "mug-3")
     assert round(sweep.yaw_deg, 6) == 300.180777
 
 
@@ -162,7 +177,7 @@ def test_a_grid_has_every_combination_as_often_as_draws(heights, sizes, draws, h
     each = draws + held_out
     assert len(choice) == len(heights) * len(sizes) * each
     rng = np.random.default_rng(0)
-    found = [choice.draw(rng, i) for i in range(len(choice))]
+    found = [choice.draw(rng, i, rng) for i in range(len(choice))]
     pairs = [(s.height_mm, s.size_mm) for s in found]
     assert all(pairs.count((h, s)) == each for h in heights for s in sizes)
     marked = [choice.draw_index(i) for i in range(len(choice))]
@@ -170,6 +185,31 @@ def test_a_grid_has_every_combination_as_often_as_draws(heights, sizes, draws, h
 
 
 # A user's own
+
+
+def test_what_is_drawn_once_is_shared_by_a_draw_s_combinations(tmp_path: Path) -> None:
+    path = write(
+        tmp_path / "mine.toml",
+        """
+        [sweeps]
+        draws = 3
+        size_mm = { between = [20, 60], once = true }
+        speed_mm_s = { between = [20, 60] }
+        yaw_deg = { between = [0, 1], plus = [0, 100] }
+        """,
+    )
+    recipe = read_recipe(path)
+    assert recipe.sweeps.size_mm == Between(20.0, 60.0, once=True)
+    assert recipe_from_dict(recipe.to_dict()) == recipe
+    drawn = [drawn_of(recipe, i) for i in range(len(recipe.sweeps))]
+    assert len(drawn) == 6
+    assert len({s.size_mm for s in drawn}) == 3 and len({s.speed_mm_s for s in drawn}) == 6
+    assert len({s.yaw_deg for s in drawn}) == 6
+    assert sum(100 <= s.yaw_deg <= 101 for s in drawn) == 3
+    assert [drawn_of(recipe, i) for i in range(6)] == drawn, "any of them can be made again"
+    refused = write(tmp_path / "no.toml", "[sweeps]\nsize_mm = { each = [1, 2], once = true }\n")
+    with pytest.raises(ConfigError, match=r"no\.toml:2: .*once = true"):
+        read_recipe(refused)
 
 
 def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
