@@ -76,7 +76,7 @@ class SweepManifest:
     withheld: tuple[str, ...] = ()
     category_of: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
-    settings: dict[str, float] = field(default_factory=dict)
+    settings: dict[str, float | str] = field(default_factory=dict)
 
     def names(self, splits: Sequence[str] = ()) -> list[str]:
         """Object names of these splits, or of all.

@@ -7,7 +7,7 @@ python -m bench.pictures.physics --only peg   # one of bars, whiskers, peg, cree
 
 import argparse
 import json
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,13 @@ from matplotlib.axes import Axes
 
 from bench.sim import area as sim
 from bench.sim.beams import beams, flat, measure
+from bench.sim.catalogue import FINE, difference
+from bench.sim.mechanics import HEARD_HZ
 from bench.sim.pegs import PEG_RADIUS_MM, Press, press, press_states, presses
 from bench.sim.reference_model import reference_cost
-from tactile_rt.sim_backend.world import PROFILES
+from bench.sim.ringing import release_error, rod_ring
+from tactile_rt.sim_backend.rods.rod import make_rod
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile
 from tests.helpers import beams as theory
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -59,7 +63,7 @@ def bars(records: list[dict[str, Any]]) -> None:
 
 def whiskers() -> None:
     """Both profiles, whisker by whisker."""
-    head = ("links", "static %", "resonance %", "rings %", "damping", "sag %")
+    head = ("static %", "resonance %", "rings %", "damping", "let go %", "sag %")
     lines = [
         "| | mm | Hz | " + " | ".join(f"{h} {p}" for p in BOTH for h in head) + " |",
         "|---" * (3 + 2 * len(head)) + "|",
@@ -68,29 +72,37 @@ def whiskers() -> None:
         whisker = flat(name)
         cells = [name, f"{whisker.length:.1f}", f"{beam.resonance_hz:.0f}"]
         for key in BOTH:
-            e = measure(whisker, beam, PROFILES[key])
-            cells.append(str(PROFILES[key].links(whisker)))
-            cells += [f"{100 * x:+.2f}" for x in (e.static, e.resonance, e.ringing)]
-            cells += [f"{e.damping:+.3f}", f"{100 * e.sag:+.2f}"]
+            profile = PROFILES[key]
+            e = measure(whisker, beam, profile)
+            cells += [f"{100 * e.static:+.2f}", f"{100 * e.resonance:+.2f}"]
+            if beam.resonance_hz < HEARD_HZ:
+                hertz, ratio = rod_ring(whisker, profile)
+                cells += [f"{100 * (hertz / beam.resonance_hz - 1):+.2f}"]
+                cells += [f"{ratio - whisker.damping_ratio:+.3f}"]
+                cells += [f"{100 * release_error(whisker, profile):.1f}"]
+            else:
+                rod = make_rod(whisker, profile.links, round(SAMPLE_MS / profile.timestep_ms))
+                cells += ["", f"{rod.damping_ratio - whisker.damping_ratio:+.3f}", ""]
+            cells.append(f"{100 * e.sag:+.2f}")
         lines.append("| " + " | ".join(cells) + " |")
     write_table("whiskers", lines)
 
 
 def peg() -> None:
-    """Draw bent whiskers beside the elastica, and the errors of all presses."""
+    """Draw bent whiskers beside the elastica, and the errors of all presses by their depth."""
     figure = plt.figure(figsize=(12.6, 8.2), dpi=100)
     grid = figure.add_gridspec(
         2, 3, height_ratios=(1, 0.85), left=0.06, right=0.985, top=0.9, bottom=0.09,
         hspace=0.36, wspace=0.16,
     )  # fmt: skip
-    shown = {
-        (c.whisker, c.depth): c
-        for c in presses()
-        if c.bend == "convex" and c.place == 0.45 and c.friction == 0.5
-    }
-    for column, name in enumerate(("E5", "C2", "B0")):
+    for column, name in enumerate(("mouse E5", "mouse C2", "mouse B0")):
         axes = figure.add_subplot(grid[0, column])
-        draw_bent(axes, [shown[name, depth] for depth in (0.05, 0.15)])
+        cases = [
+            c
+            for c in presses()
+            if (c.whisker, c.bend, c.place, c.friction) == (name, "convex", 0.6, 0.5)
+        ]
+        draw_bent(axes, cases[-2:])
         axes.set_title(f"{name}, {flat(name).length:.1f} mm", fontsize=11)
         axes.set_xlabel("mm")
     figure.axes[1].legend(fontsize=8, loc="upper left", frameon=False)
@@ -109,8 +121,8 @@ def draw_bent(axes: Axes, cases: list[Press]) -> None:
     x = np.array([theory.abscissa(whisker, at) for at in s])
     axes.plot(x, whisker.curvature * x**2, color=GREY, lw=1, ls=":", label="at rest")
     for i, case in enumerate(cases):
-        found = theory.Peg(case.side, case.place * whisker.length, case.depth * whisker.length,
-                           case.friction, PEG_RADIUS_MM)  # fmt: skip
+        found = theory.Peg(case.side, case.place * whisker.length, case.depth, case.friction,
+                           PEG_RADIUS_MM)  # fmt: skip
         line = theory.outline(whisker, found, theory.press(whisker, found))
         axes.plot(*line.T, color=BLUE, lw=5, alpha=0.35, label=None if i else "elastica")
         nodes = press_states(case, PROFILES["dataset"])
@@ -125,36 +137,39 @@ def draw_bent(axes: Axes, cases: list[Press]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
+DEPTHS = (("0.02 mm", 0.0, 0.03), ("0.05 mm", 0.04, 0.06), ("0.1 mm", 0.09, 0.11),
+          ("to L / 10", 0.11, np.inf))  # fmt: skip
+
+
 def draw_errors(axes: Axes) -> None:
-    """Moment errors of every press, by whisker and friction, for both profiles."""
-    groups = [(n, mu) for n in ("E5", "C2", "B0") for mu in (0.0, 0.5, -0.5)]
-    words = {0.0: "no friction", 0.5: "slides to tip", -0.5: "slides to base"}
+    """Moment errors of every tenth press, by depth, for four profiles."""
     rng = np.random.default_rng(0)
-    for shift, key, colour in ((-0.17, "dataset", BLUE), (0.17, "realtime", ORANGE)):
-        for at, (name, mu) in enumerate(groups):
-            errors = [
-                100 * press(c, PROFILES[key]).moment_error
-                for c in presses()
-                if (c.whisker, c.friction) == (name, mu)
-            ]
-            where = at + shift + rng.uniform(-0.1, 0.1, len(errors))
-            axes.plot(where, errors, "o", ms=4, color=colour, alpha=0.65, mew=0,
+    keys = (("accurate", GREY), ("dataset", BLUE), ("realtime", ORANGE), ("mujoco", INK))
+    cases = presses()[::10]
+    for i, (key, colour) in enumerate(keys):
+        found = [(c.depth, 100 * abs(press(c, PROFILES[key]).moment_error)) for c in cases]
+        for at, (_, least, most) in enumerate(DEPTHS):
+            errors = [e for depth, e in found if least < depth < most]
+            where = at + 0.22 * (i - 1.5) + rng.uniform(-0.07, 0.07, len(errors))
+            axes.plot(where, np.maximum(errors, 0.01), "o", ms=3, color=colour, alpha=0.55, mew=0,
                       label=None if at else key)  # fmt: skip
-    axes.axhspan(-5, 5, color=GREY, alpha=0.15, lw=0)
-    axes.axhline(0, color=INK, lw=0.6)
-    axes.set_xticks(range(len(groups)), [f"{n}\n{words[mu]}" for n, mu in groups], fontsize=9)
+    axes.axhspan(0.01, 5, color=GREY, alpha=0.15, lw=0)
+    axes.set_yscale("log")
+    axes.set_yticks((0.01, 0.1, 1, 5, 10, 100), ("0.01", "0.1", "1", "5", "10", "100"))
+    axes.minorticks_off()
+    axes.set_xticks(range(len(DEPTHS)), [f"pressed {name}" for name, _, _ in DEPTHS], fontsize=9)
     axes.set_ylabel("error of the base moment (%)")
-    axes.set_xlim(-0.5, len(groups) - 0.5)
-    axes.set_title("every press; grey: within 5 %, the bar of dataset", fontsize=10, loc="left")
-    axes.legend(fontsize=9, frameon=False, loc="upper right", ncols=2)
+    axes.set_title("every tenth press of all mouse whiskers and of a robot's; grey: within 5 %",
+                   fontsize=10, loc="left")  # fmt: skip
+    axes.legend(fontsize=9, frameon=False, loc="upper right", ncols=4)
     axes.spines[["top", "right"]].set_visible(False)
 
 
 def creep() -> None:
-    """Sliding presses at other speeds: friction is Coulomb's only where slip is fast enough."""
+    """Sliding presses at other speeds."""
     lines = ["| slides at (mm/s) | base moment % | base force % |", "|---:|---:|---:|"]
-    cases = [c for c in presses() if c.friction]
-    for speed in (30.0, 10.0, 5.0, 2.0, 0.5):
+    cases = [c for c in presses() if c.friction][::40]
+    for speed in (100.0, 30.0, 10.0, 5.0, 2.0):
         found = [press(c, PROFILES["dataset"], speed) for c in cases]
         moment = max(abs(p.moment_error) for p in found)
         force = max(p.force_error for p in found)
@@ -162,73 +177,46 @@ def creep() -> None:
     write_table("creep", lines)
 
 
-# links per mm, least links, step (ms)
-SETTINGS = (
-    (0.25, 5, 0.2), (0.5, 8, 0.5), (0.5, 8, 0.2), (0.5, 8, 0.1), (1.0, 8, 0.2),
-    (1.0, 8, 0.1),
-)  # fmt: skip
+SETTINGS = ((6, 0.5), (8, 0.5), (10, 0.5), (10, 0.25), (15, 0.25), (20, 0.1))  # links, step (ms)
 COST_MS = 500
 
 
 def cost() -> None:
-    """Draw what errors cost: settings over the prototype's sweep, 0.5 s from before contact."""
-    names = ("links_per_mm", "least_links", "timestep_ms")
-    others = [replace(PROFILES["dataset"], **dict(zip(names, s, strict=True))) for s in SETTINGS]
-    profiles = {key: PROFILES[key] for key in BOTH}
-    profiles |= {str(p): p for p in others if p not in profiles.values()}
-    settings = {}
-    for key, p in profiles.items():
-        name = f"{p.links_per_mm:g}/{p.least_links}, {p.timestep_ms:g} ms"
-        settings[f"{key}: {name}" if key in BOTH else name] = p
-    errors = sim.compare("icosphere", settings, COST_MS)
-    rows = []
-    for key, profile in settings.items():
-        reference = reference_cost(COST_MS)
-        simulation = sim.simulate("icosphere", profile)
-        share = sim.cost(simulation, COST_MS) / reference
-        worst = max(abs(press(c, profile).moment_error) for c in presses() if c.whisker != "E5")
-        rows.append((key, share, errors[key], worst))
+    """Draw what errors cost: settings over the four sweeps that costs are measured on."""
+    profiles = {f"{n} links, {step:g} ms": Profile(n, step, 0.02) for n, step in SETTINGS}
+    profiles["MuJoCo, 10 links, 0.25 ms"] = PROFILES["mujoco"]
+    truths = {name: sim.simulate(name, FINE).advance(COST_MS) for name in sim.SWEEPS}
     lines = [
-        "| links per mm / least, step | cost over the reference | moments | forces | spike | "
-        "deepest (mm) | peg moment, C2 and B0 (%) |",
-        "|---|---:|---:|---:|---:|---:|---:|",
+        "| links, step | CPU s per s | over the reference | moments, median and worst | forces |",
+        "|---|---:|---:|---:|---:|",
     ]
-    for key, share, e, worst in rows:
-        name = f"**{key}**" if key.startswith(BOTH) else key
-        lines.append(
-            f"| {name} | {share:.2f} | {e.moment:.3f} | {e.force:.3f} | {e.spike:.1f} | "
-            f"{e.deepest:.3f} | {100 * worst:.1f} |"
-        )
-    write_table("cost", lines)
     figure, axes = plt.subplots(figsize=(8.4, 5.2), dpi=100)
-    for label, values, colour in (
-        ("base moments", [r[2].moment for r in rows], BLUE),
-        ("base forces", [r[2].force for r in rows], ORANGE),
-    ):
-        named = [r[0].startswith(BOTH) for r in rows]
-        axes.scatter([r[1] for r in rows], values, s=[90 if n else 28 for n in named],
-                     color=colour, label=label, alpha=0.8, lw=0)  # fmt: skip
-    for key, share, e, _ in rows:
-        below = key.startswith("dataset")
-        axes.annotate(key, (share, e.force), (6, -13) if below else (5, 5), fontsize=8, color=INK,
-                      textcoords="offset points",
-                      weight="bold" if key.startswith(BOTH) else "normal")  # fmt: skip
-    axes.axhline(0.04, color=BLUE, lw=0.8, ls="--")
-    axes.axhline(0.05, color=ORANGE, lw=0.8, ls="--")
+    for key, profile in profiles.items():
+        costs, errors, shares = [], [], []
+        for name, truth in truths.items():
+            reference = reference_cost(COST_MS)
+            costs.append(sim.cost(sim.simulate(name, profile), COST_MS))
+            shares.append(costs[-1] / reference)
+            errors.append(difference(sim.simulate(name, profile).advance(COST_MS), truth))
+        moments, forces = [e.moment for e in errors], [e.force for e in errors]
+        lines.append(
+            f"| {key} | {np.median(costs):.2f} | {np.median(shares):.2f} | "
+            f"{np.median(moments):.3f}, {max(moments):.3f} | "
+            f"{np.median(forces):.3f}, {max(forces):.3f} |"
+        )
+        share, colour = float(np.median(shares)), ORANGE if "MuJoCo" in key else BLUE
+        axes.plot([share] * len(moments), moments, "-", color=colour, alpha=0.3)
+        axes.plot([share] * len(moments), moments, "o", ms=6, color=colour, alpha=0.8)
+        axes.annotate(key, (share, max(moments)), (0, 7), fontsize=8, color=INK,
+                      textcoords="offset points", ha="center")  # fmt: skip
+    write_table("cost", lines)
     axes.set_xscale("log")
     axes.set_yscale("log")
-    ticks = (0.1, 0.2, 0.5, 1, 2, 5)
-    axes.set_xticks(ticks, [f"{t:g}" for t in ticks])
-    heights = (0.01, 0.02, 0.05, 0.1, 0.2)
-    axes.set_yticks(heights, [f"{t:g}" for t in heights])
-    axes.minorticks_off()
-    axes.set_xlabel("cost over the fixed reference model")
-    axes.set_ylabel("RMS error over RMS, against 0.05 ms")
-    axes.set_title("What accuracy costs (icosphere past 30 whiskers; dashed: bars of `dataset`)",
+    axes.set_xlabel("cost over the fixed reference model (median of four sweeps)")
+    axes.set_ylabel("base moments: RMS error over RMS")
+    axes.set_title("What accuracy costs: an icosphere, a mug, a chair and a gear, against 0.05 ms",
                    fontsize=10.5, loc="left")  # fmt: skip
-    axes.legend(frameon=False, fontsize=9)
     axes.spines[["top", "right"]].set_visible(False)
-    figure.tight_layout()
     figure.savefig(DOCS / "physics_cost.png")
 
 

@@ -7,11 +7,13 @@ compares.
 import csv
 from dataclasses import dataclass, replace
 from importlib import resources
+from pathlib import Path
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.world import (
@@ -27,6 +29,7 @@ __all__ = ["GRAVITY", "ORIGIN", "Beam", "BeamErrors", "beams", "flat", "measure"
 
 Floats = NDArray[np.float64]
 
+ROBOT = Path(__file__).parents[2] / "docs" / "arrays" / "robot.toml"
 ORIGIN = Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 SMALL = 1e-4  # deflections, of the whisker's length: linear to 1e-6
 SETTLE_PERIODS = 30.0  # of the first mode; what is over-damped creeps back more slowly
@@ -81,13 +84,16 @@ def beams() -> dict[str, Beam]:
 
 
 def flat(name: str, bend: str = "") -> Whisker:
-    """A mouse's whisker in the plane of the world's x and y, its base at the origin.
+    """A whisker in the plane of the world's x and y, its base at the origin.
 
     Args:
-        name: of the whisker.
+        name: of a mouse's whisker, or of an array and its whisker: ``robot A0`` is of
+            `docs/arrays/robot.toml`.
         bend: ``straight`` takes its curve away.
     """
-    whisker = next(w for w in mouse_whiskers() if w.name == name)
+    array, _, one = name.rpartition(" ")
+    whiskers = load_array(str(ROBOT)).whiskers if array == "robot" else mouse_whiskers()
+    whisker = next(w for w in whiskers if w.name == one)
     curvature = 0.0 if bend == "straight" else whisker.curvature
     angles = (np.pi / 2, 0.0, -np.pi / 2)
     return replace(whisker, base=(0.0, 0.0, 0.0), angles=angles, curvature=curvature)

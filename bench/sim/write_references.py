@@ -3,15 +3,18 @@
 The benchmarks compare with these figures; the theory itself is in `tests/helpers/beams.py`.
 """
 
+import gzip
 from itertools import product
 from pathlib import Path
 
-from bench.sim.beams import GRAVITY, flat
+from bench.sim.beams import GRAVITY, ROBOT, flat
 from bench.sim.pegs import PEG_RADIUS_MM
+from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tests.helpers import beams as theory
 
 DATA = Path(__file__).parent / "data"
+LIGHT_MM, DEPTHS = (0.02, 0.05, 0.1), (0.025, 0.05, 0.1)  # these in shares of the length
 BENDS = {"straight": 1, "convex": -1, "concave": 1}  # and the side that the peg comes from
 
 
@@ -28,23 +31,27 @@ def write_beams() -> None:
 
 
 def write_elastica() -> None:
-    """A short, a middle and a long whisker on a peg."""
+    """Every whisker of the mouse and of the example robot on a peg: half an hour."""
     lines = [
-        "# Planar elastica of mouse whiskers pressed by a peg of 1 mm radius: "
-        "see bench/sim/pegs.py.",
-        "whisker,bend,place,depth,friction,centre_x_mm,centre_y_mm,moment_uNm,force_x_mN,"
-        "force_y_mN,contact_x_mm,contact_y_mm",
+        "# Planar elastica of whiskers pressed by a peg of 1 mm radius: see bench/sim/pegs.py.",
+        "whisker,bend,place,depth_mm,friction,centre_x_mm,centre_y_mm,moment_uNm,force_x_mN,"
+        "force_y_mN,contact_x_mm,contact_y_mm,arc_mm",
     ]
-    for name, bend, mu, place, depth in product(
-        ("E5", "C2", "B0"), BENDS, (0.0, 0.5, -0.5), (0.45, 0.7), (0.05, 0.15)
-    ):
+    names = [f"mouse {w.name}" for w in mouse_whiskers()]
+    names += [f"robot {w.name}" for w in load_array(str(ROBOT)).whiskers]
+    for name, bend, place, mu in product(names, BENDS, (0.4, 0.6, 0.8), (0.0, 0.5, -0.5)):
         whisker = flat(name, bend)
-        where, deep = place * whisker.length, depth * whisker.length
-        bent = theory.press(whisker, theory.Peg(BENDS[bend], where, deep, mu, PEG_RADIUS_MM))
-        figures = (*bent.centre, bent.moment * 1e3, *(bent.force * 1e3), *bent.contact)
-        cells = [name, bend, str(place), str(depth), str(mu), *(f"{x:.8g}" for x in figures)]
-        lines.append(",".join(cells))
-    (DATA / "elastica.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+        if bend != "straight" and not whisker.curvature:
+            continue
+        deeper = (share * whisker.length for share in DEPTHS)
+        for depth in (*LIGHT_MM, *(d for d in deeper if d > LIGHT_MM[-1])):
+            peg = theory.Peg(BENDS[bend], place * whisker.length, depth, mu, PEG_RADIUS_MM)
+            bent = theory.press(whisker, peg)
+            figures = (*bent.centre, bent.moment * 1e3, *(bent.force * 1e3), *bent.contact, bent.s)
+            cells = [name, bend, str(place), f"{depth:.6g}", str(mu)]
+            lines.append(",".join([*cells, *(f"{x:.8g}" for x in figures)]))
+    text = "\n".join(lines) + "\n"
+    (DATA / "elastica.csv.gz").write_bytes(gzip.compress(text.encode(), mtime=0))
 
 
 if __name__ == "__main__":

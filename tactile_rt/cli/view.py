@@ -53,8 +53,14 @@ def view(
             "others as much more as their whiskers reach further."
         ),
     ] = None,
+    roll: Annotated[float, typer.Option(help="Turn about the object's own x, degrees.")] = 0.0,
+    pitch: Annotated[float, typer.Option(help="Turn about its own y, degrees.")] = 0.0,
+    heading: Annotated[
+        float, typer.Option(help="Turn of its way about z, -60 to 60 degrees.")
+    ] = 0.0,
+    climb: Annotated[float, typer.Option(help="Rise of its way, -60 to 60 degrees.")] = 0.0,
     profile: Annotated[
-        str, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
+        str, typer.Option(help="How finely: realtime, dataset (finer), accurate, mujoco.")
     ] = "dataset",
 ) -> None:
     """Show a sweep: the scene with force arrows, the map of forces, their traces.
@@ -95,7 +101,15 @@ def view(
         raise ConfigError(f"no camera {camera!r}: there are {', '.join(VIEWS)}")
     if profile not in PROFILES:
         raise ConfigError(f"no profile {profile!r}: there are {', '.join(PROFILES)}")
-    for option, value in (("yaw", yaw), ("height", height), ("distance", distance or 0.0)):
+    for option, value in (
+        ("yaw", yaw),
+        ("height", height),
+        ("distance", distance or 0.0),
+        ("roll", roll),
+        ("pitch", pitch),
+        ("heading", heading),
+        ("climb", climb),
+    ):
         if not math.isfinite(value):
             raise ConfigError(f"--{option} must be a finite number, not {value}")
 
@@ -107,6 +121,10 @@ def view(
         yaw_deg=yaw,
         height_mm=height,
         distance_mm=usual_distance(animals) if distance is None else distance,
+        roll_deg=roll,
+        pitch_deg=pitch,
+        heading_deg=heading,
+        climb_deg=climb,
     )
     simulation = SweepSimulation(animals, thing, sweep, PROFILES[profile], whole=True)
     if at is not None and not 0 <= at <= simulation.duration_ms:

@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.sim_backend.arrays.cells import link_nodes
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
-from tactile_rt.sim_backend.world import OBJECT_BIT, Profile, link_nodes
+from tactile_rt.sim_backend.world import OBJECT_BIT, Profile
 
 __all__ = ["CONTACT_CHANNELS", "ContactProbe", "contact_distances"]
 
@@ -37,7 +38,7 @@ class ContactProbe:
         self._ends = np.zeros(model.ngeom)
         self._count = len(whiskers)
         for i, whisker in enumerate(whiskers):
-            nodes = link_nodes(whisker, profile)
+            nodes = link_nodes(whisker, profile.links)
             first = model.body(whisker.name).id + 1  # a chain's bodies follow one another
             geoms = model.body_geomadr[first : first + len(nodes) - 1]
             self._owner[geoms] = i

@@ -106,6 +106,10 @@ class SimOptions(SensorModel, Randomisation):
             same seed gives the same stream, and the same objects and sweeps whatever the sensors.
         profile: The name of the simulation profile, one of `world.PROFILES`.
         pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
+        size_mm, speed_mm_s, yaw_deg, height_mm, distance_mm, gap_mm: The parameters of every sweep,
+            see `sweep.Sweep`; left out, the size is 40 mm and the others are drawn anew each time.
+        roll_deg, pitch_deg, heading_deg, climb_deg, ramp_ms, head_moves: The parameters of every
+            sweep, see `sweep.Sweep`; 0 if left out.
     """
 
     objects: str = ""
@@ -114,6 +118,18 @@ class SimOptions(SensorModel, Randomisation):
     seed: int = 0
     profile: str = "realtime"
     pace: str = "realtime"
+    size_mm: float | None = None
+    speed_mm_s: float | None = None
+    yaw_deg: float | None = None
+    height_mm: float | None = None
+    distance_mm: float | None = None
+    gap_mm: float | None = None
+    roll_deg: float | None = None
+    pitch_deg: float | None = None
+    heading_deg: float | None = None
+    climb_deg: float | None = None
+    ramp_ms: float | None = None
+    head_moves: float | None = None
 
     def __post_init__(self) -> None:
         SensorModel.__post_init__(self)
@@ -121,10 +137,17 @@ class SimOptions(SensorModel, Randomisation):
         if self.profile not in PROFILES:
             raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
         check_pace(self.pace)
+        Sweep(**self.chosen)
         if self.sweeps < 0 or self.repeat < 1:
             raise ConfigError("sweeps must be 0 or more, and repeat 1 or more")
         if self.seed < 0:
             raise ConfigError(f"seed must be 0 or more, not {self.seed}")
+
+    @property
+    def chosen(self) -> dict[str, float]:
+        """The parameters of every sweep that are not drawn."""
+        every = {f.name: getattr(self, f.name) for f in fields(Sweep)}
+        return {name: float(value) for name, value in every.items() if value is not None}
 
     @property
     def randomisation(self) -> Randomisation:
@@ -228,7 +251,7 @@ class SimSource(PacedSource):
         draw, profile = self._options.randomisation.draw, PROFILES[self._options.profile]
         animals = tuple(draw(self._array_rng, animal) for animal in self._animals)
         sweep, self._simulation = draw_simulation(
-            self._rng, animals, target, profile, self._distance_mm
+            self._rng, animals, target, profile, self._distance_mm, self._options.chosen
         )
         self._rest = REST_SAMPLES
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)

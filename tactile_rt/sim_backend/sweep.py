@@ -5,14 +5,15 @@ it (see `whisker_array.MOUNT`). The object moves along -y, as things do past a h
 forward.
 """
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cache, cached_property
+from types import MappingProxyType
+from typing import Protocol
 
 import mujoco
 import numpy as np
 import trimesh
-from mujoco import rollout
 from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.approach import (
@@ -23,28 +24,18 @@ from tactile_rt.sim_backend.approach import (
     within_reach,
 )
 from tactile_rt.sim_backend.arrays.files import load_animals
-from tactile_rt.sim_backend.arrays.head import add_head
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import rotation
-from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, ContactProbe
+from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS
+from tactile_rt.sim_backend.mujoco_world import MujocoWorld, sweep_model
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
-from tactile_rt.sim_backend.world import (
-    OBJECT_BIT,
-    SAMPLE_MS,
-    WHISKER_BIT,
-    Profile,
-    add_whiskers,
-    empty_world,
-    quaternion,
-    read_base_loads,
-    set_damping,
-)
-from tactile_rt.stream import SourceError
+from tactile_rt.sim_backend.world import SAMPLE_MS, Profile, engine_of
+from tactile_rt.stream import ConfigError
 
 __all__ = [
-    "UNSTABLE",
     "Sweep",
     "SweepSimulation",
+    "World",
     "draw_simulation",
     "draw_sweep",
     "usual_distance",
@@ -54,21 +45,38 @@ FAR_MM = 200.0  # where the object is when the way to first contact is measured
 DRAWS = 20  # tries to draw parameters with which an object meets the array at all
 CLEAR_MM = 5.0  # how far past the last whisker a sweep goes on
 
+NOTHING: Mapping[str, float] = MappingProxyType({})
+
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """How an object is swept past the array (Chung et al. 2025, appendix A1).
+    """How an object is swept past the array (Chung et al. 2025, appendix A1), in any pose.
 
     Attributes:
         size_mm: The largest extent of the object, mm.
-        speed_mm_s: The speed of the object along -y, mm/s.
+        speed_mm_s: The speed of the object relative to the head, mm/s.
         yaw_deg: The rotation of the object about z, degrees.
         height_mm: The z of the object's centre in the world frame, mm.
         distance_mm: The distance from the mean of the whiskers' base points to the object's nearest
-            face, along world x, mm; below 5.5 the stiff rostral whiskers of a mouse jam.
+            face, to the side of its way (along world x where it goes along -y), mm; below 5.5 the
+            stiff rostral whiskers of a mouse jam.
         gap_mm: The way before first contact at which the object starts, mm.
+        roll_deg: The rotation of the object about its own x, degrees; first of the three.
+        pitch_deg: The rotation of the object about its own y, degrees; after the roll, before the
+            yaw.
+        heading_deg: The direction in which the object goes, turned about z from -y, degrees: from
+            the front where it is 0, from the front and the side on which the whiskers are where it
+            is negative on the right.
+        climb_deg: The rise of the object's way above the horizontal, degrees.
+        ramp_ms: The time in which the speed grows to its whole from the start on, ms; its
+            acceleration begins and ends at nothing.
+        head_moves: 1: the head moves past an object that stands still, and its whiskers feel its
+            acceleration; 0: the object moves.
+
+    Raises:
+        ConfigError: a value that cannot be.
     """
 
     size_mm: float = 40.0
@@ -77,6 +85,76 @@ class Sweep:
     height_mm: float = -2.0
     distance_mm: float = 6.5
     gap_mm: float = 2.0
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    heading_deg: float = 0.0
+    climb_deg: float = 0.0
+    ramp_ms: float = 0.0
+    head_moves: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in (f.name for f in fields(self)):
+            low, high = LIMITS.get(name, (-1e4, 1e4))
+            if not low <= getattr(self, name) <= high:
+                raise ConfigError(
+                    f"{name} must be {low:g} to {high:g}, not {getattr(self, name):g}"
+                )
+
+    @property
+    def turn(self) -> Floats:
+        """(3, 3) rotation of the object."""
+        roll, pitch, yaw = np.radians((self.roll_deg, self.pitch_deg, self.yaw_deg))
+        return rotation("z", yaw) @ rotation("y", pitch) @ rotation("x", roll)
+
+    @property
+    def across(self) -> Floats:
+        """(3, 3) rotation into a frame in which the object's way is along -y."""
+        heading, climb = np.radians((self.heading_deg, self.climb_deg))
+        return rotation("x", climb) @ rotation("z", -heading)
+
+
+LIMITS = {
+    "size_mm": (1e-3, 1e4),
+    "speed_mm_s": (1e-3, 1e4),
+    "gap_mm": (0.0, 1e4),
+    "heading_deg": (-60.0, 60.0),  # beyond, it comes at the head itself
+    "climb_deg": (-60.0, 60.0),
+    "ramp_ms": (0.0, 1e4),
+    "head_moves": (0.0, 1.0),
+}
+
+
+class World(Protocol):
+    """What steps whiskers while an object goes by."""
+
+    @property
+    def angles(self) -> Floats:
+        """(joint,) angles of all whiskers' hinges, rad, in the order of `sweep_model`'s."""
+
+    @property
+    def turns(self) -> Floats:
+        """(sample, whisker, 2) turns of the bases in the samples of the last `advance`, rad."""
+
+    def advance(
+        self, way: Floats, look_every: int = 0, shaken: Floats | None = None
+    ) -> tuple[Floats, Floats]:
+        """Simulate some samples of 1 ms.
+
+        Args:
+            way: (sample + 1, 3) where the object is at the beginning of each sample and at the end
+                of the last, mm.
+            look_every: look for contacts at every so many samples; 0: not at all. An engine that
+                knows them anyway gives those of every sample.
+            shaken: (sample, 3) acceleration of the head, mm/ms^2, in the world; the object's way is
+                then relative to the head. None: it is not accelerated.
+
+        Returns:
+            (sample, whisker, 6) loads, N and N m, and (sample, whisker, 3) contacts, see
+            `contacts.CONTACT_CHANNELS`.
+
+        Raises:
+            SourceError: the simulation has become unstable.
+        """
 
 
 class SweepSimulation:
@@ -109,10 +187,14 @@ class SweepSimulation:
     ) -> None:
         animals = array if isinstance(array, tuple) else (array,)
         whiskers = [w for animal in animals for w in animal.whiskers]
-        lines = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
-        turn = rotation("z", np.radians(sweep.yaw_deg))
-        shape = [piece.vertices * sweep.size_mm @ turn.T for piece in target.pieces]
-        start = _beside(lines, faces_right(animals, lines), np.concatenate(shape), sweep)
+        straight = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
+        outward = faces_right(animals, straight)
+        # All that follows is in the frame in which the object goes along -y.
+        across = sweep.across
+        lines = [line @ across.T for line in straight]
+        turned = [piece.vertices * sweep.size_mm @ sweep.turn.T for piece in target.pieces]
+        shape = [points @ across.T for points in turned]
+        start = _beside(lines, outward, np.concatenate(shape), sweep)
         pieces = [
             trimesh.Trimesh(points + start, piece.faces, process=False)
             for points, piece in zip(shape, target.pieces, strict=True)
@@ -125,41 +207,48 @@ class SweepSimulation:
         start[1] += sweep.gap_mm - way
         self._simulated = np.flatnonzero(met | whole)
         self._elements = len(whiskers)
-        self._felt = [whiskers[i] for i in self._simulated]
-        self._profile = profile
-        self._probe: ContactProbe | None = None  # made when contacts are first asked for
-
-        world = empty_world(profile)
-        names = {whiskers[i].name for i in self._simulated}
-        for animal in animals:
-            some = tuple(w for w in animal.whiskers if w.name in names)
-            head = add_whiskers(world, some, profile, animal.mount, f"head {animal.name}")
-            if animal.head is not None:
-                add_head(world, head, animal.head)
+        self._animals, self._profile = animals, profile
+        felt = [whiskers[i] for i in self._simulated]
+        self._names = {w.name for w in felt}
         touched = [lines[i] for i in self._simulated]
-        lengths = [whiskers[i].length for i in self._simulated]
-        kept = range(len(pieces)) if whole else within_reach(touched, lengths, pieces)
-        _add_object(world, [target.pieces[i] for i in kept], sweep.size_mm, turn)
-        self.model = world.compile()
-        set_damping(self.model, whiskers)
-        self.data = mujoco.MjData(self.model)
-        self._start = start
-        self._step_mm = np.array([0.0, -sweep.speed_mm_s * 1e-3 * profile.timestep_ms, 0.0])
-        self.data.mocap_pos[0] = start
-        mujoco.mj_kinematics(self.model, self.data)
-        # The solver takes a mocap body to stand still; friction must see its surface move. The
-        # flag is set at compile time by non-zero velocities only: without it they are ignored.
-        self.model.flg_surfacevel = True
-        for geom in np.flatnonzero(self.model.geom_contype == OBJECT_BIT):
-            frame = self.data.geom_xmat[geom].reshape(3, 3)
-            self.model.geom_surfacevel[geom, :3] = frame.T @ (self._step_mm / profile.timestep_ms)
-        mujoco.mj_forward(self.model, self.data)
+        kept = (
+            range(len(pieces)) if whole else within_reach(touched, [w.length for w in felt], pieces)
+        )
+        self._pieces = [
+            trimesh.Trimesh(turned[i], target.pieces[i].faces, process=False) for i in kept
+        ]
+        self._sweep, self._start, self._ahead = sweep, across.T @ start, across.T @ (0, -1, 0)
+        self._samples = 0
+        self._world: World
+        if engine_of(profile) == "rods":
+            # Where it is missing, MuJoCo steps the array.
+            from tactile_rt.sim_backend.rods.world import Piece, RodWorld
+
+            steps = round(SAMPLE_MS / profile.timestep_ms)
+            roots = _roots(animals)[self._simulated]
+            parts = [Piece.of(piece) for piece in self._pieces]
+            self._world = RodWorld(felt, roots, parts, profile.links, steps)
+        else:
+            if sweep.head_moves:
+                raise ConfigError("head_moves: MuJoCo's world has a head that stands still")
+            self._world = MujocoWorld(self.model, felt, profile, self._start)
 
         rear = start[1] + max(points[:, 1].max() for points in shape)
         last = min(line[:, 1].min() for line in lines)
-        self.duration_ms = float((rear - last + CLEAR_MM) / (sweep.speed_mm_s * 1e-3))
-        self._steps_per_sample = round(SAMPLE_MS / profile.timestep_ms)
-        self._steps_done = 0
+        # with a ramp it has gone half as far by its end
+        whole = (rear - last + CLEAR_MM) / (sweep.speed_mm_s * 1e-3)
+        self.duration_ms = float(whole + sweep.ramp_ms / 2)
+
+    @cached_property
+    def model(self) -> mujoco.MjModel:
+        """The MuJoCo model of the sweep, also where another engine steps it: for pictures."""
+        return sweep_model(self._animals, self._names, self._pieces, self._profile)
+
+    def show(self, data: mujoco.MjData) -> None:
+        """Put the whiskers and the object of a `model` where they are now."""
+        data.qpos[:] = self._world.angles
+        data.mocap_pos[0] = self._place(np.array([self._samples]))[0]
+        data.time = self._samples * SAMPLE_MS
 
     def advance(self, samples: int) -> Floats:
         """Simulate the next samples of 1 ms.
@@ -171,15 +260,15 @@ class SweepSimulation:
             SourceError: the simulation has become unstable: whiskers too stiff for the profile
                 jam against the object.
         """
-        return self._advance(samples)[0]
+        return self._advance(samples, 0)[0]
 
     def advance_with_contacts(self, samples: int, every: int = 1) -> tuple[Floats, Floats]:
-        """As `advance`, and where each whisker touches at the end of each sample.
+        """As `advance`, and where each whisker touches.
 
         Args:
             samples: as for `advance`.
-            every: look only at every so many samples, from the first, and take what is seen to
-                last until the next look, which costs as much as a step.
+            every: where looking costs as much as a step, look only at every so many samples, from
+                the first, and take what is seen to last until the next look.
 
         Returns:
             The loads, and (samples, element, 3) contacts, see `contacts.CONTACT_CHANNELS`.
@@ -187,60 +276,53 @@ class SweepSimulation:
         Raises:
             SourceError: as `advance`.
         """
-        done, steps = self._steps_done, self._steps_per_sample
-        loads, states = self._advance(samples)
+        return self._advance(samples, every)
+
+    def _advance(self, samples: int, look_every: int) -> tuple[Floats, Floats]:
+        loads = np.zeros((samples, self._elements, 6))
         contacts = np.zeros((samples, self._elements, len(CONTACT_CHANNELS)))
+        way = self._place(self._samples + np.arange(samples + 1))
+        self._samples += samples
         if len(self._simulated):
-            self._probe = self._probe or ContactProbe(self.model, self._felt, self._profile)
-            for k in range(0, samples, every):
-                step = (k + 1) * steps
-                place = self._start + (done + step) * self._step_mm
-                seen = self._probe.read(states[step - 1], place)
-                contacts[k : k + every, self._simulated] = seen
+            found = self._world.advance(way, look_every, self._shaken(samples))
+            loads[:, self._simulated], contacts[:, self._simulated] = found
         return loads, contacts
 
-    def _advance(self, samples: int) -> tuple[Floats, Floats]:
-        """The loads, and the (step, ...) states that the steps began with."""
-        steps = samples * self._steps_per_sample
-        when = self._steps_done + np.arange(1, steps + 1)
-        self._steps_done += steps
-        loads = np.zeros((samples, self._elements, 6))
-        if not len(self._simulated):
-            return loads, np.zeros((steps, 0))
-        spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
-        state = np.empty(mujoco.mj_stateSize(self.model, spec))
-        mujoco.mj_getState(self.model, self.data, state, spec)
-        states, sensors = rollout.rollout(
-            self.model,
-            self.data,
-            state[None],
-            (self._start + when[:, None] * self._step_mm)[None],
-            control_spec=int(mujoco.mjtState.mjSTATE_MOCAP_POS),
-            initial_warmstart=self.data.qacc_warmstart.copy()[None],
-        )
-        if any(self.data.warning[kind].number for kind in UNSTABLE):
-            raise SourceError(
-                "the simulation has become unstable: a whisker jams that is too stiff for this "
-                "profile; sweep at a larger distance, or at a finer profile"
-            )
-        sampled = sensors[0].reshape(samples, self._steps_per_sample, -1).mean(axis=1)
-        loads[:, self._simulated] = read_base_loads(sampled)
-        return loads, np.concatenate([state[None], states[0, :-1]])
+    def _place(self, samples: NDArray[np.int64]) -> Floats:
+        """(n, 3) where the object is after so many samples, mm, from the head."""
+        t, ramp = samples * SAMPLE_MS, self._sweep.ramp_ms
+        way = np.asarray(t, dtype=np.float64)
+        if ramp:
+            x = np.minimum(t / ramp, 1.0)
+            way = np.maximum(t - ramp, 0.0) + ramp * (x**3 - x**4 / 2)
+        place: Floats = self._start + (self._sweep.speed_mm_s * 1e-3 * way)[:, None] * self._ahead
+        return place
+
+    def _shaken(self, samples: int) -> Floats | None:
+        """(n, 3) acceleration of the head in the samples just begun, mm/ms^2; None: it has none."""
+        ramp = self._sweep.ramp_ms
+        first = (self._samples - samples) * SAMPLE_MS
+        if not self._sweep.head_moves or first >= ramp:
+            return None
+        x = np.minimum((first + (np.arange(samples) + 0.5) * SAMPLE_MS) / ramp, 1.0)
+        # the head goes against the object's way: of x^3 - x^4 / 2, the second derivative
+        rate = self._sweep.speed_mm_s * 1e-3 * (6 * x - 6 * x**2) / ramp
+        return np.outer(rate, -self._ahead)
+
+    def turns(self) -> Floats:
+        """(sample, element, 2) turns of bases that give, about the elements' y and z, rad.
+
+        Of the samples of the last `advance`, means; zero of mounts that do not give.
+        """
+        found = self._world.turns
+        turns = np.zeros((len(found), self._elements, 2))
+        turns[:, self._simulated] = found
+        return turns
 
     def loads(self, samples_at_once: int = 50) -> Iterator[Floats]:
         """Advance in pieces until the object has passed."""
-        while self._steps_done * self.model.opt.timestep < self.duration_ms:
+        while self._samples * SAMPLE_MS < self.duration_ms:
             yield self.advance(samples_at_once)
-
-
-UNSTABLE = tuple(
-    int(kind)
-    for kind in (
-        mujoco.mjtWarning.mjWARN_BADQPOS,
-        mujoco.mjtWarning.mjWARN_BADQVEL,
-        mujoco.mjtWarning.mjWARN_BADQACC,
-    )
-)
 
 
 def usual_distance(animals: tuple[WhiskerArray, ...]) -> float:
@@ -257,20 +339,26 @@ def _mouse_reach() -> float:
     return lateral_reach(load_animals("mouse"))
 
 
-def draw_sweep(rng: np.random.Generator, distance_mm: float = Sweep.distance_mm) -> Sweep:
+def draw_sweep(
+    rng: np.random.Generator,
+    distance_mm: float = Sweep.distance_mm,
+    chosen: Mapping[str, float] = NOTHING,
+) -> Sweep:
     """Draw the parameters of one sweep: any yaw, a spread of heights, distances and speeds.
 
     Args:
         rng: to draw from.
         distance_mm: about which distances spread, see `usual_distance`.
+        chosen: parameters that are not drawn, by their names.
     """
-    return Sweep(
-        speed_mm_s=float(rng.uniform(28, 40)),
-        yaw_deg=float(rng.uniform(0, 360)),
-        height_mm=float(rng.uniform(-8, 4)),
-        distance_mm=float(rng.uniform(5.5, 8)) * distance_mm / Sweep.distance_mm,
-        gap_mm=float(rng.uniform(0.5, 4)),
-    )
+    drawn = {
+        "speed_mm_s": float(rng.uniform(28, 40)),
+        "yaw_deg": float(rng.uniform(0, 360)),
+        "height_mm": float(rng.uniform(-8, 4)),
+        "distance_mm": float(rng.uniform(5.5, 8)) * distance_mm / Sweep.distance_mm,
+        "gap_mm": float(rng.uniform(0.5, 4)),
+    }
+    return Sweep(**{**drawn, **chosen})
 
 
 def draw_simulation(
@@ -279,15 +367,16 @@ def draw_simulation(
     target: TactileObject,
     profile: Profile,
     distance_mm: float = Sweep.distance_mm,
+    chosen: Mapping[str, float] = NOTHING,
 ) -> tuple[Sweep, SweepSimulation]:
     """Draw sweeps until the object meets the array; give up, with a miss, after many tries.
 
     Args:
-        rng, distance_mm: see `draw_sweep`.
+        rng, distance_mm, chosen: see `draw_sweep`.
         array, target, profile: see `SweepSimulation`.
     """
     for _ in range(DRAWS):
-        sweep = draw_sweep(rng, distance_mm)
+        sweep = draw_sweep(rng, distance_mm, chosen)
         simulation = SweepSimulation(array, target, sweep, profile)
         if simulation.touches:
             break
@@ -306,21 +395,17 @@ def _beside(
     return np.array([x, FAR_MM, sweep.height_mm])
 
 
-def _add_object(
-    world: mujoco.MjSpec, pieces: Sequence[trimesh.Trimesh], size_mm: float, turn: Floats
-) -> None:
-    body = world.worldbody.add_body(name="object", mocap=True, quat=quaternion(turn))
-    for i, piece in enumerate(pieces):
-        world.add_mesh(
-            name=f"piece {i}",
-            uservert=(piece.vertices * size_mm).astype(np.float32).ravel(),
-            userface=piece.faces.astype(np.int32).ravel(),
-        )
-        body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_MESH,
-            meshname=f"piece {i}",
-            contype=OBJECT_BIT,
-            conaffinity=WHISKER_BIT,
-            group=OBJECT_BIT,
-            rgba=(0.75, 0.55, 0.3, 1.0),
-        )
+def _roots(animals: Sequence[WhiskerArray]) -> Floats:
+    """(whisker, 4, 3) base points, mm, and the elements' frames, both in the world."""
+    return np.array(
+        [
+            np.concatenate(
+                [
+                    [a.mount.rotation @ w.base + np.array(a.mount.position)],
+                    a.mount.rotation @ w.orientation,
+                ]
+            )
+            for a in animals
+            for w in a.whiskers
+        ]
+    )

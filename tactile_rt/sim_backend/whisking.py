@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.arrays.whisker_array import Mount
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
-from tactile_rt.sim_backend.sweep import UNSTABLE
+from tactile_rt.sim_backend.mujoco_world import UNSTABLE
 from tactile_rt.sim_backend.trajectories import ANGLES, Trajectory, mirror
 from tactile_rt.sim_backend.world import (
     OBJECT_BIT,

@@ -4,16 +4,18 @@ MuJoCo works in mm, mg and ms here (so forces are mN and moments uN m): in SI th
 link falls below the smallest that MuJoCo accepts. `read_base_loads` converts to N and N m.
 
 Each whisker is cut into equal cells. The two hinges of a joint sit at a cell's midpoint and bend
-the tip as much as the cell's piece of the Euler-Bernoulli beam would (see `_joint_stiffness`).
+the tip as much as the cell's piece of the Euler-Bernoulli beam would (see `joint_stiffness`).
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.sim_backend.arrays.cells import joint_stiffness, link_inertia, link_nodes
 from tactile_rt.sim_backend.arrays.whisker_array import MOUNT, Mount, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import DAMPING_RATIO, Whisker, rotation
 from tactile_rt.stream import ArraySpec
@@ -29,7 +31,7 @@ __all__ = [
     "add_whiskers",
     "array_spec",
     "empty_world",
-    "link_nodes",
+    "engine_of",
     "quaternion",
     "read_base_loads",
     "set_damping",
@@ -39,7 +41,6 @@ __all__ = [
 CHANNELS = ("fx", "fy", "fz", "mx", "my", "mz")
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
 SAMPLE_MS = 1.0  # output period: 1 kHz
-GAUSS = np.polynomial.legendre.leggauss(5)  # nodes, weights: exact to degree 9
 WHISKER_BIT, OBJECT_BIT = 1, 2  # collision groups: whiskers touch objects, never each other
 
 # Contact is a soft layer on both surfaces that whiskers sink through by most of it under a usual
@@ -59,28 +60,31 @@ class Profile:
     """How finely an array is simulated.
 
     Attributes:
-        links_per_mm: The number of rigid links per mm of arc length.
-        least_links: The number of links of the shortest whiskers.
+        links: The number of cells that every whisker is cut into, whatever its length.
         timestep_ms: The length of a physics step, ms; divides the 1 ms output period.
-        layer_mm: The thickness of the soft layer on each of two touching surfaces, mm: thin for the
-            right moments at a light touch, thick against chatter at a coarse step.
+        layer_mm: The thickness of the soft layer that MuJoCo's contacts need on each of two
+            touching surfaces, mm: thin for the right moments at a light touch, thick against
+            chatter at a coarse step.
+        engine: The name of what steps sweeps: ``rods`` (the folder of that name) or ``mujoco``.
     """
 
-    links_per_mm: float
-    least_links: int
+    links: int
     timestep_ms: float
-    layer_mm: float = 0.02
-
-    def links(self, whisker: Whisker) -> int:
-        """Links of one whisker."""
-        return max(self.least_links, round(whisker.length * self.links_per_mm))
+    layer_mm: float
+    engine: str = "rods"
 
 
 PROFILES = {
-    "realtime": Profile(0.25, 5, 0.5, 0.05),
-    "dataset": Profile(0.5, 8, 0.25, 0.025),
-    "accurate": Profile(1.0, 8, 0.1, 0.01),
+    "realtime": Profile(8, 0.5, 0.05),
+    "dataset": Profile(10, 0.25, 0.025),
+    "accurate": Profile(20, 0.1, 0.01),
+    "mujoco": Profile(10, 0.25, 0.025, "mujoco"),
 }
+
+
+def engine_of(profile: Profile) -> str:
+    """The engine that steps a sweep: MuJoCo where no compiler for `rods` is installed."""
+    return profile.engine if find_spec("numba") is not None else "mujoco"
 
 
 def array_spec(whiskers: tuple[Whisker, ...], name: str) -> ArraySpec:
@@ -190,14 +194,14 @@ def add_whiskers(
 def _add_whisker(
     world: mujoco.MjSpec, head: mujoco.MjsBody, whisker: Whisker, profile: Profile
 ) -> None:
-    n = profile.links(whisker)
+    n = profile.links
     cell = whisker.length / n
-    s = link_nodes(whisker, profile)
+    s = link_nodes(whisker, n)
     nodes = whisker.centreline(s)
     middle = (s[:-1] + s[1:]) / 2
     radii = whisker.radius(middle)
     lengths = np.linalg.norm(np.diff(nodes, axis=0), axis=1)
-    stiffness = [_joint_stiffness(whisker, i * cell, (i + 1) * cell) for i in range(n)]
+    stiffness = [joint_stiffness(whisker, i * cell, (i + 1) * cell) for i in range(n)]
     headings = np.arctan2(np.diff(nodes[:, 1]), np.diff(nodes[:, 0]))
 
     body = head.add_body(name=whisker.name, pos=whisker.base, quat=quaternion(whisker.orientation))
@@ -221,15 +225,16 @@ def _add_whisker(
             quat=quaternion(rotation("z", turn)),
         )
         heading, origin = headings[i], nodes[i]
-        if i > 0:  # the first half cell is clamped
+        # The first half cell is clamped, or turns on what the whisker stands on.
+        if i > 0 or whisker.mount_stiffness:
             for axis in ((0, 1, 0), (0, 0, 1)):
                 body.add_joint(
                     name=f"{whisker.name} {i} {'yz'[axis[2]]}",
                     type=mujoco.mjtJoint.mjJNT_HINGE,
                     axis=axis,
-                    stiffness=[stiffness[i - 1], 0, 0],
+                    stiffness=[stiffness[i - 1] if i else whisker.mount_stiffness * 1e6, 0, 0],
                 )
-        mass, centre, axial, transverse = _inertia(whisker, s[i], s[i + 1])
+        mass, centre, axial, transverse = link_inertia(whisker, s[i], s[i + 1])
         body.explicitinertial = True
         body.mass = mass
         body.ipos = (centre, 0, 0)
@@ -244,40 +249,6 @@ def _add_whisker(
             group=WHISKER_BIT,
             rgba=(0.25, 0.2, 0.15, 1.0),
         )
-
-
-def link_nodes(whisker: Whisker, profile: Profile) -> NDArray[np.float64]:
-    """(link + 1,) arc lengths (mm) of the links' ends: base, joints in mid-cell, tip."""
-    n = profile.links(whisker)
-    joints = (np.arange(n) + 0.5) * (whisker.length / n)
-    return np.concatenate([[0.0], joints, [whisker.length]])
-
-
-def _joint_stiffness(whisker: Whisker, start: float, stop: float) -> float:
-    """Stiffness (uN m / rad) of the joint in the middle of a cell.
-
-    The cell adds to the bend of a tip under a force what the beam's own piece adds, the integral of
-    (L - s)^2 / E I: towards a thin tip that is more than its middle's E I would give.
-    """
-    s, weights = start + (GAUSS[0] + 1) * (stop - start) / 2, GAUSS[1] * (stop - start) / 2
-    lever = whisker.length - s
-    bend = float(weights @ (lever**2 / whisker.bending_stiffness(s)))  # 1/N
-    return (whisker.length - (start + stop) / 2) ** 2 / bend * 1e3
-
-
-def _inertia(whisker: Whisker, start: float, stop: float) -> tuple[float, float, float, float]:
-    """Mass (mg), centroid (mm from start), axial and transverse inertia (mg mm^2) of a link.
-
-    Of the tapered piece itself: a uniform link would have its mass too far out, and the whole
-    whisker a first resonance up to 3 % too low.
-    """
-    x, weights = (GAUSS[0] + 1) * (stop - start) / 2, GAUSS[1] * (stop - start) / 2
-    radius = whisker.radius(start + x)
-    mass = weights * whisker.density(start + x) * 1e-3 * np.pi * radius**2
-    total = float(mass.sum())
-    centre = float(mass @ x / total)
-    axial = float(mass @ radius**2 / 2)
-    return total, centre, axial, float(mass @ (radius**2 / 4 + (x - centre) ** 2))
 
 
 def set_damping(model: mujoco.MjModel, whiskers: Iterable[Whisker] = ()) -> dict[str, float]:
@@ -295,12 +266,15 @@ def set_damping(model: mujoco.MjModel, whiskers: Iterable[Whisker] = ()) -> dict
         First resonance of every whisker, Hz.
     """
     ratios = {w.name: w.damping_ratio for w in whiskers}
+    mounts = {w.name: w.mount_damping * 1e9 for w in whiskers}  # uN m ms / rad
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     mass = np.empty((model.nv, model.nv))
     mujoco.mj_fullM(model, data, mass)
     stiffness = model.jnt_stiffness[model.dof_jntid]
-    owner = np.array([model.joint(j).name.split()[0] for j in model.dof_jntid])
+    words = [model.joint(j).name.split() for j in model.dof_jntid]
+    owner = np.array([w[0] for w in words])
+    at_base = np.array([w[1] == "0" for w in words])
     resonances = {}
     for name in dict.fromkeys(owner[stiffness > 0].tolist()):
         dofs = np.flatnonzero((owner == name) & (stiffness > 0))
@@ -310,6 +284,9 @@ def set_damping(model: mujoco.MjModel, whiskers: Iterable[Whisker] = ()) -> dict
         omega = 1 / np.sqrt(np.linalg.eigvalsh(flexible)[-1])  # rad / ms
         beta = 2 * ratios.get(name, DAMPING_RATIO) / omega
         model.dof_damping[dofs] = max(beta - model.opt.timestep, 0.0) * k
+        given = dofs[at_base[dofs]]
+        own = mounts.get(name, 0.0) - model.opt.timestep * stiffness[given]
+        model.dof_damping[given] = np.maximum(own, 0.0)
         resonances[name] = float(omega / (2 * np.pi) * 1e3)
     return resonances
 

@@ -2,8 +2,8 @@
 
 Euler-Bernoulli for stiffness, resonance and sag, the planar elastica for large bends over a peg,
 with numpy and scipy alone. In mm, N and s (so mass in tonnes); the whisker lies in the x-y plane,
-leaves its clamp at the origin along +x and curves towards +y. The surface of a cone leans from its
-centreline by its taper, 0.2 degrees: contact counts as normal to the centreline here.
+leaves its clamp at the origin along +x and curves towards +y. It touches with its surface, which
+is a radius off the centreline and leans towards it by the taper.
 """
 
 import math
@@ -36,6 +36,11 @@ def radius(cone: Cone, s: Floats | float) -> Floats:
     """Radius (mm) at arc length s (mm)."""
     taper = (cone.tip_radius - cone.base_radius) / cone.length
     return np.asarray(cone.base_radius + taper * np.asarray(s))
+
+
+def taper(cone: Cone) -> float:
+    """How far the surface leans from the centreline towards the tip, rad."""
+    return math.atan((cone.base_radius - cone.tip_radius) / cone.length)
 
 
 def bending(cone: Cone, s: Floats | float) -> Floats:
@@ -174,8 +179,12 @@ def touching(cone: Cone, peg: Peg) -> tuple[float, float]:
     def place(s: float) -> tuple[float, float]:
         x = abscissa(cone, s)
         t = math.atan(2 * a * x)
-        reach = peg.side * (peg.radius + float(radius(cone, s)))
-        return x - reach * math.sin(t), a * x * x + reach * math.cos(t)
+        lean = t - peg.side * taper(cone)  # of the surface
+        thick = float(radius(cone, s))
+        return (
+            x - peg.side * (thick * math.sin(t) + peg.radius * math.sin(lean)),
+            a * x * x + peg.side * (thick * math.cos(t) + peg.radius * math.cos(lean)),
+        )
 
     s = float(brentq(lambda s: place(s)[0] - peg.x, 0.0, cone.length, xtol=1e-13))
     return s, place(s)[1]
@@ -186,14 +195,15 @@ class _Ends:
 
     def __init__(self, cone: Cone, peg: Peg, centre: Floats, unknown: Floats) -> None:
         self.s, self.direction, self.push = (float(u) for u in unknown)
-        cos, sin = math.cos(self.direction), math.sin(self.direction)
-        normal, tangent = np.array([-sin, cos]), np.array([cos, sin])
-        thick = float(radius(cone, self.s))
+        lean = self.direction - peg.side * taper(cone)  # of the surface
+        normal = np.array([-math.sin(lean), math.cos(lean)])
+        tangent = np.array([math.cos(lean), math.sin(lean)])
+        across = np.array([-math.sin(self.direction), math.cos(self.direction)])
+        arm = peg.side * float(radius(cone, self.s)) * across  # from the centreline to the surface
         self.force = self.push * (-peg.side * normal + peg.friction * tangent)
-        # friction acts on the surface, a radius off the centreline
-        self.moment = -peg.side * thick * peg.friction * self.push
+        self.moment = float(arm[0] * self.force[1] - arm[1] * self.force[0])
         self.contact = centre - peg.side * peg.radius * normal
-        self.point = centre - peg.side * (peg.radius + thick) * normal
+        self.point = self.contact - arm
 
 
 def _rates(cone: Cone, s: float, state: Floats, force: Floats) -> list[float]:

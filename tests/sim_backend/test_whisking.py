@@ -250,7 +250,7 @@ def test_turning_against_a_post_is_the_same_as_a_post_that_comes():
     c2 = dataclasses.replace(MOUSE["C2"], friction=0.0)
     here = point(c2, np.radians(6), 10.0) + AHEAD
     move = Whisk(frequency_hz=1, protraction_deg=12, retraction_deg=0, ramp_s=0.1, duration_s=0.5)
-    profile = Profile(0.5, 8, 0.2)
+    profile = Profile(10, 0.2, 0.02)
     sim = WhiskSimulation((c2,), move, profile, (prism(here),))
     sim.model.geom_friction[:] = 1e-9
     turned, touch = sim.advance(500)
@@ -320,7 +320,7 @@ def test_a_post_is_met_when_and_as_geometry_says(name):
     normal *= np.sign(normal @ ahead)
     post = prism(on_axis + normal * (radius + whisker.radius(s)), radius)
     move = Whisk(duration_s=0.1)
-    sim = WhiskSimulation((whisker,), move, Profile(1.0, 8, 0.1), (post,))
+    sim = WhiskSimulation((whisker,), move, Profile(20, 0.1, 0.02), (post,))
     loads, touch = sim.advance(100)
     grid = np.arange(0, 0.0625, 1e-5)
     theta = move.offsets(grid, (whisker,))[:, 0, 0]

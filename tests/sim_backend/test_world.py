@@ -27,6 +27,7 @@ from tactile_rt.sim_backend.world import (
     add_whiskers,
     array_spec,
     empty_world,
+    engine_of,
     quaternion,
     read_base_loads,
     set_damping,
@@ -162,18 +163,13 @@ def test_a_profile_is_usable(name: str) -> None:
     profile = PROFILES[name]
     steps = 1.0 / profile.timestep_ms
     assert steps == pytest.approx(round(steps)), "the step divides the output's millisecond"
-    for whisker in mouse_whiskers():
-        links = profile.links(whisker)
-        assert links >= profile.least_links
-        assert links == profile.least_links or abs(
-            links / whisker.length - profile.links_per_mm
-        ) < (0.5 / whisker.length + 1e-9)
+    assert profile.links >= 8 and engine_of(profile) == profile.engine
 
 
 def test_a_chain_lies_on_its_whisker() -> None:
     whisker = FLAT["D0"]
     model, data, _ = build(PROFILES["accurate"], whisker)
-    links = data.xpos[-PROFILES["accurate"].links(whisker) :]
+    links = data.xpos[-PROFILES["accurate"].links :]
     a = whisker.curvature
     np.testing.assert_allclose(links[:, 1], a * links[:, 0] ** 2, atol=1e-6)
     last = data.xpos[-1] + 2 * model.geom_size[-1, 1] * data.xmat[-1].reshape(3, 3)[:, 0]

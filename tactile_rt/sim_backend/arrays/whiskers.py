@@ -48,8 +48,10 @@ OPTIONAL = {
     "density_tip_kg_m3": "density_tip",
     "damping_ratio": "damping_ratio",
     "friction": "friction",
+    "mount_stiffness_nm_rad": "mount_stiffness",
+    "mount_damping_nms_rad": "mount_damping",
 }
-NOT_NEGATIVE = ("damping_ratio", "friction")
+NOT_NEGATIVE = ("damping_ratio", "friction", "mount_stiffness", "mount_damping")
 POSITIVE = {"arc_length_mm": "length"} | {
     column: field for column, field in OPTIONAL.items() if field not in NOT_NEGATIVE
 }
@@ -62,6 +64,7 @@ PLAUSIBLE = {
     "density_base_kg_m3": (100.0, 1e5),
     "density_tip_kg_m3": (100.0, 1e5),
 }
+SOFTEST_MOUNT = 1e-12  # N m / rad: a mouse's whisker has 1e-6 at its base
 NAME = re.compile(r"[\w.+-]+")  # MuJoCo's names are cut at spaces and joined by slashes
 TAKEN = ("world", "head", "object")  # bodies that share a model with the whiskers
 
@@ -84,6 +87,9 @@ class Whisker:
         density_base, density_tip: The mass density at either end, kg/m^3.
         damping_ratio: The damping ratio of the first mode (1 is critical).
         friction: The Coulomb coefficient of friction of the surface.
+        mount_stiffness: The rotational stiffness of what the whisker stands on, about each axis
+            across the whisker, N m / rad; 0: it does not give.
+        mount_damping: The damping of that rotation, N m s / rad.
 
     Raises:
         ConfigError: a value that no whisker can have.
@@ -103,6 +109,8 @@ class Whisker:
     density_tip: float = DENSITY_TIP
     damping_ratio: float = DAMPING_RATIO
     friction: float = FRICTION
+    mount_stiffness: float = 0.0
+    mount_damping: float = 0.0
 
     def __post_init__(self) -> None:
         who = f"whisker {self.name}"
@@ -120,9 +128,18 @@ class Whisker:
         for column, name in POSITIVE.items():
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"{who}: {column} must be positive, not {getattr(self, name):g}")
-        for name in NOT_NEGATIVE:
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ConfigError(f"{who}: {name} must be 0 or more, not {getattr(self, name):g}")
+        for column, name in OPTIONAL.items():
+            if name in NOT_NEGATIVE and not 0 <= getattr(self, name) < math.inf:
+                raise ConfigError(f"{who}: {column} must be 0 or more, not {getattr(self, name):g}")
+        if 0 < self.mount_stiffness < SOFTEST_MOUNT:
+            raise ConfigError(
+                f"{who}: mount_stiffness_nm_rad must be {SOFTEST_MOUNT:g} or more, or 0 for a "
+                f"mount that does not give, not {self.mount_stiffness:g}: mind the unit"
+            )
+        if self.mount_damping and not self.mount_stiffness:
+            raise ConfigError(
+                f"{who}: mount_damping_nms_rad needs mount_stiffness_nm_rad; give that, too"
+            )
         for column, (least, most) in PLAUSIBLE.items():
             value = getattr(self, POSITIVE[column])
             if not least <= value <= most:

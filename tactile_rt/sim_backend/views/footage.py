@@ -24,9 +24,14 @@ _STATE = int(
 class Simulation(Protocol):
     """What `record` runs, e.g. a `SweepSimulation`."""
 
-    model: mujoco.MjModel
-    data: mujoco.MjData
     duration_ms: float
+
+    @property
+    def model(self) -> mujoco.MjModel:
+        """What pictures are drawn of."""
+
+    def show(self, data: mujoco.MjData) -> None:
+        """Put everything in the model's data where it is now."""
 
     def advance(self, samples: int) -> NDArray[np.float64]:
         """Simulate the next samples of 1 ms: (samples, element, 6) base loads, N and N m."""
@@ -102,9 +107,12 @@ def record(
     moments = max(1, int(np.ceil(simulation.duration_ms / period_ms)))
     samples = round(period_ms / SAMPLE_MS)
     loads = np.empty((moments, len(spec.elements), 6))
-    states = np.empty((moments, mujoco.mj_stateSize(simulation.model, _STATE)))
+    model = simulation.model
+    data = mujoco.MjData(model)
+    states = np.empty((moments, mujoco.mj_stateSize(model, _STATE)))
     for k in range(moments):
         loads[k] = simulation.advance(samples).mean(axis=0)
-        mujoco.mj_getState(simulation.model, simulation.data, states[k], _STATE)
+        simulation.show(data)
+        mujoco.mj_getState(model, data, states[k], _STATE)
         progress((k + 1) / moments)
-    return Footage(simulation.model, spec, samples * SAMPLE_MS, loads, states)
+    return Footage(model, spec, samples * SAMPLE_MS, loads, states)

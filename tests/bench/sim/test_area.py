@@ -9,8 +9,9 @@ import pytest
 
 pytest.importorskip("mujoco")
 
-from bench.sim.area import SweepErrors, compare, run
+from bench.sim.area import run
 from bench.sim.beams import flat
+from bench.sim.catalogue import Difference, difference
 from bench.sim.pegs import PEG_RADIUS_MM, Press, press, presses
 from bench.sim.reference_model import reference_cost
 from tactile_rt.sim_backend.world import PROFILES
@@ -24,19 +25,14 @@ CASES = {
 
 def peg_of(case: Press) -> tuple[theory.Cone, theory.Peg]:
     whisker = flat(case.whisker, case.bend)
-    place, depth = case.place * whisker.length, case.depth * whisker.length
-    return whisker, theory.Peg(case.side, place, depth, case.friction, PEG_RADIUS_MM)
+    place = case.place * whisker.length
+    return whisker, theory.Peg(case.side, place, case.depth, case.friction, PEG_RADIUS_MM)
 
 
-# one of each: solving all takes a minute
-SOME = (
-    "E5 convex 0.45 0.15 +0.5",
-    "C2 straight 0.7 0.05 0",
-    "C2 concave 0.45 0.05 -0.5",
-    "B0 straight 0.45 0.15 -0.5",
-    "B0 convex 0.7 0.15 +0.5",
-)
-REST = [pytest.param(name, marks=pytest.mark.slow) for name in CASES if name not in SOME]
+# some of thousands: solving all takes half an hour
+NAMES = list(CASES)
+SOME = NAMES[7::1051]
+REST = [pytest.param(name, marks=pytest.mark.slow) for name in NAMES[50::211] if name not in SOME]
 EACH = pytest.mark.parametrize("name", [*SOME, *REST])
 
 
@@ -65,7 +61,7 @@ def test_a_faint_press_bends_a_straight_cone_as_a_beam() -> None:
     s = np.linspace(0, bent.s, 20001)
     give = np.trapezoid((bent.s - s) ** 2 / theory.bending(whisker, s), s)
     assert bent.normal == pytest.approx(depth / give, rel=1e-3)  # the contact rolls down the taper
-    assert bent.moment == pytest.approx(-bent.normal * bent.s, rel=1e-6)
+    assert bent.moment == pytest.approx(-bent.normal * bent.s, rel=1e-4)  # the cone's side leans
 
 
 @EACH
@@ -76,7 +72,8 @@ def test_the_elastica_balances_and_leans_by_the_angle_of_friction(name: str) -> 
     x, y = bent.contact
     assert x * bent.force[1] - y * bent.force[0] == pytest.approx(bent.moment, rel=1e-8)
     normal = (bent.contact - bent.centre) / peg.radius
-    along = np.array([np.cos(bent.direction), np.sin(bent.direction)])
+    lean = bent.direction - peg.side * theory.taper(whisker)  # of the cone's side
+    along = np.array([np.cos(lean), np.sin(lean)])
     assert bent.force @ normal == pytest.approx(bent.normal, rel=1e-9)
     assert bent.force @ along == pytest.approx(peg.friction * bent.normal, abs=1e-12)
     # inextensible: as long bent as at rest
@@ -97,20 +94,27 @@ def test_the_peg_slides_the_way_its_friction_says(name: str) -> None:
     assert 0.5 <= slid / step <= 1.5
 
 
-@pytest.mark.parametrize("bend", ["straight", "convex", "concave"])
-@pytest.mark.parametrize("whisker", ["E5", "C2", "B0"])
-def test_a_whisker_bends_over_a_peg_as_the_elastica(whisker: str, bend: str) -> None:
-    """Two places, two depths, without friction and with the peg sliding either way."""
-    cases = {n: c for n, c in CASES.items() if (c.whisker, c.bend) == (whisker, bend)}
-    found = {n: press(c, PROFILES["dataset"]) for n, c in cases.items()}
-    assert len(found) == 12
-    assert {n: p.moment_error for n, p in found.items() if abs(p.moment_error) > 0.05} == {}
+@pytest.mark.parametrize(
+    ("profile", "light", "deeper"), [("realtime", 0.1, 0.05), ("dataset", 0.1, 0.05)]
+)
+def test_a_whisker_bends_over_a_peg_as_the_elastica(
+    profile: str, light: float, deeper: float
+) -> None:
+    """Whiskers of a mouse and a robot, straight and curved either way, friction either way."""
+    cases = {n: CASES[n] for n in NAMES[3::29]}
+    found = {n: press(c, PROFILES[profile]) for n, c in cases.items()}
+    assert len(found) > 150
+    limit = {n: light if c.depth < 0.03 else deeper for n, c in cases.items()}
+    assert {n: p.moment_error for n, p in found.items() if abs(p.moment_error) > limit[n]} == {}
+    within = [abs(p.moment_error) <= 0.02 for n, p in found.items() if cases[n].depth > 0.03]
+    assert np.mean(within) >= 0.95
     assert {n: p.contact_error for n, p in found.items() if p.contact_error > 0.2} == {}
-    assert {n: p.deepest for n, p in found.items() if p.deepest > 0.1} == {}
+    assert {n: p.lost for n, p in found.items() if p.lost} == {}
+    assert {n: p.ripple for n, p in found.items() if p.ripple > 0.05} == {}
 
 
 def test_a_wrong_elastica_is_seen() -> None:
-    case = CASES["C2 straight 0.45 0.15 +0.5"]
+    case = next(c for c in presses() if c.whisker == "mouse C2" and c.depth > 1 and c.friction > 0)
     right = press(case, PROFILES["dataset"])
     wrong = press(replace(case, friction=0.0), PROFILES["dataset"])
     assert abs(wrong.moment_error) > abs(right.moment_error) + 0.02
@@ -123,34 +127,25 @@ def test_a_wrong_elastica_is_seen() -> None:
 def test_errors_of_a_sweep_are_what_they_say() -> None:
     rng = np.random.default_rng(0)
     truth = rng.normal(size=(50, 3, 6))
-    same = SweepErrors(truth, truth, 0.01)
-    assert (same.force, same.moment, same.deepest) == (0, 0, 0.01)
-    assert same.spike == pytest.approx(1)
+    assert difference(truth, truth) == Difference(0, 0, pytest.approx(1), 0)
     loads = truth.copy()
     loads[..., :3] *= 1.02
     loads[..., 3:] += 0.1 * np.sqrt(np.mean(truth[..., 3:] ** 2))
     loads[7, 1, :3] *= 10
-    off = SweepErrors(loads, truth, 0.0)
+    off = difference(loads, truth)
     assert off.moment == pytest.approx(0.1)
     assert off.force > 0.02 and off.spike > 3
     silent = truth.copy()
     silent[:, 2, :3] = 0.0  # a whisker that nothing touches must not divide by nothing
-    assert SweepErrors(silent, silent, 0.0).spike == pytest.approx(1)
+    assert difference(silent, silent).spike == pytest.approx(1)
+    late = np.concatenate([np.zeros((4, 3, 6)), truth])[:50]
+    assert difference(late, truth).onset_ms == 4
 
 
 def test_the_reference_model_is_frozen() -> None:
     packed = resources.files("bench.sim").joinpath("data/reference_model.xml.gz")
     assert hashlib.sha256(packed.read_bytes()).hexdigest().startswith("34592f3af85df393")
     assert reference_cost(20) > 0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["icosphere", "mug-50"])
-def test_a_sweep_is_the_sweep_in_finer_steps(name: str) -> None:
-    errors = compare(name, {"dataset": PROFILES["dataset"]}, 500)["dataset"]
-    assert errors.moment <= 0.04
-    assert errors.force <= 0.06
-    assert errors.deepest <= 0.1
 
 
 @pytest.mark.slow

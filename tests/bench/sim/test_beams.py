@@ -71,9 +71,8 @@ def test_a_whisker_is_its_beam(profile: str, looser: int, name: str) -> None:
 
 @pytest.mark.parametrize("name", ["E5", "C6", "C2", "B0"])
 def test_links_converge_to_the_beam(name: str) -> None:
-    cut = {"links_per_mm": 1e-9, "timestep_ms": 0.1}
     few, more, many = (
-        abs(measure(flat(name), beams()[name], replace(FINE, **cut, least_links=links)).resonance)
+        abs(measure(flat(name), beams()[name], Profile(links, 0.1, 0.01, "mujoco")).resonance)
         for links in (8, 16, 32)
     )
     assert more < few / 3 and many < more / 3  # in the second order: by four

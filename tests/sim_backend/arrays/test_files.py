@@ -522,11 +522,3 @@ def test_a_stream_of_any_array(name: str) -> None:
             felt |= (np.abs(chunk.values[..., :3]) > 1e-6).any(axis=(0, 2))
             assert np.abs(chunk.values[..., :3]).max() < 1  # N: bent, not jammed
         assert felt.any()
-
-
-@pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("name", [*NAMES, str(EXAMPLES / "robot.toml")])
-def test_links_are_adapted_to_the_whiskers(name: str, profile: str) -> None:
-    p = PROFILES[profile]
-    for w in load_array(name).whiskers:
-        assert p.links(w) == max(p.least_links, round(w.length * p.links_per_mm))

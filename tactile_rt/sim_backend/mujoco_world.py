@@ -1,0 +1,154 @@
+"""An array and an object as one MuJoCo model: the reference engine, and what pictures are drawn of.
+
+The object is a mocap body: prescribed motion leaves the whiskers independent of each other.
+"""
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import trimesh
+from mujoco import rollout
+from numpy.typing import NDArray
+
+from tactile_rt.sim_backend.arrays.head import add_head
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
+from tactile_rt.sim_backend.arrays.whiskers import Whisker
+from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, ContactProbe
+from tactile_rt.sim_backend.world import (
+    OBJECT_BIT,
+    SAMPLE_MS,
+    WHISKER_BIT,
+    Profile,
+    add_whiskers,
+    empty_world,
+    read_base_loads,
+    set_damping,
+)
+from tactile_rt.stream import SourceError
+
+__all__ = ["UNSTABLE", "MujocoWorld", "sweep_model"]
+
+Floats = NDArray[np.float64]
+
+UNSTABLE = tuple(
+    int(kind)
+    for kind in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+    )
+)
+
+
+def sweep_model(
+    animals: Sequence[WhiskerArray],
+    names: set[str],
+    pieces: Sequence[trimesh.Trimesh],
+    profile: Profile,
+) -> mujoco.MjModel:
+    """The model of a sweep.
+
+    Args:
+        animals: the arrays, on their mounts, with their heads.
+        names: of the whiskers that are in it.
+        pieces: convex, of the object, mm, about its place.
+        profile: how finely to cut the whiskers.
+    """
+    world = empty_world(profile)
+    for animal in animals:
+        some = tuple(w for w in animal.whiskers if w.name in names)
+        head = add_whiskers(world, some, profile, animal.mount, f"head {animal.name}")
+        if animal.head is not None:
+            add_head(world, head, animal.head)
+    body = world.worldbody.add_body(name="object", mocap=True)
+    for i, piece in enumerate(pieces):
+        world.add_mesh(
+            name=f"piece {i}",
+            uservert=piece.vertices.astype(np.float32).ravel(),
+            userface=piece.faces.astype(np.int32).ravel(),
+        )
+        body.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_MESH,
+            meshname=f"piece {i}",
+            contype=OBJECT_BIT,
+            conaffinity=WHISKER_BIT,
+            group=OBJECT_BIT,
+            rgba=(0.75, 0.55, 0.3, 1.0),
+        )
+    model = world.compile()
+    set_damping(model, [w for animal in animals for w in animal.whiskers])
+    return model
+
+
+class MujocoWorld:
+    """See `sweep.World`.
+
+    Args:
+        model: a `sweep_model`.
+        whiskers: those in it.
+        profile: how finely it was cut.
+        start: (3,) where the object is at first, mm.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, whiskers: Sequence[Whisker], profile: Profile, start: Floats
+    ) -> None:
+        self._model, self._data = model, mujoco.MjData(model)
+        self._count = len(whiskers)
+        self._steps = round(SAMPLE_MS / profile.timestep_ms)
+        self._probe = ContactProbe(model, whiskers, profile)
+        self._data.mocap_pos[0] = start
+        # The solver takes a mocap body to stand still; friction must see its surface move. The
+        # flag is set at compile time by non-zero velocities only: without it they are ignored.
+        model.flg_surfacevel = True
+        mujoco.mj_forward(model, self._data)
+
+    @property
+    def turns(self) -> Floats:
+        """None are known: no samples."""
+        return np.zeros((0, self._count, 2))
+
+    @property
+    def angles(self) -> Floats:
+        """(joint,) angles of all whiskers' hinges, rad."""
+        angles: Floats = self._data.qpos.copy()
+        return angles
+
+    def advance(
+        self, way: Floats, look_every: int = 0, shaken: Floats | None = None
+    ) -> tuple[Floats, Floats]:
+        """See `sweep.World`; the head stands still."""
+        assert shaken is None
+        model, data, steps = self._model, self._data, self._steps
+        samples = len(way) - 1
+        shares = np.arange(1, steps + 1)[:, None] / steps
+        path = (way[:-1, None] + np.diff(way, axis=0)[:, None] * shares).reshape(-1, 3)
+        velocity = (way[-1] - way[0]) / (samples * SAMPLE_MS)
+        for geom in np.flatnonzero(model.geom_contype == OBJECT_BIT):
+            frame = data.geom_xmat[geom].reshape(3, 3)
+            model.geom_surfacevel[geom, :3] = frame.T @ velocity
+        spec = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        state = np.empty(mujoco.mj_stateSize(model, spec))
+        mujoco.mj_getState(model, data, state, spec)
+        states, sensors = rollout.rollout(
+            model,
+            data,
+            state[None],
+            path[None],
+            control_spec=int(mujoco.mjtState.mjSTATE_MOCAP_POS),
+            initial_warmstart=data.qacc_warmstart.copy()[None],
+        )
+        if any(data.warning[kind].number for kind in UNSTABLE):
+            raise SourceError(
+                "the simulation has become unstable: a whisker jams that is too stiff for this "
+                "profile; sweep at a larger distance, or at a finer profile"
+            )
+        loads = read_base_loads(sensors[0].reshape(samples, steps, -1).mean(axis=1))
+        contacts = np.zeros((samples, loads.shape[1], len(CONTACT_CHANNELS)))
+        if look_every:
+            before = np.concatenate([state[None], states[0, :-1]])
+            for k in range(0, samples, look_every):
+                step = (k + 1) * steps - 1
+                contacts[k : k + look_every] = self._probe.read(before[step], path[step])
+        return loads, contacts

@@ -1,0 +1,248 @@
+"""The mechanics of a chain of links: where it is, its mass matrix, its inertial forces.
+
+In mm, mg and ms, as `world`. Link b hangs on node b and reaches to node b + 1. Its joint is a hinge
+about the y axis that it has at rest and then one about its own z axis, so its degrees of freedom
+are 2 (b - clamped) and the next one; the first link has none where the base is clamped.
+
+Featherstone, Rigid Body Dynamics Algorithms (2008): composite bodies for the mass matrix, Newton
+and Euler's equations from link to link for the forces.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from tactile_rt.sim_backend.rods.compiled import compiled
+
+__all__ = ["factor", "inertial_forces", "mass_matrix", "place", "solve_back", "solve_forth"]
+
+A = Any  # a contiguous array of float64: what is compiled knows its arguments' types by itself
+
+
+@compiled
+def place(links: int, clamped: int, turn: A, length: A, q: A, nodes: A, frames: A, axes: A) -> None:
+    """Where a chain is whose first node and first frame stand in `nodes` and `frames` already.
+
+    Args:
+        links, clamped: how many links; 1 where the first has no joint, else 0.
+        turn: (link, 2) cosine and sine of the resting angle from the link before, about z.
+        length: (link,) mm.
+        q: (degree of freedom,) rad.
+        nodes: (link + 1, 3) mm; filled from the second on.
+        frames: (link, 3, 3) x along the link; filled, the first turned by its own joint.
+        axes: (degree of freedom, 3) filled.
+    """
+    for b in range(links):
+        if b > 0:
+            c, s = turn[b, 0], turn[b, 1]
+            for i in range(3):
+                x, y = frames[b - 1, i, 0], frames[b - 1, i, 1]
+                frames[b, i, 0] = x * c + y * s
+                frames[b, i, 1] = y * c - x * s
+                frames[b, i, 2] = frames[b - 1, i, 2]
+        if b >= clamped:
+            j = 2 * (b - clamped)
+            cy, sy = math.cos(q[j]), math.sin(q[j])
+            cz, sz = math.cos(q[j + 1]), math.sin(q[j + 1])
+            for i in range(3):
+                x, y, z = frames[b, i, 0], frames[b, i, 1], frames[b, i, 2]
+                axes[j, i] = y
+                x, z = x * cy - z * sy, x * sy + z * cy
+                axes[j + 1, i] = z
+                frames[b, i, 0], frames[b, i, 1] = x * cz + y * sz, y * cz - x * sz
+                frames[b, i, 2] = z
+        for i in range(3):
+            nodes[b + 1, i] = nodes[b, i] + frames[b, i, 0] * length[b]
+
+
+@compiled
+def mass_matrix(
+    links: int, clamped: int, inertia: A, nodes: A, frames: A, axes: A, work: A, matrix: A
+) -> None:
+    """The lower triangle of the mass matrix.
+
+    Args:
+        inertia: (link, 4) mass (mg), centroid from the link's node (mm), axial and transverse
+            inertia (mg mm^2).
+        work: (3, 3) scratch.
+        matrix: (degree of freedom, degree of freedom) filled.
+    """
+    mass, h0, h1, h2 = 0.0, 0.0, 0.0, 0.0  # of the links from here on: mass and first moments
+    work[:] = 0.0  # their inertia about the world's origin
+    for b in range(links - 1, clamped - 1, -1):
+        m, across = inertia[b, 0], inertia[b, 3]
+        x0, x1, x2 = frames[b, 0, 0], frames[b, 1, 0], frames[b, 2, 0]
+        r0 = nodes[b, 0] + x0 * inertia[b, 1]
+        r1 = nodes[b, 1] + x1 * inertia[b, 1]
+        r2 = nodes[b, 2] + x2 * inertia[b, 1]
+        mass += m
+        h0 += m * r0
+        h1 += m * r1
+        h2 += m * r2
+        along = inertia[b, 2] - across
+        work[0, 0] += m * (r1 * r1 + r2 * r2) + across + along * x0 * x0
+        work[1, 1] += m * (r0 * r0 + r2 * r2) + across + along * x1 * x1
+        work[2, 2] += m * (r0 * r0 + r1 * r1) + across + along * x2 * x2
+        work[0, 1] += along * x0 * x1 - m * r0 * r1
+        work[0, 2] += along * x0 * x2 - m * r0 * r2
+        work[1, 2] += along * x1 * x2 - m * r1 * r2
+        p0, p1, p2 = nodes[b, 0], nodes[b, 1], nodes[b, 2]
+        d0, d1, d2 = h0 - mass * p0, h1 - mass * p1, h2 - mass * p2
+        for k in range(2 * (b - clamped), 2 * (b - clamped) + 2):
+            a0, a1, a2 = axes[k, 0], axes[k, 1], axes[k, 2]
+            # Momentum of all that turns with this joint at unit speed, and its moment.
+            l0, l1, l2 = a1 * d2 - a2 * d1, a2 * d0 - a0 * d2, a0 * d1 - a1 * d0
+            v0, v1, v2 = a2 * p1 - a1 * p2, a0 * p2 - a2 * p0, a1 * p0 - a0 * p1
+            m0 = work[0, 0] * a0 + work[0, 1] * a1 + work[0, 2] * a2 + h1 * v2 - h2 * v1
+            m1 = work[0, 1] * a0 + work[1, 1] * a1 + work[1, 2] * a2 + h2 * v0 - h0 * v2
+            m2 = work[0, 2] * a0 + work[1, 2] * a1 + work[2, 2] * a2 + h0 * v1 - h1 * v0
+            for c in range(clamped, b + 1):
+                q0, q1, q2 = nodes[c, 0], nodes[c, 1], nodes[c, 2]
+                n0 = m0 - q1 * l2 + q2 * l1
+                n1 = m1 - q2 * l0 + q0 * l2
+                n2 = m2 - q0 * l1 + q1 * l0
+                j = 2 * (c - clamped)
+                matrix[k, j] = n0 * axes[j, 0] + n1 * axes[j, 1] + n2 * axes[j, 2]
+                if j + 1 <= k:
+                    matrix[k, j + 1] = (
+                        n0 * axes[j + 1, 0] + n1 * axes[j + 1, 1] + n2 * axes[j + 1, 2]
+                    )
+
+
+@compiled
+def inertial_forces(
+    links: int,
+    clamped: int,
+    inertia: A,
+    nodes: A,
+    frames: A,
+    axes: A,
+    v: A,
+    a: A,
+    base: A,
+    pushed: A,
+    work: A,
+    torques: A,
+    wrench: A,
+) -> None:
+    """What an acceleration takes, less what pushes from outside.
+
+    Args:
+        v, a: (degree of freedom,) rad/ms and rad/ms^2.
+        base: (4, 3) of the base: velocity (not used), angular velocity, acceleration, angular
+            acceleration.
+        pushed: (link, 6) force (mN) and moment about the world's origin (uN m) on each link.
+        work: (link, 6) scratch.
+        torques: (degree of freedom,) filled: about each joint's axis.
+        wrench: (6,) filled: force on the base and moment about it that the base has to give.
+    """
+    w0, w1, w2 = base[1, 0], base[1, 1], base[1, 2]  # angular velocity
+    t0, t1, t2 = base[3, 0], base[3, 1], base[3, 2]  # angular acceleration
+    s0, s1, s2 = base[2, 0], base[2, 1], base[2, 2]  # acceleration of the link's node
+    for b in range(links):
+        if b >= clamped:
+            for k in range(2 * (b - clamped), 2 * (b - clamped) + 2):
+                x0, x1, x2 = axes[k, 0], axes[k, 1], axes[k, 2]
+                t0 += x0 * a[k] + (w1 * x2 - w2 * x1) * v[k]
+                t1 += x1 * a[k] + (w2 * x0 - w0 * x2) * v[k]
+                t2 += x2 * a[k] + (w0 * x1 - w1 * x0) * v[k]
+                w0 += x0 * v[k]
+                w1 += x1 * v[k]
+                w2 += x2 * v[k]
+        x0, x1, x2 = frames[b, 0, 0], frames[b, 1, 0], frames[b, 2, 0]
+        m, at, across = inertia[b, 0], inertia[b, 1], inertia[b, 3]
+        along = inertia[b, 2] - across
+        # A unit along the link is accelerated by this: tangentially and towards the axis.
+        u0, u1, u2 = w1 * x2 - w2 * x1, w2 * x0 - w0 * x2, w0 * x1 - w1 * x0
+        c0 = t1 * x2 - t2 * x1 + w1 * u2 - w2 * u1
+        c1 = t2 * x0 - t0 * x2 + w2 * u0 - w0 * u2
+        c2 = t0 * x1 - t1 * x0 + w0 * u1 - w1 * u0
+        f0, f1, f2 = m * (s0 + at * c0), m * (s1 + at * c1), m * (s2 + at * c2)
+        wx = w0 * x0 + w1 * x1 + w2 * x2
+        tx = t0 * x0 + t1 * x1 + t2 * x2
+        l0 = across * w0 + along * wx * x0
+        l1 = across * w1 + along * wx * x1
+        l2 = across * w2 + along * wx * x2
+        r0, r1, r2 = nodes[b, 0] + at * x0, nodes[b, 1] + at * x1, nodes[b, 2] + at * x2
+        work[b, 0], work[b, 1], work[b, 2] = f0 - pushed[b, 0], f1 - pushed[b, 1], f2 - pushed[b, 2]
+        work[b, 3] = (
+            across * t0 + along * tx * x0 + w1 * l2 - w2 * l1 + r1 * f2 - r2 * f1 - pushed[b, 3]
+        )
+        work[b, 4] = (
+            across * t1 + along * tx * x1 + w2 * l0 - w0 * l2 + r2 * f0 - r0 * f2 - pushed[b, 4]
+        )
+        work[b, 5] = (
+            across * t2 + along * tx * x2 + w0 * l1 - w1 * l0 + r0 * f1 - r1 * f0 - pushed[b, 5]
+        )
+        if b + 1 < links:
+            # the next node: the links' lengths are the nodes' distances
+            n = math.sqrt(
+                (nodes[b + 1, 0] - nodes[b, 0]) ** 2
+                + (nodes[b + 1, 1] - nodes[b, 1]) ** 2
+                + (nodes[b + 1, 2] - nodes[b, 2]) ** 2
+            )
+            s0 += n * c0
+            s1 += n * c1
+            s2 += n * c2
+    for b in range(links - 1, -1, -1):
+        if b + 1 < links:
+            for i in range(6):
+                work[b, i] += work[b + 1, i]
+        p0, p1, p2 = nodes[b, 0], nodes[b, 1], nodes[b, 2]
+        f0, f1, f2 = work[b, 0], work[b, 1], work[b, 2]
+        m0 = work[b, 3] - p1 * f2 + p2 * f1
+        m1 = work[b, 4] - p2 * f0 + p0 * f2
+        m2 = work[b, 5] - p0 * f1 + p1 * f0
+        if b >= clamped:
+            for k in range(2 * (b - clamped), 2 * (b - clamped) + 2):
+                torques[k] = m0 * axes[k, 0] + m1 * axes[k, 1] + m2 * axes[k, 2]
+        if b == 0:
+            wrench[0], wrench[1], wrench[2] = f0, f1, f2
+            wrench[3], wrench[4], wrench[5] = m0, m1, m2
+
+
+@compiled
+def factor(matrix: A, n: int) -> None:
+    """Cholesky's factor of the first n rows, in place, from the lower triangle."""
+    for i in range(n):
+        for j in range(i):
+            s = matrix[i, j]
+            for k in range(j):
+                s -= matrix[i, k] * matrix[j, k]
+            matrix[i, j] = s / matrix[j, j]
+        s = matrix[i, i]
+        for k in range(i):
+            s -= matrix[i, k] * matrix[i, k]
+        matrix[i, i] = math.sqrt(s)
+
+
+@compiled
+def solve_forth(lower: A, n: int, x: A) -> None:
+    """Solve L y = x, in place."""
+    for i in range(n):
+        s = x[i]
+        for k in range(i):
+            s -= lower[i, k] * x[k]
+        x[i] = s / lower[i, i]
+
+
+@compiled
+def solve_back(lower: A, n: int, x: A) -> None:
+    """Solve L' y = x, in place."""
+    for i in range(n - 1, -1, -1):
+        x[i] /= lower[i, i]
+        s = x[i]
+        for k in range(i):
+            x[k] -= lower[i, k] * s
+
+
+def chain_mass(inertia: A, turn: A, length: A, clamped: int) -> A:
+    """(degree of freedom, degree of freedom) mass matrix of a chain at rest, whole."""
+    links = len(length)
+    n = 2 * (links - clamped)
+    nodes, frames = np.zeros((links + 1, 3)), np.zeros((links, 3, 3))
+    frames[0], axes, matrix = np.eye(3), np.zeros((n, 3)), np.zeros((n, n))
+    place(links, clamped, turn, length, np.zeros(n), nodes, frames, axes)
+    mass_matrix(links, clamped, inertia, nodes, frames, axes, np.empty((3, 3)), matrix)
+    return np.tril(matrix) + np.tril(matrix, -1).T

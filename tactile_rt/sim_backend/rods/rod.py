@@ -1,0 +1,171 @@
+"""A whisker as a chain of links: the numbers that `stepping` needs of it."""
+
+import cmath
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.sim_backend.arrays.cells import joint_stiffness, link_inertia, link_nodes
+from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
+from tactile_rt.sim_backend.rods.chains import chain_mass
+
+__all__ = ["Rod", "make_rod", "matched"]
+
+Floats = NDArray[np.float64]
+
+SAG_MM = 2e-4  # how far the chord of a segment may be from the resting curve
+FINEST = 8  # how many times the step is halved at most, so that a whisker rings as it should
+HEARD_HZ = 500.0  # resonances above are beyond what samples at 1 kHz can hold
+
+
+@dataclass(frozen=True)
+class Rod:
+    """One whisker, cut and ready to be stepped: see `stepping.advance` for the arrays.
+
+    Attributes:
+        steps_per_sample: The number of steps in a sample.
+        resonance_hz: The first resonance of the whisker on its mount, Hz.
+        damping_ratio: The damping ratio with which the first mode rings when stepped, that of the
+            mount included.
+        clamped: The number of links without a joint: 1, or 0 where the base gives.
+        added: The (joint, joint) mass with which the modes have their frequencies when stepped.
+        damping: The (joint, joint) damping with which they have their damping ratios.
+        to_element: The (3, 3) rotation from the frame of the first link to that of the element.
+    """
+
+    steps_per_sample: int
+    resonance_hz: float
+    damping_ratio: float
+    clamped: int
+    turn: Floats
+    length: Floats
+    inertia: Floats
+    stiffness: Floats
+    added: Floats
+    damping: Floats
+    friction: float
+    seg_link: NDArray[np.int64]
+    seg_ends: Floats
+    seg_radii: Floats
+    seg_arcs: Floats
+    to_element: Floats
+
+
+def make_rod(whisker: Whisker, links: int, steps_per_sample: int, sample_ms: float = 1.0) -> Rod:
+    """Cut a whisker into equal cells, and choose a step with which it rings as it should.
+
+    A step that is long against a period makes a mode slower and damps it more. Both are taken back
+    for every mode, see `matched`, as far as a step allows that; where it does not for the first,
+    the step is halved, for whiskers whose ringing samples can hold at all.
+
+    Args:
+        whisker: to cut.
+        links: how many cells; one more link.
+        steps_per_sample: the fewest steps in a sample.
+        sample_ms: length of a sample, ms.
+    """
+    s = link_nodes(whisker, links)
+    nodes = whisker.centreline(s)
+    chords = np.diff(nodes, axis=0)
+    headings = np.arctan2(chords[:, 1], chords[:, 0])
+    turns = np.diff(headings, prepend=headings[0])
+    turn = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    length = np.linalg.norm(chords, axis=1)
+    inertia = np.array([link_inertia(whisker, a, b) for a, b in pairwise(s)])
+    cell = whisker.length / links
+    k = [joint_stiffness(whisker, i * cell, (i + 1) * cell) for i in range(links)]
+    stiffness = np.repeat(k, 2)
+    omegas, _ = _modes(chain_mass(inertia, turn, length, 1), stiffness)
+    damping = 2 * whisker.damping_ratio / omegas[0] * stiffness
+    clamped = 1
+    if whisker.mount_stiffness:
+        clamped = 0
+        stiffness = np.concatenate([[whisker.mount_stiffness * 1e6] * 2, stiffness])
+        damping = np.concatenate([[whisker.mount_damping * 1e9] * 2, damping])
+    mass = chain_mass(inertia, turn, length, clamped)
+    omegas, shapes = _modes(mass, stiffness)
+    ratios = damping @ shapes**2 / (2 * omegas)  # of each mode
+    steps, resonance_hz = steps_per_sample, float(omegas[0] / (2 * np.pi) * 1e3)
+    found = [matched(w, z, sample_ms / steps) for w, z in zip(omegas, ratios, strict=True)]
+    while found[0][1] < 0 and resonance_hz < HEARD_HZ and steps < FINEST * steps_per_sample:
+        steps *= 2
+        found = [matched(w, z, sample_ms / steps) for w, z in zip(omegas, ratios, strict=True)]
+    ratio = float(ratios[0])
+    if found[0][1] < 0:  # more than is wanted without any: what backward Euler leaves
+        decay = math.log1p((omegas[0] * sample_ms / steps) ** 2) / 2
+        ratio = decay / math.hypot(decay, math.atan(omegas[0] * sample_ms / steps))
+    # Mode by mode; the modes are those of the whisker at rest.
+    heavier = np.array([m if beta >= 0 else 1.0 for m, beta in found])
+    drags = np.array([max(beta, 0.0) for _, beta in found]) * omegas**2
+    onto = mass @ shapes
+    pieces = [_segments(whisker, i, s, nodes, headings[i]) for i in range(links + 1)]
+    return Rod(
+        steps_per_sample=steps,
+        resonance_hz=resonance_hz,
+        damping_ratio=ratio,
+        clamped=clamped,
+        turn=turn,
+        length=length,
+        inertia=inertia,
+        stiffness=stiffness,
+        added=(onto * (heavier - 1)) @ onto.T,
+        damping=(onto * drags) @ onto.T,
+        friction=whisker.friction,
+        seg_link=np.repeat(np.arange(links + 1), [len(p[0]) for p in pieces]),
+        seg_ends=np.concatenate([p[0] for p in pieces]),
+        seg_radii=np.concatenate([p[1] for p in pieces]),
+        seg_arcs=np.concatenate([p[2] for p in pieces]),
+        to_element=rotation("z", -headings[0]),
+    )
+
+
+def _modes(mass: Floats, stiffness: Floats) -> tuple[Floats, Floats]:
+    """Angular frequencies (mode,), rad/ms, slowest first; shapes (joint, mode) of unit mass."""
+    root = np.sqrt(stiffness)
+    inverse_squares, shapes = np.linalg.eigh(mass / np.outer(root, root))
+    omegas = 1 / np.sqrt(np.maximum(inverse_squares[::-1], 1e-300))
+    return omegas, shapes[:, ::-1] / root[:, None] * omegas
+
+
+def matched(omega: float, ratio: float, h: float) -> tuple[float, float]:
+    """How to let backward Euler ring a mode as time itself would.
+
+    The step x' = x + h v', m (v' - v) = -h (k x' + beta k v') multiplies the mode by two numbers;
+    with more mass and less damping than the mode has they are exp(h lambda), lambda its own poles.
+
+    Args:
+        omega: the mode's natural angular frequency, rad/ms.
+        ratio: its damping ratio.
+        h: the step, ms.
+
+    Returns:
+        How much heavier, and beta (ms), which is negative where the step damps more than is wanted.
+    """
+    root = cmath.sqrt(ratio * ratio - 1)
+    first, second = -omega / (ratio + root), -omega * (ratio + root)  # the poles
+    left = cmath.exp(first * h), cmath.exp(second * h)
+    gone = ((1 - left[0]) * (1 - left[1])).real
+    if abs(first * h) < 1e-3:  # without losing digits
+        gone = (first * second * h * h * (1 + (first + second) * h / 2)).real
+    product = (left[0] * left[1]).real
+    beta = h * ((left[0] + left[1]).real - 2 * product) / gone
+    return (omega * h) ** 2 * product / gone, beta
+
+
+def _segments(
+    whisker: Whisker, link: int, s: Floats, nodes: Floats, heading: float
+) -> tuple[Floats, Floats, Floats]:
+    """Ends in the link's frame (segment, 2, 3), radii (segment, 2) and arcs (segment, 2)."""
+    longest = math.sqrt(8 * SAG_MM / max(2 * abs(whisker.curvature), 1e-12))
+    count = max(1, math.ceil((s[link + 1] - s[link]) / longest))
+    at = np.linspace(s[link], s[link + 1], count + 1)
+    places = (whisker.centreline(at) - nodes[link]) @ rotation("z", -heading).T
+    radii = whisker.radius(at)
+
+    def pairs(x: Floats) -> Floats:
+        return np.ascontiguousarray(np.stack([x[:-1], x[1:]], axis=1))
+
+    return pairs(places), pairs(radii), pairs(at)

@@ -1,0 +1,176 @@
+"""An array and an object, stepped whisker by whisker."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from tactile_rt.sim_backend.arrays.whiskers import Whisker
+from tactile_rt.sim_backend.rods.rod import make_rod
+from tactile_rt.sim_backend.rods.stepping import advance
+from tactile_rt.stream import SourceError
+
+__all__ = ["Piece", "RodWorld"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A convex piece of an object: the hull of its corners, grown by a radius.
+
+    Attributes:
+        corners: The (corner, 3) corners, mm, about the object's place.
+        faces: The (face, 4) outward normals and offsets of the hull; none of a point or a line.
+        rounding: The radius by which the hull is grown, mm.
+    """
+
+    corners: Floats
+    faces: Floats
+    rounding: float = 0.0
+
+    @classmethod
+    def of(cls, mesh: trimesh.Trimesh) -> "Piece":
+        """The piece that a convex mesh is."""
+        normals = np.asarray(mesh.face_normals, dtype=np.float64)
+        offsets = np.einsum("fi,fi->f", normals, mesh.triangles[:, 0])
+        return cls(
+            np.array(mesh.vertices, dtype=np.float64),
+            np.concatenate([normals, offsets[:, None]], axis=1),
+        )
+
+
+class RodWorld:
+    """Whiskers on bases that stand still, and an object that moves among them without turning.
+
+    Args:
+        whiskers: the array.
+        roots: (whisker, 4, 3) base point (mm) and, in the rows after it, the element's frame in the
+            world.
+        pieces: of the object.
+        links: how many cells a whisker is cut into.
+        steps_per_sample: the fewest steps in a sample of 1 ms.
+
+    Attributes:
+        rods: The whiskers as they are stepped.
+        angles: The (joint,) angles of all whiskers' hinges, one whisker after the other, rad.
+        turns: The (sample, whisker, 2) turns of bases that give in the samples of the last
+            `advance`, means, about the element's y and z, rad.
+    """
+
+    def __init__(
+        self,
+        whiskers: Sequence[Whisker],
+        roots: Floats,
+        pieces: Sequence[Piece],
+        links: int,
+        steps_per_sample: int,
+    ) -> None:
+        self.rods = rods = [make_rod(w, links, steps_per_sample) for w in whiskers]
+        self.angles, self.turns = np.zeros(0), np.zeros((0, len(rods), 2))
+        if not rods:
+            return
+        self._frames = roots[:, 1:]
+        turned = [
+            np.concatenate([root[:1], root[1:] @ rod.to_element.T])
+            for root, rod in zip(roots, rods, strict=True)
+        ]
+        self._rods = (
+            np.array([r.steps_per_sample for r in rods]),
+            np.array([r.clamped for r in rods]),
+            _begins(rods, lambda r: r.length),
+            _begins(rods, lambda r: r.stiffness),
+            _begins(rods, lambda r: r.seg_link),
+            *(
+                np.concatenate([getattr(r, name) for r in rods])
+                for name in ("turn", "length", "inertia", "stiffness")
+            ),
+            *(_stacked([getattr(r, name) for r in rods]) for name in ("added", "damping")),
+            np.array([r.friction for r in rods]),
+        )
+        segments = sum(len(r.seg_link) for r in rods)
+        joints = sum(len(r.stiffness) for r in rods)
+        self.angles = np.zeros(joints)
+        self._state = (
+            self.angles,
+            np.zeros(joints),
+            np.zeros((len(rods), 1)),
+            np.zeros((sum(len(r.length) for r in rods), 4)),
+        )
+        self._roots = np.array(turned)[:, None]
+        self._segments = tuple(
+            np.concatenate([getattr(r, name) for r in rods])
+            for name in ("seg_link", "seg_ends", "seg_radii", "seg_arcs")
+        )
+        boxes = [[p.corners.min(axis=0), p.corners.max(axis=0)] for p in pieces]
+        self._pieces = (
+            np.concatenate([np.zeros((0, 3)), *(p.corners for p in pieces)]),
+            _begins(pieces, lambda p: p.corners),
+            np.concatenate([np.zeros((0, 4)), *(p.faces for p in pieces)]),
+            _begins(pieces, lambda p: p.faces),
+            np.array([p.rounding for p in pieces]),
+            np.array(boxes).reshape(-1, 2, 3),
+        )
+        self._pairs = (
+            np.full((segments, len(pieces)), -np.inf),
+            np.zeros((segments, len(pieces)), dtype=np.int64),
+        )
+
+    def advance(
+        self, way: Floats, look_every: int = 0, shaken: Floats | None = None
+    ) -> tuple[Floats, Floats]:
+        """See `sweep.World`; loads and contacts are means over each sample.
+
+        Args:
+            way, look_every: see there.
+            shaken: (sample, 3) acceleration of the head, mm/ms^2, in the world; the object's way is
+                then relative to the head. None: it is not accelerated.
+        """
+        samples = len(way) - 1
+        if not self.rods:
+            return np.zeros((samples, 0, 6)), np.zeros((samples, 0, 3))
+        loads = np.zeros((len(self.rods), samples, 6))
+        contacts = np.zeros((len(self.rods), samples, 5))
+        bases = np.zeros((1 if shaken is None else samples, 4, 3))
+        if shaken is not None:
+            bases[:, 2] = shaken
+        arguments: tuple[Any, ...] = (
+            *self._rods,
+            *self._state,
+            self._roots,
+            bases,
+            *self._segments,
+            *self._pieces,
+            np.eye(3),
+            np.ascontiguousarray(way),
+            *self._pairs,
+            loads,
+            contacts,
+        )
+        done = advance(*arguments)
+        if done < 0:
+            raise SourceError(
+                "the simulation has become unstable: a whisker jams that is too stiff for this "
+                "profile; sweep at a larger distance, or at a finer profile"
+            )
+        # Sums in a fixed order: a matrix product's rounding may depend on the number of samples.
+        felt = np.zeros_like(loads)
+        for k in range(3):
+            felt[..., :3] += loads[..., k, None] * self._frames[:, None, k] * 1e-3
+            felt[..., 3:] += loads[..., 3 + k, None] * self._frames[:, None, k] * 1e-6
+        self.turns = contacts[..., 3:].swapaxes(0, 1)
+        return felt.swapaxes(0, 1), contacts[..., :3].swapaxes(0, 1) * (1.0, 1e-3, 1e-6)
+
+
+def _stacked(squares: Sequence[Floats]) -> Floats:
+    """Matrices one below the other, the narrower ones filled up with zeros."""
+    wide = max(len(square) for square in squares)
+    return np.concatenate([np.pad(s, ((0, 0), (0, wide - len(s)))) for s in squares])
+
+
+def _begins(things: Sequence[Any], of: Callable[[Any], Any]) -> NDArray[np.int64]:
+    """Where each thing's rows begin when they stand one after the other, and where the last end."""
+    return np.cumsum([0, *(len(of(thing)) for thing in things)])

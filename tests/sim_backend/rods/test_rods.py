@@ -1,0 +1,256 @@
+"""Whiskers stepped one by one: ringing, pressing, flying, and that nothing depends on the cut."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("numba")
+
+import trimesh
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+
+from bench.sim.beams import beams, flat
+from bench.sim.ringing import release_error, rod_ring
+from tactile_rt.sim_backend.arrays.files import load_array
+from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
+from tactile_rt.sim_backend.objects.catalogue import TactileObject, make_object
+from tactile_rt.sim_backend.rods.rod import make_rod
+from tactile_rt.sim_backend.rods.world import Piece, RodWorld
+from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.world import PROFILES, Profile
+
+Floats = NDArray[np.float64]
+
+
+def alone(whisker: Whisker, profile: Profile, pieces: tuple[Piece, ...] = ()) -> RodWorld:
+    root = np.concatenate([np.zeros((1, 3)), whisker.orientation])[None]
+    steps = round(1 / profile.timestep_ms)
+    return RodWorld((whisker,), root, pieces, profile.links, steps)
+
+
+@pytest.mark.parametrize("profile", ["realtime", "dataset", "accurate"])
+@pytest.mark.parametrize("name", [n for n, b in beams().items() if b.resonance_hz < 400][::3])
+def test_it_rings_as_the_beam_at_every_step(name: str, profile: str) -> None:
+    frequency, ratio = rod_ring(flat(name), PROFILES[profile])
+    assert frequency == pytest.approx(beams()[name].resonance_hz, rel=2e-3)
+    assert ratio == pytest.approx(0.32, abs=1e-3)
+
+
+@pytest.mark.parametrize("name", ["B0", "C2", "A3"])
+def test_a_tip_let_go_swings_as_all_modes_of_the_beam_do(name: str) -> None:
+    short = 1.5 if name == "A3" else 1.0  # 360 Hz: a step of 0.25 ms is a third of a radian of it
+    assert release_error(flat(name), PROFILES["accurate"]) < 0.02
+    assert release_error(flat(name), PROFILES["dataset"]) < 0.03 * short
+    assert release_error(flat(name), PROFILES["realtime"]) < 0.08
+
+
+@pytest.mark.parametrize("ratio", [0.02, 0.05, 0.2])
+def test_a_wanted_damping_ratio_is_had(ratio: float) -> None:
+    whisker = replace(flat("robot A0"), damping_ratio=ratio)
+    rod = make_rod(whisker, 8, 2)
+    assert rod.damping_ratio == pytest.approx(ratio)
+    assert (rod.steps_per_sample > 2) == (ratio < 0.1), "a finer step where it is needed"
+    assert rod_ring(whisker, PROFILES["realtime"])[1] == pytest.approx(ratio, abs=2e-3)
+
+
+def test_what_a_step_damps_too_much_is_said() -> None:
+    rod = make_rod(replace(flat("E5"), damping_ratio=0.01), 8, 2)
+    assert rod.damping_ratio > 0.5, "1379 Hz cannot be sampled at 1 kHz, nor rung at 0.5 ms"
+
+
+def ball(radius: float, place: Floats) -> Piece:
+    return Piece(np.array([place]), np.zeros((0, 4)), radius)
+
+
+def test_a_light_touch_bends_as_a_beam() -> None:
+    """A tenth of a micrometre of a ball pressed on a straight whisker."""
+    whisker = replace(flat("C2", "straight"), friction=0.0)
+    s, depth = 0.6 * whisker.length, 1e-4
+    reach = 2.0 + float(whisker.radius(np.array([s]))[0])
+    world = alone(whisker, PROFILES["dataset"], (ball(2.0, np.array([s, reach, 0.0])),))
+    way = np.zeros((61, 3))
+    way[:, 1] = -np.minimum(np.linspace(0, 2, 61), 1) * depth
+    loads, contacts = world.advance(way)
+    at = np.linspace(0, s, 20001)
+    give = np.trapezoid((s - at) ** 2 / whisker.bending_stiffness(at), at)  # mm/N
+    assert loads[-1, 0, 1] == pytest.approx(-depth / give, rel=0.02)
+    assert loads[-1, 0, 5] == pytest.approx(-depth / give * s * 1e-3, rel=0.02)
+    assert contacts[-1, 0, 0] == 1
+    assert contacts[-1, 0, 2] / contacts[-1, 0, 1] == pytest.approx(s * 1e-3, rel=1e-3)
+
+
+def test_nothing_overlaps_after_a_fall() -> None:
+    """A tip that snaps off an edge onto the next face comes to rest on it."""
+    stairs = (
+        Piece.of(trimesh.creation.box(bounds=[[8, 0.2, -2], [9, 3, 2]])),
+        Piece.of(trimesh.creation.box(bounds=[[9, 0.8, -2], [16, 3, 2]])),
+    )
+    whisker = replace(flat("C2", "straight"), friction=0.3)
+    world = alone(whisker, PROFILES["dataset"], stairs)
+    way = np.zeros((401, 3))
+    way[:, 1] = -np.minimum(np.linspace(0, 2, 401), 1) * 3.0
+    way[:, 0] = np.minimum(np.linspace(0, 2, 401), 1) * 1.5
+    loads, contacts = world.advance(way)
+    assert np.isfinite(loads).all() and contacts[-100:, 0, 0].min() == 1
+    settled = loads[-50:, 0, 5]
+    assert np.ptp(settled) < 0.05 * abs(settled.mean())
+
+
+def sweep(name: str = "mug", profile: str = "realtime", **how: float) -> SweepSimulation:
+    return SweepSimulation(
+        load_array("mouse"), make_object(name, 3), Sweep(gap_mm=0.5, **how), PROFILES[profile]
+    )
+
+
+def test_a_sweep_does_not_depend_on_how_it_is_cut() -> None:
+    whole, _ = sweep().advance_with_contacts(120)
+    cut = sweep()
+    parts = [cut.advance(n) for n in (1, 7, 50, 2, 60)]
+    assert whole[..., 5].any()
+    np.testing.assert_array_equal(np.concatenate(parts), whole)
+
+
+def test_the_other_side_feels_the_mirror_image() -> None:
+    cube = trimesh.creation.box((1, 1, 1))
+    thing = TactileObject("cube", "cube", (cube,))
+    sides = [
+        SweepSimulation(load_array(name), thing, Sweep(yaw_deg=yaw), PROFILES["realtime"])
+        for name, yaw in (("mouse", 20.0), ("mouse-left", -20.0))
+    ]
+    right, left = (s.advance(400) for s in sides)
+    assert abs(right).max() > 1e-5
+    signs = np.array([1, 1, -1, -1, -1, 1])
+    scale = abs(right).max(axis=(0, 1))
+    off = left / scale - right * signs / scale
+    assert np.sqrt(np.mean(off**2)) < 1e-3
+    assert abs(off).max() < 0.05, "where a tip snaps, the last digit decides when"
+
+
+def test_an_untouched_array_feels_exactly_nothing() -> None:
+    simulation = sweep(height_mm=-300.0)
+    assert not simulation.touches and not simulation.advance(50).any()
+
+
+@pytest.mark.parametrize("links", [6, 12, 24])
+def test_more_links_come_to_the_same(links: int) -> None:
+    """A press by the elastica's own case does not hang on the number of links."""
+    from bench.sim.pegs import press, presses
+
+    case = next(c for c in presses() if c.whisker == "mouse C2" and c.depth > 0.5)
+    assert abs(press(case, Profile(links, 0.25, 0.02)).moment_error) < 0.03
+
+
+def rod_on_a_spring(stiffness: float, damping: float = 0.0, ratio: float = 0.05) -> Whisker:
+    """A cylinder of steel, 60 mm long, on a mount that gives."""
+    return replace(
+        flat("C2", "straight"), length=60.0, base_radius=0.15, tip_radius=0.15,
+        young_modulus=2e11, density_base=7800.0, density_tip=7800.0, damping_ratio=ratio,
+        friction=0.0, mount_stiffness=stiffness, mount_damping=damping,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("share", [0.2, 1.0, 5.0])
+def test_a_base_that_gives_lowers_the_resonance_as_a_torsion_spring_does(share: float) -> None:
+    """On a torsion spring k: k L / E I (1 + cos x cosh x) = x (cosh x sin x - sinh x cos x)."""
+    whisker = rod_on_a_spring(1.0)
+    bending = float(whisker.bending_stiffness(np.zeros(1))[0])  # N mm^2
+    spring = share * bending / whisker.length * 1e-3  # N m / rad
+    x = brentq(
+        lambda x: share * (1 + np.cos(x) * np.cosh(x))
+        - x * (np.cosh(x) * np.sin(x) - np.sinh(x) * np.cos(x)),
+        0.05, 1.87,
+    )  # fmt: skip
+    line = 7800e-12 * np.pi * 0.15**2  # t/mm
+    hertz = (x / whisker.length) ** 2 * np.sqrt(bending / line) / (2 * np.pi)
+    rod = make_rod(replace(whisker, mount_stiffness=spring), 20, 4)
+    assert rod.clamped == 0
+    assert rod.resonance_hz == pytest.approx(hertz, rel=5e-3)
+    rigid = make_rod(replace(whisker, mount_stiffness=0.0), 20, 4)
+    assert rod.resonance_hz < rigid.resonance_hz
+
+
+def test_a_base_turns_by_its_moment_and_its_damping_counts() -> None:
+    spring = 2e-3
+    whisker = rod_on_a_spring(spring, damping=2e-6)
+    s, depth = 40.0, 0.5
+    world = alone(whisker, PROFILES["dataset"], (ball(2.0, np.array([s, 2.15, 0.0])),))
+    way = np.zeros((401, 3))
+    way[:, 1] = -np.minimum(np.linspace(0, 4, 401), 1) * depth
+    loads, _ = world.advance(way)
+    moment, turn = loads[-1, 0, 5], world.turns[-1, 0, 1]
+    assert moment < 0 and turn == pytest.approx(moment / spring, rel=1e-3)
+    assert abs(world.turns[-1, 0, 0]) < 1e-9
+    # pushed at s by a force: the spring's turn and the beam's bend add up
+    force = -loads[-1, 0, 1]
+    bending = float(whisker.bending_stiffness(np.zeros(1))[0])
+    give = s**3 / (3 * bending) + s**2 / (spring * 1e3)
+    assert force * give == pytest.approx(depth, rel=0.02)
+    damped, free = (make_rod(rod_on_a_spring(spring, c), 10, 4) for c in (2e-6, 0.0))
+    assert damped.damping_ratio > 1.5 * free.damping_ratio
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        {"roll_deg": 40.0}, {"pitch_deg": -30.0}, {"heading_deg": -30.0},
+        {"heading_deg": 30.0, "distance_mm": 2.0},
+        {"climb_deg": 25.0}, {"heading_deg": 20.0, "climb_deg": -20.0, "roll_deg": 90.0},
+        {"speed_mm_s": 100.0}, {"size_mm": 80.0}, {"size_mm": 20.0, "speed_mm_s": 20.0},
+    ],
+)  # fmt: skip
+def test_an_object_comes_in_any_pose(pose: dict[str, float]) -> None:
+    simulation = SweepSimulation(
+        load_array("mouse"), make_object("mug", 3), Sweep(gap_mm=1.0, **pose), PROFILES["realtime"]
+    )
+    assert simulation.touches
+    before = round(0.7 / (pose.get("speed_mm_s", 34.0) * 1e-3))
+    assert not simulation.advance(before).any(), "clear of the whiskers at first"
+    loads = simulation.advance(int(simulation.duration_ms) - before)
+    assert (abs(loads[..., :3]) > 1e-6).any(axis=(0, 2)).sum() >= 5
+    assert abs(loads[-3:, :, :3]).max() < 0.2 * abs(loads[..., :3]).max(), "and past them at last"
+
+
+def test_the_way_s_direction_turns_with_the_world() -> None:
+    """The array and all turned about z feel the same, but for the side on which it passes."""
+    mouse, cube = load_array("mouse"), trimesh.creation.box((1, 1, 1))
+    thing = TactileObject("cube", "cube", (cube,))
+    roll, pitch, yaw = mouse.mount.roll_pitch_yaw
+    turn = np.radians(25.0)
+    where = rotation("z", turn) @ np.array(mouse.mount.position)
+    mount = replace(
+        mouse.mount, position=tuple(where.tolist()), roll_pitch_yaw=(roll, pitch, yaw + turn)
+    )
+    one, other = (
+        SweepSimulation(a, thing, sweep, PROFILES["realtime"]).advance(300)
+        for a, sweep in (
+            (mouse, Sweep(yaw_deg=10.0)),
+            (replace(mouse, mount=mount), Sweep(yaw_deg=35.0, heading_deg=25.0)),
+        )
+    )
+    assert abs(one).max() > 1e-5
+    np.testing.assert_allclose(other, one, atol=1e-3 * abs(one).max())
+
+
+def test_a_head_that_moves_feels_what_the_object_s_motion_gives_and_its_own_acceleration() -> None:
+    how = {"ramp_ms": 40.0, "gap_mm": 5.0, "speed_mm_s": 60.0}
+    still, moving = (
+        SweepSimulation(
+            load_array("mouse"), make_object("mug", 3), Sweep(head_moves=m, **how),
+            PROFILES["dataset"],
+        )
+        for m in (0.0, 1.0)
+    )  # fmt: skip
+    calm, shaken = still.advance(40), moving.advance(40)
+    assert not calm.any(), "nothing is touched while it speeds up"
+    # all that a whisker weighs, times the acceleration: mean over the ramp of what it came to
+    b0 = load_array("mouse").whiskers[5]
+    s = np.linspace(0, b0.length, 2001)
+    mass = np.trapezoid(b0.density(s) * np.pi * (b0.radius(s) * 1e-3) ** 2, s * 1e-3)  # kg
+    impulse = np.linalg.norm(shaken[:, 5, :3].sum(axis=0)) * 1e-3
+    assert impulse == pytest.approx(mass * 0.06, rel=0.1)
+    calm, shaken = still.advance(300), moving.advance(300)
+    assert abs(calm).max() > 1e-5
+    np.testing.assert_allclose(shaken[50:], calm[50:], atol=0.02 * abs(calm).max())
