@@ -203,8 +203,12 @@ def inertial_forces(
 
 
 @compiled
-def factor(matrix: A, n: int) -> None:
-    """Cholesky's factor of the first n rows, in place, from the lower triangle."""
+def factor(matrix: A, n: int) -> bool:
+    """Cholesky's factor of the first n rows, in place, from the lower triangle.
+
+    Returns:
+        Whether there is one: False of a matrix that is not positive definite.
+    """
     for i in range(n):
         for j in range(i):
             s = matrix[i, j]
@@ -214,7 +218,10 @@ def factor(matrix: A, n: int) -> None:
         s = matrix[i, i]
         for k in range(i):
             s -= matrix[i, k] * matrix[i, k]
+        if not s > 0.0:
+            return False
         matrix[i, i] = math.sqrt(s)
+    return True
 
 
 @compiled

@@ -34,4 +34,4 @@ def compiled(function: Function) -> Function:
     It lets other threads run, and its sums are in the order in which they are written: the same
     numbers on every machine.
     """
-    return cast(Function, numba.njit(cache=True, nogil=True)(function))
+    return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))

@@ -87,26 +87,29 @@ def step(
     """
     links = len(length)
     n = 2 * (links - clamped)
-    mass_matrix(links, clamped, inertia, nodes, frames, axes, work3, lower)
-    for i in range(n):
-        for j in range(i + 1):
-            lower[i, j] += added[i, j]
     pushed[:] = 0.0
     for i in range(n):
         move[i] = 0.0
     inertial_forces(
         links, clamped, inertia, nodes, frames, axes, v, move, base, pushed, work6, free, wrench
     )
-    for i in range(n):
-        s = -h * (stiffness[i] * q[i] + free[i])
-        for j in range(n):
-            s += (lower[i, j] if j <= i else lower[j, i]) * v[j]
-        move[i] = s
-    for i in range(n):
-        for j in range(i + 1):
-            lower[i, j] += h * damping[i, j]
-        lower[i, i] += h * h * stiffness[i]
-    factor(lower, n)
+    # The added mass is that of the whisker at rest: bent far, the sum may be less than nothing.
+    for share in range(1, -1, -1):
+        mass_matrix(links, clamped, inertia, nodes, frames, axes, work3, lower)
+        for i in range(n):
+            for j in range(i + 1):
+                lower[i, j] += share * added[i, j]
+        for i in range(n):
+            s = -h * (stiffness[i] * q[i] + free[i])
+            for j in range(n):
+                s += (lower[i, j] if j <= i else lower[j, i]) * v[j]
+            move[i] = s
+        for i in range(n):
+            for j in range(i + 1):
+                lower[i, j] += h * damping[i, j]
+            lower[i, i] += h * h * stiffness[i]
+        if factor(lower, n):
+            break
     solve_forth(lower, n, move)
     felt[0] = 0.0
     if count:

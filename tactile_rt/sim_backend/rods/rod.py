@@ -101,7 +101,9 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int, sample_ms: flo
     heavier = np.array([m if beta >= 0 else 1.0 for m, beta in found])
     drags = np.array([max(beta, 0.0) for _, beta in found]) * omegas**2
     onto = mass @ shapes
-    pieces = [_segments(whisker, i, s, nodes, headings[i]) for i in range(links + 1)]
+    # What cannot move cannot be kept clear of anything: the object passes through a clamped link.
+    free = range(clamped, links + 1)
+    pieces = [_segments(whisker, i, s, nodes, headings[i]) for i in free]
     return Rod(
         steps_per_sample=steps,
         resonance_hz=resonance_hz,
@@ -114,7 +116,7 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int, sample_ms: flo
         added=(onto * (heavier - 1)) @ onto.T,
         damping=(onto * drags) @ onto.T,
         friction=whisker.friction,
-        seg_link=np.repeat(np.arange(links + 1), [len(p[0]) for p in pieces]),
+        seg_link=np.repeat(np.array(free), [len(p[0]) for p in pieces]),
         seg_ends=np.concatenate([p[0] for p in pieces]),
         seg_radii=np.concatenate([p[1] for p in pieces]),
         seg_arcs=np.concatenate([p[2] for p in pieces]),

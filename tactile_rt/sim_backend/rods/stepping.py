@@ -26,6 +26,7 @@ __all__ = ["advance"]
 A = Any
 LEAP_MM = 0.1  # further no node moves in one step, or it is divided
 MOST_PARTS = 8
+WILD_MM, WILDEST_PARTS = 20.0, 64  # a leap so far is a step that failed: many more parts
 SAMPLE_MS = 1.0
 STILL = 1e-9  # rad and rad/ms: a whisker at rest that nothing is near need not be stepped
 
@@ -196,19 +197,26 @@ def _advance(
                     force += felt[0]
                     s, t = int(whose[int(felt[1]), 0]), whose[int(felt[1]), 1]
                     lever += felt[0] * (seg_arcs[s, 0] * (1 - t) + seg_arcs[s, 1] * t)
-            if not furthest < 1e6:
+            wild = not furthest < WILD_MM  # also where it is no number
+            if wild and parts >= WILDEST_PARTS:
                 return -done - 1
-            if furthest <= LEAP_MM or parts >= MOST_PARTS:
+            if not wild and (furthest <= LEAP_MM or parts >= MOST_PARTS):
                 break
             # again, in parts
-            while parts < MOST_PARTS and furthest > LEAP_MM:
-                parts *= 2
-                furthest /= 2
+            if wild:
+                parts *= MOST_PARTS
+                last[:] = 0.0
+                reach[:] = -np.inf
+                memory[0], soonest = 0.0, -np.inf
+            else:
+                while parts < MOST_PARTS and furthest > LEAP_MM:
+                    parts *= 2
+                    furthest /= 2
+                memory[0] += memory[0] - start  # and all the way back
             q[:] = q0
             v[:] = v0
             _root(root, nodes, frames)
             place(links, clamped, turn, length, q, nodes, frames, axes)
-            memory[0] += memory[0] - start  # and all the way back
         weight = 1.0 / (parts * steps_per_sample)
         loads[sample, 0] -= total0 * weight
         loads[sample, 1] -= total1 * weight
