@@ -58,16 +58,12 @@ class BeamErrors:
     Attributes:
         static: Relative error of the tip's deflection under a small force.
         resonance: Relative error of the linearised chain's first resonance.
-        ringing: Relative error of the first mode's frequency as the whisker rings when simulated.
-        damping: Damping ratio of that ringing, less the whisker's own; above 1 nothing rings.
         sag: Relative error of the tip's deflection under gravity.
         reaction: Relative error of base force and base moment under the small force.
     """
 
     static: float
     resonance: float
-    ringing: float
-    damping: float
     sag: float
     reaction: float
 
@@ -127,7 +123,7 @@ class _Chain:
 
 
 def measure(whisker: Whisker, beam: Beam, profile: Profile) -> BeamErrors:
-    """Push it, let it hang and let it ring; the whisker as `flat` lays it."""
+    """Push it and let it hang; the whisker as `flat` lays it."""
     chain = _Chain(whisker, profile)
     rest = chain.tip()
     force = np.array([0.0, SMALL * whisker.length / beam.compliance * 1e3, 0.0])  # mN
@@ -144,12 +140,9 @@ def measure(whisker: Whisker, beam: Beam, profile: Profile) -> BeamErrors:
     hanging = _Chain(whisker, profile)
     hanging.model.opt.gravity = (0.0, GRAVITY, 0.0)
     hanging.settle()
-    frequency, ratio = ring(whisker, profile)
     return BeamErrors(
         static=float((bent - rest)[1] / force[1] * 1e3 / beam.compliance - 1),
         resonance=chain.resonance_hz / beam.resonance_hz - 1,
-        ringing=frequency / beam.resonance_hz - 1,
-        damping=ratio - whisker.damping_ratio,
         sag=float((hanging.tip() - rest)[1] / beam.sag_mm - 1),
         reaction=float(max(wrong)),
     )

@@ -67,8 +67,7 @@ def _beams(key: str, names: tuple[str, ...]) -> list[Record]:
                 f"sim.{key}.whisker.{n}",
                 100 * e.static,
                 "% static",
-                how=f"{known[n].resonance_hz:.0f} Hz; resonance {100 * e.resonance:+.2f} %, rings "
-                f"{100 * e.ringing:+.1f} % off with a damping ratio of {e.damping:+.3f} more, "
+                how=f"{known[n].resonance_hz:.0f} Hz; resonance {100 * e.resonance:+.2f} %, "
                 f"sag {100 * e.sag:+.2f} %",
             )
             for n, e in errors.items()

@@ -16,6 +16,7 @@ from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, ContactProbe
 from tactile_rt.sim_backend.world import (
+    JAMMED,
     OBJECT_BIT,
     SAMPLE_MS,
     WHISKER_BIT,
@@ -140,10 +141,7 @@ class MujocoWorld:
             initial_warmstart=data.qacc_warmstart.copy()[None],
         )
         if any(data.warning[kind].number for kind in UNSTABLE):
-            raise SourceError(
-                "the simulation has become unstable: a whisker jams that is too stiff for this "
-                "profile; sweep at a larger distance, or at a finer profile"
-            )
+            raise SourceError(JAMMED)
         loads = read_base_loads(sensors[0].reshape(samples, steps, -1).mean(axis=1))
         contacts = np.zeros((samples, loads.shape[1], len(CONTACT_CHANNELS)))
         if look_every:

@@ -22,6 +22,7 @@ from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "CHANNELS",
+    "JAMMED",
     "MOUNT",
     "PROFILES",
     "SAMPLE_MS",
@@ -41,6 +42,10 @@ __all__ = [
 CHANNELS = ("fx", "fy", "fz", "mx", "my", "mz")
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
 SAMPLE_MS = 1.0  # output period: 1 kHz
+JAMMED = (
+    "the simulation has become unstable: a whisker jams that is too stiff for this profile; "
+    "sweep at a larger distance, or at a finer profile"
+)
 WHISKER_BIT, OBJECT_BIT = 1, 2  # collision groups: whiskers touch objects, never each other
 
 # Contact is a soft layer on both surfaces that whiskers sink through by most of it under a usual

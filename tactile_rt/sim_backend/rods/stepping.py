@@ -58,7 +58,6 @@ def _advance(
     face_at: A,
     rounding: A,
     boxes: A,
-    pose: A,
     way: A,
     reach: A,
     hints: A,
@@ -85,7 +84,6 @@ def _advance(
         seg_link, seg_ends, seg_radii: see `touching.find_near`.
         seg_arcs: (segment, 2) arc lengths of the ends, mm.
         corners, corner_at, faces, face_at, rounding, boxes: see `touching.find_near`.
-        pose: (3, 3) orientation of the object.
         way: (sample + 1, 3) where the object is at the beginning of each sample and at the end of
             the last, mm; straight in between.
         reach, hints: see `touching.find_near`; carried on.
@@ -116,6 +114,7 @@ def _advance(
     old = np.empty((links + 1, 3))
     lower, work3, work6 = np.zeros((n, n)), np.empty((3, 3)), np.empty((links, 6))
     pushed, wrench, felt = np.zeros((links, 6)), np.zeros(6), np.zeros(2)
+    total = np.empty(6)
     gaps, normals = np.empty(MOST_CONTACTS), np.empty((MOST_CONTACTS, 3))
     points, whose = np.empty((MOST_CONTACTS, 3)), np.empty((MOST_CONTACTS, 2))
     seen = np.empty((len(seg_link), 5))
@@ -146,10 +145,8 @@ def _advance(
         q0[:] = q
         v0[:] = v
         while True:
-            for i in range(6):
-                wrench[i] = 0.0
             furthest = 0.0
-            total0, total1, total2, total3, total4, total5 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            total[:] = 0.0
             touching, force, lever = 0.0, 0.0, 0.0
             for part in range(parts):
                 for i in range(3):
@@ -158,7 +155,7 @@ def _advance(
                 if soonest - memory[0] < NEAR_MM:
                     count = find_near(
                         links, nodes, frames, seg_link, seg_ends, seg_radii, corners, corner_at,
-                        faces, face_at, rounding, boxes, pose, centre, reach, memory[0], hints,
+                        faces, face_at, rounding, boxes, centre, reach, memory[0], hints,
                         seen, gaps, normals, points, whose,
                     )  # fmt: skip
                     soonest = reach.min()
@@ -186,12 +183,8 @@ def _advance(
                 if not moved <= furthest:
                     furthest = moved
                 memory[0] += moves / parts + 1.1 * moved
-                total0 += wrench[0]
-                total1 += wrench[1]
-                total2 += wrench[2]
-                total3 += wrench[3]
-                total4 += wrench[4]
-                total5 += wrench[5]
+                for i in range(6):
+                    total[i] += wrench[i]
                 if count and felt[0] > 0.0:
                     touching += 1.0
                     force += felt[0]
@@ -218,12 +211,8 @@ def _advance(
             _root(root, nodes, frames)
             place(links, clamped, turn, length, q, nodes, frames, axes)
         weight = 1.0 / (parts * steps_per_sample)
-        loads[sample, 0] -= total0 * weight
-        loads[sample, 1] -= total1 * weight
-        loads[sample, 2] -= total2 * weight
-        loads[sample, 3] -= total3 * weight
-        loads[sample, 4] -= total4 * weight
-        loads[sample, 5] -= total5 * weight
+        for i in range(6):
+            loads[sample, i] -= total[i] * weight
         contacts[sample, 0] += touching * weight
         contacts[sample, 1] += force * weight
         contacts[sample, 2] += lever * weight
@@ -287,7 +276,6 @@ def advance(
     face_at: A,
     rounding: A,
     boxes: A,
-    pose: A,
     way: A,
     reach: A,
     hints: A,
@@ -317,7 +305,7 @@ def advance(
             steps[w], clamped[w], turn[link], length[link], inertia[link], stiffness[free],
             added[free], damping[free], friction[w], q[free], v[free], memory[w], last[link],
             roots[w], bases, seg_link[seg], seg_ends[seg], seg_radii[seg], seg_arcs[seg], corners,
-            corner_at, faces, face_at, rounding, boxes, pose, way, reach[seg], hints[seg],
+            corner_at, faces, face_at, rounding, boxes, way, reach[seg], hints[seg],
             loads[w], contacts[w],
         )  # fmt: skip
         if computed < 0:

@@ -29,7 +29,6 @@ def find_near(
     face_at: A,
     rounding: A,
     boxes: A,
-    turn: A,
     centre: A,
     reach: A,
     travelled: float,
@@ -44,8 +43,8 @@ def find_near(
 
     Args:
         seg_link, seg_ends, seg_radii: of the segments: link, ends in its frame (2, 3), radii (2,).
-        corners, corner_at, faces, face_at, rounding, boxes: of the pieces, in the object's frame.
-        turn, centre: pose of the object.
+        corners, corner_at, faces, face_at, rounding, boxes: of the pieces, about its place.
+        centre: (3,) where the object is, mm.
         reach: (segment, piece) lower bound of the gap, plus what was travelled when it was found.
         hints: (segment, piece) corners to begin from.
         seen: (segment, 5) scratch.
@@ -77,12 +76,8 @@ def find_near(
                 x2 = (
                     d2 + frames[link, 2, 0] * e0 + frames[link, 2, 1] * e1 + frames[link, 2, 2] * e2
                 )
-                for i in range(3):
-                    y = turn[0, i] * x0 + turn[1, i] * x1 + turn[2, i] * x2
-                    if end:
-                        b[i] = y
-                    else:
-                        a[i] = y
+                place = b if end else a
+                place[0], place[1], place[2] = x0, x1, x2
             thick = rounding[p] + max(seg_radii[s, 0], seg_radii[s, 1])
             square = 0.0
             for i in range(3):
@@ -135,7 +130,7 @@ def find_near(
             gaps[slot] = gap
             whose[slot, 0], whose[slot, 1] = s, t
             for i in range(3):
-                n = turn[i, 0] * seen[s, 2] + turn[i, 1] * seen[s, 3] + turn[i, 2] * seen[s, 4]
+                n = seen[s, 2 + i]
                 normals[slot, i] = n
                 points[slot, i] = nodes[link, i] - n * radius
                 for k in range(3):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.rods.rod import make_rod
 from tactile_rt.sim_backend.rods.stepping import advance
+from tactile_rt.sim_backend.world import JAMMED
 from tactile_rt.stream import SourceError
 
 __all__ = ["Piece", "RodWorld"]
@@ -144,7 +145,6 @@ class RodWorld:
             bases,
             *self._segments,
             *self._pieces,
-            np.eye(3),
             np.ascontiguousarray(way),
             *self._pairs,
             loads,
@@ -152,10 +152,7 @@ class RodWorld:
         )
         done = advance(*arguments)
         if done < 0:
-            raise SourceError(
-                "the simulation has become unstable: a whisker jams that is too stiff for this "
-                "profile; sweep at a larger distance, or at a finer profile"
-            )
+            raise SourceError(JAMMED)
         # Sums in a fixed order: a matrix product's rounding may depend on the number of samples.
         felt = np.zeros_like(loads)
         for k in range(3):
