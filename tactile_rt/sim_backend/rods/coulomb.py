@@ -68,8 +68,9 @@ def impulses(count: int, response: A, free: A, friction: float, drag: A, found: 
                     n = max(n, 0.0)
                     slip1, slip2 = x1 + y1 * n, x2 + y2 * n
                     t, s = -d * slip1, -d * slip2
-                    wanted = friction * n / math.sqrt(slip1 * slip1 + slip2 * slip2 + CREEP * CREEP)
-                    settled = abs(wanted - d) <= 1e-7 * wanted
+                    square = slip1 * slip1 + slip2 * slip2
+                    wanted = friction * n / math.sqrt(square + CREEP * CREEP)
+                    settled = abs(wanted - d) * math.sqrt(square) <= 1e-5 * friction * n
                     d = wanted
                     if settled:
                         break

@@ -9,41 +9,48 @@ import numpy as np
 
 from tactile_rt.sim_backend.rods.compiled import compiled
 
-__all__ = ["nearest"]
+__all__ = ["WORK", "nearest"]
 
 A = Any
 MOST_ROUNDS = 40
 OVERLAP_MM = 1e-7  # nearer than that, a direction between the nearest points means nothing
+WORK = (6, 4)  # shape of the scratch
 
 
 @compiled
-def _weights(simplex: A, count: int, weights: A) -> float:
+def _weights(simplex: A, count: int, weights: A, w: A) -> float:
     """Squared distance from the origin to the hull of up to four points, and the nearest's weights.
 
     Every face of it is tried: there are fifteen at most, and the nearest inner point wins.
     """
     best = np.inf
-    w = np.empty(4)
-    at = np.empty(4, np.int64)
     for mask in range(1, 1 << count):
-        size = 0
-        for i in range(count):
-            if (mask >> i) & 1:
-                at[size] = i
+        size, i, j, k, m = 0, 0, 0, 0, 0
+        for at in range(count):
+            if (mask >> at) & 1:
+                if size == 0:
+                    i = at
+                elif size == 1:
+                    j = at
+                elif size == 2:
+                    k = at
+                else:
+                    m = at
                 size += 1
-        a0, a1, a2 = simplex[at[0], 0], simplex[at[0], 1], simplex[at[0], 2]
-        if size == 1:
-            w[0] = 1.0
-        else:
-            u0, u1, u2 = simplex[at[1], 0] - a0, simplex[at[1], 1] - a1, simplex[at[1], 2] - a2
+        a0, a1, a2 = simplex[i, 0], simplex[i, 1], simplex[i, 2]
+        p0, p1, p2 = a0, a1, a2
+        w[0] = 1.0
+        if size > 1:
+            u0, u1, u2 = simplex[j, 0] - a0, simplex[j, 1] - a1, simplex[j, 2] - a2
             uu, au = u0 * u0 + u1 * u1 + u2 * u2, a0 * u0 + a1 * u1 + a2 * u2
             if size == 2:
                 if uu < 1e-24 or not 0.0 < -au < uu:
                     continue
                 w[1] = -au / uu
                 w[0] = 1.0 - w[1]
+                p0, p1, p2 = a0 + w[1] * u0, a1 + w[1] * u1, a2 + w[1] * u2
             else:
-                v0, v1, v2 = simplex[at[2], 0] - a0, simplex[at[2], 1] - a1, simplex[at[2], 2] - a2
+                v0, v1, v2 = simplex[k, 0] - a0, simplex[k, 1] - a1, simplex[k, 2] - a2
                 if size == 3:
                     vv, uv = v0 * v0 + v1 * v1 + v2 * v2, u0 * v0 + u1 * v1 + u2 * v2
                     av, det = a0 * v0 + a1 * v1 + a2 * v2, uu * vv - uv * uv
@@ -53,9 +60,11 @@ def _weights(simplex: A, count: int, weights: A) -> float:
                     w[0] = 1.0 - w[1] - w[2]
                     if w[0] <= 0.0 or w[1] <= 0.0 or w[2] <= 0.0:
                         continue
+                    p0 = a0 + w[1] * u0 + w[2] * v0
+                    p1 = a1 + w[1] * u1 + w[2] * v1
+                    p2 = a2 + w[1] * u2 + w[2] * v2
                 else:
-                    z0, z1 = simplex[at[3], 0] - a0, simplex[at[3], 1] - a1
-                    z2 = simplex[at[3], 2] - a2
+                    z0, z1, z2 = simplex[m, 0] - a0, simplex[m, 1] - a1, simplex[m, 2] - a2
                     c0, c1, c2 = v1 * z2 - v2 * z1, v2 * z0 - v0 * z2, v0 * z1 - v1 * z0
                     det = u0 * c0 + u1 * c1 + u2 * c2
                     if abs(det) < 1e-18:
@@ -69,22 +78,23 @@ def _weights(simplex: A, count: int, weights: A) -> float:
                     w[0] = 1.0 - w[1] - w[2] - w[3]
                     if w[0] <= 0.0 or w[1] <= 0.0 or w[2] <= 0.0 or w[3] <= 0.0:
                         continue
-        p0, p1, p2 = 0.0, 0.0, 0.0
-        for i in range(size):
-            p0 += w[i] * simplex[at[i], 0]
-            p1 += w[i] * simplex[at[i], 1]
-            p2 += w[i] * simplex[at[i], 2]
+                    p0, p1, p2 = 0.0, 0.0, 0.0
         square = p0 * p0 + p1 * p1 + p2 * p2
         if square < best * (1.0 - 1e-12) - 1e-30:
             best = square
             weights[:] = 0.0
-            for i in range(size):
-                weights[at[i]] = w[i]
+            weights[i] = w[0]
+            if size > 1:
+                weights[j] = w[1]
+            if size > 2:
+                weights[k] = w[2]
+            if size > 3:
+                weights[m] = w[3]
     return best
 
 
 @compiled
-def nearest(a: A, b: A, corners: A, faces: A, start: int, found: A) -> int:
+def nearest(a: A, b: A, corners: A, faces: A, known: A, work: A, found: A) -> None:
     """Distance of a segment from a convex piece, both in the piece's frame.
 
     Args:
@@ -92,70 +102,74 @@ def nearest(a: A, b: A, corners: A, faces: A, start: int, found: A) -> int:
         corners: (corner, 3) mm.
         faces: (face, 4) outward normals and offsets, for a segment that overlaps the piece; none:
             the piece is a point or a line.
-        start: a corner to begin from, best the one that the last call returned.
-        found: (5,) filled: distance (mm; negative: depth), place on the segment from 0 (a) to
-            1 (b), and the direction from the piece to the segment.
-
-    Returns:
-        A corner near the segment.
+        known: (4,) pairs of a corner and an end between which the nearest points lie, each twice
+            the corner, plus one for b; from -1 on unknown. The last call's, if little has moved
+            since, or -1; filled.
+        work: `WORK` scratch.
+        found: (6,) filled: distance (mm; negative: depth), place on the segment from 0 (a) to
+            1 (b), the direction from the piece to the segment, and how far the piece reaches in
+            that direction, mm from its frame's origin (infinite where that is not known).
     """
-    simplex = np.empty((4, 3))
-    place = np.empty(4)
-    corner = np.empty(4, np.int64)
-    weights = np.zeros(4)
-    corner[0] = start if start < len(corners) else 0
-    place[0], weights[0], count = 0.5, 1.0, 1
-    for i in range(3):
-        simplex[0, i] = (a[i] + b[i]) / 2 - corners[corner[0], i]
-    p0, p1, p2 = simplex[0, 0], simplex[0, 1], simplex[0, 2]
-    square = p0 * p0 + p1 * p1 + p2 * p2
-    for _ in range(MOST_ROUNDS):
-        onto_a = p0 * a[0] + p1 * a[1] + p2 * a[2]
-        onto_b = p0 * b[0] + p1 * b[1] + p2 * b[2]
-        t = 0.0 if onto_a < onto_b else 1.0
-        far, furthest = 0, -np.inf
-        for i in range(len(corners)):
-            onto = p0 * corners[i, 0] + p1 * corners[i, 1] + p2 * corners[i, 2]
-            if onto > furthest:
-                furthest, far = onto, i
-        if square - (min(onto_a, onto_b) - furthest) <= 1e-12 * square:
-            break
-        known = False
-        for i in range(count):
-            known |= corner[i] == far and place[i] == t
-        if known:
-            break
+    weights = work[4]
+    if known[0] < 0:
+        known[0], known[1] = 0, -1
+    count = 0
+    while count < 4 and known[count] >= 0:
+        corner, end = known[count] // 2, b if known[count] % 2 else a
         for i in range(3):
-            simplex[count, i] = (b[i] if t else a[i]) - corners[far, i]
-        place[count], corner[count] = t, far
+            work[count, i] = end[i] - corners[corner, i]
         count += 1
-        nearer = _weights(simplex, count, weights)
+    p0, p1, p2, square = 0.0, 0.0, 0.0, np.inf
+    furthest = np.inf
+    for _ in range(MOST_ROUNDS):
+        nearer = _weights(work, count, weights, work[5])
         kept = 0
-        for i in range(count):
-            if weights[i] > 0.0:
-                for k in range(3):
-                    simplex[kept, k] = simplex[i, k]
-                place[kept], corner[kept], weights[kept] = place[i], corner[i], weights[i]
+        p0, p1, p2 = 0.0, 0.0, 0.0
+        for c in range(count):
+            if weights[c] > 0.0:
+                known[kept], weights[kept] = known[c], weights[c]
+                for i in range(3):
+                    work[kept, i] = work[c, i]
+                p0 += weights[kept] * work[kept, 0]
+                p1 += weights[kept] * work[kept, 1]
+                p2 += weights[kept] * work[kept, 2]
                 kept += 1
         count = kept
-        p0, p1, p2 = 0.0, 0.0, 0.0
-        for i in range(count):
-            p0 += weights[i] * simplex[i, 0]
-            p1 += weights[i] * simplex[i, 1]
-            p2 += weights[i] * simplex[i, 2]
         ended = nearer >= square * (1.0 - 1e-14) or nearer < OVERLAP_MM**2
-        square = nearer
+        square, furthest = nearer, np.inf
         if ended:
             break
+        onto_a = p0 * a[0] + p1 * a[1] + p2 * a[2]
+        onto_b = p0 * b[0] + p1 * b[1] + p2 * b[2]
+        far, furthest = 0, -np.inf
+        for c in range(len(corners)):
+            onto = p0 * corners[c, 0] + p1 * corners[c, 1] + p2 * corners[c, 2]
+            if onto > furthest:
+                furthest, far = onto, c
+        if square - (min(onto_a, onto_b) - furthest) <= 1e-12 * square:
+            break
+        pair = 2 * far + (0 if onto_a < onto_b else 1)
+        old = False
+        for c in range(count):
+            old |= known[c] == pair
+        if old:
+            break
+        known[count], weights[count] = pair, 0.0
+        for i in range(3):
+            work[count, i] = (b[i] if pair % 2 else a[i]) - corners[far, i]
+        count += 1
+    for c in range(count, 4):
+        known[c] = -1
     distance = math.sqrt(square)
     if distance >= OVERLAP_MM or len(faces) == 0:
         t = 0.0
-        for i in range(count):
-            t += weights[i] * place[i]
+        for c in range(count):
+            t += weights[c] * (known[c] % 2)
         away = max(distance, 1e-300)
         found[0], found[1] = distance, t
         found[2], found[3], found[4] = p0 / away, p1 / away, p2 / away
-        return int(corner[0])
+        found[5] = furthest / away
+        return
     # Inside: the place on the segment, of three, that is deepest, and the face nearest to it.
     found[0] = np.inf
     for half in range(3):
@@ -169,5 +183,5 @@ def nearest(a: A, b: A, corners: A, faces: A, start: int, found: A) -> int:
                 out, through = ahead, i
         if out < found[0]:
             found[0], found[1] = out, t
-            found[2], found[3], found[4] = faces[through, 0], faces[through, 1], faces[through, 2]
-    return int(corner[0])
+            for k in range(4):
+                found[2 + k] = faces[through, k]

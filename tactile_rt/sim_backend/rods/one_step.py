@@ -40,6 +40,7 @@ def _directions(normal: A, frame: A, rows: A) -> None:
 @compiled
 def step(
     h: float,
+    heavier: int,
     clamped: int,
     turn: A,
     length: A,
@@ -61,6 +62,8 @@ def step(
     points: A,
     whose: A,
     seg_link: A,
+    fresh: bool,
+    mass: A,
     lower: A,
     work3: A,
     work6: A,
@@ -82,6 +85,8 @@ def step(
         base: see `chains.inertial_forces`.
         surface: (3,) velocity of the object, mm/ms.
         count, gaps, normals, points, whose: what is near, see `touching.find_near`.
+        fresh: whether to fill `mass` and its factor `lower`, which otherwise are those of an
+            earlier step of the same length.
         felt: (2,) filled: the normal forces (mN), and the contact with the largest.
         last: (link, 4) see `advance`.
     """
@@ -93,23 +98,25 @@ def step(
     inertial_forces(
         links, clamped, inertia, nodes, frames, axes, v, move, base, pushed, work6, free, wrench
     )
-    # The added mass is that of the whisker at rest: bent far, the sum may be less than nothing.
-    for share in range(1, -1, -1):
-        mass_matrix(links, clamped, inertia, nodes, frames, axes, work3, lower)
+    if fresh:
+        # The added mass is that of the whisker at rest: bent far, the sum may be less than nothing.
+        for share in range(heavier, -1, -1):
+            mass_matrix(links, clamped, inertia, nodes, frames, axes, work3, mass)
+            for i in range(n):
+                for j in range(i + 1):
+                    mass[i, j] += share * added[i, j]
+                    lower[i, j] = mass[i, j] + h * damping[i, j]
+                lower[i, i] += h * h * stiffness[i]
+            if factor(lower, n):
+                break
         for i in range(n):
-            for j in range(i + 1):
-                lower[i, j] += share * added[i, j]
-        for i in range(n):
-            s = -h * (stiffness[i] * q[i] + free[i])
-            for j in range(n):
-                s += (lower[i, j] if j <= i else lower[j, i]) * v[j]
-            move[i] = s
-        for i in range(n):
-            for j in range(i + 1):
-                lower[i, j] += h * damping[i, j]
-            lower[i, i] += h * h * stiffness[i]
-        if factor(lower, n):
-            break
+            for j in range(i):
+                mass[j, i] = mass[i, j]
+    for i in range(n):
+        s = -h * (stiffness[i] * q[i] + free[i])
+        for j in range(n):
+            s += mass[i, j] * v[j]
+        move[i] = s
     solve_forth(lower, n, move)
     felt[0] = 0.0
     if count:

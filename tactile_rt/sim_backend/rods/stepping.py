@@ -57,10 +57,11 @@ def _advance(
     faces: A,
     face_at: A,
     rounding: A,
-    boxes: A,
     way: A,
     reach: A,
-    hints: A,
+    soonest: A,
+    known: A,
+    planes: A,
     loads: A,
     contacts: A,
 ) -> int:
@@ -83,10 +84,10 @@ def _advance(
         bases: (sample or 1, 4, 3) see `chains.inertial_forces`; 1: it is not accelerated.
         seg_link, seg_ends, seg_radii: see `touching.find_near`.
         seg_arcs: (segment, 2) arc lengths of the ends, mm.
-        corners, corner_at, faces, face_at, rounding, boxes: see `touching.find_near`.
+        corners, corner_at, faces, face_at, rounding: see `touching.find_near`.
         way: (sample + 1, 3) where the object is at the beginning of each sample and at the end of
             the last, mm; straight in between.
-        reach, hints: see `touching.find_near`; carried on.
+        reach, soonest, known, planes: see `touching.find_near`; carried on.
         loads: (sample, 6) zeros, filled: means of force (mN) and moment (uN m) on the base, in the
             world.
         contacts: (sample, 5) zeros, filled: share of the time in contact, mean normal force (mN),
@@ -100,37 +101,39 @@ def _advance(
     n = 2 * (links - clamped)
     h = SAMPLE_MS / steps_per_sample
     still, quiet = len(roots) == 1, len(bases) == 1
-    soonest = reach.min() if reach.size else np.inf
     busy = _moves(q, v)
     if still and quiet and not busy:  # nothing comes near it in all this time
         whole = 0.0
         for sample in range(len(way) - 1):
             whole += _distance(way, sample)
-        if soonest - memory[0] - whole >= NEAR_MM:
+        if soonest.min() - memory[0] - whole >= NEAR_MM:
             memory[0] += whole
             return 0
     wide = 3 * MOST_CONTACTS
     nodes, frames, axes = np.empty((links + 1, 3)), np.empty((links, 3, 3)), np.empty((n, 3))
     old = np.empty((links + 1, 3))
-    lower, work3, work6 = np.zeros((n, n)), np.empty((3, 3)), np.empty((links, 6))
+    mass, lower = np.zeros((n, n)), np.zeros((n, n))
+    work3, work6 = np.empty((3, 3)), np.empty((links, 6))
     pushed, wrench, felt = np.zeros((links, 6)), np.zeros(6), np.zeros(2)
     total = np.empty(6)
     gaps, normals = np.empty(MOST_CONTACTS), np.empty((MOST_CONTACTS, 3))
     points, whose = np.empty((MOST_CONTACTS, 3)), np.empty((MOST_CONTACTS, 2))
-    seen = np.empty((len(seg_link), 5))
+    ends, seen = np.empty((len(seg_link), 2, 3)), np.empty((len(seg_link), 6))
     drag = np.zeros(MOST_CONTACTS)
     rows, reply = np.empty((wide, 3)), np.empty((wide, n))
     response, free = np.empty((wide, wide)), np.empty(max(wide, n))
     found, move = np.empty(wide), np.empty(n)
     q0, v0, surface, centre = np.empty(n), np.empty(n), np.empty(3), np.empty(3)
-    done = 0
+    done, factored = 0, 0.0  # for which step length the factor is
     placed = False
     for at in range((len(way) - 1) * steps_per_sample):
         sample, within = at // steps_per_sample, at % steps_per_sample
         moves = _distance(way, sample) / steps_per_sample
         for i in range(3):
             surface[i] = (way[sample + 1, i] - way[sample, i]) / SAMPLE_MS
-        if still and quiet and soonest - memory[0] >= NEAR_MM and not _moves(q, v):
+        if within == 0:
+            factored = 0.0
+        if still and quiet and soonest.min() - memory[0] >= NEAR_MM and not _moves(q, v):
             memory[0] += moves
             q[:] = 0.0
             v[:] = 0.0
@@ -152,19 +155,19 @@ def _advance(
                 for i in range(3):
                     centre[i] = way[sample, i] + surface[i] * (h * (within + part / parts))
                 count = 0
-                if soonest - memory[0] < NEAR_MM:
+                if soonest.min() - memory[0] < NEAR_MM:
                     count = find_near(
-                        links, nodes, frames, seg_link, seg_ends, seg_radii, corners, corner_at,
-                        faces, face_at, rounding, boxes, centre, reach, memory[0], hints,
-                        seen, gaps, normals, points, whose,
+                        nodes, frames, seg_link, seg_ends, seg_radii, corners, corner_at, faces,
+                        face_at, rounding, centre, reach, soonest, memory[0], known, planes, ends, seen,
+                        gaps, normals, points, whose,
                     )  # fmt: skip
-                    soonest = reach.min()
                 step(
-                    h / parts, clamped, turn, length, inertia, stiffness, added, damping, friction,
+                    h / parts, int(parts == 1), clamped, turn, length, inertia, stiffness, added, damping, friction,
                     q, v, nodes, frames, axes, base, surface, count, gaps, normals, points, whose,
-                    seg_link, lower, work3, work6, pushed, felt, last, drag, rows, reply, response,
+                    seg_link, h / parts != factored, mass, lower, work3, work6, pushed, felt, last, drag, rows, reply, response,
                     free, found, move, wrench,
                 )  # fmt: skip
+                factored = h / parts
                 done += 1
                 old[:] = nodes
                 if still or part + 1 < parts:
@@ -200,7 +203,12 @@ def _advance(
                 parts *= MOST_PARTS
                 last[:] = 0.0
                 reach[:] = -np.inf
-                memory[0], soonest = 0.0, -np.inf
+                known[:] = -1
+                planes[:, :, :3] = 0.0
+                planes[:, :, 3] = np.inf
+                planes[:, :, 4] = start
+                soonest[:-1] = -np.inf
+                memory[0] = start
             else:
                 while parts < MOST_PARTS and furthest > LEAP_MM:
                     parts *= 2
@@ -275,10 +283,11 @@ def advance(
     faces: A,
     face_at: A,
     rounding: A,
-    boxes: A,
     way: A,
     reach: A,
-    hints: A,
+    soonest: A,
+    known: A,
+    planes: A,
     loads: A,
     contacts: A,
 ) -> int:
@@ -305,7 +314,7 @@ def advance(
             steps[w], clamped[w], turn[link], length[link], inertia[link], stiffness[free],
             added[free], damping[free], friction[w], q[free], v[free], memory[w], last[link],
             roots[w], bases, seg_link[seg], seg_ends[seg], seg_radii[seg], seg_arcs[seg], corners,
-            corner_at, faces, face_at, rounding, boxes, way, reach[seg], hints[seg],
+            corner_at, faces, face_at, rounding, way, reach[seg], soonest[w], known[seg], planes[seg],
             loads[w], contacts[w],
         )  # fmt: skip
         if computed < 0:

@@ -106,18 +106,18 @@ class RodWorld:
             np.concatenate([getattr(r, name) for r in rods])
             for name in ("seg_link", "seg_ends", "seg_radii", "seg_arcs")
         )
-        boxes = [[p.corners.min(axis=0), p.corners.max(axis=0)] for p in pieces]
         self._pieces = (
             np.concatenate([np.zeros((0, 3)), *(p.corners for p in pieces)]),
             _begins(pieces, lambda p: p.corners),
             np.concatenate([np.zeros((0, 4)), *(p.faces for p in pieces)]),
             _begins(pieces, lambda p: p.faces),
             np.array([p.rounding for p in pieces]),
-            np.array(boxes).reshape(-1, 2, 3),
         )
         self._pairs = (
             np.full((segments, len(pieces)), -np.inf),
-            np.zeros((segments, len(pieces)), dtype=np.int64),
+            np.array([[-np.inf] * len(pieces) + [np.inf]] * len(rods)),
+            np.full((segments, len(pieces), 4), -1),
+            np.tile([0.0, 0.0, 0.0, np.inf, 0.0], (segments, len(pieces), 1)),
         )
 
     def advance(
