@@ -36,8 +36,9 @@ def rod_ring(whisker: Whisker, profile: Profile) -> tuple[float, float]:
     """
     world = _alone(whisker, profile)
     (rod,) = world.rods
-    mass = chain_mass(rod.inertia, rod.turn, rod.length, rod.clamped)[PLANE, PLANE]
-    _, shapes = eigh(mass, np.diag(rod.stiffness[PLANE]))
+    chain = rod.chain
+    mass = chain_mass(chain)[PLANE, PLANE]
+    _, shapes = eigh(mass, np.diag(chain.stiffness[PLANE]))
     world.angles[PLANE] = shapes[:, -1] * SMALL / abs(shapes[:, -1]).sum()
     samples = max(8, round(1.5e3 / rod.resonance_hz))
     y = world.advance(np.zeros((samples + 1, 3)))[0][:, 0, 5]
@@ -49,11 +50,12 @@ def rod_ring(whisker: Whisker, profile: Profile) -> tuple[float, float]:
 
 def _bent(whisker: Whisker, links: int) -> tuple[Floats, Floats, Floats]:
     """Mass matrix, stiffness and angles (joint,) of a chain whose tip is pushed lightly along y."""
-    rod = make_rod(replace(whisker, damping_ratio=0.0), links, 1)  # undamped: of its own mass
-    mass = chain_mass(rod.inertia, rod.turn, rod.length, rod.clamped)[PLANE, PLANE]
-    stiffness = rod.stiffness[PLANE]
-    heading = np.cumsum(np.arctan2(rod.turn[:, 1], rod.turn[:, 0]))
-    x = np.concatenate([[0.0], np.cumsum(rod.length * np.cos(heading))])
+    # undamped: of its own mass
+    chain = make_rod(replace(whisker, damping_ratio=0.0), links, 1).chain
+    mass = chain_mass(chain)[PLANE, PLANE]
+    stiffness = chain.stiffness[PLANE]
+    heading = np.cumsum(np.arctan2(chain.turn[:, 1], chain.turn[:, 0]))
+    x = np.concatenate([[0.0], np.cumsum(chain.length * np.cos(heading))])
     force = SMALL * float(whisker.bending_stiffness(np.zeros(1))[0]) / whisker.length**2 * 1e3
     return mass, stiffness, force * (x[-1] - x[1:-1]) / stiffness
 

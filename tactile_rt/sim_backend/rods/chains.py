@@ -9,31 +9,76 @@ and Euler's equations from link to link for the forces.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from tactile_rt.sim_backend.rods.compiled import compiled
 
-__all__ = ["factor", "inertial_forces", "mass_matrix", "place", "solve_back", "solve_forth"]
+__all__ = [
+    "Chain",
+    "Pose",
+    "factor",
+    "inertial_forces",
+    "mass_matrix",
+    "place",
+    "solve_back",
+    "solve_forth",
+]
 
 A = Any  # a contiguous array of float64: what is compiled knows its arguments' types by itself
 
 
-@compiled
-def place(links: int, clamped: int, turn: A, length: A, q: A, nodes: A, frames: A, axes: A) -> None:
-    """Where a chain is whose first node and first frame stand in `nodes` and `frames` already.
+class Chain(NamedTuple):
+    """What a whisker is made of; and, their rows one after the other, what many are.
 
-    Args:
-        links, clamped: how many links; 1 where the first has no joint, else 0.
+    Attributes:
+        clamped: 1 where the first link has no joint, else 0.
         turn: (link, 2) cosine and sine of the resting angle from the link before, about z.
         length: (link,) mm.
-        q: (degree of freedom,) rad.
-        nodes: (link + 1, 3) mm; filled from the second on.
-        frames: (link, 3, 3) x along the link; filled, the first turned by its own joint.
-        axes: (degree of freedom, 3) filled.
+        inertia: (link, 4) mass (mg), centroid from the link's node (mm), axial and transverse
+            inertia (mg mm^2).
+        stiffness: (degree of freedom,) uN m / rad.
+        added, damping: (degree of freedom, as many or more columns) mg mm^2 and uN m ms / rad that
+            go with the stiffness, see `rod.make_rod`.
+        friction: Coulomb's coefficient.
     """
-    for b in range(links):
+
+    clamped: Any
+    turn: A
+    length: A
+    inertia: A
+    stiffness: A
+    added: A
+    damping: A
+    friction: Any
+
+
+class Pose(NamedTuple):
+    """Where a chain is, in the world.
+
+    Attributes:
+        nodes: (link + 1, 3) mm.
+        frames: (link, 3, 3) in columns x along the link, y and z.
+        axes: (degree of freedom, 3) of the joints.
+    """
+
+    nodes: A
+    frames: A
+    axes: A
+
+
+@compiled
+def place(chain: Chain, q: A, pose: Pose) -> None:
+    """Fill in where a chain is whose first node and first frame at rest stand in `pose` already.
+
+    Args:
+        chain, pose: see there.
+        q: (degree of freedom,) rad.
+    """
+    clamped, turn, length = chain.clamped, chain.turn, chain.length
+    nodes, frames, axes = pose
+    for b in range(len(length)):
         if b > 0:
             c, s = turn[b, 0], turn[b, 1]
             for i in range(3):
@@ -57,20 +102,19 @@ def place(links: int, clamped: int, turn: A, length: A, q: A, nodes: A, frames: 
 
 
 @compiled
-def mass_matrix(
-    links: int, clamped: int, inertia: A, nodes: A, frames: A, axes: A, work: A, matrix: A
-) -> None:
+def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
     """The lower triangle of the mass matrix.
 
     Args:
-        inertia: (link, 4) mass (mg), centroid from the link's node (mm), axial and transverse
-            inertia (mg mm^2).
+        chain, pose: see there.
         work: (3, 3) scratch.
         matrix: (degree of freedom, degree of freedom) filled.
     """
+    clamped, inertia = chain.clamped, chain.inertia
+    nodes, frames, axes = pose
     mass, h0, h1, h2 = 0.0, 0.0, 0.0, 0.0  # of the links from here on: mass and first moments
     work[:] = 0.0  # their inertia about the world's origin
-    for b in range(links - 1, clamped - 1, -1):
+    for b in range(len(inertia) - 1, clamped - 1, -1):
         m, across = inertia[b, 0], inertia[b, 3]
         x0, x1, x2 = frames[b, 0, 0], frames[b, 1, 0], frames[b, 2, 0]
         r0 = nodes[b, 0] + x0 * inertia[b, 1]
@@ -112,23 +156,12 @@ def mass_matrix(
 
 @compiled
 def inertial_forces(
-    links: int,
-    clamped: int,
-    inertia: A,
-    nodes: A,
-    frames: A,
-    axes: A,
-    v: A,
-    a: A,
-    base: A,
-    pushed: A,
-    work: A,
-    torques: A,
-    wrench: A,
+    chain: Chain, pose: Pose, v: A, a: A, base: A, pushed: A, work: A, torques: A, wrench: A
 ) -> None:
     """What an acceleration takes, less what pushes from outside.
 
     Args:
+        chain, pose: see there.
         v, a: (degree of freedom,) rad/ms and rad/ms^2.
         base: (4, 3) of the base: velocity (not used), angular velocity, acceleration, angular
             acceleration.
@@ -137,6 +170,9 @@ def inertial_forces(
         torques: (degree of freedom,) filled: about each joint's axis.
         wrench: (6,) filled: force on the base and moment about it that the base has to give.
     """
+    clamped, inertia = chain.clamped, chain.inertia
+    nodes, frames, axes = pose
+    links = len(inertia)
     w0, w1, w2 = base[1, 0], base[1, 1], base[1, 2]  # angular velocity
     t0, t1, t2 = base[3, 0], base[3, 1], base[3, 2]  # angular acceleration
     s0, s1, s2 = base[2, 0], base[2, 1], base[2, 2]  # acceleration of the link's node
@@ -244,12 +280,11 @@ def solve_back(lower: A, n: int, x: A) -> None:
             x[k] -= lower[i, k] * s
 
 
-def chain_mass(inertia: A, turn: A, length: A, clamped: int) -> A:
+def chain_mass(chain: Chain) -> A:
     """(degree of freedom, degree of freedom) mass matrix of a chain at rest, whole."""
-    links = len(length)
-    n = 2 * (links - clamped)
-    nodes, frames = np.zeros((links + 1, 3)), np.zeros((links, 3, 3))
-    frames[0], axes, matrix = np.eye(3), np.zeros((n, 3)), np.zeros((n, n))
-    place(links, clamped, turn, length, np.zeros(n), nodes, frames, axes)
-    mass_matrix(links, clamped, inertia, nodes, frames, axes, np.empty((3, 3)), matrix)
+    links, n = len(chain.length), 2 * (len(chain.length) - chain.clamped)
+    pose = Pose(np.zeros((links + 1, 3)), np.zeros((links, 3, 3)), np.zeros((n, 3)))
+    pose.frames[0], matrix = np.eye(3), np.zeros((n, n))
+    place(chain, np.zeros(n), pose)
+    mass_matrix(chain, pose, np.empty((3, 3)), matrix)
     return np.tril(matrix) + np.tril(matrix, -1).T

@@ -1,9 +1,13 @@
 """One step of one whisker: mechanics, contacts, and the load on its base."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from tactile_rt.sim_backend.rods.chains import (
+    Chain,
+    Pose,
     factor,
     inertial_forces,
     mass_matrix,
@@ -12,8 +16,9 @@ from tactile_rt.sim_backend.rods.chains import (
 )
 from tactile_rt.sim_backend.rods.compiled import compiled
 from tactile_rt.sim_backend.rods.coulomb import impulses
+from tactile_rt.sim_backend.rods.touching import MOST_CONTACTS, Contacts
 
-__all__ = ["step"]
+__all__ = ["Scratch", "scratch", "step"]
 
 A = Any
 OUT_SWEEPS = 30
@@ -37,75 +42,108 @@ def _directions(normal: A, frame: A, rows: A) -> None:
     rows[2, 2] = normal[0] * rows[1, 1] - normal[1] * rows[1, 0]
 
 
+class Scratch(NamedTuple):
+    """Room for a step's numbers; what later steps, or who calls, may want is said.
+
+    Attributes:
+        mass, lower: mass matrix, and the factor of the system of equations, of the last step for
+            which they were made.
+        wrench: (6,) force on the base (mN) and moment about it (uN m), of the last step.
+        felt: (2,) sum of the normal forces (mN), and the contact with the largest, of the last
+            step.
+    """
+
+    mass: A
+    lower: A
+    wrench: A
+    felt: A
+    cube: A
+    forces: A
+    pushed: A
+    drag: A
+    rows: A
+    reply: A
+    response: A
+    free: A
+    found: A
+    move: A
+
+
+@compiled
+def scratch(links: int, n: int) -> Scratch:
+    """Room for a whisker of some links and degrees of freedom."""
+    wide = 3 * MOST_CONTACTS
+    return Scratch(
+        np.zeros((n, n)),
+        np.zeros((n, n)),
+        np.zeros(6),
+        np.zeros(2),
+        np.empty((3, 3)),
+        np.empty((links, 6)),
+        np.zeros((links, 6)),
+        np.zeros(MOST_CONTACTS),
+        np.empty((wide, 3)),
+        np.empty((wide, n)),
+        np.empty((wide, wide)),
+        np.empty(max(wide, n)),
+        np.empty(wide),
+        np.empty(n),
+    )
+
+
 @compiled
 def step(
     h: float,
-    heavier: int,
-    clamped: int,
-    turn: A,
-    length: A,
-    inertia: A,
-    stiffness: A,
-    added: A,
-    damping: A,
-    friction: float,
+    fresh: bool,
+    matched: bool,
+    chain: Chain,
     q: A,
     v: A,
-    nodes: A,
-    frames: A,
-    axes: A,
+    pose: Pose,
     base: A,
     surface: A,
     count: int,
-    gaps: A,
-    normals: A,
-    points: A,
-    whose: A,
-    seg_link: A,
-    fresh: bool,
-    mass: A,
-    lower: A,
-    work3: A,
-    work6: A,
-    pushed: A,
-    felt: A,
+    near: Contacts,
+    link_of: A,
     last: A,
-    drag: A,
-    rows: A,
-    reply: A,
-    response: A,
-    free: A,
-    found: A,
-    move: A,
-    wrench: A,
+    room: Scratch,
 ) -> None:
-    """One step from where the chain stands: q, v and the wrench (6,) on the base are filled.
+    """One step from where the chain stands: q, v and the wrench in `room` are filled.
 
     Args:
+        h: ms.
+        fresh: whether to make mass matrix and factor anew; else those of an earlier step of the
+            same length will do.
+        matched: whether with the masses with which the modes have their frequencies at this length
+            of a step, or with the true ones.
+        chain, pose: see there.
+        q, v: (degree of freedom,) rad and rad/ms.
         base: see `chains.inertial_forces`.
         surface: (3,) velocity of the object, mm/ms.
-        count, gaps, normals, points, whose: what is near, see `touching.find_near`.
-        fresh: whether to fill `mass` and its factor `lower`, which otherwise are those of an
-            earlier step of the same length.
-        felt: (2,) filled: the normal forces (mN), and the contact with the largest.
-        last: (link, 4) see `advance`.
+        count, near: what is near, see `touching.find_near`.
+        link_of: (segment,) the link on which each segment is.
+        last: see `stepping.State`.
+        room: see there.
     """
-    links = len(length)
-    n = 2 * (links - clamped)
+    clamped, stiffness, friction = chain.clamped, chain.stiffness, chain.friction
+    nodes, frames, axes = pose
+    gaps, normals, points, segments, _ = near
+    mass, lower, wrench, felt = room.mass, room.lower, room.wrench, room.felt
+    pushed, drag, found, move = room.pushed, room.drag, room.found, room.move
+    rows, reply, response, free = room.rows, room.reply, room.response, room.free
+    n = len(stiffness)
     pushed[:] = 0.0
     for i in range(n):
         move[i] = 0.0
-    inertial_forces(
-        links, clamped, inertia, nodes, frames, axes, v, move, base, pushed, work6, free, wrench
-    )
+    inertial_forces(chain, pose, v, move, base, pushed, room.forces, free, wrench)
     if fresh:
         # The added mass is that of the whisker at rest: bent far, the sum may be less than nothing.
-        for share in range(heavier, -1, -1):
-            mass_matrix(links, clamped, inertia, nodes, frames, axes, work3, mass)
+        for share in range(int(matched), -1, -1):
+            mass_matrix(chain, pose, room.cube, mass)
             for i in range(n):
                 for j in range(i + 1):
-                    mass[i, j] += share * added[i, j]
-                    lower[i, j] = mass[i, j] + h * damping[i, j]
+                    mass[i, j] += share * chain.added[i, j]
+                    lower[i, j] = mass[i, j] + h * chain.damping[i, j]
                 lower[i, i] += h * h * stiffness[i]
             if factor(lower, n):
                 break
@@ -121,7 +159,7 @@ def step(
     felt[0] = 0.0
     if count:
         for c in range(count):
-            link = int(seg_link[int(whose[c, 0])])
+            link = link_of[segments[c]]
             _directions(normals[c], frames[link], rows[3 * c : 3 * c + 3])
             reply[3 * c : 3 * c + 3, :n] = 0.0
             for k in range(2 * (link + 1 - clamped)):
@@ -160,7 +198,7 @@ def step(
                 response[i, j], response[j, i] = s, s
         for c in range(count):
             # begin from the last step's, of the contact on the same link
-            link = int(seg_link[int(whose[c, 0])])
+            link = link_of[segments[c]]
             drag[c] = last[link, 3]
             for i in range(3):
                 found[3 * c + i] = last[link, i] * h
@@ -171,7 +209,7 @@ def step(
             felt[0] += found[3 * c] / h
             if found[3 * c] > found[3 * most]:
                 most = c
-            link = int(seg_link[int(whose[c, 0])])
+            link = link_of[segments[c]]
             if found[3 * c] >= last[link, 0] * h:
                 last[link, 3] = drag[c]
                 for i in range(3):
@@ -194,55 +232,33 @@ def step(
     solve_back(lower, n, move)
     for i in range(n):
         v[i], move[i] = move[i], (move[i] - v[i]) / h  # the new velocity, and the acceleration
-    inertial_forces(
-        links, clamped, inertia, nodes, frames, axes, v, move, base, pushed, work6, free, wrench
-    )
+    inertial_forces(chain, pose, v, move, base, pushed, room.forces, free, wrench)
     for i in range(n):
         q[i] += h * v[i]
     deep = False
     for c in range(count):
         deep |= gaps[c] < 0.0
     if deep:
-        _out(
-            h,
-            count,
-            gaps,
-            reply,
-            response,
-            rows,
-            found,
-            v,
-            lower,
-            n,
-            points,
-            nodes,
-            base,
-            surface,
-            free,
-            q,
-        )
+        _out(h, count, base, surface, q, v, pose, near, room)
 
 
 @compiled
 def _out(
     h: float,
     count: int,
-    gaps: A,
-    reply: A,
-    response: A,
-    rows: A,
-    found: A,
-    v: A,
-    lower: A,
-    n: int,
-    points: A,
-    nodes: A,
     base: A,
     surface: A,
-    free: A,
     q: A,
+    v: A,
+    pose: Pose,
+    near: Contacts,
+    room: Scratch,
 ) -> None:
     """Move out what overlaps, by the least that does it, without giving it a velocity."""
+    n = len(q)
+    gaps, points, nodes = near.gaps, near.points, pose.nodes
+    lower, rows, reply, response = room.lower, room.rows, room.reply, room.response
+    free, found = room.free, room.found
     # free: how far each contact will still be inside after the step, mm
     for c in range(count):
         i = 3 * c

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.arrays.cells import joint_stiffness, link_inertia, link_nodes
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
-from tactile_rt.sim_backend.rods.chains import chain_mass
+from tactile_rt.sim_backend.rods.chains import Chain, chain_mass
+from tactile_rt.sim_backend.rods.touching import Segments
 
 __all__ = ["Rod", "make_rod", "matched"]
 
@@ -23,34 +24,23 @@ HEARD_HZ = 500.0  # resonances above are beyond what samples at 1 kHz can hold
 
 @dataclass(frozen=True)
 class Rod:
-    """One whisker, cut and ready to be stepped: see `stepping.advance` for the arrays.
+    """One whisker, cut and ready to be stepped.
 
     Attributes:
         steps_per_sample: The number of steps in a sample.
         resonance_hz: The first resonance of the whisker on its mount, Hz.
         damping_ratio: The damping ratio with which the first mode rings when stepped, that of the
             mount included.
-        clamped: The number of links without a joint: 1, or 0 where the base gives.
-        added: The (joint, joint) mass with which the modes have their frequencies when stepped.
-        damping: The (joint, joint) damping with which they have their damping ratios.
+        chain: Its links and joints.
+        segments: Its straight parts, for contacts.
         to_element: The (3, 3) rotation from the frame of the first link to that of the element.
     """
 
     steps_per_sample: int
     resonance_hz: float
     damping_ratio: float
-    clamped: int
-    turn: Floats
-    length: Floats
-    inertia: Floats
-    stiffness: Floats
-    added: Floats
-    damping: Floats
-    friction: float
-    seg_link: NDArray[np.int64]
-    seg_ends: Floats
-    seg_radii: Floats
-    seg_arcs: Floats
+    chain: Chain
+    segments: Segments
     to_element: Floats
 
 
@@ -78,14 +68,15 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int, sample_ms: flo
     cell = whisker.length / links
     k = [joint_stiffness(whisker, i * cell, (i + 1) * cell) for i in range(links)]
     stiffness = np.repeat(k, 2)
-    omegas, _ = _modes(chain_mass(inertia, turn, length, 1), stiffness)
+    none = np.zeros((0, 0))
+    chain = Chain(1, turn, length, inertia, stiffness, none, none, whisker.friction)
+    omegas, _ = _modes(chain_mass(chain), stiffness)
     damping = 2 * whisker.damping_ratio / omegas[0] * stiffness
-    clamped = 1
     if whisker.mount_stiffness:
-        clamped = 0
         stiffness = np.concatenate([[whisker.mount_stiffness * 1e6] * 2, stiffness])
         damping = np.concatenate([[whisker.mount_damping * 1e9] * 2, damping])
-    mass = chain_mass(inertia, turn, length, clamped)
+        chain = chain._replace(clamped=0, stiffness=stiffness)
+    mass = chain_mass(chain)
     omegas, shapes = _modes(mass, stiffness)
     ratios = damping @ shapes**2 / (2 * omegas)  # of each mode
     steps, resonance_hz = steps_per_sample, float(omegas[0] / (2 * np.pi) * 1e3)
@@ -102,24 +93,19 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int, sample_ms: flo
     drags = np.array([max(beta, 0.0) for _, beta in found]) * omegas**2
     onto = mass @ shapes
     # What cannot move cannot be kept clear of anything: the object passes through a clamped link.
-    free = range(clamped, links + 1)
+    free = range(chain.clamped, links + 1)
     pieces = [_segments(whisker, i, s, nodes, headings[i]) for i in free]
     return Rod(
         steps_per_sample=steps,
         resonance_hz=resonance_hz,
         damping_ratio=ratio,
-        clamped=clamped,
-        turn=turn,
-        length=length,
-        inertia=inertia,
-        stiffness=stiffness,
-        added=(onto * (heavier - 1)) @ onto.T,
-        damping=(onto * drags) @ onto.T,
-        friction=whisker.friction,
-        seg_link=np.repeat(np.array(free), [len(p[0]) for p in pieces]),
-        seg_ends=np.concatenate([p[0] for p in pieces]),
-        seg_radii=np.concatenate([p[1] for p in pieces]),
-        seg_arcs=np.concatenate([p[2] for p in pieces]),
+        chain=chain._replace(
+            added=(onto * (heavier - 1)) @ onto.T, damping=(onto * drags) @ onto.T
+        ),
+        segments=Segments(
+            np.repeat(np.array(free), [len(p[0]) for p in pieces]),
+            *(np.concatenate(each) for each in zip(*pieces, strict=True)),
+        ),
         to_element=rotation("z", -headings[0]),
     )
 

@@ -1,13 +1,23 @@
 """Where a whisker is nearest to the pieces of an object: the places that a step has to mind."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from tactile_rt.sim_backend.rods.chains import Pose
 from tactile_rt.sim_backend.rods.compiled import compiled
 from tactile_rt.sim_backend.rods.nearest import WORK, nearest
 
-__all__ = ["MOST_CONTACTS", "NEAR_MM", "find_near"]
+__all__ = [
+    "MOST_CONTACTS",
+    "NEAR_MM",
+    "Contacts",
+    "Object",
+    "Seen",
+    "Segments",
+    "find_near",
+    "forget",
+]
 
 A = Any
 NEAR_MM = 0.1  # places that are nearer are constraints of a step
@@ -15,30 +25,96 @@ STALE_MM, CLOSE_MM = 0.05, 1.0  # where it is near, a plane found so much way ag
 MOST_CONTACTS = 8  # of one whisker at one time: the nearest ones
 
 
+class Segments(NamedTuple):
+    """The straight parts of a whisker between which and an object contacts are sought.
+
+    Attributes:
+        link: (segment,) on which it is.
+        ends: (segment, 2, 3) in the link's frame, mm.
+        radii, arcs: (segment, 2) radii and arc lengths from the base at the ends, mm.
+    """
+
+    link: A
+    ends: A
+    radii: A
+    arcs: A
+
+
+class Object(NamedTuple):
+    """The convex pieces of an object, one after the other, about the object's place.
+
+    Attributes:
+        corners: (corner, 3) mm.
+        corner_at: (piece + 1,) where the corners of each piece begin.
+        faces: (face, 4) outward normals and offsets.
+        face_at: (piece + 1,) where the faces of each piece begin.
+        rounding: (piece,) the radius by which each is grown, mm.
+    """
+
+    corners: A
+    corner_at: A
+    faces: A
+    face_at: A
+    rounding: A
+
+
+class Seen(NamedTuple):
+    """What is known from the last times about how near a whisker is to an object; carried on.
+
+    Attributes:
+        travelled: (1,) what the object and the whisker have travelled since the beginning, mm.
+        reach: (segment, piece) lower bound of the gap, plus what was travelled when it was found.
+        soonest: (piece + 1,) the least of them, and at last something infinite.
+        known: (segment, piece, 4) where to begin, see `nearest`.
+        planes: (segment, piece, 5) outward normal and offset of a plane through which the piece
+            does not reach, and what was travelled when it was found.
+    """
+
+    travelled: A
+    reach: A
+    soonest: A
+    known: A
+    planes: A
+
+
+class Contacts(NamedTuple):
+    """Places where a whisker is near an object, as many as there may be.
+
+    Attributes:
+        gaps: (contact,) mm.
+        normals: (contact, 3) from the piece to the whisker, in the world.
+        points: (contact, 3) of the whisker's surface, in the world, mm.
+        segments, places: (contact,) the segment, and the place on it from 0 to 1.
+    """
+
+    gaps: A
+    normals: A
+    points: A
+    segments: A
+    places: A
+
+
+@compiled
+def forget(seen: Seen) -> None:
+    """Begin anew."""
+    seen.reach[:] = -np.inf
+    seen.soonest[:-1] = -np.inf
+    seen.known[:] = -1
+    seen.planes[:, :, :3] = 0.0
+    seen.planes[:, :, 3] = np.inf
+    seen.planes[:, :, 4] = seen.travelled[0]
+
+
 @compiled
 def find_near(
-    nodes: A,
-    frames: A,
-    seg_link: A,
-    seg_ends: A,
-    seg_radii: A,
-    corners: A,
-    corner_at: A,
-    faces: A,
-    face_at: A,
-    rounding: A,
+    pose: Pose,
+    segments: Segments,
+    thing: Object,
     centre: A,
-    reach: A,
-    soonest: A,
-    travelled: float,
-    known: A,
-    planes: A,
+    seen: Seen,
     ends: A,
-    seen: A,
-    gaps: A,
-    normals: A,
-    points: A,
-    whose: A,
+    now: A,
+    near: Contacts,
 ) -> int:
     """Find where a whisker is nearest to pieces that are near; returns at how many places.
 
@@ -48,37 +124,35 @@ def find_near(
     neighbours' are looked at anew.
 
     Args:
-        seg_link, seg_ends, seg_radii: of the segments: link, ends in its frame (2, 3), radii (2,).
-        corners, corner_at, faces, face_at, rounding: of the pieces, about the object's place.
+        pose, segments, thing: see there.
         centre: (3,) where the object is, mm.
-        reach: (segment, piece) lower bound of the gap, plus what was travelled when it was found.
-        soonest: (piece,) the least of them; filled.
-        known: (segment, piece, 4) where to begin, see `nearest`.
-        planes: (segment, piece, 5) outward normal and offset of a plane through which the piece
-            does not reach, and what was travelled when it was found.
+        seen: see there; carried on.
         ends: (segment, 2, 3) scratch.
-        seen: (segment, 6) scratch.
-        gaps, normals, points, whose: filled: gap (mm), direction from piece to whisker and point
-            of the whisker's surface, in the world; segment and place on it.
+        now: (segment, 6) scratch: gap, place, direction, and whether it is more than a bound.
+        near: see there; filled.
     """
-    count = 0
-    found, work = np.empty(6), np.empty(WORK)
-    segments = len(seg_link)
-    for s in range(segments):
+    travelled = seen.travelled[0]
+    reach, planes = seen.reach, seen.planes
+    radii, rounding = segments.radii, thing.rounding
+    corner_at, face_at = thing.corner_at, thing.face_at
+    count, number = 0, len(segments.link)
+    found, scratch = np.empty(6), np.empty(WORK)
+    for s in range(number):
         ends[s, 0, 0] = np.inf  # not known
     for p in range(len(rounding)):
-        if soonest[p] - travelled >= NEAR_MM:
+        if seen.soonest[p] - travelled >= NEAR_MM:
             continue
-        first, last = segments, -1
-        for s in range(segments):
-            seen[s, 0] = np.inf
+        first, last = number, -1
+        for s in range(number):
+            now[s, 0] = np.inf
             if reach[s, p] - travelled >= NEAR_MM:
                 continue
             if ends[s, 0, 0] == np.inf:
-                _place(seg_ends[s], nodes[seg_link[s]], frames[seg_link[s]], centre, ends[s])
+                link = segments.link[s]
+                _place(segments.ends[s], pose.nodes[link], pose.frames[link], centre, ends[s])
             bound = np.inf
             for end in range(2):
-                ahead = -planes[s, p, 3] - rounding[p] - seg_radii[s, end]
+                ahead = -planes[s, p, 3] - rounding[p] - radii[s, end]
                 for i in range(3):
                     ahead += planes[s, p, i] * ends[s, end, i]
                 bound = min(bound, ahead)
@@ -86,76 +160,70 @@ def find_near(
                 bound = -np.inf
             reach[s, p] = bound + travelled
             if bound < NEAR_MM:
-                seen[s, 0], seen[s, 5] = bound, 0.0
+                now[s, 0], now[s, 5] = bound, 0.0
                 first, last = min(first, s), s
         again = last >= 0
         while again:
             again = False
             for s in range(first, last + 1):
-                if seen[s, 0] == np.inf or seen[s, 5] or not _least(s, seen, seg_link):
+                if now[s, 0] == np.inf or now[s, 5] or not _least(s, now, segments.link):
                     continue
-                a, b = ends[s]
                 nearest(
-                    a,
-                    b,
-                    corners[corner_at[p] : corner_at[p + 1]],
-                    faces[face_at[p] : face_at[p + 1]],
-                    known[s, p],
-                    work,
+                    ends[s, 0],
+                    ends[s, 1],
+                    thing.corners[corner_at[p] : corner_at[p + 1]],
+                    thing.faces[face_at[p] : face_at[p + 1]],
+                    seen.known[s, p],
+                    scratch,
                     found,
                 )
                 t = found[1]
-                gap = found[0] - rounding[p] - seg_radii[s, 0] * (1 - t) - seg_radii[s, 1] * t
+                gap = found[0] - rounding[p] - radii[s, 0] * (1 - t) - radii[s, 1] * t
                 reach[s, p] = gap + travelled
                 planes[s, p, 3], planes[s, p, 4] = found[5], travelled
                 for i in range(3):
-                    planes[s, p, i] = seen[s, 2 + i] = found[2 + i]
-                seen[s, 0], seen[s, 1], seen[s, 5] = gap, t, 1.0
+                    planes[s, p, i] = now[s, 2 + i] = found[2 + i]
+                now[s, 0], now[s, 1], now[s, 5] = gap, t, 1.0
                 if gap >= NEAR_MM:
-                    seen[s, 0] = np.inf
+                    now[s, 0] = np.inf
                 again = True
-        soonest[p] = np.inf
-        for s in range(segments):
-            soonest[p] = min(soonest[p], reach[s, p])
+        seen.soonest[p] = np.inf
+        for s in range(number):
+            seen.soonest[p] = min(seen.soonest[p], reach[s, p])
         for s in range(first, last + 1):
-            gap = seen[s, 0]
-            if gap == np.inf or not _least(s, seen, seg_link):
+            gap = now[s, 0]
+            if gap == np.inf or not _least(s, now, segments.link):
                 continue
             # Neighbours on two links share their ends, and a gap there.
-            if s > 0 and seen[s, 1] == 0.0 and seen[s - 1, 0] <= gap and seen[s - 1, 5]:
-                if seen[s - 1, 1] == 1.0:
+            if s > 0 and now[s, 1] == 0.0 and now[s - 1, 0] <= gap and now[s - 1, 5]:
+                if now[s - 1, 1] == 1.0:
                     continue
             slot = count
             if count == MOST_CONTACTS:
-                slot = 0
-                for c in range(count):
-                    if gaps[c] > gaps[slot]:
-                        slot = c
-                if gaps[slot] <= gap:
+                slot = int(np.argmax(near.gaps))
+                if near.gaps[slot] <= gap:
                     continue
             else:
                 count += 1
-            t, link = seen[s, 1], seg_link[s]
-            radius = seg_radii[s, 0] * (1 - t) + seg_radii[s, 1] * t
-            gaps[slot] = gap
-            whose[slot, 0], whose[slot, 1] = s, t
+            t, link = now[s, 1], segments.link[s]
+            radius = radii[s, 0] * (1 - t) + radii[s, 1] * t
+            near.gaps[slot], near.segments[slot], near.places[slot] = gap, s, t
             for i in range(3):
-                n = seen[s, 2 + i]
-                normals[slot, i] = n
-                points[slot, i] = nodes[link, i] - n * radius
+                near.normals[slot, i] = now[s, 2 + i]
+                near.points[slot, i] = pose.nodes[link, i] - now[s, 2 + i] * radius
                 for k in range(3):
-                    at = seg_ends[s, 0, k] * (1 - t) + seg_ends[s, 1, k] * t
-                    points[slot, i] += frames[link, i, k] * at
+                    at = segments.ends[s, 0, k] * (1 - t) + segments.ends[s, 1, k] * t
+                    near.points[slot, i] += pose.frames[link, i, k] * at
     return count
 
 
 @compiled
-def _least(s: int, seen: A, seg_link: A) -> bool:
+def _least(s: int, now: A, link_of: A) -> bool:
     """Whether no neighbour on the same link is nearer, for what is known of them."""
-    gap, link = seen[s, 0], seg_link[s]
-    if s > 0 and seg_link[s - 1] == link and seen[s - 1, 0] <= gap:
+    gap, link = now[s, 0], link_of[s]
+    if s > 0 and link_of[s - 1] == link and now[s - 1, 0] <= gap:
         return False
-    return not (s + 1 < len(seg_link) and seg_link[s + 1] == link and seen[s + 1, 0] < gap)
+    return not (s + 1 < len(link_of) and link_of[s + 1] == link and now[s + 1, 0] < gap)
 
 
 @compiled

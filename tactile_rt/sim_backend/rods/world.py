@@ -1,7 +1,8 @@
 """An array and an object, stepped whisker by whisker."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -9,8 +10,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
+from tactile_rt.sim_backend.rods.chains import Chain
 from tactile_rt.sim_backend.rods.rod import make_rod
-from tactile_rt.sim_backend.rods.stepping import advance
+from tactile_rt.sim_backend.rods.stepping import Rows, State, advance
+from tactile_rt.sim_backend.rods.touching import Object, Seen, Segments
 from tactile_rt.sim_backend.world import JAMMED
 from tactile_rt.stream import SourceError
 
@@ -79,45 +82,37 @@ class RodWorld:
             np.concatenate([root[:1], root[1:] @ rod.to_element.T])
             for root, rod in zip(roots, rods, strict=True)
         ]
-        self._rods = (
-            np.array([r.steps_per_sample for r in rods]),
-            np.array([r.clamped for r in rods]),
-            _begins(rods, lambda r: r.length),
-            _begins(rods, lambda r: r.stiffness),
-            _begins(rods, lambda r: r.seg_link),
-            *(
-                np.concatenate([getattr(r, name) for r in rods])
-                for name in ("turn", "length", "inertia", "stiffness")
-            ),
-            *(_stacked([getattr(r, name) for r in rods]) for name in ("added", "damping")),
-            np.array([r.friction for r in rods]),
+        chains, segments = [rod.chain for rod in rods], [rod.segments for rod in rods]
+        rows = Rows(
+            _begins([c.length for c in chains]),
+            _begins([c.stiffness for c in chains]),
+            _begins([s.link for s in segments]),
         )
-        segments = sum(len(r.seg_link) for r in rods)
-        joints = sum(len(r.stiffness) for r in rods)
+        links, joints, parts = (int(each[-1]) for each in rows)
         self.angles = np.zeros(joints)
-        self._state = (
-            self.angles,
-            np.zeros(joints),
+        seen = Seen(
             np.zeros((len(rods), 1)),
-            np.zeros((sum(len(r.length) for r in rods), 4)),
-        )
-        self._roots = np.array(turned)[:, None]
-        self._segments = tuple(
-            np.concatenate([getattr(r, name) for r in rods])
-            for name in ("seg_link", "seg_ends", "seg_radii", "seg_arcs")
-        )
-        self._pieces = (
-            np.concatenate([np.zeros((0, 3)), *(p.corners for p in pieces)]),
-            _begins(pieces, lambda p: p.corners),
-            np.concatenate([np.zeros((0, 4)), *(p.faces for p in pieces)]),
-            _begins(pieces, lambda p: p.faces),
-            np.array([p.rounding for p in pieces]),
-        )
-        self._pairs = (
-            np.full((segments, len(pieces)), -np.inf),
+            np.full((parts, len(pieces)), -np.inf),
             np.array([[-np.inf] * len(pieces) + [np.inf]] * len(rods)),
-            np.full((segments, len(pieces), 4), -1),
-            np.tile([0.0, 0.0, 0.0, np.inf, 0.0], (segments, len(pieces), 1)),
+            np.full((parts, len(pieces), 4), -1),
+            np.tile([0.0, 0.0, 0.0, np.inf, 0.0], (parts, len(pieces), 1)),
+        )
+        self._advance = partial(
+            advance,
+            np.array([r.steps_per_sample for r in rods]),
+            rows,
+            Chain(*(_stacked(each) for each in zip(*chains, strict=True))),
+            Segments(*(_stacked(each) for each in zip(*segments, strict=True))),
+            Object(
+                np.concatenate([np.zeros((0, 3)), *(p.corners for p in pieces)]),
+                _begins([p.corners for p in pieces]),
+                np.concatenate([np.zeros((0, 4)), *(p.faces for p in pieces)]),
+                _begins([p.faces for p in pieces]),
+                np.array([p.rounding for p in pieces]),
+            ),
+            State(self.angles, np.zeros(joints), np.zeros((links, 4))),
+            seen,
+            np.array(turned),
         )
 
     def advance(
@@ -138,19 +133,7 @@ class RodWorld:
         bases = np.zeros((1 if shaken is None else samples, 4, 3))
         if shaken is not None:
             bases[:, 2] = shaken
-        arguments: tuple[Any, ...] = (
-            *self._rods,
-            *self._state,
-            self._roots,
-            bases,
-            *self._segments,
-            *self._pieces,
-            np.ascontiguousarray(way),
-            *self._pairs,
-            loads,
-            contacts,
-        )
-        done = advance(*arguments)
+        done = self._advance(bases, np.ascontiguousarray(way), loads, contacts)
         if done < 0:
             raise SourceError(JAMMED)
         # Sums in a fixed order: a matrix product's rounding may depend on the number of samples.
@@ -162,12 +145,16 @@ class RodWorld:
         return felt.swapaxes(0, 1), contacts[..., :3].swapaxes(0, 1) * (1.0, 1e-3, 1e-6)
 
 
-def _stacked(squares: Sequence[Floats]) -> Floats:
-    """Matrices one below the other, the narrower ones filled up with zeros."""
-    wide = max(len(square) for square in squares)
-    return np.concatenate([np.pad(s, ((0, 0), (0, wide - len(s)))) for s in squares])
+def _stacked(each: Sequence[Any]) -> NDArray[Any]:
+    """Rows one below the other, those of narrower matrices filled up with zeros; numbers as one."""
+    if np.ndim(each[0]) == 0:
+        return np.array(each)
+    wide = max(rows.shape[-1] for rows in each)
+    if np.ndim(each[0]) == 2:
+        each = [np.pad(rows, ((0, 0), (0, wide - rows.shape[1]))) for rows in each]
+    return np.concatenate(each)
 
 
-def _begins(things: Sequence[Any], of: Callable[[Any], Any]) -> NDArray[np.int64]:
-    """Where each thing's rows begin when they stand one after the other, and where the last end."""
-    return np.cumsum([0, *(len(of(thing)) for thing in things)])
+def _begins(each: Sequence[Any]) -> NDArray[np.int64]:
+    """Where each one's rows begin when they stand one after the other, and where the last end."""
+    return np.cumsum([0, *(len(rows) for rows in each)])

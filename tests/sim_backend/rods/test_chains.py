@@ -38,13 +38,12 @@ class Both:
         self.rod = make_rod(whisker, LINKS, 4)
         s = link_nodes(whisker, LINKS)
         self.inertia = np.array([link_inertia(whisker, x, y) for x, y in pairwise(s)])
-        self.nodes, self.frames = np.zeros((LINKS + 2, 3)), np.zeros((LINKS + 1, 3, 3))
-        self.axes = np.zeros((FREE, 3))
-        self.nodes[0] = whisker.base
-        self.frames[0] = whisker.orientation @ self.rod.to_element.T
-        self.place = (LINKS + 1, 1, self.rod.turn, self.rod.length)
-        chains.place(*self.place, self.q, self.nodes, self.frames, self.axes)
-        self.where = (self.nodes, self.frames, self.axes)
+        self.chain = self.rod.chain
+        nodes, frames = np.zeros((LINKS + 2, 3)), np.zeros((LINKS + 1, 3, 3))
+        self.pose = chains.Pose(nodes, frames, np.zeros((FREE, 3)))
+        nodes[0] = whisker.base
+        frames[0] = whisker.orientation @ self.rod.to_element.T
+        chains.place(self.chain, self.q, self.pose)
 
 
 @pytest.mark.parametrize("name", ["B0", "C2", "E5"])
@@ -53,20 +52,20 @@ def test_places_masses_and_forces_are_mujoco_s(name: str, seed: int) -> None:
     both = Both(name, seed)
     model, data = both.model, both.data
     mujoco.mj_inverse(model, data)
-    np.testing.assert_allclose(both.nodes[1:-1], data.xanchor[::2], atol=1e-6)  # mm
-    np.testing.assert_allclose(both.axes, data.xaxis, atol=1e-7)
+    np.testing.assert_allclose(both.pose.nodes[1:-1], data.xanchor[::2], atol=1e-6)  # mm
+    np.testing.assert_allclose(both.pose.axes, data.xaxis, atol=1e-7)
 
     wanted = np.empty((FREE, FREE))
     mujoco.mj_fullM(model, data, wanted)
     lower = np.zeros((FREE, FREE))
-    chains.mass_matrix(LINKS + 1, 1, both.inertia, *both.where, np.empty((3, 3)), lower)
+    chains.mass_matrix(both.chain, both.pose, np.empty((3, 3)), lower)
     np.testing.assert_allclose(np.tril(lower), np.tril(wanted), atol=1e-7 * abs(wanted).max())
 
     torques, wrench = np.zeros(FREE), np.zeros(6)
     none, work = np.zeros((LINKS + 1, 6)), np.empty((LINKS + 1, 6))
     still = np.zeros((4, 3))
     chains.inertial_forces(
-        LINKS + 1, 1, both.inertia, *both.where, both.v, both.a, still, none, work, torques, wrench
+        both.chain, both.pose, both.v, both.a, still, none, work, torques, wrench
     )
     scale = abs(data.qfrc_inverse).max()
     np.testing.assert_allclose(torques, data.qfrc_inverse, atol=1e-7 * scale)
@@ -79,10 +78,9 @@ def _momentum(both: Both, q: Floats, v: Floats) -> Floats:
     """(3,) linear momentum, by differences of where the centres of mass are."""
     h, at = 1e-6, []
     for shift in (-h, h):
-        nodes, frames, axes = (x.copy() for x in both.where)
-        frames[0] = both.frames[0]
-        chains.place(*both.place, q + shift * v, nodes, frames, axes)
-        at.append(nodes[:-1] + frames[:, :, 0] * both.inertia[:, 1:2])
+        pose = chains.Pose(*(x.copy() for x in both.pose))
+        chains.place(both.chain, q + shift * v, pose)
+        at.append(pose.nodes[:-1] + pose.frames[:, :, 0] * both.inertia[:, 1:2])
     momentum: Floats = both.inertia[:, 0] @ (at[1] - at[0]) / (2 * h)
     return momentum
 
@@ -101,13 +99,11 @@ def test_a_base_that_is_accelerated_pulls_every_mass_along() -> None:
     base[2] = 0.3, -0.2, 0.1
     torques, wrench, still = np.zeros(FREE), np.zeros(6), np.zeros(FREE)
     none, work = np.zeros((LINKS + 1, 6)), np.empty((LINKS + 1, 6))
-    chains.inertial_forces(
-        LINKS + 1, 1, both.inertia, *both.where, still, still, base, none, work, torques, wrench
-    )
-    centres = both.nodes[:-1] + both.frames[:, :, 0] * both.inertia[:, 1:2]
+    chains.inertial_forces(both.chain, both.pose, still, still, base, none, work, torques, wrench)
+    centres = both.pose.nodes[:-1] + both.pose.frames[:, :, 0] * both.inertia[:, 1:2]
     mass = both.inertia[:, 0]
     np.testing.assert_allclose(wrench[:3], mass.sum() * base[2], rtol=1e-12)
-    moment = np.cross(mass @ (centres - both.nodes[0]), base[2])
+    moment = np.cross(mass @ (centres - both.pose.nodes[0]), base[2])
     np.testing.assert_allclose(wrench[3:], moment, rtol=1e-9)
 
 
