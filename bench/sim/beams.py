@@ -29,7 +29,7 @@ __all__ = ["GRAVITY", "ORIGIN", "Beam", "BeamErrors", "beams", "flat", "measure"
 
 Floats = NDArray[np.float64]
 
-ROBOT = Path(__file__).parents[2] / "docs" / "arrays" / "robot.toml"
+ARRAYS = Path(__file__).parents[2] / "docs" / "arrays"
 ORIGIN = Mount((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 SMALL = 1e-4  # deflections, of the whisker's length: linear to 1e-6
 SETTLE_PERIODS = 30.0  # of the first mode; what is over-damped creeps back more slowly
@@ -83,12 +83,13 @@ def flat(name: str, bend: str = "") -> Whisker:
     """A whisker in the plane of the world's x and y, its base at the origin.
 
     Args:
-        name: of a mouse's whisker, or of an array and its whisker: ``robot A0`` is of
-            `docs/arrays/robot.toml`.
+        name: of an array and its whisker: ``mouse C2``, ``robot A0`` of `docs/arrays/robot.toml`;
+            without an array a mouse's.
         bend: ``straight`` takes its curve away.
     """
     array, _, one = name.rpartition(" ")
-    whiskers = load_array(str(ROBOT)).whiskers if array == "robot" else mouse_whiskers()
+    own = array in {"", "mouse"}
+    whiskers = mouse_whiskers() if own else load_array(str(ARRAYS / f"{array}.toml")).whiskers
     whisker = next(w for w in whiskers if w.name == one)
     curvature = 0.0 if bend == "straight" else whisker.curvature
     angles = (np.pi / 2, 0.0, -np.pi / 2)

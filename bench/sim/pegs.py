@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.sim.beams import ORIGIN, flat
+from tactile_rt.sim_backend.rods.rod import make_rod
 from tactile_rt.sim_backend.rods.world import Piece, RodWorld
 from tactile_rt.sim_backend.world import (
     OBJECT_BIT,
@@ -37,10 +38,12 @@ Floats = NDArray[np.float64]
 PEG_RADIUS_MM = 1.0
 PEG = Piece(np.array([[0.0, 0.0, -5.0], [0.0, 0.0, 5.0]]), np.zeros((0, 4)), PEG_RADIUS_MM)
 CLEAR = 0.03  # how far from the whisker the peg starts, of the whisker's length
-RUN_UP = 0.1  # how far it slides along the whisker before it is at its place, of the length
+RUN_UP, RUN_UP_MM = 0.1, 5.0  # how far it slides before it is at its place: of the length, at most
 FASTEST_MM_S = 30.0  # of pressing, and never more than a length per second
 SLIDE_MM_S = 30.0  # as objects do in sweeps
-SETTLE_MS, WINDOW_MS = 10.0, 2.0  # window: averaged over, around the moment at the place
+SETTLE_MS, SLOW_MS = 10.0, 10.0  # rest before; of whiskers with longer periods
+SETTLE_PERIODS = 3.0  # of theirs: a long one is thrown off the peg, and comes back
+WINDOW_MS = 2.0  # averaged over, around the moment at the place
 RIPPLE_MS = 8  # before the end, over which samples should lie on a line
 
 
@@ -215,7 +218,8 @@ def _path(case: Press, step: float, slide_mm_s: float) -> Floats:
     length, a = whisker.length, whisker.curvature
     slope = 2 * a * case.contact[0]
     slide = slide_mm_s * 1e-3 * step / np.hypot(1.0, slope)
-    count = round((RUN_UP * length / (slide_mm_s * 1e-3) + WINDOW_MS / 2) / step)
+    run_up = min(RUN_UP * length, RUN_UP_MM)
+    count = round((run_up / (slide_mm_s * 1e-3) + WINDOW_MS / 2) / step)
     dx = slide * (np.arange(count + 1) - (count - round(WINDOW_MS / 2 / step)))
     dx *= -1.0 if case.friction < 0 else 1.0
     x, y = case.centre
@@ -224,7 +228,9 @@ def _path(case: Press, step: float, slide_mm_s: float) -> Floats:
     down = along[0] + np.outer(
         np.arange(round((case.depth + CLEAR * length) / abs(speed)), -1, -1), (0.0, speed, 0.0)
     )
-    rest = np.repeat(along[:1], round(SETTLE_MS / step), axis=0)
+    period = 1e3 / make_rod(whisker, 10, 1).resonance_hz
+    settle = SETTLE_PERIODS * period if period > SLOW_MS else SETTLE_MS
+    rest = np.repeat(along[:1], round(settle / step), axis=0)
     return np.concatenate([down, rest, along[1:]])
 
 

@@ -7,7 +7,7 @@ import gzip
 from itertools import product
 from pathlib import Path
 
-from bench.sim.beams import GRAVITY, ROBOT, flat
+from bench.sim.beams import ARRAYS, GRAVITY, flat
 from bench.sim.pegs import PEG_RADIUS_MM
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers
@@ -31,14 +31,15 @@ def write_beams() -> None:
 
 
 def write_elastica() -> None:
-    """Every whisker of the mouse and of the example robot on a peg: half an hour."""
+    """Every whisker of the mouse and of the example arrays on a peg: half an hour."""
     lines = [
         "# Planar elastica of whiskers pressed by a peg of 1 mm radius: see bench/sim/pegs.py.",
         "whisker,bend,place,depth_mm,friction,centre_x_mm,centre_y_mm,moment_uNm,force_x_mN,"
         "force_y_mN,contact_x_mm,contact_y_mm,arc_mm",
     ]
     names = [f"mouse {w.name}" for w in mouse_whiskers()]
-    names += [f"robot {w.name}" for w in load_array(str(ROBOT)).whiskers]
+    for array in ("robot", "long"):
+        names += [f"{array} {w.name}" for w in load_array(str(ARRAYS / f"{array}.toml")).whiskers]
     for name, bend, place, mu in product(names, BENDS, (0.4, 0.6, 0.8), (0.0, 0.5, -0.5)):
         whisker = flat(name, bend)
         if bend != "straight" and not whisker.curvature:

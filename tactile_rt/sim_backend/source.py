@@ -5,12 +5,13 @@ Like every simulated source (`PacedSource`) it is simulated when it is read, and
 sim:mouse?objects=mug-50,bottle-51&seed=3&pace=fast&profile=realtime&sweeps=10
 sim:mouse?noise_force=1e-5&noise_moment=5e-8&latency_ms=2&drop_probability=0.01
 sim:mouse?friction=0.3&young_modulus=0.2&angles_deg=3&mount_mm=0.5
+sim:springs.toml?base_turns=true
 """
 
 import abc
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Final
 
 import numpy as np
@@ -20,13 +21,14 @@ from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, 
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation, usual_distance
-from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, world_spec
+from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS, world_spec
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStream, Source
 
 __all__ = ["CHUNK_SAMPLES", "PACES", "PacedSource", "Pass", "SimOptions", "SimSource", "check_pace"]
 
 CHUNK_SAMPLES: Final = 9
 PACES: Final = ("realtime", "fast")
+TURNS: Final = ("turn_y", "turn_z")
 REST_SAMPLES = 600  # after an object its episode ends and contact is released; before one, a tare
 
 
@@ -110,6 +112,9 @@ class SimOptions(SensorModel, Randomisation):
             see `sweep.Sweep`; left out, the size is 40 mm and the others are drawn anew each time.
         roll_deg, pitch_deg, heading_deg, climb_deg, ramp_ms, head_moves: The parameters of every
             sweep, see `sweep.Sweep`; 0 if left out.
+        base_turns: Two more channels, ``turn_y`` and ``turn_z``: by how much the base of a whisker
+            whose mount gives is turned about the element's y and z, rad. They are the truth: the
+            sensor's imperfections leave them alone.
     """
 
     objects: str = ""
@@ -130,6 +135,7 @@ class SimOptions(SensorModel, Randomisation):
     climb_deg: float | None = None
     ramp_ms: float | None = None
     head_moves: float | None = None
+    base_turns: bool = False
 
     def __post_init__(self) -> None:
         SensorModel.__post_init__(self)
@@ -166,7 +172,7 @@ class Pass:
 
 
 class SimSource(PacedSource):
-    """A whisker array in MuJoCo with objects sweeping past it.
+    """A simulated whisker array with objects sweeping past it.
 
     Samples that the sensors drop count as missing.
 
@@ -182,15 +188,19 @@ class SimSource(PacedSource):
     Options = SimOptions
 
     def __init__(self, array: str, options: SimOptions) -> None:
+        self.check(array, options)
         self._animals = load_animals(array or "mouse")
-        super().__init__(world_spec(self._animals), options.pace)
+        spec = felt = world_spec(self._animals)
+        if options.base_turns:
+            spec = replace(felt, channels=felt.channels + TURNS, units=(*felt.units, "rad", "rad"))
+        super().__init__(spec, options.pace)
         self._options = options
         self._objects = _objects(options) or [promised_object(name) for name in CATEGORIES]
         self._rng = np.random.default_rng(options.seed)
         # Of its own, so that the objects are the same with and without.
         self._array_rng = np.random.default_rng([options.seed, 1])
         self._distance_mm = usual_distance(self._animals)
-        self._sensor = Sensor(options, self.spec, options.seed)
+        self._sensor = Sensor(options, felt, options.seed)
         self.passes: list[Pass] = []
         self._sent = 0  # samples simulated so far
         self._rest = 0  # samples of rest still to deliver
@@ -201,7 +211,12 @@ class SimSource(PacedSource):
     @staticmethod
     def check(array: str, options: SimOptions) -> None:
         """Raise the `ConfigError` that opening it would raise."""
-        load_animals(array or "mouse")
+        animals = load_animals(array or "mouse")
+        if options.base_turns and not any(w.mount_stiffness for a in animals for w in a.whiskers):
+            raise ConfigError(
+                f"base_turns: no mount of {' and '.join(a.name for a in animals)} gives; "
+                "a .toml array says how much with mount_stiffness_nm_rad"
+            )
         _objects(options)
 
     def close(self) -> None:
@@ -209,9 +224,16 @@ class SimSource(PacedSource):
         self._simulation = None
 
     def _simulate(self, start_ns: int) -> Chunk | None:
-        received = self._sensor.push(self._true(start_ns))
+        true = self._true(start_ns)
+        channels = len(CHANNELS)
+        loads = Chunk(true.seq, true.t_ns, true.values[..., :channels], true.valid)
+        received = self._sensor.push(loads)
         self.stats.missing = self._sensor.dropped
-        return received
+        if received is None or not self._options.base_turns:
+            return received
+        turns = true.values[received.seq - true.seq[0], :, channels:]
+        values = np.concatenate([received.values, turns], axis=2)
+        return Chunk(received.seq, received.t_ns, values, received.valid)
 
     def _true(self, start_ns: int) -> Chunk:
         """What the array really feels next."""
@@ -225,6 +247,9 @@ class SimSource(PacedSource):
             assert self._simulation is not None
             n = min(CHUNK_SAMPLES, self._left)
             values = self._simulation.advance(n).astype(np.float32)
+            if self._options.base_turns:
+                turns = self._simulation.turns().astype(np.float32)
+                values = np.concatenate([values, turns], axis=2)
             self._left -= n
         return self._stamp(values, start_ns)
 

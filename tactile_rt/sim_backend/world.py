@@ -80,7 +80,7 @@ class Profile:
 
 
 PROFILES = {
-    "realtime": Profile(8, 0.5, 0.05),
+    "realtime": Profile(7, 0.5, 0.05),
     "dataset": Profile(10, 0.25, 0.025),
     "accurate": Profile(20, 0.1, 0.01),
     "mujoco": Profile(10, 0.25, 0.025, "mujoco"),

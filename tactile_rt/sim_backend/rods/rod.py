@@ -17,7 +17,7 @@ __all__ = ["Rod", "make_rod", "matched"]
 
 Floats = NDArray[np.float64]
 
-SAG_MM = 2e-4  # how far the chord of a segment may be from the resting curve
+SAG_MM = 7e-4  # how far the chord of a segment may be from the resting curve
 FINEST = 8  # how many times the step is halved at most, so that a whisker rings as it should
 HEARD_HZ = 500.0  # resonances above are beyond what samples at 1 kHz can hold
 
@@ -145,15 +145,17 @@ def matched(omega: float, ratio: float, h: float) -> tuple[float, float]:
 
 def _segments(
     whisker: Whisker, link: int, s: Floats, nodes: Floats, heading: float
-) -> tuple[Floats, Floats, Floats]:
-    """Ends in the link's frame (segment, 2, 3), radii (segment, 2) and arcs (segment, 2)."""
+) -> tuple[Floats, ...]:
+    """What `Segments` has of a link's: ends, bows, radii and arcs."""
     longest = math.sqrt(8 * SAG_MM / max(2 * abs(whisker.curvature), 1e-12))
     count = max(1, math.ceil((s[link + 1] - s[link]) / longest))
     at = np.linspace(s[link], s[link + 1], count + 1)
-    places = (whisker.centreline(at) - nodes[link]) @ rotation("z", -heading).T
-    radii = whisker.radius(at)
+    turn = rotation("z", -heading).T
+    places = (whisker.centreline(at) - nodes[link]) @ turn
+    middles = (whisker.centreline((at[:-1] + at[1:]) / 2) - nodes[link]) @ turn
 
     def pairs(x: Floats) -> Floats:
         return np.ascontiguousarray(np.stack([x[:-1], x[1:]], axis=1))
 
-    return pairs(places), pairs(radii), pairs(at)
+    bows = middles - (places[:-1] + places[1:]) / 2
+    return pairs(places), bows, pairs(whisker.radius(at)), pairs(at)

@@ -117,6 +117,7 @@ def advance(
             Segments(
                 segments.link[segment],
                 segments.ends[segment],
+                segments.bows[segment],
                 segments.radii[segment],
                 segments.arcs[segment],
             ),

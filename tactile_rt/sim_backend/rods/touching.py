@@ -1,5 +1,6 @@
 """Where a whisker is nearest to the pieces of an object: the places that a step has to mind."""
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,16 +27,22 @@ MOST_CONTACTS = 8  # of one whisker at one time: the nearest ones
 
 
 class Segments(NamedTuple):
-    """The straight parts of a whisker between which and an object contacts are sought.
+    """The parts of a whisker between which and an object contacts are sought.
+
+    The nearest place is sought along the chord; how far the arc is from there is taken to be a
+    parabola.
 
     Attributes:
         link: (segment,) on which it is.
         ends: (segment, 2, 3) in the link's frame, mm.
+        bows: (segment, 3) how far the resting curve is from the middle of the chord, in the link's
+            frame, mm.
         radii, arcs: (segment, 2) radii and arc lengths from the base at the ends, mm.
     """
 
     link: A
     ends: A
+    bows: A
     radii: A
     arcs: A
 
@@ -150,9 +157,12 @@ def find_near(
             if ends[s, 0, 0] == np.inf:
                 link = segments.link[s]
                 _place(segments.ends[s], pose.nodes[link], pose.frames[link], centre, ends[s])
-            bound = np.inf
+            bow = 0.0
+            for i in range(3):
+                bow += segments.bows[s, i] ** 2
+            bow, bound = math.sqrt(bow), np.inf
             for end in range(2):
-                ahead = -planes[s, p, 3] - rounding[p] - radii[s, end]
+                ahead = -planes[s, p, 3] - rounding[p] - radii[s, end] - bow
                 for i in range(3):
                     ahead += planes[s, p, i] * ends[s, end, i]
                 bound = min(bound, ahead)
@@ -177,8 +187,11 @@ def find_near(
                     scratch,
                     found,
                 )
-                t = found[1]
+                t, frame = found[1], pose.frames[segments.link[s]]
                 gap = found[0] - rounding[p] - radii[s, 0] * (1 - t) - radii[s, 1] * t
+                for i in range(3):
+                    for k in range(3):
+                        gap += found[2 + i] * frame[i, k] * segments.bows[s, k] * 4 * t * (1 - t)
                 reach[s, p] = gap + travelled
                 planes[s, p, 3], planes[s, p, 4] = found[5], travelled
                 for i in range(3):
@@ -213,6 +226,7 @@ def find_near(
                 near.points[slot, i] = pose.nodes[link, i] - now[s, 2 + i] * radius
                 for k in range(3):
                     at = segments.ends[s, 0, k] * (1 - t) + segments.ends[s, 1, k] * t
+                    at += segments.bows[s, k] * 4 * t * (1 - t)
                     near.points[slot, i] += pose.frames[link, i, k] * at
     return count
 
