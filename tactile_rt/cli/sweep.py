@@ -61,12 +61,15 @@ def sweep(
         return
     try:
         with starting():
+            from tactile_rt.sim_backend.arrays.files import load_animals
             from tactile_rt.sim_backend.datasets.dataset import (
                 describe_set,
                 finished_objects,
                 make_sweeps,
             )
             from tactile_rt.sim_backend.datasets.inventory import tally
+            from tactile_rt.sim_backend.remarks import ringing
+            from tactile_rt.sim_backend.world import PROFILES
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
     chosen = _override(
@@ -79,6 +82,8 @@ def sweep(
     if address is not None and engine != "ray":
         raise ConfigError("--address is that of a Ray cluster: give --engine ray, too")
     names = describe_set(chosen).names(splits)
+    if line := ringing(load_animals(chosen.array), PROFILES[chosen.profile]):
+        console.print(line)
     there = len(finished_objects(folder, names))
     made = make_sweeps(chosen, folder, processes or None, splits, engine, address)
     with progress_bar(console, "objects", len(names), there, counted=True) as update:

@@ -7,6 +7,7 @@ Everything is off by default, and what is off changes nothing. Each effect has a
 of its own, so that switching one on leaves the draws of the others as they were.
 """
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError
 
 __all__ = ["Sensor", "SensorModel"]
+
+log = logging.getLogger("tactile_rt.sim_backend")
 
 # Cross-talk between forces and moments needs a length to be a fraction: 10 mm, the ratio of the
 # published clipping limits of 10 mN m and 1 N (Chung et al. 2025).
@@ -140,7 +143,7 @@ class Sensor:
     """
 
     def __init__(self, model: SensorModel, spec: ArraySpec, seed: int | Sequence[int] = 0) -> None:
-        self._model = model
+        self._model, self._spec = model, spec
         seeds = np.random.SeedSequence(seed).spawn(len(EFFECTS))
         self._rng = {e: np.random.default_rng(s) for e, s in zip(EFFECTS, seeds, strict=True)}
 
@@ -236,6 +239,13 @@ class Sensor:
         on = self._resolution > 0
         values[..., on] = np.rint(values[..., on] / self._resolution[on]) * self._resolution[on]
         beyond = np.abs(values) > self._range
+        if not self.saturated and beyond.any():
+            element, channel = np.argwhere(beyond)[0, 1:]
+            log.warning(
+                "%s of %s is beyond the %g %s that the sensor can read",
+                self._spec.channels[channel], self._spec.elements[element],
+                self._range[channel], self._spec.units[channel],
+            )  # fmt: skip
         self.saturated += int(beyond.sum())
         values = np.where(beyond, np.copysign(self._range, values), values)
         return values.astype(np.float32)

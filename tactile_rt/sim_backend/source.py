@@ -9,6 +9,7 @@ sim:springs.toml?base_turns=true
 """
 
 import abc
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -19,6 +20,7 @@ import numpy as np
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, promised_object
 from tactile_rt.sim_backend.randomisation import Randomisation
+from tactile_rt.sim_backend.remarks import ringing
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation, usual_distance
 from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS, world_spec
@@ -26,6 +28,7 @@ from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStre
 
 __all__ = ["CHUNK_SAMPLES", "PACES", "PacedSource", "Pass", "SimOptions", "SimSource", "check_pace"]
 
+log = logging.getLogger("tactile_rt.sim_backend")
 CHUNK_SAMPLES: Final = 9
 PACES: Final = ("realtime", "fast")
 TURNS: Final = ("turn_y", "turn_z")
@@ -202,6 +205,9 @@ class SimSource(PacedSource):
         self._distance_mm = usual_distance(self._animals)
         self._sensor = Sensor(options, felt, options.seed)
         self.passes: list[Pass] = []
+        self._strained: set[str] = set()  # whiskers of which it has been told
+        if line := ringing(self._animals, PROFILES[options.profile]):
+            log.warning(line)
         self._sent = 0  # samples simulated so far
         self._rest = 0  # samples of rest still to deliver
         self._simulation: SweepSimulation | None = None
@@ -251,7 +257,18 @@ class SimSource(PacedSource):
                 turns = self._simulation.turns().astype(np.float32)
                 values = np.concatenate([values, turns], axis=2)
             self._left -= n
+            self._tell_of_strains(self._simulation)
         return self._stamp(values, start_ns)
+
+    def _tell_of_strains(self, simulation: SweepSimulation) -> None:
+        for name, (strain, limit) in simulation.strains().items():
+            if strain > limit and name not in self._strained:
+                self._strained.add(name)
+                log.warning(
+                    "whisker %s is bent to a strain of %.2g, more than its material bears (%g): it "
+                    "would stay bent or break",
+                    name, strain, limit,
+                )  # fmt: skip
 
     def _stamp(self, values: np.ndarray, start_ns: int) -> Chunk:
         seq = self._sent + np.arange(len(values), dtype=np.int64)

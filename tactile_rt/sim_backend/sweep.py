@@ -29,6 +29,7 @@ from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS
 from tactile_rt.sim_backend.mujoco_world import MujocoWorld, sweep_model
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
+from tactile_rt.sim_backend.remarks import strains
 from tactile_rt.sim_backend.world import SAMPLE_MS, Profile, engine_of
 from tactile_rt.stream import ConfigError
 
@@ -208,7 +209,7 @@ class SweepSimulation:
         self._simulated = np.flatnonzero(met | whole)
         self._elements = len(whiskers)
         self._animals, self._profile = animals, profile
-        felt = [whiskers[i] for i in self._simulated]
+        felt = self._felt = [whiskers[i] for i in self._simulated]
         self._names = {w.name for w in felt}
         touched = [lines[i] for i in self._simulated]
         kept = (
@@ -318,6 +319,18 @@ class SweepSimulation:
         turns = np.zeros((len(found), self._elements, 2))
         turns[:, self._simulated] = found
         return turns
+
+    def strains(self) -> dict[str, tuple[float, float]]:
+        """The strains of the whiskers whose limit is known, now, and their limits, by name."""
+        known = [
+            (w, x)
+            for w, x in zip(
+                self._felt,
+                strains(self._felt, self._profile.links, self._world.angles),
+                strict=True,
+            )
+        ]
+        return {w.name: (x, w.strain_limit) for w, x in known if w.strain_limit}
 
     def loads(self, samples_at_once: int = 50) -> Iterator[Floats]:
         """Advance in pieces until the object has passed."""

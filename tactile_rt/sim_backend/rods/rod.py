@@ -29,8 +29,8 @@ class Rod:
     Attributes:
         steps_per_sample: The number of steps in a sample.
         resonance_hz: The first resonance of the whisker on its mount, Hz.
-        damping_ratio: The damping ratio with which the first mode rings when stepped, that of the
-            mount included.
+        wanted_ratio: The damping ratio of the first mode, that of the mount included.
+        damping_ratio: The damping ratio with which it rings when stepped.
         chain: Its links and joints.
         segments: Its straight parts, for contacts.
         to_element: The (3, 3) rotation from the frame of the first link to that of the element.
@@ -38,6 +38,7 @@ class Rod:
 
     steps_per_sample: int
     resonance_hz: float
+    wanted_ratio: float
     damping_ratio: float
     chain: Chain
     segments: Segments
@@ -98,6 +99,7 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int, sample_ms: flo
     return Rod(
         steps_per_sample=steps,
         resonance_hz=resonance_hz,
+        wanted_ratio=float(ratios[0]),
         damping_ratio=ratio,
         chain=chain._replace(
             added=(onto * (heavier - 1)) @ onto.T, damping=(onto * drags) @ onto.T
