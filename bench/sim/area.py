@@ -14,7 +14,8 @@ from tactile_rt.evidence.records import Record
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
 from tactile_rt.sim_backend.source import REST_SAMPLES
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.sweep import Sweep
+from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile
 
 __all__ = ["BULLET_CPU_S", "SWEEPS", "cost", "run", "simulate"]

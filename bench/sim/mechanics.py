@@ -14,7 +14,8 @@ from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import FRICTION
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.objects.solids import box
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.sweep import Sweep
+from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import MOUNT, PROFILES, Profile
 
 __all__ = ["HEARD_HZ", "drift", "mechanics"]

@@ -73,7 +73,8 @@ def view(
         with starting():
             from tactile_rt.sim_backend.arrays.files import load_animals
             from tactile_rt.sim_backend.objects.catalogue import load_object
-            from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, usual_distance
+            from tactile_rt.sim_backend.sweep import Sweep, usual_distance
+            from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
             from tactile_rt.sim_backend.views.camera import VIEWS
             from tactile_rt.sim_backend.views.film import Film, camera_of
             from tactile_rt.sim_backend.views.footage import record

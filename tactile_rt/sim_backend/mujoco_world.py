@@ -83,7 +83,7 @@ def sweep_model(
 
 
 class MujocoWorld:
-    """See `sweep.World`.
+    """See `sweep_simulation.World`.
 
     Args:
         model: a `sweep_model`.
@@ -119,7 +119,7 @@ class MujocoWorld:
     def advance(
         self, way: Floats, look_every: int = 0, shaken: Floats | None = None
     ) -> tuple[Floats, Floats]:
-        """See `sweep.World`; the head stands still."""
+        """See `sweep_simulation.World`; the head stands still."""
         assert shaken is None
         model, data, steps = self._model, self._data, self._steps
         samples = len(way) - 1

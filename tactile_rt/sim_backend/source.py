@@ -22,8 +22,9 @@ from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, 
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.remarks import ringing
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_simulation, usual_distance
-from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS, world_spec
+from tactile_rt.sim_backend.sweep import Sweep, usual_distance
+from tactile_rt.sim_backend.sweep_simulation import SweepSimulation, draw_simulation
+from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS, engine_of, world_spec
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStream, Source
 
 __all__ = ["CHUNK_SAMPLES", "PACES", "PacedSource", "Pass", "SimOptions", "SimSource", "check_pace"]
@@ -145,6 +146,8 @@ class SimOptions(SensorModel, Randomisation):
         Randomisation.__post_init__(self)
         if self.profile not in PROFILES:
             raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
+        if self.head_moves and engine_of(PROFILES[self.profile]) == "mujoco":
+            raise ConfigError("head_moves: MuJoCo's world has a head that stands still")
         check_pace(self.pace)
         Sweep(**self.chosen)
         if self.sweeps < 0 or self.repeat < 1:

@@ -1,50 +1,25 @@
-"""An object swept past the array: the world, the motion, the base loads at 1 kHz.
+"""How an object is swept past an array, and how that is drawn.
 
 World frame: z up, x away from the head, y rostral; its origin is where the published sweeps have
 it (see `whisker_array.MOUNT`). The object moves along -y, as things do past a head that moves
 forward.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from functools import cache, cached_property
+from functools import cache
 from types import MappingProxyType
-from typing import Protocol
 
-import mujoco
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.approach import (
-    centrelines,
-    faces_right,
-    lateral_reach,
-    way_to_contact,
-    within_reach,
-)
+from tactile_rt.sim_backend.approach import lateral_reach
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import rotation
-from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS
-from tactile_rt.sim_backend.mujoco_world import MujocoWorld, sweep_model
-from tactile_rt.sim_backend.objects.catalogue import TactileObject
-from tactile_rt.sim_backend.remarks import strains
-from tactile_rt.sim_backend.world import SAMPLE_MS, Profile, engine_of
 from tactile_rt.stream import ConfigError
 
-__all__ = [
-    "Sweep",
-    "SweepSimulation",
-    "World",
-    "draw_simulation",
-    "draw_sweep",
-    "usual_distance",
-]
-
-FAR_MM = 200.0  # where the object is when the way to first contact is measured
-DRAWS = 20  # tries to draw parameters with which an object meets the array at all
-CLEAR_MM = 5.0  # how far past the last whisker a sweep goes on
+__all__ = ["NOTHING", "Sweep", "draw_sweep", "usual_distance"]
 
 NOTHING: Mapping[str, float] = MappingProxyType({})
 
@@ -125,219 +100,6 @@ LIMITS = {
 }
 
 
-class World(Protocol):
-    """What steps whiskers while an object goes by."""
-
-    @property
-    def angles(self) -> Floats:
-        """(joint,) angles of all whiskers' hinges, rad, in the order of `sweep_model`'s."""
-
-    @property
-    def turns(self) -> Floats:
-        """(sample, whisker, 2) turns of the bases in the samples of the last `advance`, rad."""
-
-    def advance(
-        self, way: Floats, look_every: int = 0, shaken: Floats | None = None
-    ) -> tuple[Floats, Floats]:
-        """Simulate some samples of 1 ms.
-
-        Args:
-            way: (sample + 1, 3) where the object is at the beginning of each sample and at the end
-                of the last, mm.
-            look_every: look for contacts at every so many samples; 0: not at all. An engine that
-                knows them anyway gives those of every sample.
-            shaken: (sample, 3) acceleration of the head, mm/ms^2, in the world; the object's way is
-                then relative to the head. None: it is not accelerated.
-
-        Returns:
-            (sample, whisker, 6) loads, N and N m, and (sample, whisker, 3) contacts, see
-            `contacts.CONTACT_CHANNELS`.
-
-        Raises:
-            SourceError: the simulation has become unstable.
-        """
-
-
-class SweepSimulation:
-    """One sweep, simulated on demand: `advance` steps it, `loads` runs it to its end.
-
-    Whiskers do not touch each other, so those that the object passes by stay at rest and are not
-    simulated, nor are pieces of the object that no whisker could reach.
-
-    Args:
-        array: the whiskers; a tuple of arrays for several animals in one world
-            (`whisker_array.place`). The object passes on the side to which most of the whiskers
-            reach.
-        target: the object.
-        sweep: how it moves.
-        profile: how finely to simulate.
-        whole: simulate everything all the same: the loads are those, and a picture is complete.
-
-    Attributes:
-        touches: False when the object passes without meeting any resting whisker.
-        duration_ms: The simulated time after which the object has passed all whiskers, ms.
-    """
-
-    def __init__(
-        self,
-        array: WhiskerArray | tuple[WhiskerArray, ...],
-        target: TactileObject,
-        sweep: Sweep,
-        profile: Profile,
-        whole: bool = False,
-    ) -> None:
-        animals = array if isinstance(array, tuple) else (array,)
-        whiskers = [w for animal in animals for w in animal.whiskers]
-        straight = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
-        outward = faces_right(animals, straight)
-        # All that follows is in the frame in which the object goes along -y.
-        across = sweep.across
-        lines = [line @ across.T for line in straight]
-        turned = [piece.vertices * sweep.size_mm @ sweep.turn.T for piece in target.pieces]
-        shape = [points @ across.T for points in turned]
-        start = _beside(lines, outward, np.concatenate(shape), sweep)
-        pieces = [
-            trimesh.Trimesh(points + start, piece.faces, process=False)
-            for points, piece in zip(shape, target.pieces, strict=True)
-        ]
-        way, met = way_to_contact(whiskers, lines, pieces)
-        self.touches = bool(np.isfinite(way))
-        if not self.touches:
-            front = min(points[:, 1].min() for points in shape)
-            way = FAR_MM + front - max(line[:, 1].max() for line in lines)
-        start[1] += sweep.gap_mm - way
-        self._simulated = np.flatnonzero(met | whole)
-        self._elements = len(whiskers)
-        self._animals, self._profile = animals, profile
-        felt = self._felt = [whiskers[i] for i in self._simulated]
-        self._names = {w.name for w in felt}
-        touched = [lines[i] for i in self._simulated]
-        kept = (
-            range(len(pieces)) if whole else within_reach(touched, [w.length for w in felt], pieces)
-        )
-        self._pieces = [
-            trimesh.Trimesh(turned[i], target.pieces[i].faces, process=False) for i in kept
-        ]
-        self._sweep, self._start, self._ahead = sweep, across.T @ start, across.T @ (0, -1, 0)
-        self._samples = 0
-        self._world: World
-        if engine_of(profile) == "rods":
-            # Where it is missing, MuJoCo steps the array.
-            from tactile_rt.sim_backend.rods.world import Piece, RodWorld
-
-            steps = round(SAMPLE_MS / profile.timestep_ms)
-            roots = _roots(animals)[self._simulated]
-            parts = [Piece.of(piece) for piece in self._pieces]
-            self._world = RodWorld(felt, roots, parts, profile.links, steps)
-        else:
-            if sweep.head_moves:
-                raise ConfigError("head_moves: MuJoCo's world has a head that stands still")
-            self._world = MujocoWorld(self.model, felt, profile, self._start)
-
-        rear = start[1] + max(points[:, 1].max() for points in shape)
-        last = min(line[:, 1].min() for line in lines)
-        # with a ramp it has gone half as far by its end
-        whole = (rear - last + CLEAR_MM) / (sweep.speed_mm_s * 1e-3)
-        self.duration_ms = float(whole + sweep.ramp_ms / 2)
-
-    @cached_property
-    def model(self) -> mujoco.MjModel:
-        """The MuJoCo model of the sweep, also where another engine steps it: for pictures."""
-        return sweep_model(self._animals, self._names, self._pieces, self._profile)
-
-    def show(self, data: mujoco.MjData) -> None:
-        """Put the whiskers and the object of a `model` where they are now."""
-        data.qpos[:] = self._world.angles
-        data.mocap_pos[0] = self._place(np.array([self._samples]))[0]
-        data.time = self._samples * SAMPLE_MS
-
-    def advance(self, samples: int) -> Floats:
-        """Simulate the next samples of 1 ms.
-
-        Returns:
-            (samples, element, 6) base loads, N and N m, each the mean over its millisecond.
-
-        Raises:
-            SourceError: the simulation has become unstable: whiskers too stiff for the profile
-                jam against the object.
-        """
-        return self._advance(samples, 0)[0]
-
-    def advance_with_contacts(self, samples: int, every: int = 1) -> tuple[Floats, Floats]:
-        """As `advance`, and where each whisker touches.
-
-        Args:
-            samples: as for `advance`.
-            every: where looking costs as much as a step, look only at every so many samples, from
-                the first, and take what is seen to last until the next look.
-
-        Returns:
-            The loads, and (samples, element, 3) contacts, see `contacts.CONTACT_CHANNELS`.
-
-        Raises:
-            SourceError: as `advance`.
-        """
-        return self._advance(samples, every)
-
-    def _advance(self, samples: int, look_every: int) -> tuple[Floats, Floats]:
-        loads = np.zeros((samples, self._elements, 6))
-        contacts = np.zeros((samples, self._elements, len(CONTACT_CHANNELS)))
-        way = self._place(self._samples + np.arange(samples + 1))
-        self._samples += samples
-        if len(self._simulated):
-            found = self._world.advance(way, look_every, self._shaken(samples))
-            loads[:, self._simulated], contacts[:, self._simulated] = found
-        return loads, contacts
-
-    def _place(self, samples: NDArray[np.int64]) -> Floats:
-        """(n, 3) where the object is after so many samples, mm, from the head."""
-        t, ramp = samples * SAMPLE_MS, self._sweep.ramp_ms
-        way = np.asarray(t, dtype=np.float64)
-        if ramp:
-            x = np.minimum(t / ramp, 1.0)
-            way = np.maximum(t - ramp, 0.0) + ramp * (x**3 - x**4 / 2)
-        place: Floats = self._start + (self._sweep.speed_mm_s * 1e-3 * way)[:, None] * self._ahead
-        return place
-
-    def _shaken(self, samples: int) -> Floats | None:
-        """(n, 3) acceleration of the head in the samples just begun, mm/ms^2; None: it has none."""
-        ramp = self._sweep.ramp_ms
-        first = (self._samples - samples) * SAMPLE_MS
-        if not self._sweep.head_moves or first >= ramp:
-            return None
-        x = np.minimum((first + (np.arange(samples) + 0.5) * SAMPLE_MS) / ramp, 1.0)
-        # the head goes against the object's way: of x^3 - x^4 / 2, the second derivative
-        rate = self._sweep.speed_mm_s * 1e-3 * (6 * x - 6 * x**2) / ramp
-        return np.outer(rate, -self._ahead)
-
-    def turns(self) -> Floats:
-        """(sample, element, 2) turns of bases that give, about the elements' y and z, rad.
-
-        Of the samples of the last `advance`, means; zero of mounts that do not give.
-        """
-        found = self._world.turns
-        turns = np.zeros((len(found), self._elements, 2))
-        turns[:, self._simulated] = found
-        return turns
-
-    def strains(self) -> dict[str, tuple[float, float]]:
-        """The strains of the whiskers whose limit is known, now, and their limits, by name."""
-        known = [
-            (w, x)
-            for w, x in zip(
-                self._felt,
-                strains(self._felt, self._profile.links, self._world.angles),
-                strict=True,
-            )
-        ]
-        return {w.name: (x, w.strain_limit) for w, x in known if w.strain_limit}
-
-    def loads(self, samples_at_once: int = 50) -> Iterator[Floats]:
-        """Advance in pieces until the object has passed."""
-        while self._samples * SAMPLE_MS < self.duration_ms:
-            yield self.advance(samples_at_once)
-
-
 def usual_distance(animals: tuple[WhiskerArray, ...]) -> float:
     """A mouse's 6.5 mm, for other arrays as much more as their whiskers reach further, mm.
 
@@ -372,53 +134,3 @@ def draw_sweep(
         "gap_mm": float(rng.uniform(0.5, 4)),
     }
     return Sweep(**{**drawn, **chosen})
-
-
-def draw_simulation(
-    rng: np.random.Generator,
-    array: WhiskerArray | tuple[WhiskerArray, ...],
-    target: TactileObject,
-    profile: Profile,
-    distance_mm: float = Sweep.distance_mm,
-    chosen: Mapping[str, float] = NOTHING,
-) -> tuple[Sweep, SweepSimulation]:
-    """Draw sweeps until the object meets the array; give up, with a miss, after many tries.
-
-    Args:
-        rng, distance_mm, chosen: see `draw_sweep`.
-        array, target, profile: see `SweepSimulation`.
-    """
-    for _ in range(DRAWS):
-        sweep = draw_sweep(rng, distance_mm, chosen)
-        simulation = SweepSimulation(array, target, sweep, profile)
-        if simulation.touches:
-            break
-    return sweep, simulation
-
-
-def _beside(
-    lines: Sequence[Floats], outward: NDArray[np.bool_], shape: Floats, sweep: Sweep
-) -> Floats:
-    """Where the object's centre is far up the y axis, mm, on the side that whiskers reach to."""
-    bases = np.array([line[0, 0] for line in lines])
-    right = 2 * outward.sum() >= len(lines)
-    face = bases[outward == right].mean()
-    nearest = shape[:, 0].min() if right else shape[:, 0].max()
-    x = face + (sweep.distance_mm if right else -sweep.distance_mm) - nearest
-    return np.array([x, FAR_MM, sweep.height_mm])
-
-
-def _roots(animals: Sequence[WhiskerArray]) -> Floats:
-    """(whisker, 4, 3) base points, mm, and the elements' frames, both in the world."""
-    return np.array(
-        [
-            np.concatenate(
-                [
-                    [a.mount.rotation @ w.base + np.array(a.mount.position)],
-                    a.mount.rotation @ w.orientation,
-                ]
-            )
-            for a in animals
-            for w in a.whiskers
-        ]
-    )

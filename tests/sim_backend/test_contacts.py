@@ -26,7 +26,8 @@ from tactile_rt.sim_backend.datasets.recipes import (
     SweepRecipe,
 )
 from tactile_rt.sim_backend.objects.catalogue import make_object
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.sweep import Sweep
+from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES
 from tactile_rt.stream import ConfigError, RecordingError
 from tactile_rt.sweep_set import SweepManifest, contacts_of, read_object, read_sweeps

@@ -22,7 +22,8 @@ from tactile_rt.sim_backend.objects.catalogue import (
     make_object,
 )
 from tactile_rt.sim_backend.objects.solids import box
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation, draw_sweep, usual_distance
+from tactile_rt.sim_backend.sweep import Sweep, draw_sweep, usual_distance
+from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import (
     MOUNT,
     OBJECT_BIT,

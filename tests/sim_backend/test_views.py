@@ -16,7 +16,8 @@ from PIL import Image
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.objects.catalogue import make_object
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.sweep import Sweep
+from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.views.camera import VIEWS, Camera, framing
 from tactile_rt.sim_backend.views.film import Film, camera_of
 from tactile_rt.sim_backend.views.footage import Footage, record

@@ -29,7 +29,7 @@ from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObj
 from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
-from tactile_rt.sim_backend.sweep import SweepSimulation
+from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, world_spec
 from tactile_rt.stream import Chunk, ConfigError, SourceError, TactileError
 from tactile_rt.sweep_set import (

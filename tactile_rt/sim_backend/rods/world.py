@@ -118,7 +118,7 @@ class RodWorld:
     def advance(
         self, way: Floats, look_every: int = 0, shaken: Floats | None = None
     ) -> tuple[Floats, Floats]:
-        """See `sweep.World`; loads and contacts are means over each sample.
+        """See `sweep_simulation.World`; loads and contacts are means over each sample.
 
         Args:
             way, look_every: see there.

@@ -21,7 +21,8 @@ from tactile_rt.sim_backend.rods.chains import Pose, place
 from tactile_rt.sim_backend.rods.rod import make_rod
 from tactile_rt.sim_backend.rods.touching import Contacts, Object, Seen, find_near
 from tactile_rt.sim_backend.rods.world import Piece, RodWorld
-from tactile_rt.sim_backend.sweep import Sweep, SweepSimulation
+from tactile_rt.sim_backend.sweep import Sweep
+from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES, Profile
 
 Floats = NDArray[np.float64]
