@@ -19,7 +19,7 @@ from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.evidence.model_steps import Subject
 from tactile_rt.export.onnx_step import OPSET, step_graph, write_model
 from tactile_rt.export.precision import Precision
-from tactile_rt.models.datasets import STEPS, SUBSTEPS, channel_values
+from tactile_rt.models.datasets import MOUSE, channel_values
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.training import TactileClassifier
 from tactile_rt.stream import ArraySpec
@@ -84,8 +84,8 @@ def random_model(
         name=name,
         spec=spec.to_json(),
         period_ns=PERIOD_NS,
-        substeps=SUBSTEPS,
-        steps=STEPS,
+        substeps=MOUSE.substeps,
+        steps=MOUSE.steps,
         labels=tuple(f"class {i}" for i in range(config.classes)),
         state=(),
         clip=tuple(model.inputs.clip.tolist()),

@@ -37,7 +37,7 @@ from tactile_rt.export.precision import Precision, in_precision
 from tactile_rt.export.streaming import streaming
 from tactile_rt.export.windows import window_graph
 from tactile_rt.models.data_checks import trained_on
-from tactile_rt.models.datasets import STEPS, SUBSTEPS, channel_values
+from tactile_rt.models.datasets import channel_values
 from tactile_rt.models.training import TactileClassifier, load_checkpoint
 from tactile_rt.stream import ModelError
 from tactile_rt.sweep_set import SweepManifest
@@ -60,7 +60,7 @@ PARITY_BAR = 1e-5  # largest difference of logits between the file and the torch
 
 
 class StreamingStep(nn.Module):
-    """One 45 ms step of a classifier with its state as arguments and results.
+    """One step of a classifier with its state as arguments and results.
 
     Args:
         model: as trained.
@@ -117,8 +117,8 @@ def export_checkpoint(
         name=name,
         spec=saved["spec"],
         period_ns=manifest.period_ns,
-        substeps=SUBSTEPS,
-        steps=STEPS,
+        substeps=model.timing.substeps,
+        steps=model.timing.steps,
         labels=manifest.categories,
         state=(),
         clip=tuple(model.inputs.clip.tolist()),

@@ -10,10 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from tactile_rt.models.datasets import SUBSTEPS, channel_values
+from tactile_rt.models.datasets import Timing, channel_values
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.inputs import InputStage
-from tactile_rt.stream import ArraySpec, ModelError
+from tactile_rt.stream import ArraySpec, ConfigError, ModelError
 
 __all__ = [
     "CLIP",
@@ -37,6 +37,9 @@ class TactileClassifier(nn.Module):
     Args:
         spec: the array.
         network: the EAD's configuration.
+
+    Raises:
+        ConfigError: the network is for another array.
     """
 
     def __init__(self, spec: ArraySpec, network: EADConfig) -> None:
@@ -47,7 +50,21 @@ class TactileClassifier(nn.Module):
             channel_values(spec, CLIP).tolist(),
             channel_values(spec, SCALE).tolist(),
         )
+        channels, *grid = network.frame
+        if tuple(grid) != tuple(spec.grid_shape) or channels % len(spec.channels):
+            found = " x ".join(map(str, network.frame))
+            rows, columns = spec.grid_shape
+            raise ConfigError(
+                f"a network for frames of {found} (channels x rows x columns) does not fit an "
+                f"array of {len(spec.channels)} channels on {rows} x {columns} cells"
+            )
         self.network = EAD(network)
+
+    @property
+    def timing(self) -> Timing:
+        """How the windows are cut that it takes."""
+        config = self.network.config
+        return Timing(config.max_steps, config.frame[0] // len(self.inputs.clip))
 
     def forward(self, samples: Tensor, offset: Tensor, sigma: Tensor) -> Tensor:
         """(batch, step, sub-step, element, channel) SI -> logits (batch, step, class)"""
@@ -55,13 +72,13 @@ class TactileClassifier(nn.Module):
         return logits
 
     def features(self, frames: Tensor) -> Tensor:
-        """(batch, step, 30, row, column) -> (batch, step, feature): encoder and attender."""
+        """(batch, step, channel, row, column) -> (batch, step, feature): encoder and attender."""
         return self.network.features(frames)
 
     @torch.no_grad()
     def feature_size(self) -> int:
         """How many features a step has; the attender may change the encoder's number."""
-        frame = torch.zeros(1, 1, SUBSTEPS * len(self.inputs.clip), *self.inputs.shape)
+        frame = torch.zeros(1, 1, *self.network.config.frame)
         mode = self.training
         size = self.eval().features(frame.to(self.inputs.clip)).shape[-1]
         self.train(mode)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tactile_rt.models.datasets import STEPS, SUBSTEPS, SweepSet
+from tactile_rt.models.datasets import SweepSet
 from tactile_rt.stream import ArraySpec, RecordingError, SpecMismatch
 from tactile_rt.sweep_set import WITHHELD, SweepManifest, object_path
 
@@ -92,10 +92,10 @@ def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
     seen: dict[bytes, tuple[str, int]] = {}
     for number, data in enumerate(sets):
         sweeps, classes = data.sweeps, len(data.manifest.categories)
-        if sweeps.values.shape[1] < STEPS * SUBSTEPS:
+        if sweeps.values.shape[1] < data.timing.samples:
             raise RecordingError(
                 f"{folder}: sweeps of {sweeps.values.shape[1]} samples are shorter than a window "
-                f"of {STEPS * SUBSTEPS}"
+                f"of {data.timing.samples}"
             )
         wrong = np.flatnonzero((sweeps.labels < 0) | (sweeps.labels >= classes))
         if len(wrong):

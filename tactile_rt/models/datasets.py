@@ -20,18 +20,19 @@ from tactile_rt.stream import ArraySpec, ConfigError
 from tactile_rt.sweep_set import SweepManifest, Sweeps, read_sweeps
 
 __all__ = [
+    "MOUSE",
     "RATED_NOISE",
-    "STEPS",
-    "SUBSTEPS",
     "Onsets",
     "SweepSet",
+    "Timing",
     "TrainingBatches",
     "channel_values",
     "find_onsets",
+    "frame_of",
     "windows",
 ]
 
-STEPS, SUBSTEPS = 22, 5  # 22 steps of 45 ms, each of five 9 ms samples (Chung et al. 2025)
+STEPS, STEP_MS = 22, 45.0  # of a window (Chung et al. 2025)
 RATED_NOISE = {"N": 10e-6, "N m": 5e-8}  # sensor noise per sample, one standard deviation, SI
 NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0)  # of the rated noise, at which training finds onsets
 CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others are in between
@@ -50,6 +51,36 @@ def channel_values(spec: ArraySpec, table: dict[str, float]) -> NDArray[np.float
     if unknown:
         raise ConfigError(f"channels in {', '.join(unknown)} cannot be learnt from yet")
     return np.array([table[u] for u in spec.units], dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How a window is cut: into steps, each of so many samples.
+
+    Attributes:
+        steps: The number of steps of a window, after each of which there is a decision.
+        substeps: The number of samples of a step.
+    """
+
+    steps: int = STEPS
+    substeps: int = 5
+
+    @classmethod
+    def of(cls, period_ns: int) -> "Timing":
+        """For samples so far apart: steps as near to the paper's 45 ms as whole samples come."""
+        return cls(substeps=max(1, round(STEP_MS * 1e6 / period_ns)))
+
+    @property
+    def samples(self) -> int:
+        """The number of samples of a window."""
+        return self.steps * self.substeps
+
+
+def frame_of(manifest: SweepManifest) -> tuple[int, int, int]:
+    """Channels, rows and columns of what a network sees of a sweep set's array in a step."""
+    spec = manifest.spec
+    rows, columns = spec.grid_shape
+    return Timing.of(manifest.period_ns).substeps * len(spec.channels), rows, columns
 
 
 @dataclass(frozen=True)
@@ -76,6 +107,11 @@ class SweepSet:
             channel_values(manifest.spec, CHANNEL_FLOOR),
         )
 
+    @property
+    def timing(self) -> Timing:
+        """How its windows are cut."""
+        return Timing.of(self.manifest.period_ns)
+
     @cached_property
     def noisy_starts(self) -> NDArray[np.int64]:
         """(level, sweep) onsets with noise of each of `NOISE_LEVELS`; -1 where none was found."""
@@ -88,17 +124,22 @@ class SweepSet:
         return np.concatenate(starts, axis=1)
 
 
+MOUSE = Timing()  # 22 steps of five 9 ms samples
+
+
 def windows(
-    values: NDArray[np.float32], start: NDArray[np.int64], steps: int = STEPS
+    values: NDArray[np.float32], start: NDArray[np.int64], timing: Timing = MOUSE
 ) -> NDArray[np.float32]:
     """Cut (sweep, step, sub-step, element, channel) windows that begin at `start` (sweep,).
 
     A window that reaches past the sweep's end repeats its last sample.
     """
-    samples = start[:, None] + np.arange(steps * SUBSTEPS)
+    samples = start[:, None] + np.arange(timing.samples)
     samples = np.clip(samples, 0, values.shape[1] - 1)
     cut = values[np.arange(len(values))[:, None], samples]
-    shaped: NDArray[np.float32] = cut.reshape(len(values), steps, SUBSTEPS, *values.shape[2:])
+    shaped: NDArray[np.float32] = cut.reshape(
+        len(values), timing.steps, timing.substeps, *values.shape[2:]
+    )
     return shaped
 
 
@@ -155,7 +196,7 @@ class TrainingBatches:
         level = _noise_levels(n, rng)
         nearest = np.abs(level[:, None] - np.array(NOISE_LEVELS)).argmin(axis=1)
         start = self._starts[nearest, at] + rng.integers(-JITTER, JITTER + 1, n)
-        samples = windows(data.sweeps.values[at], start)
+        samples = windows(data.sweeps.values[at], start, data.timing)
         gain = 1 + GAIN_ERROR * rng.normal(size=(n, 1, 1, elements, 1)).astype(np.float32)
         alive = rng.random((n, 1, 1, elements, 1)) >= DROPOUT
         samples = samples * (gain * alive)

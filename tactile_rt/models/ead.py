@@ -1,9 +1,10 @@
 """Encoder-Attender-Decoder: what an array of whiskers touches, decided anew at every step.
 
     normalised frames -> encoder -> attender -> decoder -> logits
-    (batch, step, 30, 5, 7)   (batch, step, feature)   (batch, step, class)
+    (batch, step, channel, row, column) -> (batch, step, feature) -> (batch, step, class)
 
-The 30 channels are 5 sub-steps x 6 loads, the 5 x 7 cells the whiskers' grid.
+The channels are those of all sub-steps of a step, rows and columns the array's grid: 5 sub-steps
+x 6 loads on 5 x 7 cells for the mouse's whiskers of the paper.
 
 `EAD.forward` takes a whole window for training; `EAD.step` takes one frame and explicit state,
 for streaming, and gives the same logits. The logits of a step use no later frame.
@@ -17,8 +18,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from tactile_rt.models import attenders, decoders
+from tactile_rt.models.encoders import MOUSE_FRAME
 from tactile_rt.models.encoders.cells import CELLS
 from tactile_rt.stream import ConfigError
 
@@ -68,6 +71,7 @@ class EADConfig:
     dropout: float = 0.1
     max_steps: int = 22  # an episode; the GPT's positions end here
     graph: str = ""  # of encoder "graph": the text of a TOML file, see `encoders.graph_files`
+    frame: tuple[int, int, int] = MOUSE_FRAME  # channels, rows and columns of what it reads
 
     def __post_init__(self) -> None:
         for field, known in (
@@ -89,6 +93,9 @@ class EADConfig:
             raise ConfigError(f"dropout is {self.dropout}, must be in [0, 1)")
         if not 1 <= self.max_steps <= attenders.MAX_STEPS:
             raise ConfigError(f"max_steps is {self.max_steps}, must be 1 to {attenders.MAX_STEPS}")
+        object.__setattr__(self, "frame", tuple(self.frame))  # a list, from JSON
+        if len(self.frame) != 3 or min(self.frame) < 1:
+            raise ConfigError(f"frame is {self.frame}, must be channels, rows and columns")
         if bool(self.graph) != (self.encoder == "graph"):
             raise ConfigError("graph must be given with encoder 'graph', and only then")
 
@@ -108,6 +115,7 @@ class EAD(nn.Module):
         super().__init__()
         self.config = config
         self.encoder: Any = _encoder(config)
+        self._alone = _alone(config)
         self.lag: int = self.encoder.lag
         width: int = self.encoder.features
         self.attender: attenders.GPT | attenders.MambaAttender | attenders.NoAttender
@@ -125,12 +133,13 @@ class EAD(nn.Module):
         )
 
     def features(self, frames: Tensor, *others: Tensor) -> Tensor:
-        """What the decoder reads. frames (batch, step, 30, 5, 7) -> (batch, step, feature)"""
+        """What the decoder reads of frames, (batch, step, feature)."""
+        frames = F.pad(frames, (0, 1)) if self._alone else frames
         features: Tensor = self.attender(self.encoder(frames, *others))
         return features
 
     def forward(self, frames: Tensor, *others: Tensor) -> Tensor:
-        """frames (batch, step, 30, 5, 7) -> logits (batch, step, class)"""
+        """frames (batch, step, channel, row, column) -> logits (batch, step, class)"""
         logits: Tensor = self.decoder(self.features(frames, *others))
         if self.config.readout == "last":
             return logits
@@ -156,11 +165,12 @@ class EAD(nn.Module):
     def step(
         self, frame: Tensor, state: dict[str, Tensor], *others: Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One 45 ms step. frame (batch, 30, 5, 7) -> logits (batch, class), the next state.
+        """One step: frame (batch, channel, row, column) to logits (batch, class), the next state.
 
         A lane is reset by putting its rows of `initial_state` back.
         """
         index = state["index"]
+        frame = F.pad(frame, (0, 1)) if self._alone else frame
         features, encoder = self.encoder.step(frame, index, state, *others)  # (batch, feature)
         features, attender = self.attender.step(features, index, state)
         logits, decoder = self.decoder.step(features, index, state)  # (batch, class)
@@ -179,10 +189,25 @@ def _encoder(config: EADConfig) -> Any:
     if config.encoder == "graph":
         from tactile_rt.models.encoders.graph_files import parse_graph
 
-        return kind(parse_graph(config.graph).scaled(config.width))
+        graph = parse_graph(config.graph)
+        first = graph.inputs[0]
+        if (found := (first.channels, first.rows, first.columns)) != config.frame:
+            sizes = (" x ".join(map(str, size)) for size in (found, config.frame))
+            raise ConfigError(
+                "the graph's {} has {} channels, rows and columns, the array's frames "
+                "{}: change the graph".format(first.name, *sizes)
+            )
+        return kind(graph.scaled(config.width))
     if config.encoder.startswith("zhuang-"):
-        return kind(config.width, cell=config.encoder.removeprefix("zhuang-"))
-    return kind(config.width)
+        channels, rows, columns = config.frame
+        frame = (channels, rows, columns + int(_alone(config)))
+        return kind(config.width, config.encoder.removeprefix("zhuang-"), frame)
+    return kind(config.width, config.frame)
+
+
+def _alone(config: EADConfig) -> bool:
+    """Whether a single cell gets a silent one beside it: convolutions need a map."""
+    return config.encoder.startswith("zhuang-") and config.frame[1:] == (1, 1)
 
 
 def count_parameters(module: nn.Module) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import fuse
-from tactile_rt.models.datasets import STEPS, SweepSet, channel_values, windows
+from tactile_rt.models.datasets import SweepSet, channel_values, windows
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.stream import ConfigError
 
@@ -150,7 +150,7 @@ def predict(
     for i in range(0, len(data.sweeps), batch):
         values = disturbance.of_samples(data.sweeps.values[i : i + batch], data, rng)
         found = find_onsets(values, data.floor)
-        cut = disturbance.of_windows(windows(values, found.start, STEPS), data, rng)
+        cut = disturbance.of_windows(windows(values, found.start, data.timing), data, rng)
         logits = run(cut, found.offset, found.sigma)
         posterior = np.exp(logits - logits.max(axis=-1, keepdims=True))
         posterior /= posterior.sum(axis=-1, keepdims=True)

@@ -23,7 +23,6 @@ from torch.nn import functional as F
 
 from tactile_rt.models.augmentation import Augmentation, Loads
 from tactile_rt.models.checkpoints import TactileClassifier
-from tactile_rt.models.datasets import SUBSTEPS
 
 __all__ = [
     "Autoencoder",
@@ -231,7 +230,7 @@ class Autoencoder(Objective):
             model.feature_size(),
             _scaled(WIDE, network.config.width),
             _scaled(NARROW, network.config.width),
-            network.config.max_steps * SUBSTEPS * len(inputs.clip),
+            network.config.max_steps * network.config.frame[0],
         )
         rows, columns = (_kernels(cells) for cells in inputs.shape)
         self.decoder = nn.Sequential(

@@ -69,7 +69,7 @@ def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
     tried = [
         FittedSVM(
             fit(x[usable], train.sweeps.labels[usable], c),
-            "same onsets, tare, clipping and signed log; 22 steps of mean load; "
+            f"same onsets, tare, clipping and signed log; {train.timing.steps} steps of mean load; "
             f"C = {c:g} of {', '.join(f'{p:g}' for p in PENALTIES)} by validation",
         )
         for c in PENALTIES
@@ -86,7 +86,7 @@ def _features(data: "SweepSet") -> tuple[NDArray[np.float32], NDArray[np.bool_]]
     spec = data.manifest.spec
     clip, scale = channel_values(spec, CLIP), channel_values(spec, SCALE)
     found = find_onsets(data.sweeps.values, data.floor)
-    cut = windows(data.sweeps.values, found.start) - found.offset[:, None, None]
+    cut = windows(data.sweeps.values, found.start, data.timing) - found.offset[:, None, None]
     cut = np.clip(cut, -clip, clip)  # (sweep, step, sub-step, element, channel) SI
     cut = np.sign(cut) * np.log1p(np.abs(cut) / scale)
     return cut.mean(axis=2).reshape(len(cut), -1), found.start >= 0

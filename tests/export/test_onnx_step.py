@@ -5,6 +5,7 @@ from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import onnxruntime
 import pytest
@@ -30,13 +31,14 @@ from tactile_rt.export.onnx_step import (
     file_logits,
     parity,
 )
-from tactile_rt.models.datasets import STEPS, SUBSTEPS, find_onsets, windows
+from tactile_rt.models.datasets import MOUSE, find_onsets, windows
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.training import TactileClassifier
 from tactile_rt.stream import ArraySpec, ModelError
 from tactile_rt.sweep_set import SweepManifest
 from tactile_rt.testing import cut
 
+STEPS, SUBSTEPS = MOUSE.steps, MOUSE.substeps
 PERIOD_NS = 9_000_000
 CATEGORIES = ("bowl", "car", "lamp", "mug")
 UNITS = ("N", "N", "N", "N m", "N m", "N m")
@@ -92,7 +94,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
     saved = {
         "model": model.state_dict(),
         "config": {"data": str(folder / "set"), "epochs": 0},
-        "network": asdict(NETWORK),
+        "network": msgspec.to_builtins(NETWORK),
         "spec": SPEC.to_json(),
     }
     torch.save(saved, checkpoint)

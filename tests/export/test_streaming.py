@@ -174,6 +174,6 @@ def test_maps_of_one_row_have_no_site_below() -> None:
     kind = "dense"
     reads = ["a"]
     """
-    ead = build("graph", "none", graph=graph, width=1.0)
+    ead = build("graph", "none", graph=graph, width=1.0, frame=(30, 1, 7))
     x = frames()[..., :1, :]
     assert abs(stream(streaming(ead), x) - ead(x)).max() <= TOLERANCE

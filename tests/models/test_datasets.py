@@ -7,9 +7,8 @@ import pytest
 
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.models.datasets import (
+    MOUSE,
     RATED_NOISE,
-    STEPS,
-    SUBSTEPS,
     SweepSet,
     TrainingBatches,
     channel_values,
@@ -90,8 +89,8 @@ def test_onsets_are_those_of_the_detector_one_sweep_at_a_time() -> None:
 def test_windows_are_cut_where_they_start_and_repeat_the_last_sample() -> None:
     values = np.arange(2 * SAMPLES, dtype=np.float32).reshape(2, SAMPLES, 1, 1)
     cut = windows(values, np.array([7, SAMPLES - 3]))
-    assert cut.shape == (2, STEPS, SUBSTEPS, 1, 1)
-    assert cut[0].ravel().tolist() == list(range(7, 7 + STEPS * SUBSTEPS))
+    assert cut.shape == (2, MOUSE.steps, MOUSE.substeps, 1, 1)
+    assert cut[0].ravel().tolist() == list(range(7, 7 + MOUSE.steps * MOUSE.substeps))
     last = 2 * SAMPLES - 1
     assert cut[1].ravel()[:4].tolist() == [last - 2, last - 1, last, last]
     assert (cut[1].ravel()[2:] == last).all()

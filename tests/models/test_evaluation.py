@@ -11,7 +11,7 @@ from sklearn.metrics import roc_auc_score
 
 from tactile_rt.classifier.contact import CHANNEL_FLOOR, ContactDetector
 from tactile_rt.models import evaluation, onsets
-from tactile_rt.models.datasets import RATED_NOISE, STEPS, SweepSet, channel_values, find_onsets
+from tactile_rt.models.datasets import MOUSE, RATED_NOISE, SweepSet, channel_values, find_onsets
 from tactile_rt.models.evaluation import (
     Disturbance,
     accuracy,
@@ -170,7 +170,7 @@ def seen_by(disturbance: Disturbance, values: np.ndarray, seed: int = 0) -> tupl
 
     def run(samples: np.ndarray, offset: np.ndarray, sigma: np.ndarray) -> np.ndarray:
         seen.append((samples.copy(), offset, sigma))
-        return np.zeros((len(samples), STEPS, 2), dtype=np.float32)
+        return np.zeros((len(samples), MOUSE.steps, 2), dtype=np.float32)
 
     evaluation.predict(a_set(values), run, disturbance=disturbance, seed=seed)
     return tuple(np.concatenate(part) for part in zip(*seen, strict=True))

@@ -1,1 +1,3 @@
-"""Encoders: frames `(batch, step, 30, 5, 7)` to features `(batch, step, feature)`."""
+"""Encoders: frames `(batch, step, channel, row, column)` to features `(batch, step, feature)`."""
+
+MOUSE_FRAME = (30, 5, 7)  # five sub-steps of six loads, on the grid of a mouse's whiskers

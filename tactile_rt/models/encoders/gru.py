@@ -2,29 +2,32 @@
 
 from __future__ import annotations
 
+from math import prod
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-__all__ = ["FEATURES", "FRAME", "GRUEncoder"]
+from tactile_rt.models.encoders import MOUSE_FRAME
 
-FRAME = 30 * 5 * 7  # numbers in a frame
+__all__ = ["FEATURES", "GRUEncoder"]
+
 FEATURES = 512  # per step, at width 1
 LAYERS = 2
 
 
 class GRUEncoder(nn.Module):
-    """Frames `(batch, step, 30, 5, 7)` to features `(batch, step, 512 * width)` (Cho et al. 2014).
+    """Frames `(batch, step, channel, row, column)` to features `(batch, step, 512 * width)`.
 
-    Two layers; 3,978,240 parameters at width 1.
+    Two layers (Cho et al. 2014); 3,978,240 parameters at width 1 on the mouse's frames.
     """
 
     lag = 0
 
-    def __init__(self, width: float = 1.0) -> None:
+    def __init__(self, width: float = 1.0, frame: tuple[int, ...] = MOUSE_FRAME) -> None:
         super().__init__()
         self.features = round(FEATURES * width)
-        self.gru = nn.GRU(FRAME, self.features, LAYERS, batch_first=True)
+        self.gru = nn.GRU(prod(frame), self.features, LAYERS, batch_first=True)
 
     def forward(self, frames: Tensor) -> Tensor:
         """All steps at once, from a zero state: (batch, step, feature)."""
@@ -38,8 +41,8 @@ class GRUEncoder(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step. frame (batch, 30, 5, 7) -> features (batch, feature), the new state."""
-        x, new = frame.flatten(1), []  # (batch, 30 * 5 * 7)
+        """One step: frame (batch, channel, row, column) to features (batch, feature), new state."""
+        x, new = frame.flatten(1), []  # (batch, number)
         for layer, h in enumerate(state["gru_h"].unbind(1)):
             w_ih, w_hh, b_ih, b_hh = self.gru.all_weights[layer]
             r_x, z_x, n_x = F.linear(x, w_ih, b_ih).chunk(3, dim=-1)  # (batch, feature) each

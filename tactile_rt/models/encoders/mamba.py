@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
+from math import prod
+
 from torch import Tensor, nn
 
 from tactile_rt.models.attenders.mamba import MambaStack
-from tactile_rt.models.encoders.gru import FEATURES, FRAME
+from tactile_rt.models.encoders import MOUSE_FRAME
+from tactile_rt.models.encoders.gru import FEATURES
 
 __all__ = ["MambaEncoder"]
 
 
 class MambaEncoder(nn.Module):
-    """Frames `(batch, step, 30, 5, 7)` to features `(batch, step, 512 * width)`.
+    """Frames `(batch, step, channel, row, column)` to features `(batch, step, 512 * width)`.
 
-    7,322,112 parameters at width 1.
+    7,322,112 parameters at width 1 on the mouse's frames.
     """
 
     lag = 0
 
-    def __init__(self, width: float = 1.0) -> None:
+    def __init__(self, width: float = 1.0, frame: tuple[int, ...] = MOUSE_FRAME) -> None:
         super().__init__()
         self.features = round(FEATURES * width)
-        self.embed = nn.Linear(FRAME, self.features)
+        self.embed = nn.Linear(prod(frame), self.features)
         self.stack = MambaStack(self.features, "encoder")
 
     def forward(self, frames: Tensor) -> Tensor:
@@ -36,5 +39,5 @@ class MambaEncoder(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step. frame (batch, 30, 5, 7) -> features (batch, feature), the new state."""
+        """One step: frame (batch, channel, row, column) to features (batch, feature), new state."""
         return self.stack.step(self.embed(frame.flatten(1)), index, state)

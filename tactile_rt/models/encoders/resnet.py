@@ -12,9 +12,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.models.encoders import MOUSE_FRAME
+from tactile_rt.stream import ConfigError
+
 __all__ = ["FoldedResNet18", "ResNet18Encoder"]
 
-CHANNELS, GRID = 30, (5, 7)
 STAGES = (64, 128, 256, 512)  # channels at width 1
 FEATURES = 512
 
@@ -104,27 +106,28 @@ class ResidualBlock(nn.Module):
 
 
 class ResNet18Encoder(nn.Module):
-    """Frames `(batch, step, 30, 5, 7)` to features `(batch, step, 512 * width)`; no memory."""
+    """Frames `(batch, step, channel, row, column)` to `(batch, step, 512 * width)`; no memory."""
 
     lag = 0
 
-    def __init__(self, width: float = 1.0) -> None:
+    def __init__(self, width: float = 1.0, frame: tuple[int, int, int] = MOUSE_FRAME) -> None:
         super().__init__()
         channels = [round(stage * width) for stage in STAGES]
         self.features = round(FEATURES * width)
-        self.stem = ConvNorm(CHANNELS, channels[0], 7, 2, GRID)
+        self.stem = ConvNorm(frame[0], channels[0], 7, 2, frame[1:])
         shape = output_shape(self.stem.shape, 3, 2)  # the maximum
         inputs, blocks = channels[0], []
         for i, outputs in enumerate(channels):
             for stride in (1 if i == 0 else 2, 1):
                 blocks.append(ResidualBlock(inputs, outputs, stride, shape))
                 inputs, shape = outputs, blocks[-1].shape
-        assert shape == (1, 1)  # so there is nothing left to average
+        if shape != (1, 1):  # beyond 32 rows or columns, where an average would be due
+            raise ConfigError(f"resnet18 takes grids up to 32 x 32, not {frame[1]} x {frame[2]}")
         self.blocks = nn.ModuleList(blocks)
         self.fc = nn.Linear(inputs, self.features)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """frames (batch, step, 30, 5, 7) -> features (batch, step, feature)"""
+        """frames (batch, step, channel, row, column) -> features (batch, step, feature)"""
         features: Tensor = self._encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
         return features
 
@@ -134,7 +137,7 @@ class ResNet18Encoder(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step. frame (batch, 30, 5, 7) -> features (batch, feature), {}"""
+        """One step: frame (batch, channel, row, column) to features (batch, feature), {}"""
         return self._encode(frame), {}
 
     def deployed(self) -> FoldedResNet18:
@@ -142,7 +145,7 @@ class ResNet18Encoder(nn.Module):
         return FoldedResNet18(self)
 
     def _encode(self, frames: Tensor) -> Tensor:
-        """frames (frame, 30, 5, 7) -> (frame, feature)"""
+        """frames (frame, channel, row, column) -> (frame, feature)"""
         x = maximum(F.relu(self.stem(sites_first(frames))), self.stem.shape)  # (frame, site * c)
         for block in self.blocks:
             x = block(x)
@@ -170,7 +173,7 @@ class FoldedResNet18(nn.Module):
         self.layers["fc"] = _linear(encoder.fc.weight, encoder.fc.bias)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """frames (batch, step, 30, 5, 7) -> features (batch, step, feature)"""
+        """frames (batch, step, channel, row, column) -> features (batch, step, feature)"""
         features: Tensor = self._encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
         return features
 
@@ -180,7 +183,7 @@ class FoldedResNet18(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step. frame (batch, 30, 5, 7) -> features (batch, feature), {}"""
+        """One step: frame (batch, channel, row, column) to features (batch, feature), {}"""
         return self._encode(frame), {}
 
     def _encode(self, frames: Tensor) -> Tensor:

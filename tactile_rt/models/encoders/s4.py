@@ -23,7 +23,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.models.encoders.gru import FEATURES, FRAME
+from tactile_rt.models.encoders import MOUSE_FRAME
+from tactile_rt.models.encoders.gru import FEATURES
 
 __all__ = ["FoldedS4", "S4Block", "S4Encoder", "hippo_legs", "kernels"]
 
@@ -136,19 +137,22 @@ def kernels(blocks: Sequence[S4Block], steps: int) -> Tensor:
 
 
 class S4Encoder(nn.Module):
-    """Frames `(batch, step, 30, 5, 7)` to features `(batch, step, 512 * width)`.
+    """Frames `(batch, step, channel, row, column)` to features `(batch, step, 512 * width)`.
 
     Args:
         width: scales the channels.
+        frame: channels, rows and columns.
         taps: how many steps back the convolutions reach: an episode's.
     """
 
     lag = 0
 
-    def __init__(self, width: float = 1.0, taps: int = 22) -> None:
+    def __init__(
+        self, width: float = 1.0, frame: tuple[int, ...] = MOUSE_FRAME, taps: int = 22
+    ) -> None:
         super().__init__()
         self.features, self.taps = round(FEATURES * width), taps
-        self.embed = nn.Linear(FRAME, self.features)
+        self.embed = nn.Linear(math.prod(frame), self.features)
         self.blocks = nn.ModuleList(S4Block(self.features) for _ in range(LAYERS))
         self.out = nn.Linear(self.features, self.features)
 
@@ -168,7 +172,7 @@ class S4Encoder(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step. frame (batch, 30, 5, 7) -> features (batch, feature), the new state.
+        """One step: frame (batch, channel, row, column) to features (batch, feature), new state.
 
         The kernels are computed anew; `deployed` has them ready.
         """
@@ -211,7 +215,7 @@ class FoldedS4(nn.Module):
             self.register_buffer("kernels", encoder.kernels(encoder.taps))
 
     def forward(self, frames: Tensor) -> Tensor:
-        """frames (batch, step, 30, 5, 7) -> features (batch, step, feature)"""
+        """frames (batch, step, channel, row, column) -> features (batch, step, feature)"""
         features: Tensor = self.encoder(frames)
         return features
 
@@ -221,7 +225,7 @@ class FoldedS4(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step. frame (batch, 30, 5, 7) -> features (batch, feature), the new state."""
+        """One step: frame (batch, channel, row, column) to features (batch, feature), new state."""
         return self.encoder.filter(frame, self.kernels, state)
 
 

@@ -6,12 +6,12 @@ from typing import Any
 
 from torch import nn
 
+from tactile_rt.models.encoders import MOUSE_FRAME
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 
 __all__ = ["EDGES", "GRAPH", "LAG", "ZhuangEncoder", "zhuang_graph"]
 
-FRAME = Input("frame", 30, 5, 7)
 # Channels and predecessors, in the order of their channels: alphabetical.
 EDGES = {
     "conv1": (96, ("frame",)),
@@ -25,8 +25,8 @@ EDGES = {
 }
 
 
-def zhuang_graph(cell: str = "intersection-ln") -> Graph:
-    """The paper's graph with one of `cells.CELLS` on every map.
+def zhuang_graph(cell: str = "intersection-ln", frame: tuple[int, int, int] = MOUSE_FRAME) -> Graph:
+    """The paper's graph with one of `cells.CELLS` on every map, for frames of any size.
 
     Time decay, the original, is on fc7 and fc8 too; gated cells are not.
     """
@@ -36,9 +36,10 @@ def zhuang_graph(cell: str = "intersection-ln") -> Graph:
         reads = tuple(Edge(source) for source in sources)
         if name.startswith("fc"):
             nodes.append(Node(name, channels, reads, "dense", dense_cell))
-        else:  # the 5 x 7 grid becomes 4 x 6 maps in conv1
-            nodes.append(Node(name, channels, reads, "valid" if name == "conv1" else "same", cell))
-    return Graph((FRAME,), tuple(nodes), readout="fc8")
+        else:  # the mouse's 5 x 7 grid becomes 4 x 6 maps in conv1; a single row stays one
+            less = name == "conv1" and min(frame[1:]) > 1
+            nodes.append(Node(name, channels, reads, "valid" if less else "same", cell))
+    return Graph((Input("frame", *frame),), tuple(nodes), readout="fc8")
 
 
 GRAPH = zhuang_graph()
@@ -46,10 +47,15 @@ LAG = GRAPH.lag  # conv1 -> conv2 -> fc7 -> fc8
 
 
 class ZhuangEncoder(GraphEncoder):
-    """Frames `(batch, step, 30, 5, 7)` to features `(batch, step, 512 * width)`."""
+    """Frames `(batch, step, channel, row, column)` to features `(batch, step, 512 * width)`."""
 
-    def __init__(self, width: float = 1.0, cell: str = "intersection-ln") -> None:
-        super().__init__(zhuang_graph(cell).scaled(width))
+    def __init__(
+        self,
+        width: float = 1.0,
+        cell: str = "intersection-ln",
+        frame: tuple[int, int, int] = MOUSE_FRAME,
+    ) -> None:
+        super().__init__(zhuang_graph(cell, frame).scaled(width))
         self.register_load_state_dict_pre_hook(_rename_dense)  # type: ignore[no-untyped-call]
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.files import write_whole
 from tactile_rt.models.data_checks import check_sets, check_split
-from tactile_rt.models.datasets import STEPS, SweepSet, windows
+from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.ead import count_parameters
 from tactile_rt.models.evaluation import CLEAN, Disturbance, Step, hits
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
@@ -189,5 +189,6 @@ class Workbench:
             values = self.test.sweeps.values[i : i + BATCH]
             values = disturbance.of_samples(values, self.test, rng)
             at = find_onsets(values, self.test.floor)
-            parts.append((windows(values, at.start, STEPS), at.offset, at.sigma, at.start >= 0))
+            cut = windows(values, at.start, self.test.timing)
+            parts.append((cut, at.offset, at.sigma, at.start >= 0))
         return tuple(np.concatenate(part) for part in zip(*parts, strict=True))

@@ -5,6 +5,7 @@ from math import isfinite
 
 from tactile_rt.models.augmentation import AUGMENTATIONS
 from tactile_rt.models.ead import EADConfig
+from tactile_rt.models.encoders import MOUSE_FRAME
 from tactile_rt.stream import ConfigError
 
 __all__ = [
@@ -114,8 +115,8 @@ class TrainingConfig:
         if not 0 <= self.seed < 2**32:
             raise ConfigError(f"seed must be 0 to {2**32 - 1}, not {self.seed}")
 
-    def network(self, classes: int) -> EADConfig:
-        """The network's configuration for so many classes.
+    def network(self, classes: int, frame: tuple[int, int, int] = MOUSE_FRAME) -> EADConfig:
+        """The network's configuration for so many classes and for frames of a size.
 
         Raises:
             ConfigError: there is no such network.
@@ -129,6 +130,7 @@ class TrainingConfig:
             readout=self.readout,
             dropout=self.dropout,
             graph=self.graph,
+            frame=frame,
         )
 
 

@@ -26,7 +26,7 @@ from tactile_rt.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import TactileClassifier, reason, save_whole
 from tactile_rt.models.data_checks import check_sets, check_split
-from tactile_rt.models.datasets import SweepSet, TrainingBatches
+from tactile_rt.models.datasets import SweepSet, TrainingBatches, frame_of
 from tactile_rt.models.objectives import Autoencoder, Objective, SimCLR, SimSiam, Supervised
 from tactile_rt.models.training.config import Progress, TrainingConfig
 from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
@@ -174,7 +174,9 @@ def read_splits(folder: Path, config: TrainingConfig) -> tuple[SweepSet, SweepSe
         RecordingError: the set is missing, unfinished, damaged or unfit.
     """
     manifest = SweepManifest.read(folder)
-    config.network(len(manifest.categories))  # a slip of the pen is told before a set is read
+    config.network(
+        len(manifest.categories), frame_of(manifest)
+    )  # a slip of the pen is told before a set is read
     check_split(folder, manifest)
     splits = SweepSet.read(folder, "train"), SweepSet.read(folder, "validation")
     check_sets(folder, splits)
@@ -187,7 +189,8 @@ def build_objective(config: TrainingConfig, manifest: SweepManifest) -> Objectiv
     Raises:
         ConfigError: there is no such network, or the array cannot be augmented so.
     """
-    model = TactileClassifier(manifest.spec, config.network(len(manifest.categories)))
+    network = config.network(len(manifest.categories), frame_of(manifest))
+    model = TactileClassifier(manifest.spec, network)
     augmentation = build(config.augmentation, manifest.spec, config.masking)
     if config.objective == "supervised":
         return Supervised(model, augmentation, config.loss, config.label_smoothing)
@@ -281,7 +284,7 @@ def _card(
     return {
         "model": objective.model.state_dict(),
         "config": asdict(config),
-        "network": asdict(objective.model.network.config),
+        "network": msgspec.to_builtins(objective.model.network.config),
         "spec": data.manifest.spec.to_json(),
         "categories": list(data.manifest.categories),
         "metrics": metrics,

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import msgspec
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -126,7 +127,7 @@ def probe(
     card = {
         "model": model.state_dict(),
         "config": {**saved["config"], "data": str(path), "probe": asdict(config)},
-        "network": asdict(network),
+        "network": msgspec.to_builtins(network),
         "spec": manifest.spec.to_json(),
         "categories": list(manifest.categories),
         "metrics": metrics,
@@ -201,6 +202,10 @@ def _validation(model: TactileClassifier, begin: int, data: SweepSet) -> tuple[T
     parts = []
     for at in usable.split(WINDOWS):
         k = at.numpy()
-        arrays = windows(data.sweeps.values[k], found.start[k]), found.offset[k], found.sigma[k]
+        arrays = (
+            windows(data.sweeps.values[k], found.start[k], data.timing),
+            found.offset[k],
+            found.sigma[k],
+        )
         parts.append(_features(model, begin, *(torch.from_numpy(a) for a in arrays)))
     return torch.cat(parts), torch.from_numpy(data.sweeps.labels)[usable]

@@ -71,7 +71,7 @@ class Validation:
         parts = max(len(self._usable) // config.batch, 1)
         total = torch.zeros((), device=self._device)
         for index, at in enumerate(np.array_split(self._usable, parts)):
-            cut = windows(data.sweeps.values[at], self._found.start[at])
+            cut = windows(data.sweeps.values[at], self._found.start[at], data.timing)
             arrays = cut, self._found.offset[at], self._found.sigma[at]
             samples, offset, sigma = (self._share.of(torch.from_numpy(a)) for a in arrays)
             place = index, self._share.rank

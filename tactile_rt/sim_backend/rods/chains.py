@@ -33,15 +33,15 @@ class Chain(NamedTuple):
     """What a whisker is made of; and, their rows one after the other, what many are.
 
     Attributes:
-        clamped: 1 where the first link has no joint, else 0.
+        clamped: The number of links without a joint: 1, or 0 where the base gives.
         turn: (link, 2) cosine and sine of the resting angle from the link before, about z.
-        length: (link,) mm.
+        length: (link,) lengths of the links, mm.
         inertia: (link, 4) mass (mg), centroid from the link's node (mm), axial and transverse
             inertia (mg mm^2).
-        stiffness: (degree of freedom,) uN m / rad.
+        stiffness: (degree of freedom,) stiffnesses of the joints, uN m / rad.
         added, damping: (degree of freedom, as many or more columns) mg mm^2 and uN m ms / rad that
             go with the stiffness, see `rod.make_rod`.
-        friction: Coulomb's coefficient.
+        friction: Coulomb's coefficient of friction of the surface.
     """
 
     clamped: Any
@@ -58,9 +58,9 @@ class Pose(NamedTuple):
     """Where a chain is, in the world.
 
     Attributes:
-        nodes: (link + 1, 3) mm.
-        frames: (link, 3, 3) in columns x along the link, y and z.
-        axes: (degree of freedom, 3) of the joints.
+        nodes: (link + 1, 3) ends of the links, mm.
+        frames: (link, 3, 3) frames of the links, x along the link, in columns.
+        axes: (degree of freedom, 3) axes of the joints, of unit length.
     """
 
     nodes: A

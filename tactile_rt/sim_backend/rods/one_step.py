@@ -46,10 +46,10 @@ class Scratch(NamedTuple):
     """Room for a step's numbers; what later steps, or who calls, may want is said.
 
     Attributes:
-        mass, lower: mass matrix, and the factor of the system of equations, of the last step for
-            which they were made.
+        mass, lower: The mass matrix, and the factor of the system of equations, of the last step
+            for which they were made.
         wrench: (6,) force on the base (mN) and moment about it (uN m), of the last step.
-        felt: (2,) sum of the normal forces (mN), and the contact with the largest, of the last
+        felt: (2,) the sum of the normal forces (mN), and the contact with the largest, of the last
             step.
     """
 
@@ -122,7 +122,7 @@ def step(
         surface: (3,) velocity of the object, mm/ms.
         count, near: what is near, see `touching.find_near`.
         link_of: (segment,) the link on which each segment is.
-        last: see `stepping.State`.
+        last: see `stepping.RodState`.
         room: see there.
     """
     clamped, stiffness, friction = chain.clamped, chain.stiffness, chain.friction

@@ -31,8 +31,8 @@ class Rod:
         resonance_hz: The first resonance of the whisker on its mount, Hz.
         wanted_ratio: The damping ratio of the first mode, that of the mount included.
         damping_ratio: The damping ratio with which it rings when stepped.
-        chain: Its links and joints.
-        segments: Its straight parts, for contacts.
+        chain: The links and joints of the whisker.
+        segments: The parts of the whisker between which contacts are sought.
         to_element: The (3, 3) rotation from the frame of the first link to that of the element.
     """
 

@@ -30,7 +30,7 @@ from tactile_rt.sim_backend.rods.touching import (
     forget,
 )
 
-__all__ = ["Rows", "State", "advance"]
+__all__ = ["RodState", "RowBounds", "advance"]
 
 A = Any
 LEAP_MM = 0.1  # further no node moves in one step, or it is divided
@@ -40,7 +40,7 @@ SAMPLE_MS = 1.0
 STILL = 1e-9  # rad and rad/ms: a whisker at rest that nothing is near need not be stepped
 
 
-class State(NamedTuple):
+class RodState(NamedTuple):
     """What a whisker carries on from step to step.
 
     Attributes:
@@ -54,7 +54,7 @@ class State(NamedTuple):
     last: A
 
 
-class Rows(NamedTuple):
+class RowBounds(NamedTuple):
     """Where each whisker's rows begin, and where the last's end: (whisker + 1,) each."""
 
     links: A
@@ -65,11 +65,11 @@ class Rows(NamedTuple):
 @compiled
 def advance(
     steps: A,
-    rows: Rows,
+    rows: RowBounds,
     chains: Chain,
     segments: Segments,
     thing: Object,
-    state: State,
+    state: RodState,
     seen: Seen,
     roots: A,
     bases: A,
@@ -122,7 +122,7 @@ def advance(
                 segments.arcs[segment],
             ),
             thing,
-            State(state.q[joint], state.v[joint], state.last[link]),
+            RodState(state.q[joint], state.v[joint], state.last[link]),
             Seen(
                 seen.travelled[w],
                 seen.reach[segment],
@@ -148,7 +148,7 @@ def _advance(
     chain: Chain,
     segments: Segments,
     thing: Object,
-    state: State,
+    state: RodState,
     seen: Seen,
     root: A,
     bases: A,

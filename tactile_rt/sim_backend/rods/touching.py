@@ -33,9 +33,9 @@ class Segments(NamedTuple):
     parabola.
 
     Attributes:
-        link: (segment,) on which it is.
-        ends: (segment, 2, 3) in the link's frame, mm.
-        bows: (segment, 3) how far the resting curve is from the middle of the chord, in the link's
+        link: (segment,) numbers of the links on which they are.
+        ends: (segment, 2, 3) both ends, in the link's frame, mm.
+        bows: (segment, 3) ways from the middle of the chord to the resting curve, in the link's
             frame, mm.
         radii, arcs: (segment, 2) radii and arc lengths from the base at the ends, mm.
     """
@@ -51,10 +51,10 @@ class Object(NamedTuple):
     """The convex pieces of an object, one after the other, about the object's place.
 
     Attributes:
-        corners: (corner, 3) mm.
-        corner_at: (piece + 1,) where the corners of each piece begin.
+        corners: (corner, 3) corners of the pieces, mm.
+        corner_at: (piece + 1,) numbers at which the corners of each piece begin.
         faces: (face, 4) outward normals and offsets.
-        face_at: (piece + 1,) where the faces of each piece begin.
+        face_at: (piece + 1,) numbers at which the faces of each piece begin.
         rounding: (piece,) the radius by which each is grown, mm.
     """
 
@@ -72,7 +72,7 @@ class Seen(NamedTuple):
         travelled: (1,) what the object and the whisker have travelled since the beginning, mm.
         reach: (segment, piece) lower bound of the gap, plus what was travelled when it was found.
         soonest: (piece + 1,) the least of them, and at last something infinite.
-        known: (segment, piece, 4) where to begin, see `nearest`.
+        known: (segment, piece, 4) pairs of points to begin from, see `nearest`.
         planes: (segment, piece, 5) outward normal and offset of a plane through which the piece
             does not reach, and what was travelled when it was found.
     """
@@ -88,9 +88,9 @@ class Contacts(NamedTuple):
     """Places where a whisker is near an object, as many as there may be.
 
     Attributes:
-        gaps: (contact,) mm.
-        normals: (contact, 3) from the piece to the whisker, in the world.
-        points: (contact, 3) of the whisker's surface, in the world, mm.
+        gaps: (contact,) gaps between the surfaces, mm.
+        normals: (contact, 3) directions from the piece to the whisker, in the world.
+        points: (contact, 3) points of the whisker's surface, in the world, mm.
         segments, places: (contact,) the segment, and the place on it from 0 to 1.
     """
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.rods.chains import Chain
 from tactile_rt.sim_backend.rods.rod import make_rod
-from tactile_rt.sim_backend.rods.stepping import Rows, State, advance
+from tactile_rt.sim_backend.rods.stepping import RodState, RowBounds, advance
 from tactile_rt.sim_backend.rods.touching import Object, Seen, Segments
 from tactile_rt.sim_backend.world import JAMMED
 from tactile_rt.stream import SourceError
@@ -83,7 +83,7 @@ class RodWorld:
             for root, rod in zip(roots, rods, strict=True)
         ]
         chains, segments = [rod.chain for rod in rods], [rod.segments for rod in rods]
-        rows = Rows(
+        rows = RowBounds(
             _begins([c.length for c in chains]),
             _begins([c.stiffness for c in chains]),
             _begins([s.link for s in segments]),
@@ -110,7 +110,7 @@ class RodWorld:
                 _begins([p.faces for p in pieces]),
                 np.array([p.rounding for p in pieces]),
             ),
-            State(self.angles, np.zeros(joints), np.zeros((links, 4))),
+            RodState(self.angles, np.zeros(joints), np.zeros((links, 4))),
             seen,
             np.array(turned),
         )

@@ -1,0 +1,99 @@
+"""Networks for arrays of any size: what holds for the mouse's holds for a robot's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+import torch
+
+from tactile_rt.models.checkpoints import TactileClassifier
+from tactile_rt.models.datasets import Timing
+from tactile_rt.models.ead import EAD, ENCODERS, EADConfig
+from tactile_rt.stream import ArraySpec, ConfigError
+from tests.helpers.small_networks import TOLERANCE, build, stream
+
+GRIDS = [(6, 1, 1), (30, 2, 4), (12, 1, 32), (15, 3, 3), (9, 10, 14), (4, 8, 1)]
+
+
+@pytest.mark.parametrize("frame", GRIDS)
+@pytest.mark.parametrize("encoder", [name for name in ENCODERS if name != "graph"])
+def test_a_window_and_its_steps_give_the_same_logits(
+    encoder: str, frame: tuple[int, int, int]
+) -> None:
+    ead = build(encoder, "none", "mean", frame=frame)
+    x = torch.randn(2, 9, *frame, generator=torch.Generator().manual_seed(0))
+    with torch.inference_mode():
+        whole, steps = ead(x), stream(ead, x)
+    assert whole.shape == (2, 9, 7)
+    torch.testing.assert_close(whole, steps, rtol=0, atol=5 * TOLERANCE)
+    # every number of a frame has its say, from the lag on
+    loud = x.clone()
+    loud[:, 0] += torch.randn(frame, generator=torch.Generator().manual_seed(1))
+    with torch.inference_mode():
+        assert (ead(loud)[:, ead.lag] != whole[:, ead.lag]).any()
+
+
+@pytest.mark.parametrize("encoder", ["zhuang-gru-ln", "resnet18", "s4", "mamba", "gru"])
+def test_the_mouse_s_frames_are_the_default(encoder: str) -> None:
+    plain = EAD(EADConfig(3, encoder, "none", width=1 / 32))
+    told = EAD(EADConfig(3, encoder, "none", width=1 / 32, frame=(30, 5, 7)))
+    shapes = [{k: v.shape for k, v in one.state_dict().items()} for one in (plain, told)]
+    assert shapes[0] == shapes[1]
+
+
+def plate(rows: int, columns: int, channels: int, rate_hz: float = 1e3) -> ArraySpec:
+    cells = [(r, c) for r in range(rows) for c in range(columns)]
+    return ArraySpec(
+        name="plate",
+        elements=tuple(f"{r}-{c}" for r, c in cells),
+        grid=tuple(cells),
+        positions=tuple((0.0, 0.01 * c, 0.01 * r) for r, c in cells),
+        orientations=((1.0, 0.0, 0.0, 0.0),) * len(cells),
+        channels=("fx", "fy", "fz", "mx", "my", "mz")[:channels],
+        units=("N", "N", "N", "N m", "N m", "N m")[:channels],
+        rate_hz=rate_hz,
+        frame="plate",
+    )
+
+
+def test_a_network_of_another_array_is_refused_in_one_line() -> None:
+    with pytest.raises(ConfigError, match=r"30 x 5 x 7 .* does not fit an array of 6 channels on"):
+        TactileClassifier(plate(2, 4, 6), EADConfig(3, "gru", "none", width=1 / 32))
+
+
+def test_a_classifier_knows_how_its_windows_are_cut() -> None:
+    config = EADConfig(3, "gru", "none", width=1 / 32, frame=(12, 2, 4), max_steps=10)
+    model = TactileClassifier(plate(2, 4, 3), config)
+    assert model.timing == Timing(steps=10, substeps=4)
+    samples = torch.zeros(2, 10, 4, 8, 3)
+    rest = torch.zeros(2, 8, 3)
+    assert model.eval()(samples, rest, rest + 1e-6).shape == (2, 10, 3)
+
+
+@pytest.mark.parametrize(
+    ("period_ms", "substeps"), [(9, 5), (10, 4), (12.5, 4), (1, 45), (100, 1), (5, 9)]
+)
+def test_steps_are_about_45_ms_at_every_rate(period_ms: float, substeps: int) -> None:
+    assert Timing.of(round(period_ms * 1e6)) == Timing(22, substeps)
+
+
+def test_a_graph_for_another_array_is_refused_in_one_line() -> None:
+    graph = """
+readout = "fc"
+[inputs.frame]
+channels = 30
+rows = 5
+columns = 7
+[nodes.fc]
+kind = "dense"
+channels = 32
+reads = ["frame"]
+"""
+    config = EADConfig(3, "graph", "none", graph=graph)
+    assert EAD(config)
+    with pytest.raises(ConfigError, match=r"frame has 30 x 5 x 7 .* array's frames 6 x 1 x 1"):
+        EAD(replace(config, frame=(6, 1, 1)))
+    assert np.prod(config.frame) == 1050
