@@ -128,7 +128,7 @@ def export_checkpoint(
         provenance={
             "checkpoint_sha256": hashlib.sha256(checkpoint.read_bytes()).hexdigest(),
             "training": saved["config"],
-            "network": saved["network"],
+            "network": msgspec.json.decode(msgspec.json.encode(saved["network"])),
             "sweep_set": manifest.recipe,
             "unseen_objects": list(manifest.split["test"]),
             "commands": list(commands),

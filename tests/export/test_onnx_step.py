@@ -219,7 +219,7 @@ def test_the_metadata_says_everything_needed(exported: SimpleNamespace) -> None:
     assert provenance["unseen_objects"] == ["mug-2", "car-2"]
     assert provenance["commands"] == ["tactile-rt train"]
     assert provenance["sweep_set"] == {"seed": 5}
-    assert provenance["network"] == asdict(NETWORK)
+    assert provenance["network"] == {**asdict(NETWORK), "frame": list(NETWORK.frame)}
     assert provenance["training"]["epochs"] == 0
     for package in ("torch", "onnx", "onnxruntime"):
         assert provenance[package] == __import__(package).__version__
