@@ -1,15 +1,21 @@
-"""`tactile-rt demo`: objects sweep past the simulated array and every guess is scored.
+"""`tactile-rt demo`: objects sweep past whiskers and every guess is scored.
+
+The whiskers are simulated; where nothing can be, a recording of theirs is played by an emulated
+device on a serial port, and goes through driver, detector and model as a device's samples do.
 
 The view takes 80 columns and 22 lines of the terminal and is understood at a glance. Every coloured
 cell sets its own background and text colour, and bars are of middle brightness, so that it reads
 alike on dark and on light terminals; no meaning hangs on colour alone.
 """
 
+import sys
 import time
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated, Self
@@ -23,14 +29,17 @@ from rich.panel import Panel
 from rich.text import Text
 
 from tactile_rt.cli.app import Model, Seconds, app, leaving, needs, starting
-from tactile_rt.stream import NS_PER_S
+from tactile_rt.stream import NS_PER_S, ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.classifier import Classification
     from tactile_rt.sim_backend.source import Pass
+    from tactile_rt.stream import Source
 
 __all__ = ["WIDTH", "Demonstration", "SweepOutcome", "draw", "watch"]
 
+RECORDING = Path(__file__).parents[1] / "assets" / "demo.mcap"  # see bench/write_demo.py
+END_NS = 50_000_000  # before the end of what is played: the last samples may be lost
 LATENCIES_KEPT = 10_000  # steps that the latency percentiles look back on: a demo may run for days
 WIDTH = 80
 HEIGHT = 15  # of the upper panels
@@ -64,19 +73,29 @@ def demo(
     fast: Annotated[
         bool, typer.Option("--fast", help="As fast as it simulates, not in real time.")
     ] = False,
+    recorded: Annotated[
+        bool, typer.Option("--recorded", help="Play the recording, also if there is MuJoCo.")
+    ] = False,
     plain: Annotated[
         bool, typer.Option("--plain", help="One line per object instead of the view.")
     ] = False,
 ) -> None:
-    """Sweep objects that the model never saw past simulated whiskers, and keep the score."""
+    """Sweep objects that the model never saw past whiskers, and keep the score.
+
+    Without MuJoCo, or with --recorded, a short recording of simulated
+    whiskers is played by an emulated device, over a serial port.
+    """
     from tactile_rt.classifier.model_file import shipped_model
 
     console = Console()
+    recorded |= not (find_spec("mujoco") and find_spec("trimesh"))
+    if recorded and (fast or seed):
+        raise ConfigError("--fast and --seed are for a simulation: install tactile-rt[sim]")
     try:
         with starting(), console.status("building the array and the objects"):
-            demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast)
+            demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)
     except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
+        raise needs("record" if recorded else "sim", error) from None
     with leaving(seconds), demonstration:
         if plain or not console.is_terminal or console.is_dumb_terminal:
             for settled in demonstration.run():
@@ -110,8 +129,17 @@ class SweepOutcome:
         return f"{self.name:<12} feels like a {self.said:<12}{sure}  {verdict}"
 
 
+@dataclass(frozen=True)
+class RecordedPass:
+    """An object that passed when the recording was made, and when, in ns from its first sample."""
+
+    start_ns: int
+    name: str
+    category: str
+
+
 class Demonstration:
-    """Run a model on the simulated array and keep the score.
+    """Run a model on the simulated array, or on a recording of it, and keep the score.
 
     The score counts objects, not touches: only the first episode of each object's pass, by its
     final decision. An episode belongs to the pass in which it began, even if its last steps come
@@ -122,9 +150,11 @@ class Demonstration:
         sweeps: objects that pass before the end; 0: endless.
         seed: of the drawn objects and sweeps.
         fast: as fast as the simulation goes, instead of in real time.
+        recorded: play the recording instead.
 
     Attributes:
         unseen: Whether the objects are ones that the model has not been trained on.
+        recorded: Whether the recording is played.
         classifier: The classifier that is run; holds the contact state and the forces.
         target: The object that `decision` is about; None before the first touch.
         decision: The latest decision of the model; None before the first one.
@@ -134,30 +164,66 @@ class Demonstration:
         ModelError, SpecMismatch: the model cannot be used on the mouse array.
     """
 
-    def __init__(self, model: Path, sweeps: int, seed: int, fast: bool) -> None:
+    def __init__(
+        self, model: Path, sweeps: int, seed: int, fast: bool, recorded: bool = False
+    ) -> None:
         from tactile_rt.classifier.classifier import Classifier
         from tactile_rt.classifier.model_file import load_model
         from tactile_rt.classifier.session import Session
-        from tactile_rt.sim_backend.source import SimOptions, SimSource
 
         _, card = load_model(model)
         unseen = card.provenance.get("unseen_objects", [])
-        self.unseen = bool(unseen)
+        self.recorded = recorded
+        self._device = ExitStack()
+        self._ends_ns = sys.maxsize  # stream time from the first sample at which it is over
+        self.passes: Sequence[Pass | RecordedPass]
+        if recorded:
+            self._source = self._play(sweeps)
+            self.unseen = {p.name for p in self.passes} <= set(unseen)
+        else:
+            self._source, self.passes = self._simulate(unseen, sweeps, seed, fast)
+            self.unseen = bool(unseen)
+        self.classifier = Classifier(model, self._source.spec)
+        self._session = Session(self._source, self.classifier)
+        self.target: Pass | RecordedPass | None = None
+        self.decision: Classification | None = None
+        self.outcomes: list[SweepOutcome] = []
+        self._latencies: deque[float] = deque(maxlen=LATENCIES_KEPT)
+        self._first_ns = self._now_ns = 0  # stream time
+        self._base_ns = 0  # stream time from which passes count
+        self._began = self._now = 0.0  # wall time, s
+
+    def _simulate(
+        self, unseen: list[str], sweeps: int, seed: int, fast: bool
+    ) -> "tuple[Source, list[Pass]]":
+        from tactile_rt.sim_backend.source import SimOptions, SimSource
+
         options = SimOptions(
             objects=",".join(unseen),  # none listed: the first one of every category
             sweeps=sweeps,
             seed=seed,
             pace="fast" if fast else "realtime",
         )
-        self._source = SimSource("mouse", options)
-        self.classifier = Classifier(model, self._source.spec)
-        self._session = Session(self._source, self.classifier)
-        self.target: Pass | None = None
-        self.decision: Classification | None = None
-        self.outcomes: list[SweepOutcome] = []
-        self._latencies: deque[float] = deque(maxlen=LATENCIES_KEPT)
-        self._first_ns = self._now_ns = 0  # stream time
-        self._began = self._now = 0.0  # wall time, s
+        source = SimSource("mouse", options)
+        return source, source.passes
+
+    def _play(self, sweeps: int) -> "Source":
+        """The recording, from an emulated device on a serial port."""
+        from tactile_rt.drivers.emulation.device import EmulatedSerial
+        from tactile_rt.recording import Recording
+        from tactile_rt.sources.opening import open_source
+
+        recording = Recording(RECORDING)
+        notes = recording.description.session
+        told = [notes[f"pass_{i}"].split() for i in range(len(notes))]
+        passes = [RecordedPass(int(start), name, category) for start, name, category in told]
+        chunks = list(recording)
+        ends = [p.start_ns for p in passes[1:]] + [int(chunks[-1].t_ns[-1] - chunks[0].t_ns[0])]
+        count = min(sweeps or len(passes), len(passes))
+        self.passes, self._ends_ns = passes[:count], ends[count - 1] - END_NS
+        played = self._device.enter_context(open_source(f"replay:{RECORDING}?speed=0"))
+        device = self._device.enter_context(EmulatedSerial(played, "native", log=False))
+        return open_source(device.url)
 
     def run(self) -> Iterator[list[SweepOutcome]]:
         """Run to the end; yields after every chunk what it has settled."""
@@ -165,13 +231,18 @@ class Demonstration:
             self._now_ns, self._now = int(chunk.t_ns[-1]), time.monotonic()
             if not self._began:
                 self._first_ns, self._began = self._now_ns, self._now
+                if self.recorded:
+                    before = int(chunk.seq[0]) / self._source.spec.rate_hz * NS_PER_S
+                    self._base_ns = int(chunk.t_ns[0]) - round(before)
             settled = len(self.outcomes)
             for decision in decisions:
                 self._latencies.append(decision.latency_s)
                 self._score(decision)
             yield self.outcomes[settled:]
+            if self._now_ns - self._base_ns >= self._ends_ns:
+                break
         settled = len(self.outcomes)
-        self._miss_before(len(self._source.passes))
+        self._miss_before(len(self.passes))
         yield self.outcomes[settled:]
 
     @property
@@ -213,8 +284,8 @@ class Demonstration:
         )
 
     def _score(self, decision: "Classification") -> None:
-        passes = self._source.passes
-        number = bisect_right(passes, decision.onset_ns, key=lambda p: p.start_ns) - 1
+        passes, onset_ns = self.passes, decision.onset_ns - self._base_ns
+        number = bisect_right(passes, onset_ns, key=lambda p: p.start_ns) - 1
         if number < len(self.outcomes):
             return  # touched again after its first episode, which alone counts
         self._miss_before(number)
@@ -230,7 +301,7 @@ class Demonstration:
             )
 
     def _miss_before(self, number: int) -> None:
-        for missed in self._source.passes[len(self.outcomes) : number]:
+        for missed in self.passes[len(self.outcomes) : number]:
             self.outcomes.append(SweepOutcome(missed.name, missed.category, None, 0.0))
 
     def __enter__(self) -> Self:
@@ -242,7 +313,8 @@ class Demonstration:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._session.__exit__(kind, error, trace)
+        with self._device:
+            self._session.__exit__(kind, error, trace)
 
 
 def watch(demo: Demonstration, console: Console) -> None:
@@ -261,7 +333,8 @@ def watch(demo: Demonstration, console: Console) -> None:
 def draw(demo: Demonstration) -> RenderableType:
     """The view at this moment."""
     what = "objects that the model has never met" if demo.unseen else "objects"
-    title = Text.assemble((" tactile_rt", "bold"), f"  30 simulated whiskers feel {what}")
+    whiskers = "30 recorded whiskers felt" if demo.recorded else "30 simulated whiskers feel"
+    title = Text.assemble((" tactile_rt", "bold"), f"  {whiskers} {what}")
     half = WIDTH // 2
     forces = Panel(
         _forces(demo), title="force at each whisker's base", padding=0, width=half, height=HEIGHT
@@ -357,7 +430,8 @@ def _score(demo: Demonstration) -> Text:
         budget = card.substeps * card.period_ns / 1e6
         text.append(f"  (a step is {budget:.0f} ms of touch)", GREY)
     text.append(f"\nspeed    {demo.real_time_factor:.2f} x real time")
-    text.append(f"  ({demo.simulated_s:.0f} s simulated, {demo.dropped} samples dropped)", GREY)
+    how = "of a recording" if demo.recorded else "simulated"
+    text.append(f"  ({demo.simulated_s:.0f} s {how}, {demo.dropped} samples dropped)", GREY)
     return text
 
 

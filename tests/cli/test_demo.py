@@ -1,6 +1,7 @@
 """`tactile-rt demo`: what it prints, what its view shows, how it keeps the score."""
 
 import io
+from importlib.util import find_spec
 from types import SimpleNamespace
 
 import msgspec
@@ -11,14 +12,14 @@ from rich.console import Console
 from tactile_rt.classifier import model_file
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.cli import demo as demo_module
+from tactile_rt.cli.demo import Demonstration, draw, watch
 from tactile_rt.stream import Chunk
 
-pytest.importorskip("mujoco")
-
-from tactile_rt.cli.demo import Demonstration, draw, watch
+simulated = pytest.mark.skipif(not find_spec("mujoco"), reason="MuJoCo is not installed")
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def unseen(monkeypatch):
     """Three of the objects that the shipped model has not seen: all 312 take seconds to make."""
     load = model_file.load_model
@@ -34,6 +35,7 @@ def unseen(monkeypatch):
     return some
 
 
+@simulated
 def test_demo_without_a_terminal_prints_a_line_per_object(call, unseen):
     code, out, err = call("demo", "--fast", "--sweeps", "2")
     first, second, summary = out.splitlines()
@@ -46,6 +48,8 @@ def test_demo_without_a_terminal_prints_a_line_per_object(call, unseen):
     assert call("demo", "--fast", "--sweeps", "2", "--plain")[1].startswith(f"{first}\n{second}\n")
 
 
+@simulated
+@pytest.mark.usefixtures("unseen")
 def test_view_fits_a_terminal_and_says_what_it_shows():
     screen = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, record=True)
     with Demonstration(shipped_model(), sweeps=1, seed=0, fast=True) as demo:
@@ -73,9 +77,11 @@ def decision(onset_ns, t_ns, label, final=True):
     )
 
 
+@simulated
+@pytest.mark.usefixtures("unseen")
 def test_only_the_first_episode_of_each_pass_is_scored():
     demo = Demonstration(shipped_model(), sweeps=1, seed=0, fast=True)
-    demo._source.passes = [
+    demo.passes = [
         SimpleNamespace(start_ns=100 * i, name=f"mug-{i}", category="mug") for i in range(6)
     ]
     decisions = [
@@ -95,3 +101,29 @@ def test_only_the_first_episode_of_each_pass_is_scored():
     settled = [outcome.said for outcomes in demo.run() for outcome in outcomes]
     assert settled == [None, "mug", "mug", "car", None, None]
     assert demo.right == 2
+
+
+def test_without_mujoco_a_recording_is_played_over_a_serial_port(call, monkeypatch) -> None:
+    pytest.importorskip("mcap")
+    monkeypatch.setattr(demo_module, "find_spec", lambda name: None)
+    code, out, err = call("demo", "--sweeps", "2")
+    first, second, summary = out.splitlines()
+    assert (code, err) == (0, "")
+    assert first.startswith("bowl-50 ") and second.startswith("dumbbell-53 ")
+    assert first.endswith("right") and second.endswith("right")
+    assert "2 of 2 right (100 %)" in summary
+    code, out, err = call("demo", "--fast")
+    assert code == 2 and "are for a simulation: install tactile-rt[sim]" in err
+
+
+def test_the_view_of_a_recording_says_that_it_is_one() -> None:
+    pytest.importorskip("mcap")
+    screen = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, record=True)
+    with Demonstration(shipped_model(), 1, 0, fast=False, recorded=True) as demo:
+        watch(demo, screen)
+        screen.export_text()
+        screen.print(draw(demo))
+    text = screen.export_text()
+    assert "30 recorded whiskers felt objects that the model has never met" in text
+    assert "s of a recording, 0 samples dropped" in text
+    assert demo_module.RECORDING.stat().st_size < 1_000_000
