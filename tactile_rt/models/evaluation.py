@@ -183,7 +183,12 @@ def auroc(known: NDArray[np.float32], unknown: NDArray[np.float32]) -> float:
 
     Args:
         known, unknown: (sweep,) scores; NaN, where no contact was detected, is the lowest.
+
+    Returns:
+        The chance; NaN without sweeps of either kind.
     """
+    if not len(known) or not len(unknown):
+        return float("nan")
     low, high = np.nan_to_num(unknown, nan=-np.inf), np.nan_to_num(known, nan=-np.inf)
     order = np.sort(low)
     below, ties = np.searchsorted(order, high), np.searchsorted(order, high, side="right")
@@ -288,7 +293,8 @@ def bootstrap(
     """Any statistic of a set of sweeps with a percentile bootstrap over objects.
 
     Args:
-        statistic: of the sweeps with these indices (k,), some of which may come more than once.
+        statistic: of the sweeps with these indices (k,), some of which may come more than once; NaN
+            where they do not tell, as a draw without one of two kinds.
         objects: (sweep,) object of each sweep.
         resamples: bootstrap resamples.
     """
@@ -299,5 +305,5 @@ def bootstrap(
         statistic(np.concatenate([of[k] for k in rng.integers(0, len(of), len(of))]))
         for _ in range(resamples)
     ]
-    low, high = np.percentile(values, LEVELS)
+    low, high = np.nanpercentile(values, LEVELS)
     return Interval(statistic(np.arange(len(objects))), float(low), float(high))

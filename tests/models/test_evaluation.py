@@ -221,3 +221,16 @@ def test_a_sensor_cannot_be_better_than_ideal() -> None:
     for field in ("noise", "gain", "dead", "offset"):
         with pytest.raises(ConfigError, match=f"{field} is -1"):
             replace(Disturbance(), **{field: -1})
+
+
+def test_a_draw_without_one_of_two_kinds_tells_nothing() -> None:
+    assert np.isnan(auroc(np.ones(3, np.float32), np.zeros(0, np.float32)))
+    assert np.isnan(auroc(np.zeros(0, np.float32), np.ones(3, np.float32)))
+    objects = np.array(["a", "b", "c"])
+    scores = np.array([0.9, 0.8, 0.1], dtype=np.float32)  # c is the only one of its kind
+
+    def area(at: np.ndarray) -> float:
+        return auroc(scores[at[at < 2]], scores[at[at == 2]])
+
+    found = bootstrap(area, objects)
+    assert (found.value, found.low, found.high) == (1.0, 1.0, 1.0)
