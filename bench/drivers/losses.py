@@ -101,11 +101,11 @@ def _compare(name: str, script: ArrayScript, got: _Received, log: Played) -> Rec
     came = np.zeros(n, np.bool_)
     came[known] = True
     hurt, gone = np.isin(fate, HURT), np.isin(fate, GONE)
-    on_the_way = _before_unplugging(fate, came)
+    on_the_way = _around_unplugging(fate, came)
     wrong += int((~came & ~hurt & ~gone & ~on_the_way).sum()) + int((came & gone).sum())
     if script.wire == "serial":
         wrong += int((came & hurt).sum())
-        # of a damaged one on its way when the plug was pulled, some may have come
+        # of a damaged one on its way when the plug was pulled or put in, some may have come
         least, most = int((hurt & ~on_the_way).sum()), int(hurt.sum())
         wrong += max(0, least - stats.corrupt, stats.corrupt - most)
         wrong += abs(stats.corrupt + stats.missing - int((~came).sum()))
@@ -126,13 +126,18 @@ def _compare(name: str, script: ArrayScript, got: _Received, log: Played) -> Rec
     )  # fmt: skip
 
 
-def _before_unplugging(fate: NDArray[np.uint8], came: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(n,) sent, and lost on the way: nothing came between them and the plug being pulled."""
+def _around_unplugging(fate: NDArray[np.uint8], came: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(n,) sent, and lost on the way: nothing came between them and the plug being pulled or put
+    in; what waits in a port when it is opened, the driver throws away as old."""
     lost = np.zeros(len(fate), np.bool_)
-    pulled = np.flatnonzero((fate[1:] == Fate.UNHEARD) & (fate[:-1] != Fate.UNHEARD)) + 1
-    for at in pulled.tolist():
-        before = np.flatnonzero(came[:at])
+    unheard, arrived = fate == Fate.UNHEARD, np.flatnonzero(came)
+    edges = np.diff(unheard.astype(np.int8))
+    for at in (np.flatnonzero(edges == 1) + 1).tolist():  # pulled
+        before = arrived[arrived < at]
         lost[int(before[-1]) + 1 if len(before) else 0 : at] = True
+    for at in (np.flatnonzero(edges == -1) + 1).tolist():  # put in
+        after = arrived[arrived >= at]
+        lost[at : int(after[0]) if len(after) else len(fate)] = True
     lost[np.isin(fate, GONE)] = False
     return lost
 
