@@ -148,10 +148,15 @@ def test_a_source_that_cannot_be_opened_is_one_line(call, source, said):
     assert err.count("\n") == 1
 
 
-@pytest.mark.parametrize("command", [("run", "--source", ONE_MUG), ("demo",)])
-def test_without_the_extra_the_way_to_install_it_is_named(command):
-    with start(*command, program=f"import sys; sys.modules['mujoco'] = None; {PROGRAM}") as process:
+@pytest.mark.parametrize(
+    ("command", "missing", "extra"),
+    [(("run", "--source", ONE_MUG), ("mujoco",), "sim"), (("demo",), ("mujoco", "mcap"), "record")],
+    ids=["run", "demo"],
+)
+def test_without_the_extra_the_way_to_install_it_is_named(command, missing, extra):
+    without = "; ".join(f"sys.modules[{name!r}] = None" for name in missing)
+    with start(*command, program=f"import sys; {without}; {PROGRAM}") as process:
         _, err = process.communicate(timeout=120)
     assert process.returncode == 2
-    assert "pip install 'tactile-rt[sim]'" in err
+    assert f"pip install 'tactile-rt[{extra}]'" in err
     assert err.count("\n") == 1
