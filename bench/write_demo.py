@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.cli.demo import RECORDING
+from tactile_rt.cli.demonstration import RECORDING
 from tactile_rt.recording import StreamWriter
 from tactile_rt.sim_backend.source import SimOptions, SimSource
 

@@ -21,16 +21,11 @@ def ringing(animals: Sequence[WhiskerArray], profile: Profile) -> str:
     if engine_of(profile) != "rods":
         return ""
     whiskers = [w for animal in animals for w in animal.whiskers]
-    found = {w.name: _ratios(w, profile) for w in whiskers}
-    off = {name: ratios for name, ratios in found.items() if ratios[1] > TOO_MUCH * ratios[0]}
+    off = _off(whiskers, profile)
     if not off:
         return ""
-    worst = max(off, key=lambda name: off[name][1] / off[name][0])
-    wanted, had = off[worst]
-    left = {}
-    for key in FINER:
-        ratios = [_ratios(w, PROFILES[key]) for w in whiskers]
-        left[key] = sum(had > TOO_MUCH * wanted for wanted, had in ratios)
+    wanted, had, worst = max(off, key=lambda one: one[1] / one[0])
+    left = {key: len(_off(whiskers, PROFILES[key])) for key in FINER}
     best = min(left, key=lambda key: left[key])
     better = f"; at profile {best} {left[best] or 'none'}" if left[best] < len(off) else ""
     return (
@@ -40,14 +35,18 @@ def ringing(animals: Sequence[WhiskerArray], profile: Profile) -> str:
     )
 
 
-def _ratios(whisker: Whisker, profile: Profile) -> tuple[float, float]:
-    """The damping ratio that is wanted, and the one that is had, if samples can hold it at all."""
+def _off(whiskers: Sequence[Whisker], profile: Profile) -> list[tuple[float, float, str]]:
+    """Of the whiskers whose ringing samples can hold and that ring too shortly: the damping ratio
+    that is wanted, the one that is had, and the name."""
     from tactile_rt.sim_backend.rods.rod import HEARD_HZ, make_rod
 
-    rod = make_rod(whisker, profile.links, round(SAMPLE_MS / profile.timestep_ms))
-    if rod.resonance_hz >= HEARD_HZ:
-        return 1.0, 1.0
-    return rod.wanted_ratio, rod.damping_ratio
+    steps = round(SAMPLE_MS / profile.timestep_ms)
+    rods = [make_rod(w, profile.links, steps) for w in whiskers]
+    return [
+        (rod.wanted_ratio, rod.damping_ratio, w.name)
+        for rod, w in zip(rods, whiskers, strict=True)
+        if rod.resonance_hz < HEARD_HZ and rod.damping_ratio > TOO_MUCH * rod.wanted_ratio
+    ]
 
 
 def strains(whiskers: Sequence[Whisker], links: int, angles: NDArray[np.float64]) -> list[float]:

@@ -18,13 +18,14 @@ from typing import Final
 import numpy as np
 
 from tactile_rt.sim_backend.arrays.files import load_animals
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, promised_object
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.remarks import ringing
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, usual_distance
-from tactile_rt.sim_backend.sweep_simulation import SweepSimulation, draw_simulation
-from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS, engine_of, world_spec
+from tactile_rt.sim_backend.sweep_simulation import SweepSimulation, check_sweep, draw_simulation
+from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS, world_spec
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStream, Source
 
 __all__ = ["CHUNK_SAMPLES", "PACES", "PacedSource", "Pass", "SimOptions", "SimSource", "check_pace"]
@@ -146,10 +147,8 @@ class SimOptions(SensorModel, Randomisation):
         Randomisation.__post_init__(self)
         if self.profile not in PROFILES:
             raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
-        if self.head_moves and engine_of(PROFILES[self.profile]) == "mujoco":
-            raise ConfigError("head_moves: MuJoCo's world has a head that stands still")
         check_pace(self.pace)
-        Sweep(**self.chosen)
+        check_sweep(Sweep(**self.chosen), PROFILES[self.profile])
         if self.sweeps < 0 or self.repeat < 1:
             raise ConfigError("sweeps must be 0 or more, and repeat 1 or more")
         if self.seed < 0:
@@ -194,8 +193,8 @@ class SimSource(PacedSource):
     Options = SimOptions
 
     def __init__(self, array: str, options: SimOptions) -> None:
-        self.check(array, options)
         self._animals = load_animals(array or "mouse")
+        _check_turns(self._animals, options)
         spec = felt = world_spec(self._animals)
         if options.base_turns:
             spec = replace(felt, channels=felt.channels + TURNS, units=(*felt.units, "rad", "rad"))
@@ -220,12 +219,7 @@ class SimSource(PacedSource):
     @staticmethod
     def check(array: str, options: SimOptions) -> None:
         """Raise the `ConfigError` that opening it would raise."""
-        animals = load_animals(array or "mouse")
-        if options.base_turns and not any(w.mount_stiffness for a in animals for w in a.whiskers):
-            raise ConfigError(
-                f"base_turns: no mount of {' and '.join(a.name for a in animals)} gives; "
-                "a .toml array says how much with mount_stiffness_nm_rad"
-            )
+        _check_turns(load_animals(array or "mouse"), options)
         _objects(options)
 
     def close(self) -> None:
@@ -302,6 +296,14 @@ class SimSource(PacedSource):
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)
         now = start_ns + round(self._sent * SAMPLE_MS * 1e6)
         self.passes.append(Pass(now, target.name, target.category, sweep))
+
+
+def _check_turns(animals: tuple[WhiskerArray, ...], options: SimOptions) -> None:
+    if options.base_turns and not any(w.mount_stiffness for a in animals for w in a.whiskers):
+        raise ConfigError(
+            f"base_turns: no mount of {' and '.join(a.name for a in animals)} gives; "
+            "a .toml array says how much with mount_stiffness_nm_rad"
+        )
 
 
 def _objects(options: SimOptions) -> list[Callable[[], TactileObject]]:

@@ -24,13 +24,19 @@ from tactile_rt.sim_backend.sweep import NOTHING, Sweep, draw_sweep
 from tactile_rt.sim_backend.world import SAMPLE_MS, Profile, engine_of
 from tactile_rt.stream import ConfigError
 
-__all__ = ["SweepSimulation", "World", "draw_simulation"]
+__all__ = ["SweepSimulation", "World", "check_sweep", "draw_simulation"]
 
 FAR_MM = 200.0  # where the object is when the way to first contact is measured
 DRAWS = 20  # tries to draw parameters with which an object meets the array at all
 CLEAR_MM = 5.0  # how far past the last whisker a sweep goes on
 
 Floats = NDArray[np.float64]
+
+
+def check_sweep(sweep: Sweep, profile: Profile) -> None:
+    """Raise a `ConfigError` if the profile's engine cannot step such a sweep."""
+    if sweep.head_moves and engine_of(profile) == "mujoco":
+        raise ConfigError("head_moves: MuJoCo's world has a head that stands still")
 
 
 class World(Protocol):
@@ -94,6 +100,7 @@ class SweepSimulation:
         profile: Profile,
         whole: bool = False,
     ) -> None:
+        check_sweep(sweep, profile)
         animals = array if isinstance(array, tuple) else (array,)
         whiskers = [w for animal in animals for w in animal.whiskers]
         straight = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
@@ -138,8 +145,6 @@ class SweepSimulation:
             parts = [Piece.of(piece) for piece in self._pieces]
             self._world = RodWorld(felt, roots, parts, profile.links, steps)
         else:
-            if sweep.head_moves:
-                raise ConfigError("head_moves: MuJoCo's world has a head that stands still")
             self._world = MujocoWorld(self.model, felt, profile, self._start)
 
         rear = start[1] + max(points[:, 1].max() for points in shape)
@@ -230,15 +235,14 @@ class SweepSimulation:
 
     def strains(self) -> dict[str, tuple[float, float]]:
         """The strains of the whiskers whose limit is known, now, and their limits, by name."""
-        known = [
-            (w, x)
-            for w, x in zip(
-                self._felt,
-                strains(self._felt, self._profile.links, self._world.angles),
-                strict=True,
-            )
-        ]
-        return {w.name: (x, w.strain_limit) for w, x in known if w.strain_limit}
+        if not any(w.strain_limit for w in self._felt):
+            return {}
+        found = strains(self._felt, self._profile.links, self._world.angles)
+        return {
+            w.name: (strain, w.strain_limit)
+            for w, strain in zip(self._felt, found, strict=True)
+            if w.strain_limit
+        }
 
     def loads(self, samples_at_once: int = 50) -> Iterator[Floats]:
         """Advance in pieces until the object has passed."""

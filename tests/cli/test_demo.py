@@ -13,7 +13,8 @@ from tactile_rt.classifier import model_file
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.cli import demo as demo_module
-from tactile_rt.cli.demo import Demonstration, draw, watch
+from tactile_rt.cli.demo import draw, watch
+from tactile_rt.cli.demonstration import RECORDING, Demonstration
 from tactile_rt.stream import Chunk
 
 simulated = pytest.mark.skipif(not find_spec("mujoco"), reason="MuJoCo is not installed")
@@ -126,4 +127,4 @@ def test_the_view_of_a_recording_says_that_it_is_one() -> None:
     text = screen.export_text()
     assert "30 recorded whiskers felt objects that the model has never met" in text
     assert "s of a recording, 0 samples dropped" in text
-    assert demo_module.RECORDING.stat().st_size < 1_000_000
+    assert RECORDING.stat().st_size < 1_000_000

@@ -18,6 +18,7 @@ __all__ = [
     "Segments",
     "find_near",
     "forget",
+    "unseen",
 ]
 
 A = Any
@@ -99,6 +100,17 @@ class Contacts(NamedTuple):
     points: A
     segments: A
     places: A
+
+
+def unseen(whiskers: int, segments: int, pieces: int) -> Seen:
+    """What is known before anything is seen; the whiskers' segments one after the other."""
+    return Seen(
+        np.zeros((whiskers, 1)),
+        np.full((segments, pieces), -np.inf),
+        np.array([[-np.inf] * pieces + [np.inf]] * whiskers),
+        np.full((segments, pieces, 4), -1),
+        np.tile([0.0, 0.0, 0.0, np.inf, 0.0], (segments, pieces, 1)),
+    )
 
 
 @compiled

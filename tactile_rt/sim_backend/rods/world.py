@@ -13,7 +13,7 @@ from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.rods.chains import Chain
 from tactile_rt.sim_backend.rods.rod import make_rod
 from tactile_rt.sim_backend.rods.stepping import RodState, RowBounds, advance
-from tactile_rt.sim_backend.rods.touching import Object, Seen, Segments
+from tactile_rt.sim_backend.rods.touching import Object, Segments, unseen
 from tactile_rt.sim_backend.world import JAMMED
 from tactile_rt.stream import SourceError
 
@@ -90,13 +90,6 @@ class RodWorld:
         )
         links, joints, parts = (int(each[-1]) for each in rows)
         self.angles = np.zeros(joints)
-        seen = Seen(
-            np.zeros((len(rods), 1)),
-            np.full((parts, len(pieces)), -np.inf),
-            np.array([[-np.inf] * len(pieces) + [np.inf]] * len(rods)),
-            np.full((parts, len(pieces), 4), -1),
-            np.tile([0.0, 0.0, 0.0, np.inf, 0.0], (parts, len(pieces), 1)),
-        )
         self._advance = partial(
             advance,
             np.array([r.steps_per_sample for r in rods]),
@@ -111,7 +104,7 @@ class RodWorld:
                 np.array([p.rounding for p in pieces]),
             ),
             RodState(self.angles, np.zeros(joints), np.zeros((links, 4))),
-            seen,
+            unseen(len(rods), parts, len(pieces)),
             np.array(turned),
         )
 

@@ -19,7 +19,7 @@ from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, make_object
 from tactile_rt.sim_backend.rods.chains import Pose, place
 from tactile_rt.sim_backend.rods.rod import make_rod
-from tactile_rt.sim_backend.rods.touching import Contacts, Object, Seen, find_near
+from tactile_rt.sim_backend.rods.touching import Contacts, Object, find_near, unseen
 from tactile_rt.sim_backend.rods.world import Piece, RodWorld
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
@@ -280,10 +280,8 @@ def test_a_gap_is_that_of_the_curve_and_not_of_its_chords(name: str, side: int) 
             np.zeros((1, 3)), np.array([0, 1]), np.zeros((0, 4)), np.array([0, 0]), np.ones(1)
         )
         number = len(rod.segments.link)
-        seen = Seen(
-            np.zeros(1), np.full((number, 1), -np.inf), np.array([-np.inf, np.inf]),
-            np.full((number, 1, 4), -1), np.tile([0.0, 0.0, 0.0, np.inf, 0.0], (number, 1, 1)),
-        )  # fmt: skip
+        whole = unseen(1, number, 1)
+        seen = whole._replace(travelled=whole.travelled[0], soonest=whole.soonest[0])
         near = Contacts(
             np.full(8, np.inf), np.zeros((8, 3)), np.zeros((8, 3)), np.zeros(8, np.int64),
             np.zeros(8),
