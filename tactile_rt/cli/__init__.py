@@ -3,6 +3,7 @@
 A user's mistake is one clear line on stderr and exit code 2; Ctrl-C leaves quietly.
 """
 
+import os
 import sys
 from typing import NoReturn
 
@@ -44,15 +45,30 @@ def main() -> None:
     from tactile_rt.stream import TactileError
 
     try:
-        app()
+        try:
+            app()
+        finally:
+            sys.stdout.flush()  # while what goes wrong can still be told
     except TactileError as error:
         _give_up(str(error))
+    except BrokenPipeError:  # whoever read it has gone
+        _empty_stdout()
+        sys.exit(1)
     except OSError as error:  # a folder that is a file, a full disk, ...: the user's to mend
         # Folders are made where there is none, so what exists all the same is a file.
+        _empty_stdout()
         why = "is not a folder" if isinstance(error, FileExistsError) else error.strerror
         _give_up(f"cannot use {error.filename}: {why}" if error.filename else str(error))
     except KeyboardInterrupt:
         sys.exit(INTERRUPTED)
+
+
+def _empty_stdout() -> None:
+    """Print what is still buffered, or forget it: at exit Python would try, fail and say so."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _give_up(why: str) -> NoReturn:
