@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.files import write_whole
+from tactile_rt.sensor_spec import ChannelLimits, SensorSpec, channel_limits
 from tactile_rt.stream import ArraySpec, ConfigError, RecordingError
 
 __all__ = [
@@ -63,6 +64,8 @@ class SweepManifest:
         category_of: The category of objects whose name does not tell it.
         versions: The versions of what made the set (mujoco, numpy, ...).
         settings: The settings of the simulation profile.
+        sensor: The description of the array's sensor; None: it has none, and the values are base
+            loads.
         version: The version of the set's format.
     """
 
@@ -77,6 +80,16 @@ class SweepManifest:
     category_of: dict[str, str] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     settings: dict[str, float | str] = field(default_factory=dict)
+    sensor: SensorSpec | None = None
+
+    @property
+    def limits(self) -> ChannelLimits:
+        """What a network may believe of the channels.
+
+        Raises:
+            ConfigError: as `channel_limits`.
+        """
+        return channel_limits(self.spec, self.sensor, self.period_ns)
 
     def names(self, splits: Sequence[str] = ()) -> list[str]:
         """Object names of these splits, or of all.

@@ -13,16 +13,16 @@ from pathlib import Path
 import torch
 
 from tactile_rt import export
-from tactile_rt.classifier.contact import CHANNEL_FLOOR
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.evidence.model_steps import Subject
 from tactile_rt.export.onnx_step import OPSET, step_graph, write_model
 from tactile_rt.export.precision import Precision
-from tactile_rt.models.datasets import MOUSE, channel_values
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.training import TactileClassifier
+from tactile_rt.sensor_spec import channel_limits
 from tactile_rt.stream import ArraySpec
+from tactile_rt.timing import MOUSE
 from tactile_rt.version import VERSION
 
 __all__ = ["full_size", "full_size_models", "random_model"]
@@ -90,6 +90,6 @@ def random_model(
         state=(),
         clip=tuple(model.inputs.clip.tolist()),
         scale=tuple(model.inputs.scale.tolist()),
-        floor=tuple(channel_values(spec, CHANNEL_FLOOR).tolist()),
+        floor=tuple(channel_limits(spec).floor.tolist()),
         provenance={"weights": f"random, seed {seed}"},
     )

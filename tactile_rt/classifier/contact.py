@@ -9,7 +9,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CHANNEL_FLOOR", "ContactDetector"]
+__all__ = ["ContactDetector"]
 
 TARE_SAMPLES = 20  # quiet samples before the first decision: 180 ms at 9 ms
 BASELINE_SAMPLES = 100  # the baseline is the mean of at most this many of the last quiet samples
@@ -28,9 +28,6 @@ SUSPICION = 0.45  # of the onset's threshold: samples since then are not the bas
 # One sample adds no more than this to a mean, in sigma: a glitch is no touch, and a mean forgets a
 # touch soon after its end.
 LIMIT = np.array([np.inf, 3.0, 3.0], dtype=np.float32)[:, None, None]
-
-# The smallest sigma assumed per channel, for sources without noise: 2 uN and 0.01 uN m.
-CHANNEL_FLOOR = {"N": 2e-6, "N m": 1e-8}
 
 
 def onset_z2(quiet: NDArray[np.int64]) -> NDArray[np.float64]:

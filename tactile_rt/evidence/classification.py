@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.evidence.records import Record
-from tactile_rt.evidence.robustness import RATED, measure_robustness, robustness_records
+from tactile_rt.evidence.robustness import measure_robustness, rated_amount, robustness_records
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.stream import ConfigError, SpecMismatch
@@ -107,7 +107,9 @@ def evaluate_model(
             )
         )
     noisy = evaluation.predict(test, run, 1.0)
-    how = f"{sample}; white noise {RATED} added to every 9 ms sample, undetected sweeps count as "
+    rated, period_ms = rated_amount(test), card.period_ns * 1e-6
+    how = f"{sample}; white noise {rated} added to every {period_ms:g} ms sample, "
+    how += "undetected sweeps count as "
     records.append(
         _accuracy("top-1 at rated noise", noisy[:, -1], labels, objects, "", how + "wrong")
     )
@@ -122,12 +124,12 @@ def evaluate_model(
             how + "wrong",
         )
     )
-    # The same noise on the sensor's own 1 kHz samples: the resampler's Hann kernel leaves 0.29.
-    raw = evaluation.predict(test, run, float(np.sqrt(1.5 / 18)))
-    how = f"{sample}; white noise {RATED} on every 1 kHz sample, through the resampler"
-    records.append(
-        _accuracy("top-1 at rated noise of 1 kHz samples", raw[:, -1], labels, objects, "", how)
-    )
+    if test.manifest.sensor is None:
+        # The same noise on samples of 1 kHz: the resampler's Hann kernel leaves 0.29.
+        raw = evaluation.predict(test, run, float(np.sqrt(1.5 / 18)))
+        how = f"{sample}; white noise {rated} on every 1 kHz sample, through the resampler"
+        name = "top-1 at rated noise of 1 kHz samples"
+        records.append(_accuracy(name, raw[:, -1], labels, objects, "", how))
     few = _first_of_each(test, ROBUSTNESS_SWEEPS)
     robustness = measure_robustness(few, run, clean[_firsts(objects, ROBUSTNESS_SWEEPS), -1])
     records += robustness_records(robustness, f"{len(few.sweeps)} of the sweeps")
@@ -154,7 +156,7 @@ def evaluate_model(
         draw_confusion(table, card.labels, pictures / "confusion.png")
         curves = {
             "no sensor noise": over_time,
-            f"rated noise ({RATED} per sample)": evaluation.accuracy_over_time(noisy, labels),
+            f"rated noise ({rated} per sample)": evaluation.accuracy_over_time(noisy, labels),
         }
         draw_accuracy_over_time(curves, 1e-3 * step_ms, pictures / "accuracy_over_time.png")
         draw_robustness(

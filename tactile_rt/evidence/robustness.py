@@ -1,6 +1,5 @@
 """A model with a sensor that is not what it was trained on: noisy, drifting, wrong, half dead."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,31 +7,46 @@ from numpy.typing import NDArray
 
 from tactile_rt.evidence.records import Record
 from tactile_rt.models import evaluation
-from tactile_rt.models.datasets import RATED_NOISE, SweepSet
+from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import OFFSET, Disturbance
 
-__all__ = ["CONDITIONS", "RATED", "Robustness", "measure_robustness", "robustness_records"]
+__all__ = [
+    "Robustness",
+    "conditions",
+    "measure_robustness",
+    "rated_amount",
+    "robustness_records",
+]
 
 
-def _amount(table: Mapping[str, float], factor: float = 1.0) -> str:
-    return " and ".join(f"{1e6 * factor * v:g} u{u}" for u, v in table.items())
+REST = 80  # samples: 0.7 s of a mouse's, which a tare can be taken from
 
 
-RATED = _amount(RATED_NOISE)
+def rated_amount(data: SweepSet, factor: float = 1.0) -> str:
+    """The rated noise per sample in words, or a multiple of it, e.g. 10 uN and 0.05 uN m."""
+    largest: dict[str, float] = {}
+    for unit, noise in zip(data.manifest.spec.units, data.noise.tolist(), strict=True):
+        largest[unit] = max(largest.get(unit, 0.0), noise)
+    return " and ".join(f"{1e6 * factor * v:.3g} u{unit}" for unit, v in largest.items())
 
-REST = 80  # samples: 0.7 s, which a tare can be taken from
 
-CONDITIONS = {
-    "noise at a quarter of the rated": Disturbance(noise=0.25),
-    "noise at half the rated": Disturbance(noise=0.5),
-    f"rated noise, {RATED}": Disturbance(noise=1.0),
-    f"rated noise, after {REST} samples of rest": Disturbance(noise=1.0, rest=REST),
-    "noise at twice the rated": Disturbance(noise=2.0),
-    f"offset of {_amount(OFFSET, 0.25)} after the tare": Disturbance(offset=0.25),
-    f"offset of {_amount(OFFSET)} after the tare": Disturbance(offset=1.0),
-    "gain error of 20 % per whisker": Disturbance(gain=0.2),
-    "6 dead whiskers": Disturbance(dead=6),
-}
+def conditions(data: SweepSet) -> dict[str, Disturbance]:
+    """What is tried, by name: amounts are those of the set's own sensor."""
+    rated, whiskers = rated_amount(data), len(data.manifest.spec.elements)
+    found = {
+        "noise at a quarter of the rated": Disturbance(noise=0.25),
+        "noise at half the rated": Disturbance(noise=0.5),
+        f"rated noise, {rated}": Disturbance(noise=1.0),
+        f"rated noise, after {REST} samples of rest": Disturbance(noise=1.0, rest=REST),
+        "noise at twice the rated": Disturbance(noise=2.0),
+        f"offset of {rated_amount(data, OFFSET / 4)} after the tare": Disturbance(offset=0.25),
+        f"offset of {rated_amount(data, OFFSET)} after the tare": Disturbance(offset=1.0),
+        "gain error of 20 % per whisker": Disturbance(gain=0.2),
+    }
+    if whiskers > 1:
+        dead = max(1, whiskers // 5)
+        found[f"{dead} dead whisker{'s' if dead > 1 else ''}"] = Disturbance(dead=dead)
+    return found
 
 
 @dataclass(frozen=True)
@@ -58,7 +72,7 @@ def measure_robustness(
     base = evaluation.hits(clean, labels)
     nothing = evaluation.Interval(0.0, 0.0, 0.0)
     found = [Robustness("an ideal sensor", evaluation.accuracy(base, objects), nothing)]
-    for name, disturbance in CONDITIONS.items():
+    for name, disturbance in conditions(test).items():
         there = evaluation.predict(test, run, disturbance=disturbance)[:, -1]
         right = evaluation.hits(there, labels)
         lost = evaluation.accuracy(base.astype(np.float64) - right, objects)

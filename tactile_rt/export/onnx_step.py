@@ -23,7 +23,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from tactile_rt.classifier.contact import CHANNEL_FLOOR
 from tactile_rt.classifier.model_card import Kind
 from tactile_rt.classifier.model_file import (
     METADATA_KEY,
@@ -37,7 +36,6 @@ from tactile_rt.export.precision import Precision, in_precision
 from tactile_rt.export.streaming import streaming
 from tactile_rt.export.windows import window_graph
 from tactile_rt.models.data_checks import trained_on
-from tactile_rt.models.datasets import channel_values
 from tactile_rt.models.training import TactileClassifier, load_checkpoint
 from tactile_rt.stream import ModelError
 from tactile_rt.sweep_set import SweepManifest
@@ -123,7 +121,7 @@ def export_checkpoint(
         state=(),
         clip=tuple(model.inputs.clip.tolist()),
         scale=tuple(model.inputs.scale.tolist()),
-        floor=tuple(channel_values(manifest.spec, CHANNEL_FLOOR).tolist()),
+        floor=tuple(manifest.limits.floor.tolist()),
         temperature=temperature,
         provenance={
             "checkpoint_sha256": hashlib.sha256(checkpoint.read_bytes()).hexdigest(),

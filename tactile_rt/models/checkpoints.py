@@ -10,25 +10,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from tactile_rt.models.datasets import Timing, channel_values
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.inputs import InputStage
+from tactile_rt.sensor_spec import ChannelLimits, channel_limits
 from tactile_rt.stream import ArraySpec, ConfigError, ModelError
+from tactile_rt.timing import Timing
 
 __all__ = [
-    "CLIP",
-    "SCALE",
     "TactileClassifier",
     "load_checkpoint",
     "reason",
     "run_on",
     "save_whole",
+    "untrained",
 ]
-
-# What is believed of a sensor, and the smallest scale of the logarithm: a third of the median
-# load of a touching whisker in passive sweeps.
-CLIP = {"N": 5e-3, "N m": 5e-6}
-SCALE = {"N": 1e-5, "N m": 1e-7}
 
 
 class TactileClassifier(nn.Module):
@@ -37,18 +32,20 @@ class TactileClassifier(nn.Module):
     Args:
         spec: the array.
         network: the EAD's configuration.
+        limits: what is believed of the channels; None: what `channel_limits` says of an array
+            without a described sensor.
 
     Raises:
         ConfigError: the network is for another array.
     """
 
-    def __init__(self, spec: ArraySpec, network: EADConfig) -> None:
+    def __init__(
+        self, spec: ArraySpec, network: EADConfig, limits: ChannelLimits | None = None
+    ) -> None:
         super().__init__()
+        limits = limits or channel_limits(spec)
         self.inputs = InputStage(
-            spec.grid,
-            spec.grid_shape,
-            channel_values(spec, CLIP).tolist(),
-            channel_values(spec, SCALE).tolist(),
+            spec.grid, spec.grid_shape, limits.clip.tolist(), limits.scale.tolist()
         )
         channels, *grid = network.frame
         if tuple(grid) != tuple(spec.grid_shape) or channels % len(spec.channels):
@@ -111,8 +108,7 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
     """
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
-        spec = ArraySpec.from_json(saved["spec"])
-        model = TactileClassifier(spec, EADConfig(**saved["network"]))
+        model = untrained(saved)
         model.load_state_dict(saved["model"])
     except FileNotFoundError:
         raise ModelError(f"no checkpoint {path}") from None
@@ -121,6 +117,14 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
             f"{path} is not a checkpoint of `tactile-rt train`: {reason(error)}"
         ) from None
     return model.eval(), saved
+
+
+def untrained(saved: dict[str, Any]) -> TactileClassifier:
+    """The network of a checkpoint as it might be before training: for the same channels."""
+    clip, scale = (saved["model"][f"inputs.{name}"].numpy() for name in ("clip", "scale"))
+    limits = ChannelLimits(noise=scale, floor=scale, clip=clip, scale=scale)
+    spec = ArraySpec.from_json(saved["spec"])
+    return TactileClassifier(spec, EADConfig(**saved["network"]), limits)
 
 
 def reason(error: Exception) -> str:

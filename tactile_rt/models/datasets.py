@@ -14,66 +14,25 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tactile_rt.classifier.contact import CHANNEL_FLOOR
 from tactile_rt.models.onsets import Onsets, find_onsets
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.stream import ConfigError
 from tactile_rt.sweep_set import SweepManifest, Sweeps, read_sweeps
+from tactile_rt.timing import MOUSE, Timing
 
 __all__ = [
-    "MOUSE",
-    "RATED_NOISE",
     "Onsets",
     "SweepSet",
-    "Timing",
     "TrainingBatches",
-    "channel_values",
     "find_onsets",
     "frame_of",
     "windows",
 ]
 
-STEPS, STEP_MS = 22, 45.0  # of a window (Chung et al. 2025)
-RATED_NOISE = {"N": 10e-6, "N m": 5e-8}  # sensor noise per sample, one standard deviation, SI
 NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0)  # of the rated noise, at which training finds onsets
 CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others are in between
 GAIN_ERROR = 0.1
 DROPOUT = 0.05  # of whole whiskers
 JITTER = 5  # samples either side of the onset
-
-
-def channel_values(spec: ArraySpec, table: dict[str, float]) -> NDArray[np.float32]:
-    """(channel,) values from a table by unit.
-
-    Raises:
-        ConfigError: a channel's unit is not in the table.
-    """
-    unknown = sorted(set(spec.units) - set(table))
-    if unknown:
-        raise ConfigError(f"channels in {', '.join(unknown)} cannot be learnt from yet")
-    return np.array([table[u] for u in spec.units], dtype=np.float32)
-
-
-@dataclass(frozen=True)
-class Timing:
-    """How a window is cut: into steps, each of so many samples.
-
-    Attributes:
-        steps: The number of steps of a window, after each of which there is a decision.
-        substeps: The number of samples of a step.
-    """
-
-    steps: int = STEPS
-    substeps: int = 5
-
-    @classmethod
-    def of(cls, period_ns: int) -> "Timing":
-        """For samples so far apart: steps as near to the paper's 45 ms as whole samples come."""
-        return cls(substeps=max(1, round(STEP_MS * 1e6 / period_ns)))
-
-    @property
-    def samples(self) -> int:
-        """The number of samples of a window."""
-        return self.steps * self.substeps
 
 
 def frame_of(manifest: SweepManifest) -> tuple[int, int, int]:
@@ -97,15 +56,11 @@ class SweepSet:
         """Read a split.
 
         Raises:
-            RecordingError, ConfigError: as `read_sweeps`.
+            RecordingError, ConfigError: as `read_sweeps` and `channel_limits`.
         """
         manifest = SweepManifest.read(folder)
-        return cls(
-            manifest,
-            read_sweeps(folder, split),
-            channel_values(manifest.spec, RATED_NOISE),
-            channel_values(manifest.spec, CHANNEL_FLOOR),
-        )
+        limits = manifest.limits
+        return cls(manifest, read_sweeps(folder, split), limits.noise, limits.floor)
 
     @property
     def timing(self) -> Timing:
@@ -122,9 +77,6 @@ class SweepSet:
             noisy = (values + np.float32(level) * noise for level in NOISE_LEVELS)
             starts.append(np.stack([find_onsets(v, self.floor).start for v in noisy]))
         return np.concatenate(starts, axis=1)
-
-
-MOUSE = Timing()  # 22 steps of five 9 ms samples
 
 
 def windows(
@@ -196,7 +148,11 @@ class TrainingBatches:
         level = _noise_levels(n, rng)
         nearest = np.abs(level[:, None] - np.array(NOISE_LEVELS)).argmin(axis=1)
         start = self._starts[nearest, at] + rng.integers(-JITTER, JITTER + 1, n)
-        samples = windows(data.sweeps.values[at], start, data.timing)
+        values = data.sweeps.values[at]
+        # Relative to rest, where a magnetometer reads its magnet's field, and a load cell nothing.
+        rest = values[:, : data.manifest.lead].mean(axis=1) if data.manifest.lead else 0.0
+        samples = windows(values, start, data.timing)
+        samples -= np.asarray(rest, dtype=np.float32)[..., None, None, :, :]
         gain = 1 + GAIN_ERROR * rng.normal(size=(n, 1, 1, elements, 1)).astype(np.float32)
         alive = rng.random((n, 1, 1, elements, 1)) >= DROPOUT
         samples = samples * (gain * alive)

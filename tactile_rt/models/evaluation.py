@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.classifier import fuse
-from tactile_rt.models.datasets import SweepSet, channel_values, windows
+from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.stream import ConfigError
 
@@ -43,7 +43,7 @@ __all__ = [
 Step = Callable[
     [NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]
 ]
-OFFSET = {"N": 20e-6, "N m": 1e-7}  # a unit of offset that appears after the tare, SI
+OFFSET = 2.0  # a unit of offset that appears after the tare, in units of the rated noise
 LEVELS = (2.5, 97.5)  # percentiles of the 95 % interval
 
 
@@ -80,6 +80,8 @@ class Disturbance:
     ) -> NDArray[np.float32]:
         """What the detector sees, of (sweep, sample, element, channel) SI."""
         n, elements = len(values), values.shape[2]
+        if data.manifest.lead:  # what is wrong adds to rest, which is not nothing in a field
+            values = values - values[:, : data.manifest.lead].mean(axis=1, keepdims=True)
         if self.rest:
             silence = np.zeros((n, self.rest, *values.shape[2:]), dtype=np.float32)
             values = np.concatenate([silence, values], axis=1)
@@ -100,7 +102,7 @@ class Disturbance:
         """What the network sees, of (sweep, step, sub-step, element, channel) SI."""
         if not self.offset:
             return samples
-        size = channel_values(data.manifest.spec, OFFSET) * np.float32(self.offset)
+        size = OFFSET * data.noise * np.float32(self.offset)
         sign = rng.choice(np.array([-1, 1], dtype=np.float32), (len(samples), *samples.shape[3:]))
         there: NDArray[np.float32] = samples + (sign * size)[:, None, None]
         return there

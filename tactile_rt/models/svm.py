@@ -79,14 +79,12 @@ def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
 
 def _features(data: "SweepSet") -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """(sweep, step * element * channel) compressed loads, and whether there was an onset."""
-    # Imported here: they bring torch, which whoever only writes a set's card does without.
-    from tactile_rt.models.checkpoints import CLIP, SCALE
-    from tactile_rt.models.datasets import channel_values, windows
+    # Imported here: it brings torch, which whoever only writes a set's card does without.
+    from tactile_rt.models.datasets import windows
 
-    spec = data.manifest.spec
-    clip, scale = channel_values(spec, CLIP), channel_values(spec, SCALE)
+    limits = data.manifest.limits
     found = find_onsets(data.sweeps.values, data.floor)
     cut = windows(data.sweeps.values, found.start, data.timing) - found.offset[:, None, None]
-    cut = np.clip(cut, -clip, clip)  # (sweep, step, sub-step, element, channel) SI
-    cut = np.sign(cut) * np.log1p(np.abs(cut) / scale)
+    cut = np.clip(cut, -limits.clip, limits.clip)  # (sweep, step, sub-step, element, channel) SI
+    cut = np.sign(cut) * np.log1p(np.abs(cut) / limits.scale)
     return cut.mean(axis=2).reshape(len(cut), -1), found.start >= 0

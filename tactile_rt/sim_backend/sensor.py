@@ -15,6 +15,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError
 
 __all__ = ["Sensor", "SensorModel"]
@@ -134,6 +135,10 @@ class Sensor:
         model: what is wrong with the sensor.
         spec: the array that it belongs to.
         seed: of everything that is drawn.
+        described: what the array's description says of its sensor, which adds to the model; None:
+            nothing.
+        drawn: whether what the description says of noise, offset and drift counts; else only what
+            is the same at every time does, which is how it rounds and where it saturates.
 
     Attributes:
         dead: The (element,) bool that tells which elements are dead.
@@ -142,7 +147,14 @@ class Sensor:
         dropped: The number of samples dropped so far.
     """
 
-    def __init__(self, model: SensorModel, spec: ArraySpec, seed: int | Sequence[int] = 0) -> None:
+    def __init__(
+        self,
+        model: SensorModel,
+        spec: ArraySpec,
+        seed: int | Sequence[int] = 0,
+        described: SensorSpec | None = None,
+        drawn: bool = True,
+    ) -> None:
         self._model, self._spec = model, spec
         seeds = np.random.SeedSequence(seed).spawn(len(EFFECTS))
         self._rng = {e: np.random.default_rng(s) for e, s in zip(EFFECTS, seeds, strict=True)}
@@ -151,14 +163,20 @@ class Sensor:
             size = {"N": float(force), "N m": float(moment)}
             return np.array([size.get(unit, 0.0) for unit in spec.units])
 
-        self._alters = any(
+        def said(name: str, counts: bool = True) -> NDArray[np.float64]:
+            channels = described.channels if described and counts else ()
+            return np.array([getattr(c, name) for c in channels] or [0.0] * len(spec.channels))
+
+        self._alters = described is not None or any(
             getattr(model, f.name) for f in fields(SensorModel) if f.name not in NOT_VALUES
         )
+        self._latency_ms = model.latency_ms + (described.latency_ms if described else 0.0)
         self._mix = _leaks(self._rng["crosstalk"], spec) * model.crosstalk_channels
         gain = 1 + model.gain * self._rng["gain"].standard_normal(spec.shape)
         self._mix += gain[..., None] * np.eye(spec.shape[1])
         self._neighbours = _neighbours(spec)
         self._noise = per_channel(model.noise_force, model.noise_moment)
+        self._noise = np.hypot(self._noise, described.noise() if described and drawn else 0.0)
         self._flicker = per_channel(model.flicker_force, model.flicker_moment)
         # A process that forgets in T has the density 4 v T / (1 + (2 pi f T)^2); their sum over T
         # in steps of a factor r is v / (f ln r).
@@ -169,10 +187,14 @@ class Sensor:
         powers = np.arange(0, decades * PER_DECADE) / PER_DECADE
         self._forgets_s = self._period_s / math.pi * 10.0**powers
         self._drift = per_channel(model.drift_force, model.drift_moment)
+        self._drift = np.hypot(self._drift, said("drift", drawn))
         self._range = per_channel(model.range_force, model.range_moment)
         self._range[self._range == 0] = np.inf
+        if described:
+            self._range = np.minimum(self._range, said("range"))
         self._resolution = per_channel(model.resolution_force, model.resolution_moment)
-        bias = per_channel(model.bias_force, model.bias_moment)
+        self._resolution = np.maximum(self._resolution, said("resolution"))
+        bias = np.hypot(per_channel(model.bias_force, model.bias_moment), said("offset", drawn))
         self.bias = bias * self._rng["bias"].standard_normal(spec.shape)
         self.dead = self._rng["dead"].random(len(spec.elements)) < model.dead_probability
         self.saturated = 0
@@ -193,8 +215,8 @@ class Sensor:
         since = self._since_s(chunk.t_ns)
         values = self._readings(chunk, since) if self._alters else chunk.values
         t_ns = chunk.t_ns
-        if self._model.latency_ms or self._model.jitter_ms:
-            delay = np.full(len(chunk), float(self._model.latency_ms))
+        if self._latency_ms or self._model.jitter_ms:
+            delay = np.full(len(chunk), float(self._latency_ms))
             if self._model.jitter_ms:
                 delay += self._model.jitter_ms * self._lateness(since)
             t_ns = t_ns + np.rint(delay * NS_PER_MS).astype(np.int64)

@@ -6,6 +6,9 @@ sim:mouse?objects=mug-50,bottle-51&seed=3&pace=fast&profile=realtime&sweeps=10
 sim:mouse?noise_force=1e-5&noise_moment=5e-8&latency_ms=2&drop_probability=0.01
 sim:mouse?friction=0.3&young_modulus=0.2&angles_deg=3&mount_mm=0.5
 sim:springs.toml?base_turns=true
+
+An array whose file has a [sensor] delivers what that sensor reads, at its own rate and in its own
+units; the options of `SensorModel` then act on its readings.
 """
 
 import abc
@@ -25,7 +28,8 @@ from tactile_rt.sim_backend.remarks import ringing
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, usual_distance
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation, check_sweep, draw_simulation
-from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS, world_spec
+from tactile_rt.sim_backend.transducer import Transducer, device_spec, sensor_of
+from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStream, Source
 
 __all__ = ["CHUNK_SAMPLES", "PACES", "PacedSource", "Pass", "SimOptions", "SimSource", "check_pace"]
@@ -195,9 +199,12 @@ class SimSource(PacedSource):
     def __init__(self, array: str, options: SimOptions) -> None:
         self._animals = load_animals(array or "mouse")
         _check_turns(self._animals, options)
-        spec = felt = world_spec(self._animals)
+        spec, described = device_spec(self._animals), sensor_of(self._animals)
+        self._sensor = Sensor(options, spec, options.seed, described)
+        self._transducer = Transducer(described, spec.elements) if described else None
+        self._feels_turns = options.base_turns or bool(described and described.feels_turns)
         if options.base_turns:
-            spec = replace(felt, channels=felt.channels + TURNS, units=(*felt.units, "rad", "rad"))
+            spec = replace(spec, channels=spec.channels + TURNS, units=(*spec.units, "rad", "rad"))
         super().__init__(spec, options.pace)
         self._options = options
         self._objects = _objects(options) or [promised_object(name) for name in CATEGORIES]
@@ -205,7 +212,6 @@ class SimSource(PacedSource):
         # Of its own, so that the objects are the same with and without.
         self._array_rng = np.random.default_rng([options.seed, 1])
         self._distance_mm = usual_distance(self._animals)
-        self._sensor = Sensor(options, felt, options.seed)
         self.passes: list[Pass] = []
         self._strained: set[str] = set()  # whiskers of which it has been told
         if line := ringing(self._animals, PROFILES[options.profile]):
@@ -228,6 +234,11 @@ class SimSource(PacedSource):
 
     def _simulate(self, start_ns: int) -> Chunk | None:
         true = self._true(start_ns)
+        if self._transducer is not None:
+            sampled = self._transducer.push(true)
+            read = self._sensor.push(sampled) if sampled is not None else None
+            self.stats.missing = self._sensor.dropped
+            return read
         channels = len(CHANNELS)
         loads = Chunk(true.seq, true.t_ns, true.values[..., :channels], true.valid)
         received = self._sensor.push(loads)
@@ -244,13 +255,14 @@ class SimSource(PacedSource):
             self._begin_sweep(start_ns)
         if self._rest:
             n = min(CHUNK_SAMPLES, self._rest)
-            values = np.zeros((n, *self.spec.shape), dtype=np.float32)
+            channels = len(CHANNELS) + (len(TURNS) if self._feels_turns else 0)
+            values = np.zeros((n, len(self.spec.elements), channels), dtype=np.float32)
             self._rest -= n
         else:
             assert self._simulation is not None
             n = min(CHUNK_SAMPLES, self._left)
             values = self._simulation.advance(n).astype(np.float32)
-            if self._options.base_turns:
+            if self._feels_turns:
                 turns = self._simulation.turns().astype(np.float32)
                 values = np.concatenate([values, turns], axis=2)
             self._left -= n
@@ -299,6 +311,8 @@ class SimSource(PacedSource):
 
 
 def _check_turns(animals: tuple[WhiskerArray, ...], options: SimOptions) -> None:
+    if options.base_turns and sensor_of(animals) is not None:
+        raise ConfigError("base_turns: the array's [sensor] says already what is measured")
     if options.base_turns and not any(w.mount_stiffness for a in animals for w in a.whiskers):
         raise ConfigError(
             f"base_turns: no mount of {' and '.join(a.name for a in animals)} gives; "

@@ -19,7 +19,6 @@ import torch
 
 import tactile_rt
 from tactile_rt.classifier.classifier import Classifier
-from tactile_rt.classifier.contact import CHANNEL_FLOOR
 from tactile_rt.classifier.model_file import ModelCard, load_model
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.classifier.stepper import Stepper
@@ -31,12 +30,14 @@ from tactile_rt.export.onnx_step import (
     file_logits,
     parity,
 )
-from tactile_rt.models.datasets import MOUSE, find_onsets, windows
+from tactile_rt.models.datasets import find_onsets, windows
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.training import TactileClassifier
+from tactile_rt.sensor_spec import CHANNEL_FLOOR
 from tactile_rt.stream import ArraySpec, ModelError
 from tactile_rt.sweep_set import SweepManifest
 from tactile_rt.testing import cut
+from tactile_rt.timing import MOUSE
 
 STEPS, SUBSTEPS = MOUSE.steps, MOUSE.substeps
 PERIOD_NS = 9_000_000

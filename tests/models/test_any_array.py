@@ -10,9 +10,9 @@ pytest.importorskip("torch")
 import torch
 
 from tactile_rt.models.checkpoints import TactileClassifier
-from tactile_rt.models.datasets import Timing
 from tactile_rt.models.ead import EAD, ENCODERS, EADConfig
 from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.timing import Timing
 from tests.helpers.small_networks import TOLERANCE, build, stream
 
 GRIDS = [(6, 1, 1), (30, 2, 4), (12, 1, 32), (15, 3, 3), (9, 10, 14), (4, 8, 1)]

@@ -7,16 +7,14 @@ import pytest
 
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.models.datasets import (
-    MOUSE,
-    RATED_NOISE,
     SweepSet,
     TrainingBatches,
-    channel_values,
     find_onsets,
     windows,
 )
 from tactile_rt.stream import ArraySpec, ConfigError
 from tactile_rt.sweep_set import SweepManifest, Sweeps
+from tactile_rt.timing import MOUSE
 
 ELEMENTS, CHANNELS, SAMPLES, LEAD = 4, 6, 170, 30
 SPEC = ArraySpec(
@@ -57,12 +55,6 @@ def noise_level(samples: np.ndarray) -> np.ndarray:
     """(window,) noise in units of the rated, by the spread of what is constant late in it."""
     late = samples.reshape(len(samples), -1, ELEMENTS, CHANNELS)[:, 40:100].astype(np.float64)
     return (late.std(axis=1) / RATED).mean(axis=(1, 2))
-
-
-def test_rated_noise_by_channel() -> None:
-    assert channel_values(SPEC, RATED_NOISE) == pytest.approx(RATED)
-    with pytest.raises(ConfigError, match="channels in N m cannot be learnt from"):
-        channel_values(SPEC, {"N": 1.0})
 
 
 def test_onsets_are_those_of_the_detector_one_sweep_at_a_time() -> None:

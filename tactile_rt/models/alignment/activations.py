@@ -23,8 +23,8 @@ from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.models.attenders.gpt import GPT, TOKENS
 from tactile_rt.models.attenders.mamba import MambaStack
-from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint
-from tactile_rt.models.ead import EADConfig, count_parameters
+from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, untrained
+from tactile_rt.models.ead import count_parameters
 from tactile_rt.models.encoders.graph import Graph, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 from tactile_rt.models.encoders.gru import GRUEncoder
@@ -54,8 +54,7 @@ def untrained_layers(saved: dict[str, Any], stimuli: StimuliInput, seed: int = 0
     """Layers of a checkpoint's network as it might be before training: its random control."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        spec = ArraySpec.from_json(saved["spec"])
-        model = TactileClassifier(spec, EADConfig(**saved["network"]))
+        model = untrained(saved)
     return network_layers(model, stimuli, f"untrained, seed {seed}")
 
 

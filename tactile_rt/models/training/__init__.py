@@ -9,8 +9,6 @@ go on) and `best.pt` (the network of the best validation).
 """
 
 from tactile_rt.models.checkpoints import (
-    CLIP,
-    SCALE,
     TactileClassifier,
     load_checkpoint,
     run_on,
@@ -21,8 +19,6 @@ from tactile_rt.models.training.probing import ProbeConfig, probe
 from tactile_rt.models.training.recipes import read_recipe, shipped_recipes
 
 __all__ = [
-    "CLIP",
-    "SCALE",
     "ProbeConfig",
     "Progress",
     "TactileClassifier",

@@ -190,7 +190,7 @@ def build_objective(config: TrainingConfig, manifest: SweepManifest) -> Objectiv
         ConfigError: there is no such network, or the array cannot be augmented so.
     """
     network = config.network(len(manifest.categories), frame_of(manifest))
-    model = TactileClassifier(manifest.spec, network)
+    model = TactileClassifier(manifest.spec, network, manifest.limits)
     augmentation = build(config.augmentation, manifest.spec, config.masking)
     if config.objective == "supervised":
         return Supervised(model, augmentation, config.loss, config.label_smoothing)

@@ -108,7 +108,7 @@ def probe(
         decoder="linear",
         readout=config.readout,
     )
-    model = TactileClassifier(manifest.spec, network)
+    model = TactileClassifier(manifest.spec, network, manifest.limits)
     kept = {k: v for k, v in trained.state_dict().items() if not k.startswith("network.decoder.")}
     kept |= {f"network.decoder.{name}": value for name, value in layer.state_dict().items()}
     model.load_state_dict(kept)

@@ -9,6 +9,12 @@ see ``docs/arrays/robot.toml`` and ``robot.csv`` for one array in both. In TOML:
     [mount]                    # if left out: unturned, the mean base point at the world's origin
     position_mm = [0.0, 0.0, 0.0]
     roll_pitch_yaw_rad = [0.0, 0.0, 0.0]
+    [sensor]                   # what reads the whiskers; if left out: their base loads, 1 kHz
+    rate_hz = 100              # see `sensor_spec.SensorSpec`
+    [[sensor.channel]]         # see `sensor_spec.ChannelSpec`
+    name = "mz"
+    ...
+    [sensor.magnet]            # see `sensor_spec.MagnetSpec`
     [defaults]                 # of every whisker
     young_modulus_pa = 2.9e9
     [[whisker]]
@@ -26,6 +32,7 @@ from typing import Any
 
 import msgspec
 
+from tactile_rt.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec
 from tactile_rt.settings import (
     SettingNode,
     check_columns,
@@ -65,11 +72,21 @@ class _Animal(msgspec.Struct, forbid_unknown_fields=True):
     mount: _Mount | None = None
 
 
+class _Sensor(msgspec.Struct, forbid_unknown_fields=True):
+    channel: tuple[ChannelSpec, ...] = ()
+    rate_hz: float = SensorSpec.rate_hz
+    bandwidth_hz: float = SensorSpec.bandwidth_hz
+    latency_ms: float = SensorSpec.latency_ms
+    magnet: MagnetSpec | None = None
+    matrix: dict[str, tuple[tuple[float, ...], ...]] = {}
+
+
 class _File(msgspec.Struct, forbid_unknown_fields=True):
     name: str = ""
     head: str = ""
     mirror: bool = False
     mount: _Mount | None = None
+    sensor: _Sensor | None = None
     defaults: dict[str, Any] = {}
     whisker: list[dict[str, Any]] = []
     animal: list[_Animal] = []
@@ -125,10 +142,10 @@ def _toml_animals(path: Path) -> tuple[WhiskerArray, ...]:
     if bool(file.animal) == bool(file.whisker):
         raise ConfigError(f"{path}: needs [[whisker]] tables or [[animal]] tables, one of the two")
     if file.animal:
-        if file.name or file.head or file.mirror or file.mount or file.defaults:
+        if any((file.name, file.head, file.mirror, file.mount, file.sensor, file.defaults)):
             raise ConfigError(
                 f"{path}: beside [[animal]] tables there is nothing else; name, head, mirror, "
-                f"mount and defaults belong in the file of an array"
+                f"mount, sensor and defaults belong in the file of an array"
             )
         return place([_animal(path, animal) for animal in file.animal])
     if file.defaults:
@@ -144,7 +161,7 @@ def _toml_animals(path: Path) -> tuple[WhiskerArray, ...]:
     made = _distinct(path, whiskers)
     mount = _mount(path, file.mount) if file.mount else centred_mount(made)
     name = file.name or path.stem
-    array = WhiskerArray(name, made, mount, _head(path, file.head))
+    array = WhiskerArray(name, made, mount, _head(path, file.head), _sensor(nodes, file.sensor))
     return (both_sides(array, name) if file.mirror else array,)
 
 
@@ -174,6 +191,22 @@ def _mount(path: Path, mount: _Mount) -> Mount:
         return Mount(mount.position_mm, mount.roll_pitch_yaw_rad)
     except ConfigError as error:
         raise ConfigError(f"{path}: {error}") from None
+
+
+def _sensor(nodes: SettingNode, sensor: _Sensor | None) -> SensorSpec | None:
+    if sensor is None:
+        return None
+    try:
+        return SensorSpec(
+            channels=sensor.channel,
+            rate_hz=sensor.rate_hz,
+            bandwidth_hz=sensor.bandwidth_hz,
+            latency_ms=sensor.latency_ms,
+            magnet=sensor.magnet,
+            matrix=sensor.matrix,
+        )
+    except ConfigError as error:
+        raise ConfigError(f"{nodes.at(['sensor']).where}: {error}") from None
 
 
 def _whisker(where: str, values: Mapping[str, object]) -> Whisker:

@@ -6,12 +6,13 @@ animal's right), y rostral, z dorsal; the left side of an animal is its right si
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 from tactile_rt.stream import ConfigError
 
@@ -68,6 +69,7 @@ class WhiskerArray:
         whiskers: The array's whiskers in the frame of the head, in mm and rad.
         mount: The pose of the head in the world.
         head: The mesh file of the head, in the head's frame and in mm; None: no head is drawn.
+        sensor: What reads the whiskers; None: the base loads are read as they are.
 
     Raises:
         ConfigError: no whiskers, or two of one name or in one cell of the grid.
@@ -77,6 +79,7 @@ class WhiskerArray:
     whiskers: tuple[Whisker, ...]
     mount: Mount = MOUNT
     head: Path | None = None
+    sensor: SensorSpec | None = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
         if not self.whiskers:
@@ -149,7 +152,11 @@ def place(
         whiskers = tuple(
             replace(w, name=f"{k}.{w.name}", row=w.row + above) for w in array.whiskers
         )
-        placed.append(replace(array, name=f"{k}.{array.name}", whiskers=whiskers))
+        sensor = array.sensor
+        if sensor is not None:
+            matrix = {f"{k}.{name}": rows for name, rows in sensor.matrix.items()}
+            sensor = replace(sensor, matrix=matrix)
+        placed.append(replace(array, name=f"{k}.{array.name}", whiskers=whiskers, sensor=sensor))
         above = max(w.row for w in whiskers) + 1
     return tuple(placed)
 

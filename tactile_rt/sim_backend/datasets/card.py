@@ -6,6 +6,7 @@ card.png        forces, which whiskers are touched, what was drawn, what can be 
 examples.png    a sweep of some categories
 """
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,7 +19,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tactile_rt.files import write_whole
-from tactile_rt.sim_backend.datasets.card_survey import NETWORK_CLIP, Card, survey
+from tactile_rt.sim_backend.datasets.card_survey import Card, survey
 from tactile_rt.sim_backend.datasets.separability import Fit, Separability
 from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest
@@ -26,7 +27,8 @@ from tactile_rt.sweep_set import SweepManifest
 __all__ = ["write_card"]
 
 EXAMPLES = 12
-FAINTEST_N = 1e-6
+FAINTEST = 5000  # times below what networks believe is where a picture begins
+PREFIXES = {0: "", -1: "m", -2: "u", -3: "n", -4: "p"}
 PAPER = (
     "The recipe follows the published generator (Chung et al. 2025): 312 sweeps of an object with "
     "high variation, 288 of them to train on, 16 with low. The table of the paper has totals of "
@@ -50,7 +52,8 @@ def write_card(folder: Path, fit: Fit) -> Card:
     write_whole(folder / "card.png", lambda file: _draw_card(card, spec, file))
     if examples:
         write_whole(
-            folder / "examples.png", lambda file: _draw_examples(examples, period_ms, spec, file)
+            folder / "examples.png",
+            lambda file: _draw_examples(examples, period_ms, spec, card, file),
         )
     numbers = msgspec.json.format(msgspec.json.encode(asdict(card)), indent=1)
     write_whole(folder / "card.json", lambda file: file.write(numbers))
@@ -130,8 +133,8 @@ def _felt(card: Card) -> str:
     )
     largest, where = card.largest
     lines = [
-        f"- Largest force of a touched whisker in a sweep: median {1e6 * card.median_force:.3g} "
-        f"uN; the largest of all {1e3 * largest:.3g} mN ({where}).",
+        f"- Largest load of a touched whisker in a sweep: median {_amount(card.median_load, card)}"
+        f"; the largest of all {_amount(largest, card)} ({where}).",
         f"- A sweep that touches, touches {card.whiskers_touched:.1f} whiskers on average.",
         f"- Sweeps without any touch: {card.without_touch}, of which {card.misses} pass beside "
         f"the array and {card.unstable} could not be simulated at this profile.",
@@ -140,6 +143,12 @@ def _felt(card: Card) -> str:
     if card.not_finite:
         lines.append(f"- **{card.not_finite} sweeps hold values that are no numbers.**")
     return "\n".join(lines)
+
+
+def _amount(value: float, card: Card) -> str:
+    """A load in words, e.g. 39 uN."""
+    power = min(max(math.floor(math.log10(value) / 3), -4), 0) if value > 0 else 0
+    return f"{value / 1000**power:.3g} {PREFIXES[power]}{card.unit}"
 
 
 def _coverage(card: Card, spec: ArraySpec) -> str:
@@ -180,21 +189,23 @@ def _draw_card(card: Card, spec: ArraySpec, file: BinaryIO) -> None:
     """Draw forces, coverage, counts and separability as a PNG."""
     figure = Figure(figsize=(11, 7.6), layout="constrained")
     axes = figure.subplots(2, 2)
-    _draw_forces(axes[0, 0], card)
+    _draw_loads(axes[0, 0], card)
     _draw_coverage(axes[0, 1], card, spec)
     _draw_counts(axes[1, 0], card)
     _draw_separability(axes[1, 1], card)
     figure.savefig(file, dpi=100, format="png")
 
 
-def _draw_forces(axes: Axes, card: Card) -> None:
-    edges = np.array(card.force_edges)
-    axes.stairs(card.force_counts, edges, fill=True, color="tab:blue", alpha=0.7)
-    axes.axvline(card.median_force, color="black", label=f"median {1e6 * card.median_force:.3g} uN")
-    axes.axvline(NETWORK_CLIP["N"], color="tab:red", linestyle="--", label="clip of the networks")
-    axes.axvline(1.0, color="tab:red", linestyle=":", label="published clip")
+def _draw_loads(axes: Axes, card: Card) -> None:
+    edges = np.array(card.load_edges)
+    axes.stairs(card.load_counts, edges, fill=True, color="tab:blue", alpha=0.7)
+    median = f"median {_amount(card.median_load, card)}"
+    axes.axvline(card.median_load, color="black", label=median)
+    axes.axvline(card.clip, color="tab:red", linestyle="--", label="clip of the networks")
+    if card.unit == "N":
+        axes.axvline(1.0, color="tab:red", linestyle=":", label="published clip")
     axes.set_xscale("log")
-    axes.set_xlabel("largest force of a touched whisker in a sweep (N)")
+    axes.set_xlabel(f"largest load of a touched whisker in a sweep ({card.unit})")
     axes.set_ylabel("whiskers x sweeps")
     axes.legend(fontsize=8)
 
@@ -248,29 +259,34 @@ def _draw_separability(axes: Axes, card: Card) -> None:
 
 
 def _draw_examples(
-    examples: dict[str, NDArray[np.float32]], period_ms: float, spec: ArraySpec, file: BinaryIO
+    examples: dict[str, NDArray[np.float32]],
+    period_ms: float,
+    spec: ArraySpec,
+    card: Card,
+    file: BinaryIO,
 ) -> None:
-    """Draw the force (sample, element), N, of one sweep of each of some categories as a PNG."""
+    """Draw the load (sample, element) of one sweep of each of some categories as a PNG."""
     spread = np.linspace(0, len(examples) - 1, min(len(examples), EXAMPLES)).round().astype(int)
     chosen = [sorted(examples)[i] for i in spread]
     columns = min(4, len(chosen))
     rows = -(-len(chosen) // columns)
     figure = Figure(figsize=(11, 0.6 + 2.4 * rows), layout="constrained")
     axes = figure.subplots(rows, columns, squeeze=False)
-    norm = LogNorm(FAINTEST_N, NETWORK_CLIP["N"])
+    faintest = card.clip / FAINTEST
+    norm = LogNorm(faintest, card.clip)
     for at, panel in enumerate(axes.flat):
         if at >= len(chosen):
             panel.set_axis_off()
             continue
-        force = np.maximum(examples[chosen[at]].T, FAINTEST_N)
-        span = (0, force.shape[1] * period_ms, len(force) - 0.5, -0.5)
+        load = np.maximum(examples[chosen[at]].T, faintest)
+        span = (0, load.shape[1] * period_ms, len(load) - 0.5, -0.5)
         image = panel.imshow(
-            force, norm=norm, aspect="auto", extent=span, interpolation="nearest", cmap="magma"
+            load, norm=norm, aspect="auto", extent=span, interpolation="nearest", cmap="magma"
         )
         panel.set_title(chosen[at], fontsize=9)
         firsts = [i for i, (row, _) in enumerate(spec.grid) if i == 0 or spec.grid[i - 1][0] != row]
         panel.set_yticks(firsts, [spec.elements[i] for i in firsts], fontsize=7)
     for panel in axes[-1]:
         panel.set_xlabel("time (ms)", fontsize=8)
-    figure.colorbar(image, ax=axes, label="force on the follicle (N)", shrink=0.8)
+    figure.colorbar(image, ax=axes, label=f"load at the base ({card.unit})", shrink=0.8)
     figure.savefig(file, dpi=100, format="png")

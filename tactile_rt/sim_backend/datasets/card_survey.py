@@ -3,6 +3,7 @@
 One object is read at a time, so that the set may be larger than the memory.
 """
 
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,16 +18,15 @@ from tactile_rt.sim_backend.datasets.separability import (
     check_separability,
     window_features,
 )
-from tactile_rt.stream import ArraySpec, RecordingError
+from tactile_rt.stream import RecordingError
 from tactile_rt.sweep_set import SweepManifest, has_object, read_object, read_skipped
 
 __all__ = ["Card", "survey"]
 
-TOUCH_N = 1e-6  # a whisker is touched when its force exceeds this, and twice the lead's largest
-DECADES = (-7, 1)  # of the force histogram, N
+TOUCH_N = 1e-6  # a whisker is touched when its load exceeds this, and twice the lead's largest
+DECADES = (-7, 1)  # of the histogram of forces, N
 BINS_A_DECADE = 5
 PUBLISHED_CLIP = {"N": 1.0, "N m": 1e-2}  # Chung et al. (2025)
-NETWORK_CLIP = {"N": 5e-3, "N m": 5e-6}  # this package's networks
 
 
 @dataclass
@@ -37,16 +37,19 @@ class Card:
         sweeps, objects: The counts of sweeps and of objects, by split and category.
         skipped: The names of objects that could not be made, and why each could not.
         parameters: The least, mean and greatest value of each sweep parameter.
-        force_edges: The (bin + 1,) edges of the histogram of the largest force of every touched
-            whisker in every sweep, N.
-        force_counts: The (bin,) numbers of whiskers and sweeps in each bin of that histogram.
-        median_force: The median of the forces in that histogram, N.
+        unit: The unit of what counts as load: the force, N, if it is measured, else all channels
+            that have the first one's unit.
+        clip: The largest load that networks believe.
+        load_edges: The (bin + 1,) edges of the histogram of the largest load of every touched
+            whisker in every sweep.
+        load_counts: The (bin,) numbers of whiskers and sweeps in each bin of that histogram.
+        median_load: The median of the loads in that histogram.
         coverage: The share of the sweeps in which each whisker is touched, 0 to 1, by its name.
         whiskers_touched: The mean number of whiskers touched by a sweep that touches.
         samples: The number of values in all sweeps, of every channel of every element at every
             time.
         clips: The number of values that exceed a limit, by the name of the limit.
-        largest: The largest force, N, and the sweep in which it occurs.
+        largest: The largest load, and the sweep in which it occurs.
         without_touch: The number of sweeps in which nothing is felt.
         misses: The number of sweeps known to pass beside the array.
         unstable: The number of sweeps that could not be simulated at the set's profile, and are
@@ -59,9 +62,11 @@ class Card:
     objects: dict[str, dict[str, int]] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
     parameters: dict[str, tuple[float, float, float]] = field(default_factory=dict)
-    force_edges: list[float] = field(default_factory=list)
-    force_counts: list[int] = field(default_factory=list)
-    median_force: float = 0.0
+    unit: str = "N"
+    clip: float = 0.0
+    load_edges: list[float] = field(default_factory=list)
+    load_counts: list[int] = field(default_factory=list)
+    median_load: float = 0.0
     coverage: dict[str, float] = field(default_factory=dict)
     whiskers_touched: float = 0.0
     samples: int = 0
@@ -78,7 +83,7 @@ class Card:
 class _Findings:
     """What is gathered from one object after the other."""
 
-    # (element,) of every sweep: the largest force, N; 0 where it is not touched.
+    # (element,) of every sweep: the largest load; 0 where it is not touched.
     peaks: list[NDArray[np.float32]] = field(default_factory=list)
     parameters: dict[str, list[NDArray[Any]]] = field(default_factory=dict)
     # Of the sweeps with a touch, of the splits that a machine is trained and tested on.
@@ -86,7 +91,7 @@ class _Findings:
         default_factory=lambda: {"train": [], "test": []}
     )
     categories: dict[str, list[str]] = field(default_factory=lambda: {"train": [], "test": []})
-    examples: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # (sample, element) N
+    examples: dict[str, NDArray[np.float32]] = field(default_factory=dict)  # (sample, element)
 
 
 def survey(folder: Path, fit: Fit) -> tuple[Card, dict[str, NDArray[np.float32]]]:
@@ -97,20 +102,23 @@ def survey(folder: Path, fit: Fit) -> tuple[Card, dict[str, NDArray[np.float32]]
         fit: fits a support vector machine, as `models.svm.fit`.
 
     Returns:
-        The card, and the force (sample, element), N, of one sweep of some categories.
+        The card, and the load (sample, element) of one sweep of some categories.
 
     Raises:
         RecordingError: no such set, nothing in it, or an object is damaged.
     """
     manifest = SweepManifest.read(folder)
-    card, found = Card(skipped=read_skipped(folder)), _Findings()
+    units = manifest.spec.units
+    unit = "N" if "N" in units else units[0]
+    clip = float(manifest.limits.clip[units.index(unit)])
+    card, found = Card(skipped=read_skipped(folder), unit=unit, clip=clip), _Findings()
     for split, names in manifest.split.items():
         for name in names:
             if has_object(folder, name):
                 _take(card, found, manifest, folder, split, name)
     if not found.peaks:
         raise RecordingError(f"{folder} has no sweeps yet: there is nothing to write a card of")
-    _summarise(card, found, manifest.spec)
+    _summarise(card, found, manifest)
     train, test = (
         Features(np.array(found.features[s]), np.array(found.categories[s]))
         for s in ("train", "test")
@@ -125,7 +133,10 @@ def _take(
 ) -> None:
     """Add one object's sweeps."""
     values, parameters = read_object(folder, name)
-    category, units = manifest.category(name), manifest.spec.units
+    category, units, limits = manifest.category(name), manifest.spec.units, manifest.limits
+    own = {unit: float(limits.clip[units.index(unit)]) for unit in dict.fromkeys(units)}
+    loads = _of(units, card.unit)
+    least = TOUCH_N if card.unit == "N" else float(limits.floor[loads].min())
     for counts, n in ((card.objects, 1), (card.sweeps, len(values))):
         counts.setdefault(split, {}).setdefault(category, 0)
         counts[split][category] += n
@@ -136,30 +147,32 @@ def _take(
     card.misses += int((parameters.get("touches", np.array(True)) == 0).sum())
     card.unstable += int(parameters.get("unstable", np.array(False)).sum())
     card.samples += values.size
-    for label, limits in (("published", PUBLISHED_CLIP), ("networks", NETWORK_CLIP)):
-        for unit in dict.fromkeys(units):
-            beyond = np.abs(values[..., _of(units, unit)]) > limits[unit]
-            key = f"{limits[unit]:g} {unit} ({label})"
+    for label, clips in (("published", PUBLISHED_CLIP), ("networks", own)):
+        for unit in dict.fromkeys(u for u in units if u in clips):
+            beyond = np.abs(values[..., _of(units, unit)]) > clips[unit]
+            key = f"{clips[unit]:.6g} {unit} ({label})"
             card.clips[key] = card.clips.get(key, 0) + int(beyond.sum())
     for index, sweep in enumerate(values):
         if not np.isfinite(sweep).all():
             card.not_finite += 1
             continue
-        force = np.linalg.norm(sweep[..., _of(units, "N")], axis=2)  # (sample, element)
-        noise = force[: manifest.lead].max(initial=0.0)
-        threshold = max(TOUCH_N, float(2 * noise))
-        peak = force.max(axis=0)
+        if manifest.lead:
+            sweep = sweep - sweep[: manifest.lead].mean(axis=0)  # a magnet's field is there at rest
+        load = np.linalg.norm(sweep[..., loads], axis=2)  # (sample, element)
+        noise = load[: manifest.lead].max(initial=0.0)
+        threshold = max(least, float(2 * noise))
+        peak = load.max(axis=0)
         found.peaks.append(np.where(peak > threshold, peak, np.float32(0)))
         if peak.max() > card.largest[0]:
             card.largest = (float(peak.max()), f"{name}, sweep {index}")
         if not (peak > threshold).any():
             card.without_touch += 1
             continue
-        found.examples.setdefault(category, force)
+        found.examples.setdefault(category, load)
         if split in found.features:
-            start = int(np.argmax((force > threshold).any(axis=1)))
+            start = int(np.argmax((load > threshold).any(axis=1)))
             period_ms = manifest.period_ns * 1e-6
-            found.features[split].append(window_features(sweep, start, period_ms, units))
+            found.features[split].append(window_features(sweep, start, period_ms, limits))
             found.categories[split].append(category)
 
 
@@ -167,17 +180,21 @@ def _of(units: tuple[str, ...], unit: str) -> list[int]:
     return [i for i, u in enumerate(units) if u == unit]
 
 
-def _summarise(card: Card, found: _Findings, spec: ArraySpec) -> None:
+def _summarise(card: Card, found: _Findings, manifest: SweepManifest) -> None:
     for key, drawn in found.parameters.items():
         all_of_it = np.concatenate(drawn)
         least, mean, greatest = all_of_it.min(), all_of_it.mean(), all_of_it.max()
         card.parameters[key] = (float(least), float(mean), float(greatest))
     peaks = np.stack(found.peaks)  # (sweep, element), 0 where untouched
     touched = peaks > 0
-    edges = np.logspace(*DECADES, (DECADES[1] - DECADES[0]) * BINS_A_DECADE + 1)
-    card.force_edges = edges.tolist()
-    card.force_counts = np.histogram(peaks[touched], edges)[0].tolist()
-    card.median_force = float(np.median(peaks[touched])) if touched.any() else 0.0
-    card.coverage = dict(zip(spec.elements, touched.mean(axis=0).tolist(), strict=True))
+    low, high = DECADES
+    if card.unit != "N":
+        floor = manifest.limits.floor[manifest.spec.units.index(card.unit)]
+        low, high = math.floor(math.log10(floor)), math.ceil(math.log10(card.clip))
+    edges = np.logspace(low, high, (high - low) * BINS_A_DECADE + 1)
+    card.load_edges = edges.tolist()
+    card.load_counts = np.histogram(peaks[touched], edges)[0].tolist()
+    card.median_load = float(np.median(peaks[touched])) if touched.any() else 0.0
+    card.coverage = dict(zip(manifest.spec.elements, touched.mean(axis=0).tolist(), strict=True))
     touching = touched.any(axis=1)
     card.whiskers_touched = float(touched[touching].sum(axis=1).mean()) if touching.any() else 0.0

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.sensor_spec import LOADS
 from tactile_rt.settings import no_such
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, contact_distances
@@ -30,7 +31,8 @@ from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
-from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, world_spec
+from tactile_rt.sim_backend.transducer import FASTEST_HZ, Transducer, device_spec, sensor_of
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
 from tactile_rt.stream import Chunk, ConfigError, SourceError, TactileError
 from tactile_rt.sweep_set import (
     MANIFEST,
@@ -67,7 +69,8 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
     of_meshes = () if recipe.objects.source == SHAPES else ("manifold3d",)
     packages = ("mujoco", "numpy", "scipy", "trimesh", *of_meshes)
     return SweepManifest(
-        spec=world_spec(animals),
+        spec=device_spec(animals),
+        sensor=sensor_of(animals),
         period_ns=recipe.period_ns,
         lead=recipe.lead,
         categories=objects.categories,
@@ -233,15 +236,13 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
     """
     rng, profile = recipe.rng(target.name, index), PROFILES[recipe.profile]
     ideal = load_animals(recipe.array)
-    # The description stays the ideal arrays': a robot does not know by how much its own differs.
-    spec = world_spec(ideal)
     draws = recipe.rng(target.name, index, RANDOMISATION)
     animals = tuple(recipe.randomisation.draw(draws, animal) for animal in ideal)
     for _ in range(1 if recipe.sweeps.keeps_misses else DRAWS):
         shared = recipe.rng(target.name, recipe.sweeps.draw_index(index), SHARED)
         sweep = recipe.sweeps.draw(rng, index, shared)
         simulation = SweepSimulation(animals, target, sweep, profile)
-        made = _with_lead(recipe, simulation) if simulation.touches else None
+        made = _simulated(recipe, simulation) if simulation.touches else None
         if made is not None:
             break
     parameters = {
@@ -250,21 +251,24 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
         "touches": float(simulation.touches),
         "unstable": float(simulation.touches and made is None),
     }
-    nothing = np.zeros((0, len(spec.elements), len(CONTACT_CHANNELS)))
-    chunk, felt = made or (_chunk(recipe, np.zeros((0, *spec.shape))), _chunk(recipe, nothing))
-    if recipe.sensor != SensorModel():
-        sensor = Sensor(recipe.sensor, spec, recipe.key(target.name, index, SENSOR))
-        chunk = sensor.push(chunk) or chunk
+    elements = sum(len(animal.whiskers) for animal in ideal)
+    loads, felt = made or (np.zeros((0, elements, len(LOADS))),) * 2
     # Through the loads' own resampler, so that a contact is of the same time as what it causes.
-    contacts = contact_distances(_resampled(recipe, felt)) if recipe.contacts else None
-    return SweepRecord(_resampled(recipe, chunk), parameters, contacts)
+    contacts = None
+    if recipe.contacts:
+        felt = felt[..., : len(CONTACT_CHANNELS)]
+        contacts = contact_distances(_resampled(recipe, _chunk(recipe, felt), FASTEST_HZ))
+    return SweepRecord(_sensed(recipe, target, index, loads), parameters, contacts)
 
 
-def _with_lead(recipe: SweepRecipe, simulation: SweepSimulation) -> tuple[Chunk, Chunk] | None:
-    """A lead at rest, then the sweep, at the simulator's own rate; None: it went unstable.
+def _simulated(
+    recipe: SweepRecipe, simulation: SweepSimulation
+) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
+    """Simulate a sweep at the simulator's own rate; None: it went unstable.
 
     Returns:
-        Loads and contacts; of these, nothing unless the recipe asks for them.
+        (sample, element, load) `sensor_spec.LOADS`, and contacts; of these, nothing unless the
+        recipe asks for them.
     """
     lead, total = _lengths(recipe)
     try:
@@ -274,9 +278,31 @@ def _with_lead(recipe: SweepRecipe, simulation: SweepSimulation) -> tuple[Chunk,
         else:
             loads = simulation.advance(total - lead)
             contacts = np.zeros((0, loads.shape[1], len(CONTACT_CHANNELS)))
-        return _chunk(recipe, loads), _chunk(recipe, contacts)
     except SourceError:
         return None
+    return np.concatenate([loads, simulation.turns()], axis=2), contacts
+
+
+def _sensed(
+    recipe: SweepRecipe, target: TactileObject, index: int, loads: NDArray[np.float64]
+) -> NDArray[np.float32]:
+    """(sample, element, channel) what the array's sensor, and the recipe's, make of the loads.
+
+    Noise, offset and drift that the array's description tells of are left to training, which draws
+    them afresh each time that it takes a sweep.
+    """
+    # The description stays the ideal arrays': a robot does not know by how much its own differs.
+    ideal = load_animals(recipe.array)
+    spec, described = device_spec(ideal), sensor_of(ideal)
+    if described is None:
+        chunk: Chunk | None = _chunk(recipe, loads[..., : len(spec.channels)])
+    else:
+        chunk = Transducer(described, spec.elements).push(_chunk(recipe, loads))
+    assert chunk is not None  # of a lead and a sweep there is always a sample
+    if described is not None or recipe.sensor != SensorModel():
+        key = recipe.key(target.name, index, SENSOR)
+        chunk = Sensor(recipe.sensor, spec, key, described, drawn=False).push(chunk) or chunk
+    return _resampled(recipe, chunk, spec.rate_hz)
 
 
 def _lengths(recipe: SweepRecipe) -> tuple[int, int]:
@@ -299,11 +325,12 @@ def _chunk(recipe: SweepRecipe, loads: NDArray[np.float64]) -> Chunk:
     return Chunk(seq, t_ns, values, np.ones(values.shape[:2], dtype=np.bool_))
 
 
-def _resampled(recipe: SweepRecipe, chunk: Chunk) -> NDArray[np.float32]:
+def _resampled(recipe: SweepRecipe, chunk: Chunk, rate_hz: float) -> NDArray[np.float32]:
     """(sample, element, channel): what the live stream's own resampler makes of it."""
-    outputs = Resampler(recipe.period_ns, 1e3 / SAMPLE_MS).push(chunk)
+    outputs = Resampler(recipe.period_ns, rate_hz).push(chunk)
     values = np.zeros((recipe.samples, *chunk.values.shape[1:]), dtype=np.float32)
     if outputs is not None:  # fewer where the last samples were dropped
         n = min(len(outputs), recipe.samples)
         values[:n] = outputs.values[:n]
+        values[n:] = outputs.values[n - 1]
     return values

@@ -31,7 +31,9 @@ from tactile_rt.sim_backend.datasets.recipes import (
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor import SensorModel
 from tactile_rt.sim_backend.sweep import usual_distance
+from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.stream import ConfigError
+from tactile_rt.timing import STEP_MS, Timing
 
 __all__ = [
     "DEFAULT_RECIPE",
@@ -85,9 +87,9 @@ class _File(msgspec.Struct):
     array: Text = SweepRecipe.array
     profile: Text = SweepRecipe.profile
     seed: int = SweepRecipe.seed
-    period_ms: float = SweepRecipe.period_ms
-    lead_ms: float = SweepRecipe.lead_ms
-    length_ms: float = SweepRecipe.length_ms
+    period_ms: float | None = None
+    lead_ms: float | None = None
+    length_ms: float | None = None
     contacts: bool = False
     objects: _Objects = msgspec.field(default_factory=_Objects)
     sweeps: _Sweeps = msgspec.field(default_factory=_Sweeps)
@@ -171,9 +173,14 @@ def _recipe(nodes: SettingNode) -> SweepRecipe:
             raise refusal(nodes, ["objects", key], f"{twice!r} is there twice; remove one")
     array = _absolute(array) if Path(array).suffix else array
     usual = {name: getattr(SweepChoice, name) for name in PARAMETERS}
-    if file.sweeps.distance_mm is None:
-        with suppress(ConfigError):  # of an array that is not there: told when it is needed
-            usual["distance_mm"] = usual_distance(load_animals(array))
+    period_ms = SweepRecipe.period_ms
+    with suppress(ConfigError):  # of an array that is not there: told when it is needed
+        animals = load_animals(array)
+        period_ms = max(period_ms, 1e3 / device_spec(animals).rate_hz)
+        if file.sweeps.distance_mm is None:
+            usual["distance_mm"] = usual_distance(animals)
+    period_ms = period_ms if file.period_ms is None else file.period_ms
+    lead_ms, length_ms = _usual_lengths(period_ms)
     all_of_it = objects.source != SHAPES  # a folder's own counts; the published split is 8 : 1 : 1
 
     def counted(given: float | None, of_a_folder: float, of_shapes: float) -> float:
@@ -185,9 +192,9 @@ def _recipe(nodes: SettingNode) -> SweepRecipe:
             array=array,
             profile=file.profile,
             seed=file.seed,
-            period_ms=file.period_ms,
-            lead_ms=file.lead_ms,
-            length_ms=file.length_ms,
+            period_ms=period_ms,
+            lead_ms=lead_ms if file.lead_ms is None else file.lead_ms,
+            length_ms=length_ms if file.length_ms is None else file.length_ms,
             contacts=file.contacts,
             objects=ObjectChoice(
                 source=_absolute(objects.source) if all_of_it else SHAPES,
@@ -208,6 +215,15 @@ def _recipe(nodes: SettingNode) -> SweepRecipe:
         )
     except ConfigError as error:  # how its parts fit together
         raise ConfigError(f"{nodes.where}: {error}") from None
+
+
+def _usual_lengths(period_ms: float) -> tuple[float, float]:
+    """Lead and length of a sweep whose samples are so far apart, ms, enough for tare and window."""
+    # A tare takes so many samples, however long they last; a window so many steps, and some spare.
+    lead_ms = max(SweepRecipe.lead_ms, SweepRecipe.lead_ms / SweepRecipe.period_ms * period_ms)
+    after_ms = SweepRecipe.length_ms - SweepRecipe.lead_ms
+    step_ms = Timing.of(round(period_ms * 1e6)).substeps * period_ms
+    return lead_ms, lead_ms + after_ms * max(1.0, step_ms / STEP_MS)
 
 
 def _absolute(path: str) -> str:

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.sensor_spec import ChannelLimits
+from tactile_rt.timing import STEP_MS, STEPS
+
 __all__ = ["Features", "Fit", "Separability", "check_separability", "window_features"]
 
-STEPS, STEP_MS = 22, 45.0  # the window that the networks see
-CLIP = {"N": 5e-3, "N m": 5e-6}
-SCALE = {"N": 1e-5, "N m": 5e-8}  # of the signed logarithm: rated sensor noise
 PENALTY = 10.0  # C of the machine
 SUBSETS = 12  # of each number of classes, at most
 PER_CLASS = 120  # sweeps of a class to train on, at most: enough to see that it can be learnt
@@ -73,7 +73,7 @@ class Separability:
 
 
 def window_features(
-    values: NDArray[np.float32], start: int, period_ms: float, units: tuple[str, ...]
+    values: NDArray[np.float32], start: int, period_ms: float, limits: ChannelLimits
 ) -> NDArray[np.float32]:
     """(22 * element * channel,) what a machine sees of one sweep.
 
@@ -81,17 +81,15 @@ def window_features(
         values: (sample, element, channel) SI.
         start: sample of first contact.
         period_ms: of the samples, ms.
-        units: (channel,) of the values.
+        limits: what is believed of the channels.
     """
-    clip, scale = (np.array([table[u] for u in units]) for table in (CLIP, SCALE))
     edges = start + np.arange(STEPS + 1) * STEP_MS / period_ms
     edges = np.minimum(edges.round().astype(int), len(values) - 1)
     steps = np.stack([values[a : max(b, a + 1)].mean(axis=0) for a, b in itertools.pairwise(edges)])
-    steps = np.clip(steps, -clip, clip)
-    features: NDArray[np.float32] = (np.sign(steps) * np.log1p(np.abs(steps) / scale)).astype(
-        np.float32
-    )
-    return features.ravel()
+    steps = np.clip(steps, -limits.clip, limits.clip)
+    features = np.sign(steps) * np.log1p(np.abs(steps) / limits.noise)
+    flat: NDArray[np.float32] = features.astype(np.float32).ravel()
+    return flat
 
 
 def check_separability(train: Features, test: Features, fit: Fit) -> list[Separability]:

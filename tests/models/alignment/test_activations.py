@@ -113,7 +113,9 @@ def test_batch_norm_and_dropout_are_off_and_the_mode_is_kept(encoder, attender):
 
 
 def test_untrained_networks_are_of_a_seed_and_leave_the_generator_alone():
-    saved = {"spec": SPEC.to_json(), "network": {"classes": 7, "encoder": "gru", "width": 1 / 32}}
+    network = {"classes": 7, "encoder": "gru", "width": 1 / 32}
+    weights = TactileClassifier(SPEC, EADConfig(**network)).state_dict()
+    saved = {"spec": SPEC.to_json(), "network": network, "model": weights}
     torch.manual_seed(5)
     before = torch.random.get_rng_state()
     one, again, other = (untrained_layers(saved, FELT, seed) for seed in (1, 1, 2))

@@ -12,6 +12,7 @@ pytest.importorskip("sklearn")
 from matplotlib.image import imread
 
 from tactile_rt.models.svm import fit
+from tactile_rt.sensor_spec import channel_limits
 from tactile_rt.sim_backend.datasets import separability
 from tactile_rt.sim_backend.datasets.card import write_card
 from tactile_rt.sim_backend.datasets.card_survey import survey
@@ -26,6 +27,7 @@ from tactile_rt.testing import small_spec
 
 SPEC = small_spec()  # 3 elements
 UNITS = ("N", "N m")
+LIMITS = channel_limits(replace(SPEC, channels=("fx", "mx"), units=UNITS))
 LEAD, SAMPLES = 4, 40
 MANIFEST = SweepManifest(
     spec=replace(SPEC, channels=("fx", "mx"), units=UNITS),
@@ -82,10 +84,10 @@ def test_a_card_counts_what_is_there(folder: Path) -> None:
     assert (card.without_touch, card.misses, card.not_finite) == (0, 0, 0)
     assert card.largest == (pytest.approx(1e-3), "goblet-0, sweep 0")
     peaks = [FORCE[c] for c, n in (("bowl", 12), ("mug", 12), ("goblet", 2)) for _ in range(n)]
-    assert sum(card.force_counts) == len(peaks) + 13
-    assert card.median_force == pytest.approx(np.median([*peaks, *[2e-5] * 13]))
-    at = np.searchsorted(card.force_edges, 2e-5) - 1
-    assert card.force_counts[at] == 13
+    assert sum(card.load_counts) == len(peaks) + 13
+    assert card.median_load == pytest.approx(np.median([*peaks, *[2e-5] * 13]))
+    at = np.searchsorted(card.load_edges, 2e-5) - 1
+    assert card.load_counts[at] == 13
     assert set(examples) == {"bowl", "mug", "goblet"}
     assert np.array_equal(examples["mug"], abs(sweeps_of("mug-0")[0, :, :, 0]))
 
@@ -158,7 +160,7 @@ def test_a_set_that_nothing_touched_has_a_card(folder: Path) -> None:
     for name in MANIFEST.names():
         write_object(folder, name, np.zeros_like(sweeps_of(name)), {})
     card = write_card(folder, fit)
-    assert (card.without_touch, card.whiskers_touched, card.median_force) == (26, 0, 0)
+    assert (card.without_touch, card.whiskers_touched, card.median_load) == (26, 0, 0)
     assert "examples.png" not in (folder / "README.md").read_text()
 
 
@@ -208,13 +210,13 @@ def test_the_published_classes_are_taken_where_they_are() -> None:
 def test_a_machine_sees_one_second_from_the_first_touch() -> None:
     values = np.zeros((200, 2, 2), dtype=np.float32)
     values[60:, 1, 0] = np.arange(140) * 1e-6
-    seen = window_features(values, 60, 9.0, UNITS).reshape(22, 2, 2)
+    seen = window_features(values, 60, 9.0, LIMITS).reshape(22, 2, 2)
     steps = np.arange(110).reshape(22, 5).mean(axis=1) * 1e-6
     assert seen[:, 1, 0] == pytest.approx(np.log1p(steps / 1e-5), rel=1e-5)
     assert not seen[:, 0].any()
     values[:] = -1.0
     limits = -np.log1p(np.array([5e-3 / 1e-5, 5e-6 / 5e-8]))
-    seen = window_features(values, 190, 9.0, UNITS).reshape(22, 2, 2)  # beyond the end, too
+    seen = window_features(values, 190, 9.0, LIMITS).reshape(22, 2, 2)  # beyond the end, too
     assert seen == pytest.approx(np.broadcast_to(limits, (22, 2, 2)), rel=1e-6)
 
 
