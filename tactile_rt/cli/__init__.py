@@ -32,6 +32,7 @@ def main() -> None:
         hil,
         locate,
         model,
+        project,
         record,
         replay,
         run,

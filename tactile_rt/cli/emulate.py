@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, leaving, starting
+from tactile_rt.cli.app import app, leaving, needs, starting
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -19,10 +19,16 @@ LINGER_S = 0.5  # for the host to read the last samples before the port disappea
 
 @app.command()
 def emulate(
-    codec: Annotated[str, typer.Argument(help="What it speaks: native, bota, xela, ...")],
+    codec: Annotated[
+        str | None, typer.Argument(help="What it speaks: native, bota, xela, ...")
+    ] = None,
     source: Annotated[
-        str, typer.Option(help="What it measures: sim:mouse, replay:FILE, synthetic:35x6, ...")
-    ] = "synthetic:",
+        str | None, typer.Option(help="What it measures: sim:mouse, replay:FILE. Default: waves.")
+    ] = None,
+    project: Annotated[
+        Path | None,
+        typer.Option(help="A folder of `tactile-rt new`: its array, in the codec of robot.toml."),
+    ] = None,
     wire: Annotated[
         str | None, typer.Option(help="serial, slcan or can. Default: serial, else slcan.")
     ] = None,
@@ -60,6 +66,12 @@ def emulate(
     from tactile_rt.drivers.opening import make_codec
     from tactile_rt.sources.opening import open_source
 
+    fields = codec_options(option or [])
+    if project is not None:
+        codec, source, wire, link, fields = _of_project(project, codec, source, wire, link, fields)
+    elif codec is None:
+        raise ConfigError("name a CODEC (`tactile-rt codecs` lists them), or a --project")
+    source = source or "synthetic:"
     if wire is None:
         only_can = ("can", codec) in CODECS and ("serial", codec) not in CODECS
         wire = "can" if bus else "slcan" if only_can else "serial"
@@ -69,7 +81,6 @@ def emulate(
         raise ConfigError("--wire can needs --bus INTERFACE:CHANNEL, and only it takes one")
     if bus is not None and link is not None:
         raise ConfigError("--link names a port; a --bus has none")
-    fields = codec_options(option or [])
     make_codec("serial" if wire == "serial" else "can", codec, fields)  # refused before the rest
     further: dict[str, Any] = {
         "options": fields,
@@ -93,6 +104,34 @@ def emulate(
             _watch(device)
     if device is not None:
         typer.echo(_count(device), err=True)
+
+
+def _of_project(
+    folder: Path,
+    codec: str | None,
+    source: str | None,
+    wire: str | None,
+    link: Path | None,
+    fields: dict[str, str],
+) -> tuple[str, str, str, Path | None, dict[str, str]]:
+    """What a project says of its device, where nothing else is asked for."""
+    try:
+        from tactile_rt.project.folder import Project
+    except ModuleNotFoundError as error:
+        raise needs("sim", error) from None
+    project = Project(folder)
+    line = project.line()
+    if line.wire == "serial" and link is None and not line.port.startswith("/dev/"):
+        link = Path(line.port)
+    if codec is None or codec == line.codec:
+        fields = {**line.options, **project.full_scale(line.codec), **fields}
+    return (
+        codec or line.codec,
+        source or project.source_url(project.unseen()),
+        wire or ("serial" if line.wire == "serial" else "slcan"),
+        link,
+        fields,
+    )
 
 
 def codec_options(given: list[str]) -> dict[str, str]:

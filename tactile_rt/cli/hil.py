@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli.app import INTERRUPTED, app, leaving, starting
+from tactile_rt.cli.app import INTERRUPTED, app, leaving, needs, starting
 from tactile_rt.cli.emulate import codec_options
 from tactile_rt.stream import ConfigError
 
@@ -47,6 +47,9 @@ def hil(
     model: Annotated[
         Path | None, typer.Option(help="An .onnx model; default: the package's own.")
     ] = None,
+    project: Annotated[
+        Path | None, typer.Option(help="A folder of `tactile-rt make`: its array and its model.")
+    ] = None,
 ) -> None:
     """Run a simulated array through an emulated device and its real driver.
 
@@ -61,6 +64,9 @@ def hil(
     from tactile_rt.evidence.hil import Loop, check_line
     from tactile_rt.sources.opening import open_source
 
+    fields = codec_options(option or [])
+    if project is not None:
+        source, model, fields = _of_project(project, source, model, codec, fields, seed)
     file = model or shipped_model()
     if source is None:
         unseen = load_model(file)[1].provenance.get("unseen_objects", [])
@@ -73,7 +79,6 @@ def hil(
     elif sweeps is not None:
         raise ConfigError("--sweeps is of a sim: source; of others give --seconds")
     schedule = read_faults(faults) if faults else None
-    fields = codec_options(option or [])
     check_line(wire, codec, fields, clock)
     console = Console(stderr=True)
     with starting():
@@ -93,6 +98,26 @@ def hil(
     if report.failure:
         typer.secho(f"tactile-rt: {report.failure}", err=True, fg="red")
         raise typer.Exit(1)
+
+
+def _of_project(
+    folder: Path,
+    source: str | None,
+    model: Path | None,
+    codec: str,
+    fields: dict[str, str],
+    seed: int,
+) -> tuple[str, Path, dict[str, str]]:
+    """Source, model and options of the codec that a project has, unless others are asked for."""
+    try:
+        from tactile_rt.project.folder import Project
+    except ModuleNotFoundError as error:
+        raise needs("sim", error) from None
+    made = Project(folder)
+    if model is None and not made.model.exists():
+        raise ConfigError(f"{folder} has no model yet: `tactile-rt make {folder}`")
+    url = source or made.source_url(made.unseen(), seed)
+    return url, model or made.model, {**made.full_scale(codec), **fields}
 
 
 def _with(url: str, name: str, value: str) -> str:

@@ -24,6 +24,7 @@ from tactile_rt.drivers.codecs.native_common import (
     IMPOSSIBLE,
     RANGE_N,
     RANGE_NM,
+    RANGE_SI,
     STATUS,
     UNKNOWN,
     DeviceDescription,
@@ -58,15 +59,17 @@ class NativeOptions:
             describe themselves.
         range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
             can tell.
+        range_si: The largest reading of channels of other units that it can tell.
     """
 
     format: str = "float32"
     array: str = ""
     range_n: float = RANGE_N
     range_nm: float = RANGE_NM
+    range_si: float = RANGE_SI
 
     def __post_init__(self) -> None:
-        check_ranges(self.range_n, self.range_nm)
+        check_ranges(self.range_n, self.range_nm, self.range_si)
         if self.format not in FORMATS:
             raise ConfigError(f"format must be one of {', '.join(FORMATS)}, not {self.format!r}")
 
@@ -102,7 +105,8 @@ class NativeSerial(SerialCodec):
 
     def __init__(self, options: NativeOptions) -> None:
         super().__init__(read_array(options.array))
-        self._format, self._ranges = FORMATS[options.format], (options.range_n, options.range_nm)
+        self._format = FORMATS[options.format]
+        self._ranges = options.range_n, options.range_nm, options.range_si
         self._described: DeviceDescription | None = None
         self._rest = b""  # of a frame that is not complete
         self._synchronised = True

@@ -37,6 +37,7 @@ from tactile_rt.drivers.codecs.native_common import (
     IMPOSSIBLE,
     RANGE_N,
     RANGE_NM,
+    RANGE_SI,
     STATUS,
     UNKNOWN,
     DeviceDescription,
@@ -68,6 +69,7 @@ class NativeCanOptions:
         array: JSON file of an array for devices that do not describe themselves.
         range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
             can tell.
+        range_si: The largest reading of channels of other units that it can tell.
     """
 
     base: int = 0x100
@@ -76,9 +78,10 @@ class NativeCanOptions:
     array: str = ""
     range_n: float = RANGE_N
     range_nm: float = RANGE_NM
+    range_si: float = RANGE_SI
 
     def __post_init__(self) -> None:
-        check_ranges(self.range_n, self.range_nm)
+        check_ranges(self.range_n, self.range_nm, self.range_si)
         if not 0 <= self.base <= 0x7FF - DESCRIPTION:
             raise ConfigError(
                 f"base must be from 0 to {0x7FF - DESCRIPTION:#x}, so that base to base + 4 have "
@@ -108,7 +111,7 @@ class NativeCan(CanCodec):
         super().__init__(read_array(options.array))
         self._base, self._fd = options.base, options.fd
         self._float32 = options.format == "float32"
-        self._ranges = options.range_n, options.range_nm
+        self._ranges = options.range_n, options.range_nm, options.range_si
         self._described: DeviceDescription | None = None
         self._sample = SampleParts(self.stats)
         self._text = DescriptionParts()

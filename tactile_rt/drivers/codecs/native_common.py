@@ -16,6 +16,7 @@ __all__ = [
     "IMPOSSIBLE",
     "RANGE_N",
     "RANGE_NM",
+    "RANGE_SI",
     "STATUS",
     "UNKNOWN",
     "DeviceDescription",
@@ -36,6 +37,7 @@ FORMATS: Final = {"float32": 0, "int16": 1}
 RANGE_N: Final = 0.1
 RANGE_NM: Final = 1e-3
 RANGE_RAD: Final = float(np.pi)
+RANGE_SI: Final = 1.0
 LARGEST: Final = 1e30  # scale: any count times it is a float32
 # Bits of the status; 4 to 7 are ours to give a meaning later, 8 to 15 the device's own (serial).
 STATUS: Final = {
@@ -74,17 +76,22 @@ class DeviceDescription:
 
     @classmethod
     def of(
-        cls, spec: ArraySpec, range_n: float = RANGE_N, range_nm: float = RANGE_NM
+        cls,
+        spec: ArraySpec,
+        range_n: float = RANGE_N,
+        range_nm: float = RANGE_NM,
+        range_si: float = RANGE_SI,
     ) -> "DeviceDescription":
-        """A description with scales for these largest forces and moments, and +-pi rad.
+        """A description with scales for these largest readings, and +-pi rad.
 
         Args:
             spec: The array that the device is.
             range_n: Largest force that an int16 can tell, N.
             range_nm: Largest moment that an int16 can tell, N m.
+            range_si: Largest reading in any other unit that an int16 can tell.
         """
         full = {"N": range_n, "N m": range_nm, "rad": RANGE_RAD}
-        return cls(spec, tuple(full.get(unit, 1.0) / 32767 for unit in spec.units))
+        return cls(spec, tuple(full.get(unit, range_si) / 32767 for unit in spec.units))
 
     def to_json(self) -> bytes:
         """The payload of a DESCRIPTION."""
@@ -151,4 +158,4 @@ def _explain(text: str, path: str) -> None:
 def check_ranges(*ranges: float) -> None:
     """Raise a `ConfigError` if one cannot be a range."""
     if not all(0 < r <= LARGEST for r in ranges):
-        raise ConfigError("range_n and range_nm must be above 0")
+        raise ConfigError("range_n, range_nm and range_si must be above 0")

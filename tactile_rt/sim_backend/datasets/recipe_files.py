@@ -103,16 +103,19 @@ def shipped_recipes() -> tuple[str, ...]:
     return tuple(sorted(p.name[:-5] for p in folder.iterdir() if p.name.endswith(".toml")))
 
 
-def read_recipe(name: str) -> SweepRecipe:
+def read_recipe(name: str, folder: Path | None = None) -> SweepRecipe:
     """The recipe of this name that ships with the package, or the one in a TOML file.
 
-    Folders and files in it are found from the working directory, as they are on a command line.
+    Args:
+        name: of the recipe, or its file.
+        folder: where folders and files in it are found from; None: the working directory, as they
+            are on a command line.
 
     Raises:
         ConfigError: no such recipe, or something in it is wrong.
     """
     if Path(name).suffix == ".toml":
-        return _recipe(read_toml(Path(name)))
+        return _recipe(read_toml(Path(name)), folder)
     if name not in shipped_recipes():
         known = no_such("recipe", name, shipped_recipes())
         raise ConfigError(f"{known} (or give a file that ends in .toml)")
@@ -163,7 +166,7 @@ def recipe_from_dict(raw: dict[str, Any], where: str = "recipe") -> SweepRecipe:
     return _recipe(make_node(raw, where, 0, Path()))
 
 
-def _recipe(nodes: SettingNode) -> SweepRecipe:
+def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
     file: _File = convert(nodes, _File)
     objects, array = file.objects, file.array
     for key in ("categories", "withheld"):
@@ -171,7 +174,7 @@ def _recipe(nodes: SettingNode) -> SweepRecipe:
         if len(set(names)) < len(names):
             twice = next(n for i, n in enumerate(names) if n in names[:i])
             raise refusal(nodes, ["objects", key], f"{twice!r} is there twice; remove one")
-    array = _absolute(array) if Path(array).suffix else array
+    array = _absolute(array, folder) if Path(array).suffix else array
     usual = {name: getattr(SweepChoice, name) for name in PARAMETERS}
     period_ms = SweepRecipe.period_ms
     with suppress(ConfigError):  # of an array that is not there: told when it is needed
@@ -197,7 +200,7 @@ def _recipe(nodes: SettingNode) -> SweepRecipe:
             length_ms=length_ms if file.length_ms is None else file.length_ms,
             contacts=file.contacts,
             objects=ObjectChoice(
-                source=_absolute(objects.source) if all_of_it else SHAPES,
+                source=_absolute(objects.source, folder) if all_of_it else SHAPES,
                 categories=objects.categories,
                 withheld=objects.withheld,
                 per_category=int(counted(objects.per_category, 0, 60)),
@@ -226,9 +229,9 @@ def _usual_lengths(period_ms: float) -> tuple[float, float]:
     return lead_ms, lead_ms + after_ms * max(1.0, step_ms / STEP_MS)
 
 
-def _absolute(path: str) -> str:
+def _absolute(path: str, folder: Path | None) -> str:
     """Whoever makes a part of the set may do so from another folder."""
-    return str(Path(path).expanduser().absolute())
+    return str(((folder or Path()) / Path(path).expanduser()).absolute())
 
 
 def _choice(nodes: SettingNode, name: str, sweeps: _Sweeps, usual: Choice) -> Choice:

@@ -1,0 +1,82 @@
+"""`tactile-rt new` and `make`: from the description of an array to a model that decides."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+
+from tactile_rt.cli.app import app, needs, progress_bar, starting
+
+if TYPE_CHECKING:
+    from tactile_rt.project.making import Stage
+
+ABOUT = ("top-1", "top-1 at rated noise", "RBF SVM top-1", "points above the SVM")
+
+
+@app.command()
+def new(
+    folder: Annotated[Path, typer.Argument(help="Where the project begins: a new folder.")],
+    array: Annotated[
+        str, typer.Option(help="A .toml file, or mouse, rat-both, ...; default: an example.")
+    ] = "",
+    kinds: Annotated[
+        str, typer.Option(help="Categories of objects to tell apart, comma-separated.")
+    ] = "",
+) -> None:
+    """Begin a project: your whiskers, what touches them, your robot."""
+    try:
+        with starting():
+            from tactile_rt.project.folder import KINDS, new_project
+    except ModuleNotFoundError as error:
+        raise needs("sim", error) from None
+    chosen = tuple(k.strip() for k in kinds.split(",") if k.strip()) or KINDS
+    new_project(folder, array, chosen)
+    typer.echo(f"{folder}: edit array.toml and sweeps.toml, then `tactile-rt make {folder}`")
+
+
+@app.command()
+def make(
+    folder: Annotated[Path, typer.Argument(help="A project: see `tactile-rt new`.")],
+    minutes: Annotated[
+        float, typer.Option(help="For all of it; less time makes a smaller model.")
+    ] = 60.0,
+) -> None:
+    """Make a project's model: sweeps, training, export, evaluation, report.
+
+    What is there is not made again; what was interrupted goes on.
+    """
+    console = Console(stderr=True, soft_wrap=True)
+    try:
+        with starting():
+            from tactile_rt.project.folder import Project
+            from tactile_rt.project.making import make as make_project
+    except ModuleNotFoundError as error:
+        raise needs("sim,train", error) from None
+    project = Project(folder)
+    with progress_bar(console, "reading") as update:
+        seen = ""
+
+        def tell(stage: "Stage") -> None:
+            nonlocal seen
+            left = f"about {max(stage.left_s, 0) / 60:.0f} min left of all"
+            update(
+                description=f"{stage.name}, {left}",
+                total=stage.of,
+                completed=stage.done,
+            )
+            if stage.name != seen:
+                seen = stage.name
+                console.print(f"{stage.name} ({left})")
+
+        records = make_project(project, minutes, tell)
+    for record in records:
+        if record.name.removeprefix("models.") in ABOUT:
+            console.print(
+                f"{record.name.removeprefix('models.')}: {record.value:.1f} {record.unit}"
+                f" ({record.anchor})"
+            )
+    console.print(
+        f"{project.report / 'report.html'} tells the rest; `tactile-rt run "
+        f"{folder / 'robot.toml'}` decides"
+    )

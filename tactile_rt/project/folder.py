@@ -1,0 +1,224 @@
+"""A project's folder: your whiskers, what touches them, your robot.
+
+array.toml       your whiskers and what reads them
+sweeps.toml      what touches them, and how
+robot.toml       the device and the model of `tactile-rt run robot.toml`
+test_robot.py    your robot's own code, driven by the device that does not exist yet
+README.md        the commands, in order
+model.onnx, array.json, report/, build/        what `tactile-rt make` makes
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from string import Template
+from urllib.parse import urlencode
+
+from tactile_rt.classifier.model_file import read_model
+from tactile_rt.daemon.loading import load_config
+from tactile_rt.drivers.codec import codec_class
+from tactile_rt.files import write_whole
+from tactile_rt.settings import no_such, split_url
+from tactile_rt.sim_backend.arrays.files import ARRAY_FILES, load_animals, read_animals
+from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
+from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
+from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
+from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
+from tactile_rt.sim_backend.sweep import Sweep, usual_distance
+from tactile_rt.sim_backend.transducer import device_spec, sensor_of
+from tactile_rt.sim_backend.world import PROFILES
+from tactile_rt.stream import ConfigError
+
+__all__ = ["KINDS", "DeviceLine", "Project", "new_project"]
+
+RANGES = {"N": "range_n", "N m": "range_nm"}  # options of the native codec
+KINDS = ("bottle", "car", "chair", "gear", "mug", "pumpkin")
+FILES = ("sweeps.toml", "robot.toml", "test_robot.py", "README.md")
+SPREAD = (5.5 / 6.5, 8 / 6.5)  # of the distances at which objects pass, as `draw_sweep` draws them
+
+
+@dataclass(frozen=True)
+class DeviceLine:
+    """The line that a project's robot listens to.
+
+    Attributes:
+        wire: The kind of line, ``serial`` or ``can``.
+        port: The serial port, or INTERFACE:CHANNEL of a bus.
+        codec: The name of the codec that the device speaks.
+        options: The options of the codec.
+    """
+
+    wire: str
+    port: str
+    codec: str
+    options: dict[str, str]
+
+
+@dataclass(frozen=True)
+class Project:
+    """A project's folder.
+
+    Attributes:
+        folder: The folder itself.
+
+    Raises:
+        ConfigError: there is no such folder, or a file of it is missing.
+    """
+
+    folder: Path
+
+    def __post_init__(self) -> None:
+        if not self.folder.is_dir():
+            raise ConfigError(f"no folder {self.folder}: begin with `tactile-rt new {self.folder}`")
+        for name in ("array.toml", "sweeps.toml"):
+            if not (self.folder / name).is_file():
+                raise ConfigError(
+                    f"{self.folder} is no project, it has no {name}: begin one with "
+                    "`tactile-rt new` in a folder of its own"
+                )
+
+    @property
+    def array(self) -> Path:
+        """The description of the array."""
+        return self.folder / "array.toml"
+
+    @property
+    def model(self) -> Path:
+        """The model that is made."""
+        return self.folder / "model.onnx"
+
+    @property
+    def build(self) -> Path:
+        """The folder of what is made on the way."""
+        return self.folder / "build"
+
+    @property
+    def report(self) -> Path:
+        """The folder of the report card."""
+        return self.folder / "report"
+
+    def recipe(self) -> SweepRecipe:
+        """What is to be swept past the array; its numbers of objects and sweeps are the most.
+
+        Raises:
+            ConfigError: a mistake in the file.
+        """
+        recipe = read_recipe(str(self.folder / "sweeps.toml"), self.folder)
+        if Path(recipe.array).resolve() != self.array.resolve():
+            raise ConfigError(f'{self.folder / "sweeps.toml"}: array must be "array.toml"')
+        return recipe
+
+    def source_url(self, objects: Sequence[str], seed: int = 0, **options: object) -> str:
+        """The URL of the simulated array with these objects, as its device would deliver it."""
+        asked = {"objects": ",".join(objects), "seed": seed, **options}
+        return f"sim:{self.array}?{urlencode(asked, safe=',')}"
+
+    def unseen(self) -> tuple[str, ...]:
+        """Objects that the model has never met; without a model, one of every category."""
+        if self.model.exists():
+            found = read_model(self.model)[0].provenance.get("unseen_objects", [])
+            return tuple(map(str, found))
+        return choose_objects(self.recipe().objects).categories
+
+    def full_scale(self, codec: str) -> dict[str, str]:
+        """Options of a codec whose format rounds: the largest readings of the array's sensor."""
+        sensor = sensor_of(load_animals(str(self.array)))
+        if codec != "native" or sensor is None:
+            return {}
+        largest: dict[str, float] = {}
+        for channel in sensor.channels:
+            name = RANGES.get(channel.unit, "range_si")
+            largest[name] = max(largest.get(name, 0.0), channel.range)
+        return {name: f"{value:g}" for name, value in largest.items()}
+
+    def line(self) -> DeviceLine:
+        """The line and the codec of the first source of robot.toml.
+
+        Raises:
+            ConfigError: robot.toml has a mistake, or its source is no device.
+        """
+        file = self.folder / "robot.toml"
+        url = load_config(file).config.source[0].url
+        scheme, target, fields = split_url(url)
+        if scheme not in ("serial", "can") or "codec" not in fields:
+            raise ConfigError(
+                f"{file}: the source {url} is no device to emulate: give it a URL as "
+                "serial:///tmp/whiskers?codec=native"
+            )
+        known = codec_class(scheme, fields["codec"]).Options.__dataclass_fields__
+        options = {name: value for name, value in fields.items() if name in known}
+        return DeviceLine(scheme, target.removeprefix("//"), fields["codec"], options)
+
+
+def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> Project:
+    """Begin a project in a new or an empty folder.
+
+    Args:
+        folder: where.
+        array: the name of an array, or a .toml file, which is copied; empty: eight nylon whiskers
+            on a plate, to be changed into one's own.
+        kinds: the categories of objects that it is to tell apart.
+
+    Raises:
+        ConfigError: the folder holds something, no such array or category, or an array that is
+            more than one file.
+    """
+    templates = resources.files("tactile_rt.project") / "templates"
+    with resources.as_file(templates / "array.toml.txt") as example:
+        described = _described(array) if array else example.read_text("utf-8")
+        animals = load_animals(array) if array else read_animals(example)
+    spec = device_spec(animals)
+    for kind in kinds:
+        if kind not in CATEGORIES:
+            raise ConfigError(no_such("category", kind, tuple(CATEGORIES)))
+    if len(set(kinds)) < len(kinds) or len(kinds) < 2:
+        raise ConfigError("--kinds takes two or more categories, each once")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigError(f"{folder} is not empty: name a new folder")
+    distance = usual_distance(animals)
+    near, far = (f"{share * distance:.3g}" for share in SPREAD)
+    words = {
+        "name": folder.resolve().name,
+        "kinds": ", ".join(f'"{kind}"' for kind in kinds),
+        "near": near,
+        "far": far,
+        "usual": f"{Sweep.size_mm:g}",
+        "profiles": ", ".join(PROFILES),
+        "whiskers": str(len(spec.elements)),
+        "link": f"/tmp/{folder.resolve().name}",
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in FILES:
+        text = Template((templates / f"{name}.txt").read_text("utf-8")).substitute(words)
+        _write(folder / name, text)
+    _write(folder / "array.toml", described)
+    return Project(folder)
+
+
+def _described(array: str) -> str:
+    """The text of the project's own array.toml."""
+    path = Path(array)
+    if path.suffix.lower() not in ARRAY_FILES:
+        return (
+            "# The array is one that comes with tactile_rt. One of your own is described as in\n"
+            "# docs/arrays/robot.toml: its whiskers, and what reads them.\n\n"
+            f'[[animal]]\narray = "{array}"\n'
+        )
+    if path.suffix.lower() == ".csv":
+        raise ConfigError(
+            f"{array}: a project's array is a .toml file, which can say what reads the whiskers; "
+            "copy the columns into [[whisker]] tables as in docs/arrays/robot.toml"
+        )
+    text = path.read_text("utf-8")
+    whiskers = load_animals(array)
+    if any(animal.head for animal in whiskers):
+        raise ConfigError(
+            f"{array}: takes a head from another file, which a project's copy would not find; "
+            "remove `head`, which only pictures need"
+        )
+    return text
+
+
+def _write(path: Path, text: str) -> None:
+    write_whole(path, lambda file: file.write(text.encode()))
