@@ -173,9 +173,10 @@ def _checked(card: ModelCard, session: ort.InferenceSession, path: Path) -> Mode
     if window and "samples" in inputs and not isinstance((inputs["samples"][0] or (0,))[0], int):
         # A window may be made for any number of steps.
         expected["samples"] = ((inputs["samples"][0][0], *sample), _onnx_type("float32"))
-    if inputs != expected:
-        wrong = sorted(k for k in inputs | expected if inputs.get(k) != expected.get(k))
-        raise _disagree(path, wrong)
+    wrong = {k for k in inputs | expected if inputs.get(k) != expected.get(k)}
+    wrong |= {i.name for i in session.get_inputs() if not i.shape}  # not even a batch
+    if wrong:
+        raise _disagree(path, sorted(wrong))
     batches = {i.shape[0] for i in session.get_inputs()}
     if any(isinstance(batch, int) and batch != 1 for batch in batches):
         raise ModelError(f"{path}: the graph's batch size is fixed to another than 1")

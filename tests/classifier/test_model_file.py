@@ -211,6 +211,16 @@ def test_a_graph_that_disagrees_with_its_card_is_refused(
         load_model(path)
 
 
+def test_a_state_without_a_batch_axis_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of no further axes it is like the card's but for that."""
+    monkeypatch.setattr("onnx.checker.check_model", lambda *a, **k: None)
+    path = write_model(tmp_path / "m.onnx", GRAPH.replace("int64[B] steps,", "int64[] steps,"))
+    with pytest.raises(ModelError, match=f"^{path}: .* disagree with its metadata at steps$"):
+        load_model(path)
+
+
 @pytest.mark.parametrize(
     ("graph", "changes", "complaint"),
     [

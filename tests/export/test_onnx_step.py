@@ -306,12 +306,14 @@ def test_the_cache_is_written_in_place_with_the_same_result(exported: SimpleName
     stepper = Stepper(session, card)
     for name in (s.name for s in card.state):
         assert (stepper._states[0][name] is stepper._states[1][name]) == (name in marked)
-    expected = file_outputs(session, card, samples, offset, sigma)["logits"][0]
+    outputs = file_outputs(session, card, samples, offset, sigma)
+    expected, embedding = outputs["logits"][0], outputs["embedding"][0]
     for steps in (*range(1, STEPS + 1), STEPS):
         stepper.begin(offset[0], sigma[0])
         for step in range(steps):
             stepper.samples[:] = samples[:, step]
             assert np.array_equal(stepper.run()[0], expected[step]), (steps, step)
+            assert np.array_equal(stepper.embedding[0], embedding[step]), (steps, step)
 
 
 def test_a_lane_begun_anew_leaves_the_others_cache_alone(exported: SimpleNamespace) -> None:
