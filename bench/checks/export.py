@@ -2,9 +2,10 @@
 
 Small networks: the streaming rewrite against the trained window (bar 2e-6, also after a reset at
 every step, and in the form that is quantised), the same in double precision (bar 1e-9, where a
-mistake cannot pass for rounding), and the file in fp32 against the window (bar 1e-5), as a step
-over many episodes in a row and as a window. And the file in the classifier: a stream cut at random
-must give the very decisions of the whole. Wide networks take other forms of their products: with
+mistake cannot pass for rounding), and the file in fp32 against the window (bar 1e-5), logits and
+embedding, as a step over many episodes in a row and as a window. In both, samples that are no
+number must be as good as rest. And the file in the classifier: a stream cut at random must give
+the very decisions of the whole. Wide networks take other forms of their products: with
 one decoder, so do the small ones here, once more. Prints the worst of each and fails if one misses
 its bar.
 """
@@ -30,6 +31,7 @@ from rich.table import Table
 from bench.inference.full_size import random_model
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, read_model, shipped_model
+from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.export import streaming as streaming_module
 from tactile_rt.export import streaming_gpt
@@ -48,6 +50,7 @@ BARS = {
     "double": DOUBLE_BAR,
     "file": PARITY_BAR,
     "window": PARITY_BAR,
+    "bad": 0.0,
     "cut": 0.0,
 }
 STEPS, CLASSES, WIDTH = 22, 7, 1 / 32
@@ -101,7 +104,7 @@ def main() -> int:
 
 
 def measure(job: tuple[Combination, int]) -> tuple[Combination, list[float]]:
-    """Largest differences, in the order of `BARS`: of logits, and last of posteriors."""
+    """Largest differences, in the order of `BARS`: of outputs, and last of posteriors."""
     (encoder, attender, decoder, form), episodes = job
     streaming_module.LARGE, streaming_gpt.WIDE = FORMS[form]
     torch.set_num_threads(1)
@@ -114,7 +117,7 @@ def measure(job: tuple[Combination, int]) -> tuple[Combination, list[float]]:
         for name, parameter in model.named_parameters():
             if parameter.dim() < 2 or name.endswith(("gamma", "beta")):
                 parameter += 0.1 * torch.randn_like(parameter)
-    figures = [*in_torch(model), 0.0, 0.0, 0.0]
+    figures = [*in_torch(model), 0.0, 0.0, 0.0, 0.0]
     if episodes:
         with tempfile.TemporaryDirectory() as folder:
             proto, state = step_graph(model, card)
@@ -123,7 +126,8 @@ def measure(job: tuple[Combination, int]) -> tuple[Combination, list[float]]:
             window_card = write_model(proto, state, model, card, window, kind="window")
             figures[4] = over_episodes(model, path, episodes)
             figures[5] = float(window_card.figures["parity"])
-            figures[6] = cut_at_random(path)
+            figures[6] = float(np.max([after_bad_samples(p) for p in (path, window)]))
+            figures[7] = cut_at_random(path)
     return job[0], figures
 
 
@@ -178,15 +182,32 @@ def over_episodes(model: TactileClassifier, path: Path, episodes: int) -> float:
         offset = (rng.normal(size=(n, elements, channels)) * scale).astype(np.float32)
         sigma = np.abs(offset)
         with torch.inference_mode():
-            arrays = (samples, offset, sigma)
-            expected = model(*(torch.from_numpy(a) for a in arrays)).numpy()
+            arrays = [torch.from_numpy(a) for a in (samples, offset, sigma)]
+            expected = model(*arrays).numpy()
+            embedded = model.network.embed(model.inputs(*arrays)).numpy()
+        spread = max(1.0, float(embedded.std()))  # of the features of a linear decoder
         for i in range(n):
             stepper.begin(offset[i], sigma[i])
             for step in range(card.steps):
                 stepper.samples[0] = samples[i, step]
                 gap = abs(stepper.run()[0] - expected[i, step]).max()
-                worst = float(np.maximum(worst, gap))  # NaN stays
+                hidden = abs(stepper.embedding[0] - embedded[i, step]).max() / spread
+                worst = float(np.max([worst, gap, hidden]))  # NaN stays
     return worst
+
+
+def after_bad_samples(path: Path) -> float:
+    """Of a window with NaN and infinity in a step, against rest there; NaN if that is left."""
+    session, card = load_model(path, kind=None)
+    rng, scale = np.random.default_rng(5), np.array(card.scale, dtype=np.float32)
+    shape = (1, card.steps, card.substeps, *card.array.shape)
+    rest = rng.standard_normal(shape, dtype=np.float32) * scale
+    offset = rng.standard_normal((1, *card.array.shape), dtype=np.float32) * scale
+    rest[:, 3, :, ::2] = offset[:, None, ::2]
+    bad = rest.copy()
+    bad[:, 3, :, ::2] = np.resize((np.nan, np.inf, -np.inf), bad[:, 3, :, ::2].shape)
+    found, expected = (file_outputs(session, card, s, offset, abs(offset)) for s in (bad, rest))
+    return float(np.max([abs(found[name] - expected[name]).max() for name in expected]))
 
 
 def cut_at_random(path: Path) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_file import ModelCard, load_model, read_model, shipped_model
+from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.evidence.records import Record
 
 if TYPE_CHECKING:  # a robot has no torch
@@ -64,7 +65,7 @@ def _windows(model: TactileClassifier, card: ModelCard, folder: Path) -> dict[st
     import torch
 
     from bench.models.plain_network import PlainEncoder
-    from tactile_rt.export.onnx_step import export_step, file_logits
+    from tactile_rt.export.onnx_step import export_step
     from tactile_rt.models.encoders.zhuang import ZhuangEncoder
 
     rng, scale = np.random.default_rng(0), np.array(card.scale, dtype=np.float32)
@@ -86,9 +87,9 @@ def _windows(model: TactileClassifier, card: ModelCard, folder: Path) -> dict[st
             export_step(model, card, path, precision, "window")
         session, written = load_model(path, kind="window")
         path.unlink()
-        windows[precision] = lambda session=session, written=written: file_logits(  # type: ignore[misc]
+        windows[precision] = lambda session=session, written=written: file_outputs(  # type: ignore[misc]
             session, written, samples, offset, sigma
-        )[0]
+        )["logits"][0]
     return windows
 
 

@@ -31,8 +31,9 @@ from torch import Tensor
 from bench.models.published import EPSILON, NETWORKS, NetworkPair, in_our_order, open_code
 from bench.models.training_speed import STEPS, training_step
 from tactile_rt.classifier.model_file import load_model
+from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.evidence.records import Record, show
-from tactile_rt.export.onnx_step import file_logits, step_graph, write_model
+from tactile_rt.export.onnx_step import step_graph, write_model
 from tactile_rt.models.ead import count_parameters
 from tactile_rt.stream import ConfigError
 
@@ -105,7 +106,7 @@ class Comparison(NetworkPair):
             session, card = load_model(path, kind="window")
         with torch.inference_mode():
             frames = self.model.inputs(*(torch.from_numpy(a) for a in (samples, offset, sigma)))
-            run = lambda: file_logits(session, card, samples, offset, sigma)  # noqa: E731
+            run = lambda: file_outputs(session, card, samples, offset, sigma)["logits"]  # noqa: E731
             calls = [lambda: self.theirs(frames), lambda: self.ours(frames), run]
             theirs, ours, file = best(calls, 3 * repeats)
             apart = gap(self.theirs(frames)[:, -1], torch.from_numpy(run())[:, -1])

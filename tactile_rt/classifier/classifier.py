@@ -27,7 +27,7 @@ from tactile_rt.classifier.model_file import element_order, load_model
 from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, SpecMismatch
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, ModelError, SpecMismatch
 
 __all__ = ["Classification", "Classifier", "ClassifierStats", "fuse"]
 
@@ -53,6 +53,8 @@ class Classification:
         probabilities: (class,) The posterior probability of each class, float32.
         latency_s: The time that the model's step took, s.
         late: Whether more work had gathered than the deadline allows.
+        embedding: (unit,) What the network's last layer read in the step, float32; None unless the
+            classifier was asked for it.
     """
 
     onset_ns: int
@@ -64,6 +66,7 @@ class Classification:
     probabilities: NDArray[np.float32]
     latency_s: float
     late: bool = False
+    embedding: NDArray[np.float32] | None = None
 
     def top(self, k: int = 5) -> list[tuple[str, float]]:
         """The k most probable classes with their probabilities."""
@@ -109,6 +112,7 @@ class Classifier:
         late: what becomes of a late decision, see `tactile_rt.classifier.exits.Deadline`.
         providers: execution providers, first choice first: cpu, cuda, tensorrt, openvino, coreml.
         threads: that may share one operator of the network.
+        embedding: whether decisions carry the step's embedding, a copy each.
 
     Attributes:
         card: The metadata of the model file.
@@ -119,7 +123,7 @@ class Classifier:
         providers: Names of the execution providers in use, as onnxruntime has them.
 
     Raises:
-        ModelError: the file cannot be used.
+        ModelError: the file cannot be used, or has no embedding and is asked for one.
         SpecMismatch: the model was made for another array; the message says where they differ.
         ConfigError: an option that cannot be, or an execution provider that is not there.
     """
@@ -137,6 +141,7 @@ class Classifier:
         late: Policy = "count",
         providers: Sequence[str] = ("cpu",),
         threads: int = 1,
+        embedding: bool = False,
     ) -> None:
         if mode not in get_args(Mode):
             raise ConfigError(f"mode: {mode!r}; it can be {', '.join(get_args(Mode))}")
@@ -144,6 +149,11 @@ class Classifier:
             raise ConfigError("sure: windows that slide have no early end; decide by episodes")
         self._exit = EarlyExit(sure, in_a_row)
         session, self.card = load_model(model, onnxruntime_names(providers), threads)
+        if embedding and not self.card.embedding:
+            raise ModelError(
+                f"{model} has no embedding: its metadata is of version {self.card.version}, and "
+                "files have one since version 3; export it anew"
+            )
         try:
             order = element_order(self.card.array, spec)
         except SpecMismatch as error:
@@ -155,6 +165,7 @@ class Classifier:
         self.stats = ClassifierStats()
         self.providers: tuple[str, ...] = tuple(session.get_providers())
         self._sliding = mode == "sliding"
+        self._embeds = embedding
         steps = self.card.steps
         every = min(EVERY, steps) if every is None else every
         self._lanes = Lanes(steps, every if self._sliding else steps)
@@ -261,6 +272,7 @@ class Classifier:
             probabilities=probabilities,
             latency_s=latency,
             late=late,
+            embedding=self._stepper.embedding[lane].copy() if self._embeds else None,
         )
 
     def _posterior(self, logits: NDArray[np.float32]) -> NDArray[np.float32] | None:

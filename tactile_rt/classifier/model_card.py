@@ -12,18 +12,18 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.classifier.decision_rules import MAX_NAME, CandidateRule, UnknownRule, named
 from tactile_rt.classifier.onnx_check import MAX_ELEMENTS
 from tactile_rt.stream import ArraySpec, ConfigError, ModelError, SpecMismatch
 
 __all__ = ["Kind", "ModelCard", "StateTensor", "element_order", "one_line", "parse_card"]
 
-CARD_VERSION = 2
-CARD_VERSIONS = (1, 2)  # 1: without what `ModelCard` says is since 2
+CARD_VERSION = 3
+CARD_VERSIONS = (1, 2, 3)  # the older ones without what `ModelCard` says is since 2 or 3
 STATE_TYPES = ("bool", "float16", "float32", "float64", "int32", "int64", "int8", "uint8")
 MAX_STEPS = 1_000_000
 MAX_PERIOD_NS = 10**12
 MAX_EPISODE = 2**24  # values: checks run one at once, and a robot's has some 20,000
-MAX_NAME = 200  # characters
 LISTS = ("commands", "unseen_objects")  # of the provenance, where they are there
 
 Kind = Literal["step", "window"]
@@ -58,7 +58,7 @@ class ModelCard(msgspec.Struct, frozen=True):
             probabilities mean what they say.
         provenance: The origin of the file: network, training, data set, hashes, commands.
         figures: The figures measured on the model, such as parity and accuracy.
-        version: The version of this schema, 1 or 2.
+        version: The version of this schema, 1 to 3.
 
     Since version 2:
         kind: What the graph takes at once, "step" or "window", see `model_file`.
@@ -70,6 +70,15 @@ class ModelCard(msgspec.Struct, frozen=True):
         decision: The defaults of the decision modes.
         probe: (step, class) Logits of the built-in probe episode, by which `tactile-rt model
             verify` tells whether another machine computes the same.
+
+    Since version 3, in which the graph has the output ``embedding`` and takes a sample that is no
+    number, or infinite, for no load:
+        embedding: The number of units of the output ``embedding``; 0 before version 3.
+        sensor: What is known of the array's sensor (rate, noise, range, ...); empty if nothing.
+        unknown: When an object is of no known class; None if the model never says so.
+        candidates: Which classes a step leaves possible, one rule for each promise.
+        loads: Statistics of the loads, tare removed, that training saw: by name a table
+            (element, channel), SI.
     """
 
     name: str
@@ -93,6 +102,11 @@ class ModelCard(msgspec.Struct, frozen=True):
     thresholds: dict[str, float] = {}
     decision: dict[str, Any] = {}
     probe: tuple[tuple[float, ...], ...] = ()
+    embedding: int = 0
+    sensor: dict[str, Any] = {}
+    unknown: UnknownRule | None = None
+    candidates: tuple[CandidateRule, ...] = ()
+    loads: dict[str, tuple[tuple[float, ...], ...]] = {}
 
     @property
     def array(self) -> ArraySpec:
@@ -149,7 +163,7 @@ def parse_card(path: Path, text: str) -> ModelCard:
         if version not in CARD_VERSIONS:
             raise ModelError(
                 f"{path} has metadata of version {repr(version)[:40]}; this release reads "
-                f"{' and '.join(map(str, CARD_VERSIONS))}"
+                f"{CARD_VERSIONS[0]} to {CARD_VERSIONS[-1]}"
             )
         card = msgspec.json.decode(text, type=ModelCard)
         elements, channels = card.array.shape
@@ -169,7 +183,7 @@ def parse_card(path: Path, text: str) -> ModelCard:
     if not card.labels or len(set(card.labels)) != len(card.labels):
         raise damaged("labels are missing or repeat")
     # Decisions carry them to terminals, pages and logs.
-    if not all(0 < len(label) <= MAX_NAME and label.isprintable() for label in card.labels):
+    if not all(map(named, card.labels)):
         raise damaged(f"labels must be 1 to {MAX_NAME} printable characters")
     if len(card.name) > MAX_NAME:
         raise damaged(f"a name of {len(card.name)} characters")
@@ -198,6 +212,17 @@ def parse_card(path: Path, text: str) -> ModelCard:
             raise damaged(f"{state.name[:40]} of type {state.dtype[:40]!r}")
     if card.probe and [len(row) for row in card.probe] != [len(card.labels)] * card.steps:
         raise damaged(f"the probe is not {card.steps} steps of {len(card.labels)} logits")
+    if (card.version >= 3) != (card.embedding > 0):
+        raise damaged(f"an embedding of {card.embedding} units in version {card.version}")
+    rules = {f"candidates[{i}]": rule for i, rule in enumerate(card.candidates)}
+    for what, rule in {"unknown": card.unknown, **rules}.items():
+        if rule is not None and (wrong := rule.fault(card.steps)):
+            raise damaged(f"{what}.{wrong}")
+    for what, table in card.loads.items():
+        if not named(what):
+            raise damaged(f"names of loads must be 1 to {MAX_NAME} printable characters")
+        if [len(row) for row in table] != [channels] * elements or not np.isfinite(table).all():
+            raise damaged(f"loads.{what} is not {elements} x {channels} finite numbers")
     return card
 
 

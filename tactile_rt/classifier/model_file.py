@@ -7,11 +7,13 @@ Inputs of the graph, one step of a stream, for a batch of independent streams:
     sigma    (batch, element, channel) float32, SI: noise per sample, measured with the tare
     <state>  every tensor of `ModelCard.state`, all zeros when an episode begins
 
-Outputs: ``logits (batch, class)`` and for every state tensor ``<name>_next``, its next value.
-Units, clipping, scaling and the layout on the grid are inside the graph.
+Outputs: ``logits (batch, class)``, ``embedding (batch, unit)`` (what the network's last linear
+layer reads in this step; since version 3) and for every state tensor ``<name>_next``, its next
+value. Units, clipping, scaling and the layout on the grid are inside the graph, and since version
+3 a sample that is no number, or infinite, is no load there and leaves nothing in the state.
 
 A file of kind "window" takes a whole episode instead: ``samples (batch, step, sub-step, element,
-channel)``, no state, and gives ``logits (batch, step, class)``.
+channel)``, no state, and gives ``logits`` and ``embedding`` with a step axis after the batch's.
 """
 
 import hashlib
@@ -20,9 +22,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import onnxruntime as ort
-from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_card import (
     Kind,
@@ -36,7 +36,6 @@ from tactile_rt.classifier.onnx_check import (
     MAX_BYTES,
     BadModel,
     Contents,
-    graph_sha256,
     read_onnx,
 )
 from tactile_rt.classifier.runtime import FlushDenormals
@@ -49,17 +48,12 @@ __all__ = [
     "element_order",
     "hash_of",
     "load_model",
-    "probe_logits",
     "read_model",
     "shipped_model",
-    "verify_model",
 ]
 
 METADATA_KEY = "tactile_rt"
 MESSAGE = 300  # characters of what a file, or onnxruntime, has us say
-# Of the probe's logits, over their spread: sums are rounded in another order on another processor,
-# and int8 activations then fall on the other side of a step now and then.
-PROBE_BARS = {"fp32": 1e-4, "fp16": 1e-2, "bf16": 1e-2, "int8": 0.1}
 SHIPPED = Path(__file__).parents[1] / "assets" / "mouse24.onnx"
 
 
@@ -110,7 +104,8 @@ def read_model(path: Path) -> tuple[ModelCard, Contents, bytes]:
     named = {"samples", "offset", "sigma", *(s.name for s in card.state)}
     if wrong := sorted(named ^ set(contents.inputs)):
         raise _disagree(path, wrong)
-    for name in ("logits", *(f"{s.name}_next" for s in card.state)):
+    embedding = ("embedding",) if card.embedding else ()
+    for name in ("logits", *embedding, *(f"{s.name}_next" for s in card.state)):
         if name not in contents.outputs:
             raise ModelError(f"{path}: no output `{one_line(name)}`, which its metadata promises")
     return card, contents, data
@@ -163,72 +158,6 @@ def load_model(
     return session, _checked(card, session, path)
 
 
-def probe_logits(session: ort.InferenceSession, card: ModelCard) -> NDArray[np.float32]:
-    """Run one episode of built-in input, the same on every machine: logits (step, class).
-
-    The input is made by integer and exact arithmetic only: a heavy-tailed sequence that reaches
-    from below the scale of the input compression to above its clip.
-    """
-    elements, channels = card.array.shape
-    shape = (card.steps + 2, card.substeps, elements, channels)
-    index = np.arange(np.prod(shape), dtype=np.uint64)
-    mixed = (index + np.uint64(1)) * np.uint64(2654435761) % np.uint64(2**32)
-    for shift, factor in ((15, 2246822519), (13, 3266489917), (16, 1)):  # as xxHash ends
-        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor) % np.uint64(2**32)
-    uniform = mixed.astype(np.float64) / 2**31 - 1  # [-1, 1)
-    values = (uniform / (1.001 - abs(uniform))).reshape(shape) * np.array(card.scale)
-    samples = values[: card.steps].astype(np.float32)[None]
-    offset = values[card.steps, 0].astype(np.float32)[None]
-    sigma = np.maximum(abs(values[card.steps + 1, 0]), card.floor).astype(np.float32)[None]
-    feed: dict[str, NDArray[Any]] = {"offset": offset, "sigma": sigma}
-    if card.kind == "window":
-        window: NDArray[np.float32] = session.run(["logits"], {"samples": samples, **feed})[0][0]
-        return window
-    feed |= {s.name: np.zeros((1, *s.shape), dtype=s.dtype) for s in card.state}
-    names = [o.name for o in session.get_outputs()]
-    logits = []
-    for t in range(card.steps):
-        out = dict(zip(names, session.run(names, {"samples": samples[:, t], **feed}), strict=True))
-        feed |= {s.name: out[f"{s.name}_next"] for s in card.state}
-        logits.append(out["logits"][0])
-    return np.stack(logits)
-
-
-def verify_model(path: Path) -> list[str]:
-    """Check a file against what it says of itself: one line for each thing checked.
-
-    Raises:
-        ModelError: as `load_model`; the graph is not the one that was exported, or this machine
-            computes other logits than those stored.
-    """
-    session, card = load_model(path, kind=None)
-    said = []
-    if stored := card.hashes.get("graph"):
-        found = graph_sha256(read_model(path)[2])
-        if found != stored:
-            raise ModelError(f"{path}: the graph is another than was exported: sha256 {found}")
-        said.append(f"graph: as it was exported, sha256 {found}")
-    else:
-        said.append("graph: the file stores no hash of it")
-    logits = probe_logits(session, card)
-    if not np.isfinite(logits).all():
-        raise ModelError(f"{path}: the probe episode gives logits that are not finite")
-    if not np.array_equal(logits, probe_logits(session, card)):
-        raise ModelError(f"{path}: the probe episode gives other logits when run again")
-    said.append(f"probe: {card.steps} finite steps, the same again after a reset")
-    if not card.probe:
-        return [*said, "parity: the file stores no logits to compare with"]
-    expected = np.array(card.probe)
-    bar = PROBE_BARS[card.precision] * max(1.0, float(expected.std()))
-    worst = float(abs(logits - expected).max())
-    if worst > bar:
-        raise ModelError(
-            f"{path}: logits of the probe episode differ by {worst:.1e} from those stored "
-            f"(at most {bar:.1e} is allowed): damage, or arithmetic unlike where it was made"
-        )
-    return [*said, f"parity: logits within {worst:.1e} of those stored (bar {bar:.1e})"]
-
-
 def _checked(card: ModelCard, session: ort.InferenceSession, path: Path) -> ModelCard:
     window = card.kind == "window"
     # (shape without the batch axis, element type) of everything the classifier will feed
@@ -244,21 +173,26 @@ def _checked(card: ModelCard, session: ort.InferenceSession, path: Path) -> Mode
     if window and "samples" in inputs and not isinstance((inputs["samples"][0] or (0,))[0], int):
         # A window may be made for any number of steps.
         expected["samples"] = ((inputs["samples"][0][0], *sample), _onnx_type("float32"))
-    if inputs != expected:
-        wrong = sorted(k for k in inputs | expected if inputs.get(k) != expected.get(k))
-        raise _disagree(path, wrong)
+    wrong = {k for k in inputs | expected if inputs.get(k) != expected.get(k)}
+    wrong |= {i.name for i in session.get_inputs() if not i.shape}  # not even a batch
+    if wrong:
+        raise _disagree(path, sorted(wrong))
     batches = {i.shape[0] for i in session.get_inputs()}
     if any(isinstance(batch, int) and batch != 1 for batch in batches):
         raise ModelError(f"{path}: the graph's batch size is fixed to another than 1")
     outputs = {o.name: (tuple(o.shape[1:]), o.type) for o in session.get_outputs()}
-    shape, kind = outputs.get("logits", ((), ""))
-    if shape[-1:] != (len(card.labels),) or len(shape) != 1 + window or kind != "tensor(float)":
-        raise ModelError(f"{path}: no output `logits` of {len(card.labels)} classes")
+    sizes = {"logits": (len(card.labels), "classes")}
+    if card.embedding:
+        sizes["embedding"] = (card.embedding, "units")
+    for name, (size, what) in sizes.items():
+        shape, kind = outputs.get(name, ((), ""))
+        if shape[-1:] != (size,) or len(shape) != 1 + window or kind != "tensor(float)":
+            raise ModelError(f"{path}: no output `{name}` of {size} {what}")
     for state in card.state:
         shape, kind = outputs.get(f"{state.name}_next", ((), ""))
         # onnxruntime may not know every size before it runs.
-        sizes = zip(shape, state.shape, strict=False)
-        same = all(a == b or not isinstance(a, int) for a, b in sizes)
+        axes = zip(shape, state.shape, strict=False)
+        same = all(a == b or not isinstance(a, int) for a, b in axes)
         if not same or len(shape) != len(state.shape) or kind != _onnx_type(state.dtype):
             raise ModelError(f"{path}: no output `{state.name}_next` like `{state.name}`")
     return card

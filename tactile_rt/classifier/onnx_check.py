@@ -326,7 +326,12 @@ class _Walk:
             for _, c, d in self.messages(a, b, tensor=1):
                 for _, e, f in self.messages(c, d, shape=2):
                     for _, g, h in self.messages(e, f, dimension=1):
-                        sizes = [v for n, w, v, _ in self.fields(g, h) if (n, w) == (1, VARINT)]
+                        sizes = []
+                        for number, wire, start, stop in self.fields(g, h):
+                            if (number, wire) == (1, VARINT):
+                                sizes.append(start)
+                            elif (number, wire) == (2, BYTES):
+                                self.text(start, stop)  # a name, which onnxruntime hands on
                         elements *= max(sizes, default=1)
         if elements > MAX_ELEMENTS:
             raise BadModel(f"a value of {elements} elements")

@@ -30,6 +30,8 @@ class Stepper:
 
     Attributes:
         samples: (lane, sub-step, element, channel) SI: write the step's input here.
+        embedding: (lane, unit) The embedding of the last step, which the next one overwrites; of no
+            units if the file has none.
 
     Raises:
         ConfigError: the graph's batch is fixed to another number than `lanes`.
@@ -50,6 +52,7 @@ class Stepper:
         self._offset = _Tensor(shape, np.float32, device)
         self._sigma = _Tensor(shape, np.float32, device)
         self._logits = _Tensor((lanes, len(card.labels)), np.float32, "cpu")
+        self._embedding = _Tensor((lanes, card.embedding), np.float32, "cpu")
         first = {s.name: _Tensor((lanes, *s.shape), s.dtype, device) for s in card.state}
         # How other providers than onnxruntime's own write rows is not known.
         own = session.get_providers() == ["CPUExecutionProvider"]
@@ -61,6 +64,7 @@ class Stepper:
         }
         self._states = (first, second)
         self.samples = self._samples.array
+        self.embedding = self._embedding.array
         self._bindings = tuple(
             self._bound(self._states[now], self._states[1 - now]) for now in range(2)
         )
@@ -103,6 +107,8 @@ class Stepper:
         for name, tensor in inputs.items():
             binding.bind_ortvalue_input(name, tensor.value)
         outputs = {"logits": self._logits, **{f"{k}_next": v for k, v in after.items()}}
+        if self.embedding.size:
+            outputs["embedding"] = self._embedding
         for name, tensor in outputs.items():
             binding.bind_ortvalue_output(name, tensor.value)
         return binding

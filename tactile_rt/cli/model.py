@@ -44,13 +44,18 @@ def show(file: File) -> None:
         f"{period_ms:g} ms, an episode {card.steps} steps "
         f"({card.steps * card.substeps * period_ms / 1e3:.3g} s)",
         "classes": f"{len(card.labels)}: {', '.join(card.labels[:MANY])}{rest}",
+        "embedding": f"{card.embedding} units" if card.embedding else "none before version 3",
         "state": f"{len(card.state)} tensors, {state} values" if card.state else "none",
+        "sensor": _pairs(card.sensor),
         "clip": _channels(spec, card.clip),
         "scale": _channels(spec, card.scale),
         "noise floor": _channels(spec, card.floor),
         "temperature": f"{card.temperature:.4g}",
         "thresholds": _pairs(card.thresholds),
         "decisions": _pairs(card.decision),
+        "unknown": _unknown(card.unknown),
+        "candidates": "\n".join(map(_candidates, card.candidates)),
+        "loads": ", ".join(card.loads),
         "figures": _pairs(card.figures),
         "probe": "stored" if card.probe else "none stored",
         "hashes": _pairs(card.hashes),
@@ -77,7 +82,8 @@ def verify(file: File) -> None:
     """
     import hashlib
 
-    from tactile_rt.classifier.model_file import load_model, read_model, verify_model
+    from tactile_rt.classifier.model_file import load_model, read_model
+    from tactile_rt.classifier.model_runs import verify_model
 
     _, contents, data = read_model(file)
     typer.echo(f"sha256 {hashlib.sha256(data).hexdigest()}")
@@ -109,6 +115,19 @@ def bench(
 def _channels(spec: Any, values: tuple[float, ...]) -> str:
     named = zip(spec.channels, values, spec.units, strict=True)
     return ", ".join(f"{channel} {value:.3g} {unit}" for channel, value, unit in named)
+
+
+def _unknown(rule: Any) -> str:
+    if rule is None:
+        return ""
+    least, most = min(rule.thresholds), max(rule.thresholds)
+    above = f"{least:.4g}" if least == most else f"{least:.4g} to {most:.4g}, by step"
+    return f"{rule.score} of the {rule.output} above {above}"
+
+
+def _candidates(rule: Any) -> str:
+    noise = "" if rule.noise is None else f" up to {rule.noise:.3g} x the rated noise"
+    return f"{100 * rule.coverage:.3g} % by {rule.score}, of {rule.objects} objects{noise}"
 
 
 def _pairs(values: dict[str, Any]) -> str:

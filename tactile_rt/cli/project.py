@@ -9,7 +9,7 @@ from rich.console import Console
 from tactile_rt.cli.app import app, needs, progress_bar, starting
 
 if TYPE_CHECKING:
-    from tactile_rt.project.making import Stage
+    from tactile_rt.project.making import MakeProgress
 
 ABOUT = ("top-1", "top-1 at rated noise", "RBF SVM top-1", "points above the SVM")
 
@@ -57,7 +57,7 @@ def make(
     with progress_bar(console, "reading") as update:
         seen = ""
 
-        def tell(stage: "Stage") -> None:
+        def tell(stage: "MakeProgress") -> None:
             nonlocal seen
             left = f"about {max(stage.left_s, 0) / 60:.0f} min left of all"
             update(

@@ -20,17 +20,11 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from tactile_rt.classifier.model_card import Kind
-from tactile_rt.classifier.model_file import (
-    METADATA_KEY,
-    ModelCard,
-    StateTensor,
-    load_model,
-    probe_logits,
-)
+from tactile_rt.classifier.model_card import CARD_VERSION, Kind
+from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, StateTensor, load_model
+from tactile_rt.classifier.model_runs import file_outputs, probe_logits
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.export.precision import Precision, in_precision
 from tactile_rt.export.streaming import streaming
@@ -47,7 +41,6 @@ __all__ = [
     "StreamingStep",
     "export_checkpoint",
     "export_step",
-    "file_logits",
     "parity",
     "step_graph",
     "write_model",
@@ -74,10 +67,14 @@ class StreamingStep(nn.Module):
     def forward(
         self, samples: Tensor, offset: Tensor, sigma: Tensor, *state: Tensor
     ) -> tuple[Tensor, ...]:
-        """(batch, sub-step, element, channel) SI and state -> logits (batch, class) and state."""
+        """(batch, sub-step, element, channel) SI and state -> logits (batch, class), embedding
+        (batch, unit) and state.
+        """
         frame = self.inputs(samples, offset, sigma)
-        logits, following = self.network.step(frame, dict(zip(self.names, state, strict=True)))
-        return (logits, *(following[name] for name in self.names))
+        logits, embedding, following = self.network.step_embedded(
+            frame, dict(zip(self.names, state, strict=True))
+        )
+        return (logits, embedding, *(following[name] for name in self.names))
 
 
 def export_checkpoint(
@@ -122,6 +119,7 @@ def export_checkpoint(
         clip=tuple(model.inputs.clip.tolist()),
         scale=tuple(model.inputs.scale.tolist()),
         floor=tuple(manifest.limits.floor.tolist()),
+        sensor=msgspec.to_builtins(manifest.sensor) if manifest.sensor else {},
         temperature=temperature,
         provenance={
             "checkpoint_sha256": hashlib.sha256(checkpoint.read_bytes()).hexdigest(),
@@ -150,9 +148,9 @@ def export_step(
 ) -> ModelCard:
     """Write a classifier's streaming step, or a whole window of it.
 
-    What the card says of the graph (state, kind, precision, hashes, parity, probe) is filled in.
-    Parity is of the graph in single precision; what less precise weights change is
-    ``quantisation_logits``, on the same input.
+    What the card says of the graph (state, embedding, kind, precision, hashes, parity, probe) is
+    filled in. Parity is of the graph in single precision, the worse of logits and embedding; what
+    less precise weights change is ``quantisation_logits``, on the same input.
 
     Raises:
         ModelError: the exported graph misses the parity bar.
@@ -193,7 +191,7 @@ def step_graph(
             dynamo=True,
             opset_version=OPSET,
             input_names=["samples", "offset", "sigma", *state],
-            output_names=["logits", *(f"{n}_next" for n in state)],
+            output_names=["logits", "embedding", *(f"{n}_next" for n in state)],
             dynamic_shapes=(shapes[0], shapes[1], shapes[2], tuple(shapes[3:])),
             verbose=False,
         )
@@ -238,7 +236,16 @@ def write_model(
     kind: Kind = "step",
 ) -> ModelCard:
     """Write what `step_graph` made, in a precision, as `export_step` says."""
-    card = msgspec.structs.replace(card, state=state, kind="step", precision="fp32", opset=OPSET)
+    (embedding,) = (o.type.tensor_type.shape for o in proto.graph.output if o.name == "embedding")
+    card = msgspec.structs.replace(
+        card,
+        version=CARD_VERSION,
+        state=state,
+        embedding=embedding.dim[1].dim_value,
+        kind="step",
+        precision="fp32",
+        opset=OPSET,
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, partial_name = tempfile.mkstemp(dir=path.parent, suffix=".partial")
     os.close(handle)
@@ -249,18 +256,19 @@ def write_model(
         form = window_graph(proto, state) if kind == "window" else proto
         _write(form, card, partial)
         worst = parity(model, partial)
-        if not worst <= PARITY_BAR:  # NaN misses it too
-            raise ModelError(
-                f"{path}: logits of the exported graph differ by {worst:.1e} from torch's "
-                f"(at most {PARITY_BAR:.0e} is allowed); nothing was written"
-            )
-        figures = {**card.figures, "parity": worst}
+        for name, difference in worst.items():
+            if not difference <= PARITY_BAR:  # NaN misses it too
+                raise ModelError(
+                    f"{path}: {name} of the exported graph: numbers differ by {difference:.1e} "
+                    f"from torch's (at most {PARITY_BAR:.0e} is allowed); nothing was written"
+                )
+        figures = {**card.figures, "parity": max(worst.values())}
         if precision != "fp32":
             form = in_precision(proto, precision)
             form = window_graph(form, state) if kind == "window" else form
             card = msgspec.structs.replace(card, precision=precision)
             _write(form, card, partial)
-            figures["quantisation_logits"] = parity(model, partial)
+            figures["quantisation_logits"] = parity(model, partial)["logits"]
         session, _ = load_model(partial, kind=None)
         probe = tuple(tuple(row) for row in probe_logits(session, card).tolist())
         del session
@@ -279,10 +287,12 @@ def _write(proto: onnx.ModelProto, card: ModelCard, path: Path) -> None:
     onnx.save(proto, path)
 
 
-def parity(model: TactileClassifier, path: Path, episodes: int = 3, seed: int = 0) -> float:
-    """Largest difference of logits, over every step, between a file and the torch window.
+def parity(
+    model: TactileClassifier, path: Path, episodes: int = 3, seed: int = 0
+) -> dict[str, float]:
+    """Largest difference of each output, over every step, between a file and the torch window.
 
-    In units of the logits' spread where that is more than 1: training makes logits larger, and
+    In units of the output's spread where that is more than 1: training makes logits larger, and
     single precision rounds what is larger more coarsely. NaN if either computes one.
     """
     session, card = load_model(path, kind=None)
@@ -293,32 +303,13 @@ def parity(model: TactileClassifier, path: Path, episodes: int = 3, seed: int = 
     samples = (rng.standard_cauchy(shape) * scale).astype(np.float32)
     offset = (rng.normal(size=(episodes, elements, channels)) * scale).astype(np.float32)
     sigma = np.abs(offset)
+    arrays = [torch.from_numpy(a) for a in (samples, offset, sigma)]
     with torch.inference_mode():
-        expected = model.eval()(*(torch.from_numpy(a) for a in (samples, offset, sigma))).numpy()
-    found = file_logits(session, card, samples, offset, sigma)
-    return float(np.abs(found - expected).max()) / max(1.0, float(expected.std()))
-
-
-def file_logits(
-    session: onnxruntime.InferenceSession,
-    card: ModelCard,
-    samples: NDArray[np.float32],
-    offset: NDArray[np.float32],
-    sigma: NDArray[np.float32],
-) -> NDArray[np.float32]:
-    """Logits (batch, step, class) of windows (batch, step, sub-step, element, channel)."""
-    if card.kind == "window":
-        feed = {"samples": samples, "offset": offset, "sigma": sigma}
-        window: NDArray[np.float32] = session.run(["logits"], feed)[0]
-        return window
-    names = [o.name for o in session.get_outputs()]
-    state: dict[str, NDArray[Any]] = {
-        s.name: np.zeros((len(samples), *s.shape), dtype=s.dtype) for s in card.state
+        expected = {"logits": model.eval()(*arrays).numpy()}
+        if card.embedding:
+            expected["embedding"] = model.network.embed(model.inputs(*arrays)).numpy()
+    found = file_outputs(session, card, samples, offset, sigma)
+    return {
+        name: float(np.abs(found[name] - values).max()) / max(1.0, float(values.std()))
+        for name, values in expected.items()
     }
-    logits = []
-    for t in range(samples.shape[1]):
-        feed = {"samples": samples[:, t], "offset": offset, "sigma": sigma, **state}
-        out = dict(zip(names, session.run(names, feed), strict=True))
-        state = {s.name: out[f"{s.name}_next"] for s in card.state}
-        logits.append(out["logits"])
-    return np.stack(logits, axis=1)

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_card import Kind
 from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, load_model
-from tactile_rt.export.onnx_step import export_checkpoint, file_logits
+from tactile_rt.classifier.model_runs import file_outputs
+from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.export.precision import Precision
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet
@@ -85,9 +86,8 @@ def run_file(path: Path) -> Step:
     ) -> NDArray[np.float32]:
         # One by one, as a robot runs it: a batch would share the scale of its activations.
         parts = (slice(i, i + 1) for i in range(len(samples)))
-        return np.concatenate(
-            [file_logits(session, card, samples[i], offset[i], sigma[i]) for i in parts]
-        )
+        outputs = [file_outputs(session, card, samples[i], offset[i], sigma[i]) for i in parts]
+        return np.concatenate([output["logits"] for output in outputs])
 
     return run
 

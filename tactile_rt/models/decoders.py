@@ -1,7 +1,8 @@
 """Decoders: from what a step means to the classes' logits.
 
 Every decoder maps features `(batch, step, feature)` to logits `(batch, step, class)`, where a
-step's logits use no later step, and has a `step` that gives the same one by one.
+step's logits use no later step. It does so in two parts: `embed` gives what its last linear layer
+reads, the embedding `(batch, step, unit)`, and `logits` is that layer. `step` embeds one by one.
 """
 
 from __future__ import annotations
@@ -21,7 +22,16 @@ HIDDEN = (1024, 512)  # at width 1
 
 
 class LinearDecoder(nn.Linear):
-    """Each step alone: one layer."""
+    """Each step alone: one layer, so the features are the embedding."""
+
+    def embed(self, features: Tensor) -> Tensor:
+        """features (..., feature) -> themselves"""
+        return features
+
+    def logits(self, embedding: Tensor) -> Tensor:
+        """(..., feature) -> (..., class)"""
+        logits: Tensor = self(embedding)
+        return logits
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
         return {}
@@ -29,8 +39,8 @@ class LinearDecoder(nn.Linear):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """features (batch, feature) -> logits (batch, class), {}"""
-        return self(features), {}
+        """features (batch, feature) -> embedding (batch, feature), {}"""
+        return features, {}
 
 
 class MLPDecoder(nn.Sequential):
@@ -46,14 +56,25 @@ class MLPDecoder(nn.Sequential):
             nn.Linear(narrow, classes),
         )
 
+    def embed(self, features: Tensor) -> Tensor:
+        """features (..., feature) -> embedding (..., unit)"""
+        for layer in list(self)[:-1]:
+            features = layer(features)
+        return features
+
+    def logits(self, embedding: Tensor) -> Tensor:
+        """(..., unit) -> (..., class)"""
+        logits: Tensor = self[-1](embedding)
+        return logits
+
     def initial_state(self, batch: int) -> dict[str, Tensor]:
         return {}
 
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """features (batch, feature) -> logits (batch, class), {}"""
-        return self(features), {}
+        """features (batch, feature) -> embedding (batch, unit), {}"""
+        return self.embed(features), {}
 
 
 class MLPAllDecoder(nn.Module):
@@ -75,7 +96,11 @@ class MLPAllDecoder(nn.Module):
         self.layer3 = nn.Linear(narrow, classes)
 
     def forward(self, features: Tensor) -> Tensor:
-        """features (batch, step, feature) -> logits (batch, step, class)
+        """features (batch, step, feature) -> logits (batch, step, class), as `embed`"""
+        return self.logits(self.embed(features))
+
+    def embed(self, features: Tensor) -> Tensor:
+        """features (batch, step, feature) -> embedding (batch, step, unit)
 
         Raises:
             ValueError: more steps than the decoder has weights for.
@@ -88,6 +113,11 @@ class MLPAllDecoder(nn.Module):
         exact = torch.promote_types(products.dtype, torch.float32)
         return self._rest(products.cumsum(1, dtype=exact))
 
+    def logits(self, embedding: Tensor) -> Tensor:
+        """(..., unit) -> (..., class)"""
+        logits: Tensor = self.layer3(embedding)
+        return logits
+
     def initial_state(self, batch: int) -> dict[str, Tensor]:
         """Zero: the first layer's running sum, (batch, hidden)."""
         return {"decoder_sum": self.bias.new_zeros(batch, len(self.bias))}
@@ -95,7 +125,7 @@ class MLPAllDecoder(nn.Module):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """features (batch, feature), index (batch,) int64 -> logits (batch, class), state
+        """features (batch, feature), index (batch,) int64 -> embedding (batch, unit), state
 
         Steps past the last weight change nothing.
         """
@@ -106,9 +136,8 @@ class MLPAllDecoder(nn.Module):
         return self._rest(total), {"decoder_sum": total}
 
     def _rest(self, total: Tensor) -> Tensor:
-        """The first layer's sum (..., hidden) -> logits (..., class)"""
-        logits: Tensor = self.layer3(F.relu(self.layer2(F.relu(total + self.bias))))
-        return logits
+        """The first layer's sum (..., hidden) -> embedding (..., unit)"""
+        return F.relu(self.layer2(F.relu(total + self.bias)))
 
 
 def hidden(width: float) -> tuple[int, int]:

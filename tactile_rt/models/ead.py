@@ -138,6 +138,10 @@ class EAD(nn.Module):
         features: Tensor = self.attender(self.encoder(frames, *others))
         return features
 
+    def embed(self, frames: Tensor, *others: Tensor) -> Tensor:
+        """What the decoder's last layer reads of frames at each step, (batch, step, unit)."""
+        return self.decoder.embed(self.features(frames, *others))
+
     def forward(self, frames: Tensor, *others: Tensor) -> Tensor:
         """frames (batch, step, channel, row, column) -> logits (batch, step, class)"""
         logits: Tensor = self.decoder(self.features(frames, *others))
@@ -169,18 +173,29 @@ class EAD(nn.Module):
 
         A lane is reset by putting its rows of `initial_state` back.
         """
+        logits, _, new = self.step_embedded(frame, state, *others)
+        return logits, new
+
+    def step_embedded(
+        self, frame: Tensor, state: dict[str, Tensor], *others: Tensor
+    ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """As `step`, with the step's embedding (batch, unit) between logits and state.
+
+        It is that of the step alone, also where the logits are a mean over steps.
+        """
         index = state["index"]
         frame = F.pad(frame, (0, 1)) if self._alone else frame
         features, encoder = self.encoder.step(frame, index, state, *others)  # (batch, feature)
         features, attender = self.attender.step(features, index, state)
-        logits, decoder = self.decoder.step(features, index, state)  # (batch, class)
+        embedding, decoder = self.decoder.step(features, index, state)  # (batch, unit)
+        logits = self.decoder.logits(embedding)  # (batch, class)
         new = {"index": index + 1, **encoder, **attender, **decoder}
         if self.config.readout == "mean":
             count = index[:, None] - self.lag + 1  # steps in the mean; none before the lag is over
             total = state["logits_sum"] + torch.where(count > 0, logits, 0.0)
             logits = torch.where(count > 0, total / count.clamp(min=1), logits)
             new["logits_sum"] = total
-        return logits, {name: new[name] for name in state}
+        return logits, embedding, {name: new[name] for name in state}
 
 
 def _encoder(config: EADConfig) -> Any:

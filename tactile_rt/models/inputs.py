@@ -3,6 +3,9 @@
 Most whiskers feel micronewtons while one that jams feels newtons, so values are compressed as
 sign(v) log(1 + |v| / s). The scale s never falls below the noise measured at rest, or the
 logarithm would magnify silent channels into signals.
+
+A recurrent network would never forget a number that is none. So a sample that is NaN or infinite
+counts as no load, and so does a channel whose tare or noise is: also in a file that others run.
 """
 
 from __future__ import annotations
@@ -82,8 +85,11 @@ class InputStage(nn.Module):
             )
         for _ in range(samples.dim() - offset.dim()):
             offset, sigma = offset.unsqueeze(1), sigma.unsqueeze(1)
-        value = torch.clamp(samples - offset, -self.clip, self.clip)  # as samples, SI
+        load = samples - offset  # as samples, SI
+        load = torch.where(load.abs() < torch.inf, load, 0.0)  # NaN is not less either
+        value = torch.clamp(load, -self.clip, self.clip)  # as samples, SI
         scale = torch.sqrt(self.scale**2 + (NOISE_FLOOR * sigma) ** 2)  # as offset, SI
+        scale = torch.where(scale < torch.inf, scale, torch.inf)  # of which any load is nothing
         value = torch.sign(value) * torch.log1p(value.abs() / scale)  # as samples, no unit
         cells = F.pad(value, (0, 0, 0, 1)).index_select(-2, self.element)
         # (batch, ..., sub-step, cell, channel) -> (batch, ..., sub-step * channel, row, column)

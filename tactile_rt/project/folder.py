@@ -60,7 +60,7 @@ class Project:
     """A project's folder.
 
     Attributes:
-        folder: The folder itself.
+        folder: The path of the project's folder.
 
     Raises:
         ConfigError: there is no such folder, or a file of it is missing.

@@ -7,7 +7,8 @@ Each part is made once: what is there is not made again, and what was interrupte
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,15 +22,19 @@ from tactile_rt.export.release import release
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.training import Progress, TrainingConfig, read_recipe, train
 from tactile_rt.models.training.loop import read_splits
+from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized, write_budget
 from tactile_rt.project.folder import Project
-from tactile_rt.project.plan import Plan, plan_sweeps, read_plan, sized, write_plan
 from tactile_rt.project.report import write_report
 from tactile_rt.sim_backend.datasets.dataset import describe_set, finished_objects, make_sweeps
+from tactile_rt.sim_backend.datasets.inventory import write_sums
 from tactile_rt.stream import ConfigError
+from tactile_rt.sweep_set import read_skipped, write_skipped
 
-__all__ = ["Stage", "make"]
+__all__ = ["MakeProgress", "make"]
 
 LEAST_MINUTES = 1.0
+SWEPT_BY = 0.48  # of the time given, even where sweeps take longer than those that were timed
+FEWEST = 3  # objects of a category to train on, however long they take
 TRAINED_BY = 0.87  # of the time given: the rest is for export, evaluation and report
 PILOT = 24  # updates that are timed
 MOST_EPOCHS = 60
@@ -40,12 +45,12 @@ Splits = tuple[SweepSet, SweepSet]
 
 
 @dataclass(frozen=True)
-class Stage:
+class MakeProgress:
     """How far a project is.
 
     Attributes:
         name: The name of what is being made.
-        done, of: How much of it is there, and how much there is to be.
+        done, of: The amount of it that is there, and the amount that is to be.
         left_s: The time that everything still takes, s.
     """
 
@@ -55,7 +60,11 @@ class Stage:
     left_s: float
 
 
-Tell = Callable[[Stage], None]
+class _OutOfTime(Exception):
+    """Ends a training after an epoch; its best network is on disk."""
+
+
+Tell = Callable[[MakeProgress], None]
 
 
 def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[Record]:
@@ -77,16 +86,17 @@ def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[
         raise ConfigError(f"--minutes must be at least {LEAST_MINUTES:g}, not {minutes:g}")
     project.line()  # a mistake in robot.toml is told before the work, not after
     end = time.monotonic() + 60 * minutes
-    plan = read_plan(project)
-    if plan is None:
-        tell(Stage("timing sweeps", 0, 1, 60 * minutes))
-        plan = plan_sweeps(project, 60 * minutes)
-        write_plan(project, plan)
-    sweeps = _sweep(project, plan, end, tell)
-    best = _train(project, plan, sweeps, end - (1 - TRAINED_BY) * 60 * minutes, tell)
-    tell(Stage("exporting", 0, 1, end - time.monotonic()))
+    budget = read_budget(project)
+    if budget is None:
+        tell(MakeProgress("timing sweeps", 0, 1, 60 * minutes))
+        budget = budget_sweeps(project, 60 * minutes)
+        write_budget(project, budget)
+    begun = end - 60 * minutes
+    sweeps = _sweep(project, budget, begun + SWEPT_BY * 60 * minutes, end, tell)
+    best = _train(project, budget, sweeps, begun + TRAINED_BY * 60 * minutes, end, tell)
+    tell(MakeProgress("exporting", 0, 1, end - time.monotonic()))
     release(best, project.model, project.folder.resolve().name)
-    tell(Stage("evaluating", 0, 1, end - time.monotonic()))
+    tell(MakeProgress("evaluating", 0, 1, end - time.monotonic()))
     project.report.mkdir(exist_ok=True)
     records = evaluate_model(project.model, sweeps, svm=True, pictures=project.report)
     write(records, project.report / "figures.json")
@@ -94,35 +104,63 @@ def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[
     return records
 
 
-def _sweep(project: Project, plan: Plan, end: float, tell: Tell) -> Path:
+def _sweep(project: Project, budget: Budget, until: float, end: float, tell: Tell) -> Path:
+    """Make the set: first what is held out, then as much to train on as there is time for."""
     folder = project.build / "sweeps"
-    recipe = sized(project.recipe(), plan)
-    names = describe_set(recipe).names()
-    there = len(finished_objects(folder, names))
-    for done, _ in enumerate(make_sweeps(recipe, folder), start=1):
-        if done > there:
-            tell(Stage("sweeping", done, len(names), end - time.monotonic()))
+    recipe = sized(project.recipe(), budget)
+    manifest = describe_set(recipe)
+    done, of = 0, len(manifest.names())
+    for splits in (("test", "validation"), ("train",)):
+        left = manifest.names(splits)
+        there = len(finished_objects(folder, left))
+        fewest = FEWEST * len(manifest.categories) if "train" in splits else len(left)
+        with closing(make_sweeps(recipe, folder, splits=splits)) as made:
+            for count, name in enumerate(made, start=1):
+                left.remove(name)
+                done += 1
+                if count > there:
+                    tell(MakeProgress("sweeping", done, of, end - time.monotonic()))
+                if count >= max(there, fewest) and time.monotonic() > until:
+                    break
+    if left:
+        _leave_out(folder, left)
     return folder
 
 
-def _train(project: Project, plan: Plan, sweeps: Path, end: float, tell: Tell) -> Path:
+def _leave_out(folder: Path, names: Sequence[str]) -> None:
+    """Go on without objects for which there was no time."""
+    for name in names:
+        (folder / f"{name}.part").unlink(missing_ok=True)
+    write_skipped(folder, read_skipped(folder) | dict.fromkeys(names, "there was no time for it"))
+    write_sums(folder)
+
+
+def _train(
+    project: Project, budget: Budget, sweeps: Path, until: float, end: float, tell: Tell
+) -> Path:
     torch.set_num_threads(os.cpu_count() or 1)
-    tell(Stage("finding onsets", 0, 1, end - time.monotonic()))
+    tell(MakeProgress("finding onsets", 0, 1, end - time.monotonic()))
     config = read_recipe(RECIPE, str(sweeps.resolve()))
     splits = read_splits(sweeps, config)
     batch = max(2, min(config.batch, len(splits[0].sweeps) // 8))
     config = replace(config, batch=batch)
-    if not plan.updates:
+    if not budget.updates:
         each_s = _time_of_an_update(project, config, splits)
         most = MOST_EPOCHS * len(splits[0].sweeps) // batch
-        plan.updates = max(FEWEST_UPDATES, min(int((end - time.monotonic()) / each_s), most))
-        write_plan(project, plan)
+        budget.updates = max(FEWEST_UPDATES, min(int((until - time.monotonic()) / each_s), most))
+        write_budget(project, budget)
+
+    run = project.build / "run"
 
     def show(at: Progress) -> None:
-        tell(Stage("training", at.update, at.updates, end - time.monotonic()))
+        tell(MakeProgress("training", at.update, at.updates, end - time.monotonic()))
+        # The machine has become busier than it was when the updates were timed.
+        if at.metrics and time.monotonic() > (until + end) / 2:
+            raise _OutOfTime
 
-    config = replace(config, updates=plan.updates)
-    return train(config, project.build / "run", show, splits=splits)
+    with suppress(_OutOfTime):
+        train(replace(config, updates=budget.updates), run, show, splits=splits)
+    return run / "best.pt"
 
 
 def _time_of_an_update(project: Project, config: TrainingConfig, splits: Splits) -> float:

@@ -169,6 +169,23 @@ def test_the_most_probable_classes_come_first() -> None:
     assert len(d.top(99)) == 5
 
 
+@pytest.mark.parametrize("options", [{}, {"mode": "sliding", "every": 1}])
+def test_decisions_carry_their_own_step_s_embedding_if_asked(model: Path, options: dict) -> None:
+    """Also where one push, or one run of the network, gives several."""
+    values = signal([(QUIET, 300, 0.1)], 330)
+    values[QUIET:, 0, 0] += np.linspace(0, 1, len(values) - QUIET, dtype=np.float32)
+    whole = stream(values, samples=len(values) + 1)
+    decisions = push_all(Classifier(model, SAME_RATE, embedding=True, **options), whole)
+    assert len(decisions) >= STEPS
+    for d in decisions:
+        assert d.embedding is not None and d.embedding.dtype == np.float32
+        logits = logits_of(d.probabilities)
+        assert d.embedding == pytest.approx([d.step, logits[3]], abs=1e-5)
+    assert len({d.embedding[1] for d in decisions}) == len(decisions)
+    plain = push_all(Classifier(model, SAME_RATE, **options), whole)
+    assert [d.embedding for d in plain] == [None] * len(decisions)
+
+
 # Other rates
 
 

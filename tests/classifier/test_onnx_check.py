@@ -211,6 +211,14 @@ def test_what_parsers_read_differently_is_refused(data: bytes) -> None:
         read_onnx(data)
 
 
+def test_an_axis_whose_name_is_no_text_is_refused() -> None:
+    """onnxruntime hands it on as it is, and Python cannot read it."""
+    data = tiny().SerializeToString()
+    assert data.count(b"\x12\x01B") > 5
+    with pytest.raises(BadModel, match="damaged text at byte"):
+        read_onnx(data.replace(b"\x12\x01B", b"\x12\x01\xc2", 1))
+
+
 def test_many_small_parts_end_soon() -> None:
     with pytest.raises(BadModel, match="more than 1000000 parts"):
         read_onnx(b"\x08\x01" * 1_100_000)

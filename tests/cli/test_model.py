@@ -6,22 +6,25 @@ from pathlib import Path
 
 import pytest
 
+from tactile_rt.classifier.decision_rules import CandidateRule, UnknownRule
 from tactile_rt.classifier.model_file import (
     METADATA_KEY,
     load_model,
-    probe_logits,
     read_model,
     shipped_model,
 )
+from tactile_rt.classifier.model_runs import probe_logits
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.evidence import model_steps, roofline
 
 pytest.importorskip("onnx")
 
 import onnx
+from msgspec.structs import replace
 from onnx import helper
 
-from tests.helpers.tiny_model import WINDOW, write_model
+from tests.helpers.old_models import write_old_model
+from tests.helpers.tiny_model import GRAPH, WINDOW, write_model
 
 
 @pytest.fixture
@@ -50,8 +53,59 @@ def test_show_says_what_the_shipped_model_is(call):
         "mouse-right: 30 elements x fx, fy, fz, mx, my, mz at 1000 Hz",
         "a step is 5 x 9 ms, an episode 22 steps",
         "24: beehive, birdcage",
+        "embedding 64 units",
     ):
         assert said in words
+
+
+def test_show_says_what_the_file_knows_of_sensor_and_rules(call, tmp_path):
+    promise = CandidateRule("1 - posterior", 0.95, (0.9,) * 4, 200)
+    path = write_model(
+        tmp_path / "m.onnx",
+        sensor={"rate_hz": 80.0, "note": "\x1b[2J"},
+        unknown=UnknownRule("entropy", "logits", (1.0, 1.0, 1.5, 2.0)),
+        candidates=(promise, replace(promise, coverage=0.8, noise=1.0)),
+        loads={"mean": ((0.0, 0.0),) * 3, "rms": ((1.0, 1.0),) * 3},
+    )
+    code, out, err = call("model", "show", path)
+    assert (code, err) == (0, "")
+    words = " ".join(out.split())
+    for said in (
+        "embedding 2 units",
+        "sensor rate_hz: 80 note: ?[2J",
+        "unknown entropy of the logits above 1 to 2, by step",
+        "candidates 95 % by 1 - posterior, of 200 objects",
+        "80 % by 1 - posterior, of 200 objects up to 1 x the rated noise",
+        "loads mean, rms",
+    ):
+        assert said in words
+    _, out, _ = call("model", "show", write_model(path, unknown=UnknownRule("x", "logits", (1.0,))))
+    assert "unknown x of the logits above 1 probe" in " ".join(out.split())
+    assert "candidates" not in out
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_an_older_file_is_shown_and_verified_for_what_it_has(call, tmp_path, version):
+    path = write_old_model(tmp_path / "m.onnx", version)
+    code, out, _ = call("model", "show", path)
+    assert code == 0
+    assert f"metadata version {version}" in out
+    assert "none before version 3" in " ".join(out.split())
+    code, out, _ = call("model", "verify", path)
+    assert code == 0
+    assert "probe: 4 finite steps, the same again after a reset" in out
+    assert ("parity: logits within" in out) == (version == 2)
+    assert "embedding" not in out and "bad samples" not in out
+
+
+REMEMBERS = GRAPH.replace("Where(known, load, none)", "Where(known, load, load)")
+
+
+def test_verify_finds_a_graph_that_remembers_bad_samples(call, tmp_path):
+    path = write_model(tmp_path / "m.onnx", REMEMBERS)
+    code, _, err = call("model", "verify", path)
+    assert (code, err.count("\n")) == (2, 1)
+    assert f"{path}: a sample that is no number is not taken for no load" in err
 
 
 def test_a_stranger_s_text_cannot_command_the_terminal(call, tmp_path):
@@ -74,6 +128,8 @@ def test_verify_a_sealed_file(call, sealed):
     assert (code, err) == (0, "")
     assert out.splitlines()[0] == f"sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
     assert "graph: as it was exported" in out
+    assert "embedding: 2 units, finite" in out
+    assert "bad samples: NaN and infinity are no load" in out
     assert "parity: logits within 0.0e+00 of those stored" in out
 
 
@@ -156,7 +212,7 @@ BROKEN = {
     "two opsets": (lambda proto: proto.opset_import.add(domain="ai.onnx", version=7), "say, once"),
     "no metadata": (lambda proto: proto.ClearField("metadata_props"), "no 'tactile_rt' metadata"),
     "types": (described(steps="many"), "has damaged metadata: Expected `int`, got `str` - at `$.s"),
-    "future": (described(version=99), "has metadata of version 99; this release reads 1 and 2"),
+    "future": (described(version=99), "has metadata of version 99; this release reads 1 to 3"),
     "episode": (described(steps=900_000), "an episode of 810000000 values"),
     "state": (described(state=[]), "the graph's inputs disagree with its metadata at "),
     "spec": (described(spec="{}"), "array spec of version None"),

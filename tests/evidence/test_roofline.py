@@ -57,7 +57,8 @@ tiny (float[B,3,3,2] samples, float[B,3,2] offset, float[B,3,2] sigma) => (float
 
 def test_the_products_of_a_model_are_counted(tmp_path: Path) -> None:
     path = write_model(tmp_path / "m.onnx", DENSE.replace(
-        "{0, -1}>", "{0, -1}, float[18,5] weights = {" + ", ".join(["1"] * 90) + "}>"), state=()
+        "{0, -1}>", "{0, -1}, float[18,5] weights = {" + ", ".join(["1"] * 90) + "}>"), state=(),
+        version=2, embedding=0,
     )  # fmt: skip
     assert products(path) == [MatrixProduct(1, 18, 5, 360, integer=False)]
 

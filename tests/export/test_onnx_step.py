@@ -18,8 +18,11 @@ import onnx.parser
 import torch
 
 import tactile_rt
+from bench.inference.full_size import random_model
 from tactile_rt.classifier.classifier import Classifier
+from tactile_rt.classifier.decision_rules import CandidateRule, UnknownRule
 from tactile_rt.classifier.model_file import ModelCard, load_model
+from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.export import onnx_step, streaming, streaming_gpt
@@ -27,8 +30,9 @@ from tactile_rt.export.onnx_step import (
     PARITY_BAR,
     export_checkpoint,
     export_step,
-    file_logits,
     parity,
+    step_graph,
+    write_model,
 )
 from tactile_rt.models.datasets import find_onsets, windows
 from tactile_rt.models.ead import EADConfig
@@ -147,6 +151,15 @@ def in_torch(model: TactileClassifier, *arrays: np.ndarray) -> np.ndarray:
         return model(*(torch.from_numpy(a) for a in arrays)).numpy()
 
 
+def embedded(model: TactileClassifier, *arrays: np.ndarray) -> np.ndarray:
+    """What goes into the network's last linear layer, caught where it does."""
+    *_, last = (m for m in model.network.decoder.modules() if isinstance(m, torch.nn.Linear))
+    caught = []
+    with last.register_forward_pre_hook(lambda _, inputs: caught.append(inputs[0])):
+        in_torch(model, *arrays)
+    return caught[0].numpy()
+
+
 def follow(path: Path, model: TactileClassifier, batch: int) -> None:
     """A stream loop as a stranger would write it, from the file's metadata."""
     card = metadata(path)
@@ -154,13 +167,16 @@ def follow(path: Path, model: TactileClassifier, batch: int) -> None:
     expected = in_torch(model, samples, offset, sigma)
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     state = {s["name"]: np.zeros((batch, *s["shape"]), s["dtype"]) for s in card["state"]}
-    outputs = ["logits", *(f"{name}_next" for name in state)]
+    outputs = ["logits", "embedding", *(f"{name}_next" for name in state)]
     assert card["steps"] == STEPS
+    hidden = embedded(model, samples, offset, sigma)
+    assert hidden.shape[2] == card["embedding"]
     for t in range(card["steps"]):
         feed = {"samples": samples[:, t], "offset": offset, "sigma": sigma, **state}
-        logits, *following = session.run(outputs, feed)
+        logits, embedding, *following = session.run(outputs, feed)
         state = dict(zip(state, following, strict=True))
         assert abs(logits - expected[:, t]).max() <= 1e-5, f"step {t}"
+        assert abs(embedding - hidden[:, t]).max() <= 1e-5, f"step {t}"
     assert np.ptp(expected) > 0.5, "logits that say nothing would agree in any graph"
     assert all(np.any(value) for value in state.values()), "a state that is never written"
 
@@ -187,14 +203,16 @@ def test_so_it_does_in_the_forms_of_a_wide_network(
 
 def test_parity_is_measured_and_stored(exported: SimpleNamespace) -> None:
     assert 0 < exported.card.figures["parity"] <= PARITY_BAR <= 1e-5
-    assert parity(exported.model, exported.path, episodes=2, seed=7) <= PARITY_BAR
+    found = parity(exported.model, exported.path, episodes=2, seed=7)
+    assert set(found) == {"logits", "embedding"}
+    assert 0 < max(found.values()) <= PARITY_BAR
 
 
 def test_parity_tells_another_network_from_the_file_s(exported: SimpleNamespace) -> None:
     other = build()
     with torch.no_grad():
         next(other.parameters()).mul_(1.01)
-    assert parity(other, exported.path, episodes=1) > PARITY_BAR
+    assert min(parity(other, exported.path, episodes=1).values()) > PARITY_BAR
 
 
 def test_the_metadata_says_everything_needed(exported: SimpleNamespace) -> None:
@@ -202,7 +220,9 @@ def test_the_metadata_says_everything_needed(exported: SimpleNamespace) -> None:
     assert set(card) == set(ModelCard.__struct_fields__)
     assert ArraySpec.from_json(card["spec"]) == SPEC
     assert card["name"] == "tiny"
-    assert card["version"] == 2
+    assert card["version"] == 3
+    places = {"sensor": {}, "unknown": None, "candidates": [], "loads": {}}
+    assert {name: card[name] for name in places} == places
     assert (card["kind"], card["precision"], card["opset"]) == ("step", "fp32", onnx_step.OPSET)
     assert card["hashes"]["graph"] == graph_sha256(exported.path.read_bytes())
     assert card["period_ns"] == PERIOD_NS
@@ -234,7 +254,7 @@ def test_the_file_is_read_back_as_the_card_that_was_returned(exported: SimpleNam
         "samples", "offset", "sigma", *(s.name for s in card.state)
     ]  # fmt: skip
     assert [o.name for o in session.get_outputs()] == [
-        "logits", *(f"{s.name}_next" for s in card.state)
+        "logits", "embedding", *(f"{s.name}_next" for s in card.state)
     ]  # fmt: skip
 
 
@@ -287,18 +307,20 @@ def test_the_cache_is_written_in_place_with_the_same_result(exported: SimpleName
     stepper = Stepper(session, card)
     for name in (s.name for s in card.state):
         assert (stepper._states[0][name] is stepper._states[1][name]) == (name in marked)
-    expected = file_logits(session, card, samples, offset, sigma)[0]
+    outputs = file_outputs(session, card, samples, offset, sigma)
+    expected, embedding = outputs["logits"][0], outputs["embedding"][0]
     for steps in (*range(1, STEPS + 1), STEPS):
         stepper.begin(offset[0], sigma[0])
         for step in range(steps):
             stepper.samples[:] = samples[:, step]
             assert np.array_equal(stepper.run()[0], expected[step]), (steps, step)
+            assert np.array_equal(stepper.embedding[0], embedding[step]), (steps, step)
 
 
 def test_a_lane_begun_anew_leaves_the_others_cache_alone(exported: SimpleNamespace) -> None:
     session, card = load_model(exported.path)
     samples, offset, sigma = episodes(1, seed=5)
-    alone = file_logits(session, card, samples, offset, sigma)[0]
+    alone = file_outputs(session, card, samples, offset, sigma)["logits"][0]
     stepper = Stepper(session, card, lanes=2)
     stepper.begin(offset[0], sigma[0])
     late = 7  # lane 1 begins so many steps after lane 0
@@ -322,6 +344,82 @@ def test_a_state_that_something_else_reads_is_not_written_in_place(other, marked
         f"{{ {other}\n cache_next = ScatterND(cache, rows, new) }}"
     )
     assert onnx_step._written_by_rows(graph, "cache") == marked
+
+
+def test_a_sample_that_is_no_number_is_gone_with_its_step(exported: SimpleNamespace) -> None:
+    """In the file alone, as a stranger runs it, beside a stream that was at rest there."""
+    card = metadata(exported.path)
+    session = onnxruntime.InferenceSession(exported.path, providers=["CPUExecutionProvider"])
+    outputs = [output.name for output in session.get_outputs()]
+    samples, offset, sigma = (np.repeat(a, 2, 0) for a in episodes(1))
+    offset[:, 5, 0], sigma[:, 6, 1] = np.nan, np.inf  # all the time
+    bad = np.resize(np.float32([np.nan, np.inf, -np.inf]), (5, 10, 6))
+    samples[0, 3, :, 10:20], samples[1, 3, :, 10:20] = bad, offset[1, 10:20]
+    samples[1, :, :, 5, 0] = 0  # which is then not felt
+    state = {s["name"]: np.zeros((2, *s["shape"]), s["dtype"]) for s in card["state"]}
+    for t in range(STEPS):
+        feed = {"samples": samples[:, t], "offset": offset, "sigma": sigma, **state}
+        out = dict(zip(outputs, session.run(outputs, feed), strict=True))
+        state = {name: out[f"{name}_next"] for name in state}
+        for name, values in out.items():
+            assert np.isfinite(values).all(), (t, name)
+            assert np.array_equal(values[0], values[1]), (t, name)
+
+
+def test_what_the_card_says_of_sensor_and_rules_is_in_the_file(
+    exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    replay(monkeypatch, exported.proto)
+    given = {
+        "sensor": {"rate_hz": 80.0, "noise_density": [1e-6] * 6},
+        "unknown": UnknownRule("entropy", "embedding", (0.5,) * STEPS),
+        "candidates": (CandidateRule("rank", 0.95, (2.5,) * STEPS, 200),),
+        "loads": {"rms": ((1e-4,) * 6,) * 30},
+    }
+    for version in (2, 3):  # a card taken from an older file is of an older version
+        card = msgspec.structs.replace(exported.card, version=version, **given)
+        written = export_step(exported.model, card, tmp_path / "m.onnx")
+        assert written.version == 3
+        found = load_model(tmp_path / "m.onnx")[1]
+        assert {name: getattr(found, name) for name in given} == given
+
+
+# Every encoder, attender and decoder at least once.
+KINDS = [
+    ("zhuang-timedecay-ln", "mamba", "linear"),
+    ("zhuang-vanilla-ln", "none", "linear"),
+    ("zhuang-ugrnn", "gpt", "mlp-all"),
+    ("zhuang-gru", "none", "mlp-all"),
+    ("zhuang-lstm", "none", "linear"),
+    ("resnet18", "none", "mlp"),
+    ("s4", "gpt", "mlp"),
+    ("mamba", "none", "linear"),
+    ("gru", "none", "linear"),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("encoder", "attender", "decoder"), KINDS)
+def test_files_of_every_network_give_its_embedding_and_forget_bad_samples(
+    tmp_path: Path, encoder: str, attender: str, decoder: str
+) -> None:
+    config = EADConfig(4, encoder, attender, decoder, width=1 / 4 if encoder == "gru" else 1 / 32)
+    model, card = random_model(SPEC, config, encoder)
+    proto, state = step_graph(model, card)
+    samples, offset, sigma = episodes(2)
+    expected = embedded(model, samples, offset, sigma)
+    rest = samples.copy()
+    samples[0, 3, :, ::3], rest[0, 3, :, ::3] = np.nan, offset[0, ::3]
+    for kind in ("step", "window"):
+        path = tmp_path / f"{kind}.onnx"
+        write_model(proto, state, model, card, path, kind=kind)  # refused if past the bar
+        opened = load_model(path, kind=None)
+        struck, rested = (file_outputs(*opened, s, offset, sigma) for s in (samples, rest))
+        for name, values in struck.items():
+            assert np.isfinite(values).all()
+            assert np.array_equal(values, rested[name])
+        gap = abs(struck["embedding"][1] - expected[1]).max()
+        assert gap <= 1e-5 * max(1, expected.std())
 
 
 # What goes wrong

@@ -17,8 +17,9 @@ import torch
 from onnx import numpy_helper
 
 from bench.inference.full_size import random_model
-from tactile_rt.classifier.model_file import load_model, read_model, shipped_model, verify_model
-from tactile_rt.export.onnx_step import PARITY_BAR, file_logits, parity, step_graph, write_model
+from tactile_rt.classifier.model_file import load_model, read_model, shipped_model
+from tactile_rt.classifier.model_runs import file_outputs, verify_model
+from tactile_rt.export.onnx_step import PARITY_BAR, parity, step_graph, write_model
 from tactile_rt.export.precision import CONTRIB, PRECISIONS, in_precision
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.stream import ConfigError
@@ -73,8 +74,10 @@ def windows(card, batch: int, steps: int = 22, seed: int = 3) -> tuple[np.ndarra
 def test_logits_are_the_network_s_within_what_the_precision_allows(
     files: SimpleNamespace, precision: str
 ) -> None:
-    worst = parity(files.model, files.paths[precision], episodes=2, seed=5)
-    assert worst <= TOLERANCE[precision]
+    found = parity(files.model, files.paths[precision], episodes=2, seed=5)
+    assert set(found) == {"logits", "embedding"}
+    assert max(found.values()) <= TOLERANCE[precision]
+    worst = min(found.values())
     if precision != "fp32":
         assert worst > PARITY_BAR, "nothing was rounded"
         assert files.cards[precision].figures["quantisation_logits"] <= TOLERANCE[precision]
@@ -144,10 +147,11 @@ def test_int8_weights_are_rounded_by_at_most_half_a_step(files: SimpleNamespace)
 def test_lanes_do_not_disturb_each_other_in_fp32(files: SimpleNamespace) -> None:
     session, card = load_model(files.paths["fp32"])
     arrays = windows(card, batch=3)
-    together = file_logits(session, card, *arrays)
+    together = file_outputs(session, card, *arrays)
     for lane in range(3):
-        alone = file_logits(session, card, *(a[lane : lane + 1] for a in arrays))
-        assert abs(together[lane] - alone[0]).max() <= PARITY_BAR
+        alone = file_outputs(session, card, *(a[lane : lane + 1] for a in arrays))
+        for name, values in together.items():
+            assert abs(values[lane] - alone[name][0]).max() <= PARITY_BAR
 
 
 @pytest.mark.parametrize("precision", ["fp32", "int8"])
@@ -158,15 +162,37 @@ def test_a_window_is_its_steps(files: SimpleNamespace, precision: str, steps: in
     assert card.kind == "window" and card.state == ()
     for batch in (1, 2):
         arrays = windows(card, batch, steps)
-        expected = file_logits(step, step_card, *arrays)
-        assert abs(file_logits(session, card, *arrays) - expected).max() <= 1e-6
+        expected = file_outputs(step, step_card, *arrays)
+        found = file_outputs(session, card, *arrays)
+        for name, size in (("logits", CLASSES), ("embedding", card.embedding)):
+            assert found[name].shape == expected[name].shape == (batch, steps, size)
+            assert abs(found[name] - expected[name]).max() <= 1e-6
     # A window without a batch or with too many steps is onnxruntime's to refuse.
     assert {i.name for i in session.get_inputs()} == {"samples", "offset", "sigma"}
 
 
+def test_in_every_form_a_sample_that_is_no_number_is_gone_with_its_step(
+    files: SimpleNamespace,
+) -> None:
+    for name, path in files.paths.items():
+        session, card = load_model(path, kind=None)
+        samples, offset, sigma = windows(card, batch=1)
+        struck, rest = samples.copy(), samples.copy()
+        struck[:, 3, :, ::2], rest[:, 3, :, ::2] = np.nan, offset[:, None, ::2]
+        struck[:, 9, :, 1], rest[:, 9, :, 1] = np.inf, offset[:, None, 1]
+        found, expected = (file_outputs(session, card, s, offset, sigma) for s in (struck, rest))
+        for output, values in found.items():
+            assert np.isfinite(values).all(), (name, output)
+            assert np.array_equal(values, expected[output]), (name, output)
+        other = file_outputs(session, card, samples, offset, sigma)["logits"]
+        assert not np.array_equal(other[:, -1], found["logits"][:, -1]), "nothing was felt there"
+
+
 def test_every_file_verifies_and_is_plain_onnx(files: SimpleNamespace) -> None:
     for name, path in files.paths.items():
-        assert any("parity" in line for line in verify_model(path)), name
+        said = " ".join(verify_model(path))
+        for line in ("parity: logits within", "embedding: 32 units, finite", "bad samples: NaN"):
+            assert line in said, name
         if "int8" not in name:  # the checker does not know onnxruntime's own operators
             onnx.checker.check_model(onnx.load(path), full_check=True)
 

@@ -1,8 +1,10 @@
 """A model file whose logits say what the runtime fed it, so that every feed can be checked.
 
     logits = [0, steps so far, sum of all windows, last sample, sigma]
+    embedding = [steps so far, last sample]
 
-of the first channel of the first element, sample and sum less the offset. Needs onnx, not torch.
+of the first channel of the first element, sample and sum less the offset; what is not finite is
+at rest. Needs onnx, not torch.
 """
 
 from pathlib import Path
@@ -24,11 +26,15 @@ GRAPH = """
 <ir_version: 9, opset_import: ["" : 18]>
 tiny (float[B,3,3,2] samples, float[B,3,2] offset, float[B,3,2] sigma,
       int64[B] steps, float[B,1] total)
-  => (float[B,5] logits, int64[B] steps_next, float[B,1] total_next)
-<int64[1] one = {1}, int64 first = {0}, int64[1] head = {0}, int64[1] tail = {2}>
+  => (float[B,5] logits, float[B,2] embedding, int64[B] steps_next, float[B,1] total_next)
+<int64[1] one = {1}, int64 first = {0}, int64[1] head = {0}, int64[1] tail = {2},
+ float none = {0}, float most = {3e38}>
 {
   offset_k = Unsqueeze(offset, one)
-  tared = Sub(samples, offset_k)
+  load = Sub(samples, offset_k)
+  size = Abs(load)
+  known = Less(size, most)
+  tared = Where(known, load, none)
   element = Gather<axis = 2>(tared, first)
   channel = Gather<axis = 2>(element, first)
   sum = ReduceSum<keepdims = 1>(channel, one)
@@ -41,6 +47,7 @@ tiny (float[B,3,3,2] samples, float[B,3,2] offset, float[B,3,2] sigma,
   noise_column = Gather<axis = 1>(noise, head)
   zero = Sub(last, last)
   logits = Concat<axis = 1>(zero, steps_column, total_next, last, noise_column)
+  embedding = Concat<axis = 1>(steps_column, last)
 }
 """
 
@@ -48,12 +55,19 @@ tiny (float[B,3,3,2] samples, float[B,3,2] offset, float[B,3,2] sigma,
 WINDOW = """
 <ir_version: 9, opset_import: ["" : 18]>
 tiny (float[B,T,3,3,2] samples, float[B,3,2] offset, float[B,3,2] sigma)
-  => (float[B,T,5] logits)
-<int64[2] axes = {3, 4}, int64[1] width = {2}, int64[3] same = {1, 1, 5}>
+  => (float[B,T,5] logits, float[B,T,2] embedding)
+<int64[2] axes = {3, 4}, int64[1] width = {2}, int64[3] same = {1, 1, 5},
+ int64[3] twice = {1, 1, 2}, int64[2] steps = {1, 2}, float none = {0}, float most = {3e38}>
 {
-  spread = ReduceSum<keepdims = 0>(samples, axes)
+  offset_k = Unsqueeze(offset, steps)
+  load = Sub(samples, offset_k)
+  size = Abs(load)
+  known = Less(size, most)
+  tared = Where(known, load, none)
+  spread = ReduceSum<keepdims = 0>(tared, axes)
   first = ReduceSum<keepdims = 1>(spread, width)
   logits = Tile(first, same)
+  embedding = Tile(first, twice)
 }
 """
 
@@ -68,6 +82,7 @@ CARD = ModelCard(
     clip=(1.0, 1.0),
     scale=(1e-3, 1e-3),
     floor=(1e-3, 1e-3),
+    embedding=2,
 )
 
 

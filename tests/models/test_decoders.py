@@ -40,8 +40,20 @@ def test_stream_is_the_window(name, steps):
     decoder, x = decoders.make(name, 16, 7, 1 / 32), features(steps)
     window, state = decoder(x), decoder.initial_state(3)
     for t in range(steps):
-        out, state = decoder.step(x[:, t], torch.full((3,), t), state)
-        torch.testing.assert_close(out, window[:, t], rtol=0, atol=2e-6)
+        embedding, state = decoder.step(x[:, t], torch.full((3,), t), state)
+        torch.testing.assert_close(embedding, decoder.embed(x)[:, t], rtol=0, atol=2e-6)
+        torch.testing.assert_close(decoder.logits(embedding), window[:, t], rtol=0, atol=2e-6)
+
+
+@pytest.mark.parametrize(("name", "last"), [("linear", ""), ("mlp", "4."), ("mlp-all", "layer3.")])
+def test_logits_are_one_linear_layer_of_the_embedding(name, last):
+    """Its weights taken by the names that checkpoints have."""
+    decoder, x = decoders.make(name, 16, 7, 1 / 32), features()
+    saved = decoder.state_dict()
+    embedding = decoder.embed(x)
+    assert embedding.shape == (3, 22, 16)
+    expected = embedding @ saved[f"{last}weight"].T + saved[f"{last}bias"]
+    torch.testing.assert_close(decoder(x), expected, rtol=0, atol=2e-6)
 
 
 def test_all_steps_is_one_layer_over_the_flattened_window():
@@ -66,7 +78,7 @@ def test_all_steps_in_lanes_of_different_age():
         x[:1, 0], torch.zeros(1).long(), decoder.initial_state(1)
     )[1]["decoder_sum"]
     out, _ = decoder.step(x[:1, [0, 1]][0], torch.tensor([0, 1]), state)
-    torch.testing.assert_close(out, decoder(x[:1])[0, :2], rtol=0, atol=2e-6)
+    torch.testing.assert_close(decoder.logits(out), decoder(x[:1])[0, :2], rtol=0, atol=2e-6)
 
 
 def test_all_steps_ends():

@@ -60,13 +60,43 @@ def test_silence_is_zero_and_noise_stays_small():
     assert stage(noise, torch.zeros_like(offset), sigma).abs().max() < 1.0
 
 
-def test_a_broken_element_stays_in_its_cell():
+def loads(batch: int = 2) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Samples, offset and sigma, none of them zero."""
+    rng = torch.Generator().manual_seed(0)
+    shapes = (batch, 5, 30, 6), (batch, 30, 6), (batch, 30, 6)
+    samples, offset, sigma = (1e-4 * torch.randn(shape, generator=rng) for shape in shapes)
+    return samples, offset, sigma.abs()
+
+
+BAD = [torch.nan, torch.inf, -torch.inf]
+
+
+@pytest.mark.parametrize("bad", BAD)
+def test_a_sample_that_is_no_number_is_no_load_and_changes_nothing_else(bad):
     stage = InputStage(POSITIONS, (5, 7), CLIP, SCALE)
-    samples = torch.zeros(1, 5, 30, 6)
-    samples[:, :, 0] = torch.nan
-    frame = stage(samples, torch.zeros(1, 30, 6), torch.zeros(1, 30, 6))
-    assert frame.isnan().sum() == 30
-    assert frame[0, :, 0, 0].isnan().all()
+    samples, offset, sigma = loads()
+    whole = stage(samples, offset, sigma)
+    struck = torch.rand(samples.shape, generator=torch.Generator().manual_seed(1)) < 0.2
+    found = stage(samples.masked_fill(struck, bad), offset, sigma)
+    at_rest = torch.where(struck, offset[:, None].expand_as(samples), samples)
+    assert torch.equal(found, stage(at_rest, offset, sigma))
+    assert struck.sum() > 300 and torch.count_nonzero(found) < torch.count_nonzero(whole)
+    assert torch.equal(found[found != 0], whole[found != 0])
+
+
+@pytest.mark.parametrize("bad", BAD)
+@pytest.mark.parametrize("which", [1, 2])
+def test_a_channel_whose_tare_or_noise_is_no_number_is_silent(bad, which):
+    stage = InputStage(POSITIONS, (5, 7), CLIP, SCALE)
+    arrays = loads()
+    whole = stage(*arrays)
+    arrays[which][1, 7, 2] = bad  # of the second in the batch
+    found = stage(*arrays)
+    row, column = POSITIONS[7]
+    silent = torch.zeros_like(whole, dtype=torch.bool)
+    silent[1, 2::6, row, column] = True
+    assert (found[silent] == 0).all() and (whole[silent] != 0).all()
+    assert torch.equal(found[~silent], whole[~silent])
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ go to a journal at once, and become its file when all are there.
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -94,7 +94,7 @@ def make_sweeps(
     splits: Sequence[str] = (),
     engine: str = "processes",
     address: str | None = None,
-) -> Iterator[str]:
+) -> Generator[str, None, None]:
     """Make a sweep set, or what is missing of it; yields each object's name as it is finished.
 
     Args:

@@ -22,7 +22,7 @@ from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.stream import ConfigError
 
-__all__ = ["Plan", "plan_sweeps", "read_plan", "sized", "write_plan"]
+__all__ = ["Budget", "budget_sweeps", "read_budget", "sized", "write_budget"]
 
 SWEEPS_SHARE = 0.45  # of the time given; training has as much, and the rest is for the report
 PILOTS = 5  # sweeps that are timed
@@ -34,7 +34,7 @@ TEST_SHARE, VALIDATION_SHARE = 0.18, 0.12  # of the objects of a category
 MEMORY_SHARE = 0.1  # of the machine's, for the set
 
 
-class Plan(msgspec.Struct, forbid_unknown_fields=True):
+class Budget(msgspec.Struct, forbid_unknown_fields=True):
     """What was decided for a project.
 
     Attributes:
@@ -52,37 +52,37 @@ class Plan(msgspec.Struct, forbid_unknown_fields=True):
     updates: int = 0
 
 
-def read_plan(project: Project) -> Plan | None:
-    """The plan of a project that was begun before; None: it was not.
+def read_budget(project: Project) -> Budget | None:
+    """The budget of a project that was begun before; None: it was not.
 
     Raises:
-        ConfigError: the array or the sweeps have been changed since, or the plan is damaged.
+        ConfigError: the array or the sweeps have been changed since, or the budget is damaged.
     """
-    path = project.build / "plan.json"
+    path = project.build / "budget.json"
     if not path.exists():
         return None
     try:
-        plan = msgspec.json.decode(path.read_bytes(), type=Plan)
+        budget = msgspec.json.decode(path.read_bytes(), type=Budget)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ConfigError(
             f"{path} is damaged ({error}): remove {project.build} to begin anew"
         ) from None
-    if plan.described != _described(project):
+    if budget.described != _described(project):
         raise ConfigError(
             f"array.toml or sweeps.toml of {project.folder} has been changed since {project.build} "
             f"was begun: remove {project.build} to begin anew"
         )
-    return plan
+    return budget
 
 
-def write_plan(project: Project, plan: Plan) -> None:
-    """Keep a plan."""
+def write_budget(project: Project, budget: Budget) -> None:
+    """Keep a budget."""
     project.build.mkdir(exist_ok=True)
-    text = msgspec.json.format(msgspec.json.encode(plan), indent=1)
-    write_whole(project.build / "plan.json", lambda file: file.write(text))
+    text = msgspec.json.format(msgspec.json.encode(budget), indent=1)
+    write_whole(project.build / "budget.json", lambda file: file.write(text))
 
 
-def plan_sweeps(project: Project, seconds: float) -> Plan:
+def budget_sweeps(project: Project, seconds: float) -> Budget:
     """Time some sweeps, and decide how many fit.
 
     Args:
@@ -105,25 +105,27 @@ def plan_sweeps(project: Project, seconds: float) -> Plan:
     if recipe.objects.source != SHAPES:  # a folder's own objects: all of them, swept less often
         chosen = recipe.objects
         most = max(1, int(sweeps / max(1, sum(map(len, objects.split.values())))))
-        return Plan(_described(project), chosen.per_category, 0, 0, min(recipe.sweeps.draws, most))
+        return Budget(
+            _described(project), chosen.per_category, 0, 0, min(recipe.sweeps.draws, most)
+        )
     per_category = min(of_a_kind, recipe.objects.per_category)
     test = max(round(TEST_SHARE * per_category), math.ceil(TEST_OBJECTS / kinds))
     test = max(1, min(test, per_category // 4))
     validation = max(1, round(VALIDATION_SHARE * per_category))
-    return Plan(_described(project), per_category, validation, test, draws)
+    return Budget(_described(project), per_category, validation, test, draws)
 
 
-def sized(recipe: SweepRecipe, plan: Plan) -> SweepRecipe:
-    """The recipe with the plan's numbers of objects and sweeps."""
+def sized(recipe: SweepRecipe, budget: Budget) -> SweepRecipe:
+    """The recipe with the budget's numbers of objects and sweeps."""
     objects = recipe.objects
-    if plan.test:
+    if budget.test:
         objects = replace(
             objects,
-            per_category=plan.per_category,
-            validation=plan.validation,
-            test=plan.test,
+            per_category=budget.per_category,
+            validation=budget.validation,
+            test=budget.test,
         )
-    return replace(recipe, objects=objects, sweeps=replace(recipe.sweeps, draws=plan.draws))
+    return replace(recipe, objects=objects, sweeps=replace(recipe.sweeps, draws=budget.draws))
 
 
 def _time_of_a_sweep(recipe: SweepRecipe) -> float:
