@@ -22,7 +22,7 @@ from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.stream import ConfigError
 
-__all__ = ["Budget", "budget_sweeps", "read_budget", "sized", "write_budget"]
+__all__ = ["Budget", "budget_sweeps", "described", "read_budget", "sized", "write_budget"]
 
 SWEEPS_SHARE = 0.45  # of the time given; training has as much, and the rest is for the report
 PILOTS = 5  # sweeps that are timed
@@ -67,7 +67,7 @@ def read_budget(project: Project) -> Budget | None:
         raise ConfigError(
             f"{path} is damaged ({error}): remove {project.build} to begin anew"
         ) from None
-    if budget.described != _described(project):
+    if budget.described != described(project):
         raise ConfigError(
             f"array.toml or sweeps.toml of {project.folder} has been changed since {project.build} "
             f"was begun: remove {project.build} to begin anew"
@@ -105,14 +105,12 @@ def budget_sweeps(project: Project, seconds: float) -> Budget:
     if recipe.objects.source != SHAPES:  # a folder's own objects: all of them, swept less often
         chosen = recipe.objects
         most = max(1, int(sweeps / max(1, sum(map(len, objects.split.values())))))
-        return Budget(
-            _described(project), chosen.per_category, 0, 0, min(recipe.sweeps.draws, most)
-        )
+        return Budget(described(project), chosen.per_category, 0, 0, min(recipe.sweeps.draws, most))
     per_category = min(of_a_kind, recipe.objects.per_category)
     test = max(round(TEST_SHARE * per_category), math.ceil(TEST_OBJECTS / kinds))
     test = max(1, min(test, per_category // 4))
     validation = max(1, round(VALIDATION_SHARE * per_category))
-    return Budget(_described(project), per_category, validation, test, draws)
+    return Budget(described(project), per_category, validation, test, draws)
 
 
 def sized(recipe: SweepRecipe, budget: Budget) -> SweepRecipe:
@@ -141,7 +139,8 @@ def _time_of_a_sweep(recipe: SweepRecipe) -> float:
     return float(np.mean(times[1:] or times))
 
 
-def _described(project: Project) -> str:
+def described(project: Project) -> str:
+    """The fingerprint of what a project's set is made of."""
     digest = hashlib.sha256()
     for name in ("array.toml", "sweeps.toml"):
         digest.update((project.folder / name).read_bytes())

@@ -1,0 +1,109 @@
+"""A new project: what is in it, and what it refuses."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("torch")
+pytest.importorskip("matplotlib")
+
+from tactile_rt.daemon.loading import load_config
+from tactile_rt.project.budget import Budget, read_budget, write_budget
+from tactile_rt.project.folder import KINDS, Project, new_project
+from tactile_rt.project.making import make
+from tactile_rt.project.report import confused
+from tactile_rt.sim_backend.arrays.files import load_array
+from tactile_rt.sim_backend.transducer import device_spec
+from tactile_rt.sources.opening import check_source
+from tactile_rt.stream import ConfigError
+from tests.helpers.source_tree import ROOT
+
+MAGNETS = ROOT / "docs" / "arrays" / "magnets.toml"
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Project:
+    return new_project(tmp_path / "mine")
+
+
+def test_a_new_project_is_ready_to_be_made(project: Project) -> None:
+    recipe = project.recipe()
+    assert recipe.name == "mine"
+    assert recipe.objects.categories == KINDS
+    assert Path(recipe.array) == project.array
+    assert len(load_array(str(project.array)).whiskers) == 8
+    assert load_config(project.folder / "robot.toml").config.model[0].file == str(project.model)
+    line = project.line()
+    assert (line.wire, line.port, line.codec) == ("serial", "/tmp/mine", "native")
+    assert project.unseen() == KINDS
+    check_source(project.source_url(project.unseen()))
+
+
+@pytest.mark.parametrize("array", ["mouse", "rat-both", str(MAGNETS)])
+def test_its_array_is_the_one_that_was_asked_for(array: str, tmp_path: Path) -> None:
+    project = new_project(tmp_path / "mine", array, ("mug", "gear"))
+    mine, theirs = (device_spec((load_array(a),)) for a in (str(project.array), array))
+    assert mine == theirs
+    period_ms = 12.5 if array == str(MAGNETS) else 9.0
+    assert project.recipe().period_ms == period_ms
+
+
+def test_full_scale_of_a_codec_that_rounds_is_the_sensor_s(tmp_path: Path) -> None:
+    magnets = new_project(tmp_path / "magnets", str(MAGNETS))
+    assert magnets.full_scale("native") == {"range_si": "0.0079"}
+    assert magnets.full_scale("bota") == {}
+    assert new_project(tmp_path / "loads").full_scale("native") == {}
+
+
+def test_what_cannot_begin_is_one_line(refused, tmp_path: Path) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").write_text("x")
+    assert "is not empty: name a new folder" in refused("new", tmp_path / "full")
+    assert "no category 'mugg'" in refused("new", tmp_path / "a", "--kinds", "mugg,gear")
+    assert "two or more" in refused("new", tmp_path / "a", "--kinds", "mug")
+    assert "no simulated array" in refused("new", tmp_path / "a", "--array", "hamster")
+    assert "is a .toml file" in refused(
+        "new", tmp_path / "a", "--array", MAGNETS.parent / "robot.csv"
+    )
+    assert not (tmp_path / "a").exists(), "nothing is half-written"
+    assert "begin with `tactile-rt new" in refused("make", tmp_path / "a")
+    assert "is no project, it has no array.toml" in refused("make", tmp_path / "full")
+    assert "is no project" in refused("emulate", "--project", tmp_path / "full")
+    assert "is no project" in refused("hil", "--project", tmp_path / "full")
+    assert "name a CODEC" in refused("emulate")
+
+
+def test_mistakes_in_its_files_are_told_before_the_work(project: Project, refused) -> None:
+    assert "has no model yet" in refused("hil", "--project", project.folder)
+    with pytest.raises(ConfigError, match="--minutes must be at least 1"):
+        make(project, 0.5)
+    robot = project.folder / "robot.toml"
+    text = robot.read_text()
+    robot.write_text(text.replace("serial:///tmp/mine?codec=native", "synthetic:3x6"))
+    with pytest.raises(ConfigError, match="is no device to emulate"):
+        make(project, 10)
+    robot.write_text(text)
+    sweeps = project.folder / "sweeps.toml"
+    sweeps.write_text(sweeps.read_text().replace("array.toml", "mouse"))
+    with pytest.raises(ConfigError, match=r'sweeps\.toml: array must be "array\.toml"'):
+        make(project, 10)
+    assert not project.build.exists()
+
+
+def test_a_project_that_was_changed_is_not_gone_on_with(project: Project) -> None:
+    assert read_budget(project) is None
+    write_budget(project, Budget("other", 8, 1, 2, 3))
+    with pytest.raises(ConfigError, match=r"has been changed since .*build was begun: remove"):
+        read_budget(project)
+    (project.build / "budget.json").write_text("{")
+    with pytest.raises(ConfigError, match=r"budget\.json is damaged"):
+        read_budget(project)
+
+
+def test_what_is_taken_for_what_worst_first() -> None:
+    table = np.array([[18, 2, 0], [5, 15, 0], [0, 0, 0]])
+    assert confused(table, ("a", "b", "c")) == [("b", "a", 0.25), ("a", "b", 0.1)]
+    assert confused(table, ("a", "b", "c"), 0.2) == [("b", "a", 0.25)]
+    assert confused(np.eye(3, dtype=np.int64), ("a", "b", "c")) == []
