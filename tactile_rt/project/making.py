@@ -34,7 +34,6 @@ __all__ = ["MakeProgress", "make"]
 
 LEAST_MINUTES = 1.0
 SWEPT_BY = 0.48  # of the time given, even where sweeps take longer than those that were timed
-FEWEST = 3  # objects of a category to train on, however long they take
 TRAINED_BY = 0.87  # of the time given: the rest is for export, evaluation and report
 PILOT = 24  # updates that are timed
 MOST_EPOCHS = 60
@@ -105,23 +104,22 @@ def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[
 
 
 def _sweep(project: Project, budget: Budget, until: float, end: float, tell: Tell) -> Path:
-    """Make the set: first what is held out, then as much to train on as there is time for."""
+    """Make the set, or as much of it as there is time for."""
     folder = project.build / "sweeps"
     recipe = sized(project.recipe(), budget)
     manifest = describe_set(recipe)
-    done, of = 0, len(manifest.names())
-    for splits in (("test", "validation"), ("train",)):
-        left = manifest.names(splits)
-        there = len(finished_objects(folder, left))
-        fewest = FEWEST * len(manifest.categories) if "train" in splits else len(left)
-        with closing(make_sweeps(recipe, folder, splits=splits)) as made:
-            for count, name in enumerate(made, start=1):
-                left.remove(name)
-                done += 1
-                if count > there:
-                    tell(MakeProgress("sweeping", done, of, end - time.monotonic()))
-                if count >= max(there, fewest) and time.monotonic() > until:
-                    break
+    left = manifest.names()
+    of, there = len(left), len(finished_objects(folder, left))
+    # All splits grow alike: of the smallest one object of every category is enough.
+    smallest = min(len(names) for names in manifest.split.values() if names)
+    fewest = of * len(manifest.categories) / smallest + (os.cpu_count() or 1)
+    with closing(make_sweeps(recipe, folder)) as made:
+        for done, name in enumerate(made, start=1):
+            left.remove(name)
+            if done > there:
+                tell(MakeProgress("sweeping", done, of, end - time.monotonic()))
+            if done > max(there, fewest) and time.monotonic() > until:
+                break
     if left:
         _leave_out(folder, left)
     return folder
@@ -138,7 +136,8 @@ def _leave_out(folder: Path, names: Sequence[str]) -> None:
 def _train(
     project: Project, budget: Budget, sweeps: Path, until: float, end: float, tell: Tell
 ) -> Path:
-    torch.set_num_threads(os.cpu_count() or 1)
+    # More would wait for each other: dozens of times slower where another program has a core.
+    torch.set_num_threads(1)
     tell(MakeProgress("finding onsets", 0, 1, end - time.monotonic()))
     config = read_recipe(RECIPE, str(sweeps.resolve()))
     splits = read_splits(sweeps, config)

@@ -123,8 +123,7 @@ def make_sweeps(
         write_skipped(folder, skipped)
     done = finished_objects(folder, names)
     yield from done
-    missing = set(names) - set(done)
-    todo = [n for n in names if n in missing]
+    todo = _spread(manifest, set(names) - set(done))
     work = _Work(recipe, folder.resolve())
     if engine == "ray":
         outcomes = run_ray(work, todo, processes, address)
@@ -138,6 +137,16 @@ def make_sweeps(
             write_skipped(folder, skipped)
         yield name
     write_sums(folder)
+
+
+def _spread(manifest: SweepManifest, missing: set[str]) -> list[str]:
+    """What is to be made, in an order in which all splits grow alike: one may stop any time."""
+    place = {
+        name: (at + 1) / len(names)
+        for names in manifest.split.values()
+        for at, name in enumerate(names)
+    }
+    return sorted(missing, key=lambda name: (place[name], name))
 
 
 def finished_objects(folder: Path, names: Sequence[str]) -> list[str]:
