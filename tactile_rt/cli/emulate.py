@@ -74,7 +74,7 @@ def emulate(
     source = source or "synthetic:"
     if wire is None:
         only_can = ("can", codec) in CODECS and ("serial", codec) not in CODECS
-        wire = "can" if bus else "slcan" if only_can else "serial"
+        wire = "can" if bus else "slcan" if only_can or project is not None else "serial"
     if wire not in ("serial", "slcan", "can"):
         raise ConfigError(f"--wire must be serial, slcan or can, not {wire!r}")
     if (wire == "can") != (bus is not None):
@@ -113,7 +113,7 @@ def _of_project(
     wire: str | None,
     link: Path | None,
     fields: dict[str, str],
-) -> tuple[str, str, str, Path | None, dict[str, str]]:
+) -> tuple[str, str, str | None, Path | None, dict[str, str]]:
     """What a project says of its device, where nothing else is asked for."""
     try:
         from tactile_rt.project.folder import Project
@@ -128,7 +128,7 @@ def _of_project(
     return (
         codec or line.codec,
         source or project.source_url(project.unseen()),
-        wire or ("serial" if line.wire == "serial" else "slcan"),
+        wire or ("serial" if line.wire == "serial" else None),
         link,
         fields,
     )

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_file import load_model
+from tactile_rt.evidence.pictures import draw_confusion
 from tactile_rt.evidence.records import Record
 from tactile_rt.export.release import run_file
 from tactile_rt.files import write_whole
@@ -55,6 +56,7 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
     step_ms = card.period_ns * card.substeps * 1e-6
     draw_over_time(curves, labels, objects, step_ms, project.report / "over_time.png")
     table = evaluation.confusion(curves["rated noise"][:, -1], labels, len(card.labels))
+    draw_confusion(table, card.labels, project.report / "confusion.png")
     found = {r.name.removeprefix("models."): r for r in records}
     robust = [r for name, r in found.items() if name.startswith("top-1, ")]
     page = resources.files("tactile_rt.project") / "templates" / "report.html.txt"
