@@ -195,17 +195,14 @@ class SimSource(PacedSource):
     def __init__(self, array: str, options: SimOptions) -> None:
         self._animals = load_animals(array or "mouse")
         _check_turns(self._animals, options)
-        spec = felt = world_spec(self._animals)
-        if options.base_turns:
-            spec = replace(felt, channels=felt.channels + TURNS, units=(*felt.units, "rad", "rad"))
-        super().__init__(spec, options.pace)
+        super().__init__(_spec(self._animals, options), options.pace)
         self._options = options
         self._objects = _objects(options) or [promised_object(name) for name in CATEGORIES]
         self._rng = np.random.default_rng(options.seed)
         # Of its own, so that the objects are the same with and without.
         self._array_rng = np.random.default_rng([options.seed, 1])
         self._distance_mm = usual_distance(self._animals)
-        self._sensor = Sensor(options, felt, options.seed)
+        self._sensor = Sensor(options, world_spec(self._animals), options.seed)
         self.passes: list[Pass] = []
         self._strained: set[str] = set()  # whiskers of which it has been told
         if line := ringing(self._animals, PROFILES[options.profile]):
@@ -217,10 +214,12 @@ class SimSource(PacedSource):
         self._order: list[int] = []
 
     @staticmethod
-    def check(array: str, options: SimOptions) -> None:
-        """Raise the `ConfigError` that opening it would raise."""
-        _check_turns(load_animals(array or "mouse"), options)
+    def check(array: str, options: SimOptions) -> ArraySpec:
+        """The array that it would be; raises the `ConfigError` that opening it would raise."""
+        animals = load_animals(array or "mouse")
+        _check_turns(animals, options)
         _objects(options)
+        return _spec(animals, options)
 
     def close(self) -> None:
         super().close()
@@ -296,6 +295,14 @@ class SimSource(PacedSource):
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)
         now = start_ns + round(self._sent * SAMPLE_MS * 1e6)
         self.passes.append(Pass(now, target.name, target.category, sweep))
+
+
+def _spec(animals: tuple[WhiskerArray, ...], options: SimOptions) -> ArraySpec:
+    """What the samples are."""
+    felt = world_spec(animals)
+    if not options.base_turns:
+        return felt
+    return replace(felt, channels=felt.channels + TURNS, units=(*felt.units, "rad", "rad"))
 
 
 def _check_turns(animals: tuple[WhiskerArray, ...], options: SimOptions) -> None:

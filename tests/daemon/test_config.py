@@ -181,14 +181,15 @@ def test_how_many_steps_there_are_is_the_models_affair(tmp_path, steps):
     from tests.helpers.tiny_model import write_model
 
     write_model(tmp_path / "m.onnx", steps=steps)
-    table = '[[model]]\nfile = "m.onnx"\nmode = "sliding"\nevery = {}\nin_a_row = {}\n'
-    check_config(load(tmp_path, SMALL + table.format(steps, steps)))
+    table = SMALL.replace("synthetic:5x6", "serial:/dev/none?codec=native")  # of any array
+    table += '[[model]]\nfile = "m.onnx"\nmode = "sliding"\nevery = {}\nin_a_row = {}\n'
+    check_config(load(tmp_path, table.format(steps, steps)))
     said = f"expected a whole number <= {steps}, the steps that m.onnx has, got {steps + 1}"
     for key, values in (("every", (steps + 1, 1)), ("in_a_row", (1, steps + 1))):
-        found = refusal_of(tmp_path, SMALL + table.format(*values))
+        found = refusal_of(tmp_path, table.format(*values))
         assert found.endswith(f": model[0].{key}: {said}")
         setting = f"model.0.{key}={steps + 1}"
-        found = refusal_of(tmp_path, SMALL + table.format(1, 1), setting)
+        found = refusal_of(tmp_path, table.format(1, 1), setting)
         assert found == f"--set {setting}: model[0].{key}: {said}"
 
 

@@ -31,7 +31,6 @@ from tactile_rt.drivers.codecs.native_common import (
     check_ranges,
     pack_valid,
     quantise,
-    read_array,
 )
 from tactile_rt.stream import Chunk, ConfigError
 
@@ -54,14 +53,11 @@ class NativeOptions:
     Attributes:
         format: Number format that an emulated device sends, ``float32`` or ``int16``. A host takes
             both.
-        array: JSON file of an array (`tactile-rt describe` writes one) for devices that do not
-            describe themselves.
         range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
             can tell.
     """
 
     format: str = "float32"
-    array: str = ""
     range_n: float = RANGE_N
     range_nm: float = RANGE_NM
 
@@ -101,7 +97,7 @@ class NativeSerial(SerialCodec):
     cannot_detect = ""
 
     def __init__(self, options: NativeOptions) -> None:
-        super().__init__(read_array(options.array))
+        super().__init__(None)
         self._format, self._ranges = FORMATS[options.format], (options.range_n, options.range_nm)
         self._described: DeviceDescription | None = None
         self._rest = b""  # of a frame that is not complete
