@@ -35,7 +35,6 @@ __all__ = [
 # machine keeps the host waiting, nothing shall be lost here.
 FIFO_BYTES = 64 << 20
 LOOP_S = 6.0  # of bumps, that come again and again: four of them
-QUIET_AT_S = 0.6  # in it: a model first measures what it feels untouched
 PIECE_S = 0.064
 # Each strikes within a moment, so that what is undisturbed is known; none beside another.
 KINDS = (
@@ -113,8 +112,7 @@ def bumps(script: ArrayScript) -> NDArray[np.float32]:
     elements, channels = script.spec.shape
     options = SyntheticOptions(script.spec.rate_hz, LOOP_S, pace="fast")
     made = SyntheticSource(f"{elements}x{channels}", options)
-    loop = np.concatenate([chunk.values for chunk in made])
-    return np.roll(loop, -round(QUIET_AT_S * script.spec.rate_hz), axis=0)
+    return np.concatenate([chunk.values for chunk in made])
 
 
 def noise(script: ArrayScript) -> NDArray[np.float32]:

@@ -160,6 +160,8 @@ class ArraySpec:
                     if a != b and not (pose and np.allclose(a, b, rtol=0, atol=POSE_TOLERANCE)):
                         found.append(f"{what}[{at}] is {b!r}, not {a!r}")
                         break
+            elif what in ("channels", "units"):
+                found.append(f"{what} are ({', '.join(theirs)}), not ({', '.join(mine)})")
             elif isinstance(mine, tuple):
                 found.append(f"{what}: {len(theirs)} entries, not {len(mine)}")
             else:

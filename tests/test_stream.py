@@ -77,7 +77,7 @@ def with_item(items: tuple, at: int, item: object) -> tuple:
         ),
         (
             {"channels": (*SPEC.channels, "fx"), "units": (*SPEC.units, "N")},
-            "channels: 3 entries, not 2; units: 3 entries, not 2",
+            "channels are (fy, mz, fx), not (fy, mz); units are (N, N m, N), not (N, N m)",
         ),
         ({"name": "other", "frame": "base"}, "name is 'other', not 'small'; frame is"),
     ],

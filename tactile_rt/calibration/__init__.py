@@ -2,14 +2,16 @@
 
 output = mirror(map(matrix @ (raw - tare)))
 
-correction   what one device needs, applied to its chunks and to its source
-files        stored per device id, as TOML that people can read
-taring       offsets and noise, measured while nothing is touched
-loads        tables of known loads
-fitting      the matrix, by least squares from such a table
+correction         what one device needs, applied to its chunks
+calibrated_source  the same on a whole source, which may be declared to be another array's
+files              stored per device id, as TOML that people can read
+taring             offsets and noise, measured while nothing is touched
+loads              tables of known loads
+fitting            the matrix, by least squares from such a table
 """
 
-from tactile_rt.calibration.correction import CalibratedSource, Calibration
+from tactile_rt.calibration.calibrated_source import CalibratedSource, declare, declared
+from tactile_rt.calibration.correction import Calibration
 from tactile_rt.calibration.files import (
     calibration_path,
     load_calibration,
@@ -29,6 +31,8 @@ __all__ = [
     "Tare",
     "calibrate",
     "calibration_path",
+    "declare",
+    "declared",
     "load_calibration",
     "raw_readings",
     "read_loads",

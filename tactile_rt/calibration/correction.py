@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from tactile_rt.calibration.mirroring import Mirror
 from tactile_rt.settings import no_such
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError, Source, SpecMismatch
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError, SpecMismatch
 
-__all__ = ["CalibratedSource", "Calibration", "check_device"]
+__all__ = ["Calibration", "check_device"]
 
 Row = tuple[float, ...]
 
@@ -28,7 +28,8 @@ class Calibration:
 
     Of each element, output = M (raw - tare). M is its own matrix; else the gain of each channel;
     else nothing is changed, if the output has the raw channels and units. Otherwise the element is
-    uncalibrated, and never valid. Then elements are mapped, then mirrored.
+    uncalibrated, and never valid. Then elements are mapped, then mirrored. What comes out may be
+    declared to be an array: then it has that array's names and places.
 
     Attributes:
         device: Id of the device, which names the file: letters, digits, and ``_ . : + -``.
@@ -44,10 +45,14 @@ class Calibration:
         mapping: Raw element by output element, in the order of the output; empty if the elements
             come out as the device sends them.
         mirror: Reflection that makes the output the array's mirror image; None for none.
+        array: Array that the output is declared to be; None for the device's own. Its elements are
+            those of the same names or, if the names are not all the same, those in the same place
+            of the order. Its channels are those of the same name and unit; others are left out.
         history: Measurements that the numbers come from, one line each with its date.
 
     Raises:
         ConfigError: sizes disagree, a name is unknown, or a number is not finite.
+        SpecMismatch: the output has not as many elements as `array`, or lacks a channel of it.
     """
 
     device: str
@@ -62,6 +67,7 @@ class Calibration:
     matrices: dict[str, tuple[Row, ...]] = field(default_factory=dict)
     mapping: dict[str, str] = field(default_factory=dict)
     mirror: Mirror | None = None
+    array: ArraySpec | None = None
     history: tuple[str, ...] = ()
 
     @classmethod
@@ -110,6 +116,8 @@ class Calibration:
         for channel in self.mirror.signs if self.mirror else ():
             _known(f"mirror.signs.{channel}", channel, channels, "output channel")
         _ = self.signs  # a mirror that cannot be must fail here, not on the robot's first sample
+        if self.array is not None:
+            self._check_array(self.array)
 
     @property
     def output(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -144,6 +152,8 @@ class Calibration:
                     f"calibration of {self.device} is for {what} {_listed(mine)}; "
                     f"{raw.name} has {_listed(theirs)}"
                 )
+        if self.array is not None:
+            return replace(self.array, rate_hz=raw.rate_hz)
         at = self._plan.index
         poses = [(raw.positions[i], raw.orientations[i]) for i in at]
         if self.mirror is not None:
@@ -184,7 +194,8 @@ class Calibration:
         with np.errstate(over="ignore", invalid="ignore"):  # of what is not valid, or becomes so
             values = values - plan.tare
             if plan.gain is not None:
-                values *= plan.gain
+                # By number, not by a product with zeros: what is left out need not be finite.
+                values = values[..., plan.channels] * plan.gain
             else:
                 values = np.matmul(values.transpose(1, 0, 2), plan.matrix).transpose(1, 0, 2)
         if plan.lacking is not None:
@@ -193,28 +204,51 @@ class Calibration:
             valid = valid & np.isfinite(values).all(axis=2)
         return Chunk(chunk.seq, chunk.t_ns, values, valid)
 
+    def _check_array(self, array: ArraySpec) -> None:
+        names = tuple(self.mapping) or self.elements
+        if len(names) != len(array.elements):
+            raise SpecMismatch(
+                f"elements: the array {array.name!r} has {len(array.elements)} "
+                f"({_listed(array.elements)}), {self.device} {len(names)} ({_listed(names)})"
+            )
+        given, wanted = (
+            [f"{channel} ({unit})" for channel, unit in zip(*both, strict=True)]
+            for both in (self.output, (array.channels, array.units))
+        )
+        if lacking := [channel for channel in wanted if channel not in given]:
+            raise SpecMismatch(
+                f"channels: the array {array.name!r} has {_listed(lacking)}, {self.device} gives "
+                f"{_listed(given)}: a calibration can rename and convert them"
+            )
+
     @cached_property
     def _plan(self) -> "_Plan":
-        index = [self.elements.index(e) for e in self.mapping.values() or self.elements]
+        mapped = self.mapping or dict(zip(self.elements, self.elements, strict=True))
+        order, channels = list(mapped), self.output[0]
+        if self.array is not None:
+            channels = self.array.channels
+            if set(self.array.elements) == set(order):
+                order = list(self.array.elements)
+        index = [self.elements.index(mapped[e]) for e in order]
         used = [self.elements[i] for i in index]
         shape = len(self.elements), len(self.channels)
         default = np.diag(self.gain) if self.gain else np.eye(len(self.output[0]), shape[1])
         matrix = np.stack([np.asarray(self.matrices.get(e, default), np.float64) for e in used])
         matrix = matrix * np.asarray(self.signs)[:, None]
+        matrix = matrix[:, [self.output[0].index(c) for c in channels]]
         zero = (0.0,) * shape[1]
         tare = np.array([self.tare.get(e, zero) for e in used])
         lacking = np.array([e not in self.uncalibrated for e in used])
-        gain = None
-        if matrix.shape[1] == matrix.shape[2]:
-            diagonal = np.einsum("ecc->ec", matrix)
-            if np.array_equal(matrix, diagonal[:, :, None] * np.eye(shape[1])):
-                gain = diagonal.astype(np.float32)
+        one = np.abs(matrix).max(axis=0).argmax(axis=1)  # (output,) the channel, if it is one
+        gain = np.take_along_axis(matrix, one[None, :, None], axis=2)
+        alone = np.array_equal(matrix, gain * np.eye(shape[1])[one])
         return _Plan(
             shape,
             np.array(index, np.intp),
             index != list(range(shape[0])),
             tare.astype(np.float32),
-            gain,
+            slice(None) if one.tolist() == list(range(shape[1])) else one,
+            gain[..., 0].astype(np.float32) if alone else None,
             np.ascontiguousarray(matrix.transpose(0, 2, 1), dtype=np.float32),
             None if lacking.all() else lacking,
         )
@@ -230,46 +264,20 @@ class Calibration:
 
 @dataclass(frozen=True, eq=False)
 class _Plan:
-    """A calibration as arrays, by output element; `matrix` is (element, channel, output)."""
+    """A calibration as arrays, by output element; `matrix` is (element, channel, output).
+
+    Where each output is a multiple of one channel, that is `channels` (output,) and `gain`
+    (element, output).
+    """
 
     shape: tuple[int, int]
     index: NDArray[np.intp]
     moves: bool
     tare: NDArray[np.float32]
+    channels: NDArray[np.intp] | slice
     gain: NDArray[np.float32] | None
     matrix: NDArray[np.float32]
     lacking: NDArray[np.bool_] | None
-
-
-class CalibratedSource(Source):
-    """A source whose samples are corrected; all else (statistics, health, commands) is its own.
-
-    Args:
-        source: of raw samples; closed with this one.
-        calibration: for its device.
-
-    Raises:
-        SpecMismatch: it is for another array.
-    """
-
-    def __init__(self, source: Source, calibration: Calibration) -> None:
-        # No `stats` of our own: like all that is not here, they are looked up in the source.
-        self.source, self.calibration = source, calibration
-        self.spec = calibration.output_spec(source.spec)
-        self.live = source.live
-
-    def read(self, timeout: float | None = None) -> Chunk | None:
-        chunk = self.source.read(timeout)
-        return None if chunk is None else self.calibration.apply(chunk)
-
-    def close(self) -> None:
-        self.source.close()
-
-    def __getattr__(self, name: str) -> Any:
-        # While it is copied or unpickled there is no source yet to ask.
-        if name == "source" or name.startswith("__"):
-            raise AttributeError(name)
-        return getattr(self.source, name)
 
 
 def check_device(device: str) -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.calibration.correction import CalibratedSource
+from tactile_rt.calibration.calibrated_source import CalibratedSource
 from tactile_rt.stream import (
     ArraySpec,
     Chunk,

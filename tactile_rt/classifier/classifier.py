@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.classifier.exits import IN_A_ROW, Deadline, EarlyExit, Lanes, Policy
-from tactile_rt.classifier.model_file import element_order, load_model
+from tactile_rt.classifier.model_file import fit_source, load_model
 from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, ModelError, SpecMismatch
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, ModelError
 
 __all__ = ["Classification", "Classifier", "ClassifierStats", "fuse"]
 
@@ -154,12 +154,7 @@ class Classifier:
                 f"{model} has no embedding: its metadata is of version {self.card.version}, and "
                 "files have one since version 3; export it anew"
             )
-        try:
-            order = element_order(self.card.array, spec)
-        except SpecMismatch as error:
-            raise SpecMismatch(
-                f"{model} was made for another array than {spec.name!r}: {error}"
-            ) from None
+        order = fit_source(model, self.card, spec)
         self.detector = ContactDetector(spec.shape, np.array(self.card.floor, dtype=np.float32))
         self.tared = np.zeros(spec.shape, dtype=np.float32)
         self.stats = ClassifierStats()

@@ -5,6 +5,7 @@ fields that it does not know; a version is raised only when an older reader woul
 """
 
 import math
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,11 +13,20 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.calibration import declared
 from tactile_rt.classifier.decision_rules import MAX_NAME, CandidateRule, UnknownRule, named
 from tactile_rt.classifier.onnx_check import MAX_ELEMENTS
 from tactile_rt.stream import ArraySpec, ConfigError, ModelError, SpecMismatch
 
-__all__ = ["Kind", "ModelCard", "StateTensor", "element_order", "one_line", "parse_card"]
+__all__ = [
+    "Kind",
+    "ModelCard",
+    "StateTensor",
+    "element_order",
+    "fit_source",
+    "one_line",
+    "parse_card",
+]
 
 CARD_VERSION = 3
 CARD_VERSIONS = (1, 2, 3)  # the older ones without what `ModelCard` says is since 2 or 3
@@ -142,6 +152,30 @@ def element_order(card_spec: ArraySpec, source_spec: ArraySpec) -> NDArray[np.in
     if differences:
         raise SpecMismatch("; ".join(differences))
     return order
+
+
+def fit_source(model: Path, card: ModelCard, spec: ArraySpec) -> NDArray[np.intp]:
+    """As `element_order`, for a model's file: where the source has the elements of its array.
+
+    Args:
+        model: the file, for the message.
+        card: what the file says of itself.
+        spec: the array of the source.
+
+    Raises:
+        SpecMismatch: the model was made for another array; the message says where they differ, and
+            what to do.
+    """
+    try:
+        return element_order(card.array, spec)
+    except SpecMismatch as error:
+        do = "name a model of this array"
+        with suppress(SpecMismatch):
+            declared(spec, card.array)
+            do += f"; or, if the sensor is the model's array, declare it: array={model}"
+        raise SpecMismatch(
+            f"{model} was made for another array than {spec.name!r}: {error}; {do}"
+        ) from None
 
 
 def parse_card(path: Path, text: str) -> ModelCard:

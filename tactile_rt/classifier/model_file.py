@@ -29,6 +29,7 @@ from tactile_rt.classifier.model_card import (
     ModelCard,
     StateTensor,
     element_order,
+    fit_source,
     one_line,
     parse_card,
 )
@@ -46,6 +47,7 @@ __all__ = [
     "ModelCard",
     "StateTensor",
     "element_order",
+    "fit_source",
     "hash_of",
     "load_model",
     "read_model",

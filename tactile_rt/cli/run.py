@@ -7,7 +7,7 @@ import typer
 
 from tactile_rt.cli.app import Model, Seconds, app, leaving, starting
 from tactile_rt.cli.daemon import Settings, serve
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import ConfigError, SpecMismatch
 
 
 @app.command()
@@ -55,13 +55,18 @@ def run(
     from tactile_rt.classifier.classifier import Classifier
     from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.classifier.session import Session
-    from tactile_rt.sources.opening import open_source
+    from tactile_rt.sources.opening import check_model, open_source
 
+    file = model or shipped_model()
     samples = printed = 0
+    check_model(file, source)
     with starting():
         opened = open_source(source)
     with opened:
-        session = Session(opened, Classifier(model or shipped_model(), opened.spec))
+        try:
+            session = Session(opened, Classifier(file, opened.spec))
+        except SpecMismatch as error:
+            raise SpecMismatch(f"{source}: {error}") from None
         with leaving(seconds), session:
             for chunk, decisions in session:
                 samples += len(chunk)

@@ -24,7 +24,7 @@ LARGEST = 16 << 20  # bytes of a state
 COLOURS = {
     "running": "green", "streaming": "green", "ended": "dim", "stopped": "dim",
     "starting": "yellow", "connecting": "yellow", "waiting": "red", "stalled": "red",
-    "stale": "red", "lost": "red", "degraded": "red", "stopping": "yellow",
+    "failed": "bold red", "stale": "red", "lost": "red", "degraded": "red", "stopping": "yellow",
 }  # fmt: skip
 
 

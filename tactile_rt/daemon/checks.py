@@ -10,16 +10,15 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tactile_rt.calibration import load_calibration
-from tactile_rt.classifier.model_file import load_model, read_model, shipped_model
+from tactile_rt.classifier.model_file import fit_source, load_model, read_model, shipped_model
 from tactile_rt.classifier.runtime import onnxruntime_names
-from tactile_rt.daemon.config import Config, ModelConfig, is_loopback
+from tactile_rt.daemon.config import Config, ModelConfig, SourceConfig, is_loopback
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.lock import lock_keys
 from tactile_rt.settings import no_such
 from tactile_rt.sources.opening import check_source
-from tactile_rt.stream import TactileError
+from tactile_rt.stream import ArraySpec, SpecMismatch, TactileError
 
 __all__ = ["check_config"]
 
@@ -34,13 +33,10 @@ def check_config(loaded: Loaded) -> None:
     """Raise `ConfigError` with file, line and key of whatever cannot be."""
     config = loaded.config
     _check_names(loaded, config)
-    for i, source in enumerate(config.source):
-        _try(loaded, ["source", i, "url"], check_source, source.url)
-        if source.calibration:
-            _try(loaded, ["source", i, "calibration"], load_calibration, source.calibration)
+    arrays = {s.name: _check_source(loaded, i, s) for i, s in enumerate(config.source)}
     _check_devices(loaded, config)
     for i, model in enumerate(config.model):
-        _check_model(loaded, ["model", i], model)
+        _check_model(loaded, ["model", i], model, arrays[model.source])
     _check_tables(loaded, config)
     found = wanted_consumers(loaded)
     _check_listeners(loaded, found)
@@ -72,7 +68,27 @@ def _check_names(loaded: Loaded, config: Config) -> None:
             )
 
 
-def _check_model(loaded: Loaded, path: KeyPath, model: ModelConfig) -> None:
+def _check_source(loaded: Loaded, i: int, source: SourceConfig) -> ArraySpec | None:
+    """The array that it will be, where that is known beforehand."""
+    path: KeyPath = ["source", i]
+    spec: ArraySpec | None = _try(loaded, [*path, "url"], check_source, source.url)
+    if source.calibration:
+        spec = _try(
+            loaded, [*path, "calibration"],
+            lambda c: check_source(source.url, calibration=c), source.calibration,
+        )  # fmt: skip
+    if source.array:
+        spec = _try(
+            loaded, [*path, "array"],
+            lambda a: check_source(source.url, calibration=source.calibration, array=a),
+            source.array,
+        )  # fmt: skip
+    return spec
+
+
+def _check_model(
+    loaded: Loaded, path: KeyPath, model: ModelConfig, array: ArraySpec | None
+) -> None:
     if model.file and os.path.isdir(model.file):
         loaded.refuse([*path, "file"], f"{model.file} is a folder")
     file = Path(model.file) if model.file else shipped_model()
@@ -88,6 +104,11 @@ def _check_model(loaded: Loaded, path: KeyPath, model: ModelConfig) -> None:
         if value > steps:
             allowed = f"a whole number <= {steps}, the steps that {file.name} has"
             loaded.refuse([*path, key], f"expected {allowed}, got {value}")
+    if array is not None:
+        try:
+            fit_source(file, read_model(file)[0], array)
+        except SpecMismatch as error:
+            loaded.refuse([*path, "file"], f"source {model.source}: {error}")
 
 
 def _check_devices(loaded: Loaded, config: Config) -> None:

@@ -50,11 +50,14 @@ class SourceConfig(_Table, frozen=True, kw_only=True):
         url: The URL of the source, as `tactile-rt run --source` takes it.
         calibration: A calibration file, or the id of a device calibrated before; empty if the
             samples are used as they come.
+        array: A file of the array that the source is, as `tactile-rt describe` writes it, or an
+            ``.onnx`` model, whose array it then is; empty if it is what the URL says.
     """
 
     name: Name
     url: str
     calibration: str = ""
+    array: str = ""
 
 
 class ModelConfig(_Table, frozen=True, kw_only=True):
@@ -241,8 +244,9 @@ version = 1
 
 [[source]]
 name = "whiskers"
-url = "synthetic:35x6"         # a device: serial:///dev/ttyACM0?codec=native
+url = "synthetic:mouse"        # a device: serial:///dev/ttyACM0?codec=native
 # calibration = "cell-3"       # file, or id of a device: tactile-rt calibrate
+# array = "array.json"         # what the device is, if its codec cannot know; or a model's .onnx
 
 # [[model]]                    # none: nothing is classified
 # source = "whiskers"          # needed if there are several

@@ -226,7 +226,8 @@ class Daemon:
         old += [
             self._sources.pop(name)
             for name, part in list(self._sources.items())
-            if sources.get(name) != part.config
+            # a file that one has failed of may be another by now
+            if sources.get(name) != part.config or part.state.state == "failed"
         ]
         self._end(old)
         for name, (key, model) in models.items():

@@ -63,7 +63,8 @@ class PartState:
     Attributes:
         name: The name of the part, as in `Event.part`.
         state: ``starting``; ``running``; ``stalled``: in a call that does not return; ``waiting``:
-            it broke and is tried again after a pause; ``ended``: its stream is over; ``stopped``.
+            it broke and is tried again after a pause; ``failed``: it cannot work as it is
+            configured, and is not tried again; ``ended``: its stream is over; ``stopped``.
         reason: The reason why the part is not running, in words.
         since_ns: The time at which the part came into this state, host CLOCK_MONOTONIC, ns.
         starts: The number of times that the part was started.
@@ -265,11 +266,14 @@ def degraded(
 
 def _broken(part: PartState) -> bool:
     # While it is tried again it is not well yet.
-    return part.state in ("waiting", "stalled") or (part.state == "starting" and part.failures > 0)
+    broken = part.state in ("waiting", "stalled", "failed")
+    return broken or (part.state == "starting" and part.failures > 0)
 
 
 def _why(part: PartState) -> str:
-    return f"{part.name} {'stalls' if part.state == 'stalled' else 'fails: ' + part.reason}"
+    if part.state == "stalled":
+        return f"{part.name} stalls"
+    return f"{part.name} {'has failed' if part.state == 'failed' else 'fails'}: {part.reason}"
 
 
 def _what(consumer: ConsumerState) -> str:

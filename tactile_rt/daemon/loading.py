@@ -107,7 +107,8 @@ def _absolute(nodes: SettingNode) -> None:
             continue
         last = path[-1] if path else ""
         top = (path[0], last) if path else ()
-        if top in (("model", "file"), ("recorder", "folder"), ("log", "file")) or (
+        files = (("source", "array"), ("model", "file"), ("recorder", "folder"), ("log", "file"))
+        if top in files or (
             path[0] == "publisher"
             and "options" in path
             and (last in ("file", "folder") or str(last).endswith("_file"))

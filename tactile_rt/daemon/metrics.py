@@ -28,7 +28,7 @@ LIMITS = HttpLimits(connections=16, head_bytes=8192, head_s=2.0, send_s=2.0)
 HEADERS = {"cache-control": "no-store", "x-content-type-options": "nosniff"}
 EXPOSITION, JSON = "text/plain; version=0.0.4; charset=utf-8", "application/json"
 STATES = ("starting", "running", "degraded", "stopping")
-PART_STATES = ("starting", "running", "stalled", "waiting", "ended", "stopped")
+PART_STATES = ("starting", "running", "stalled", "waiting", "failed", "ended", "stopped")
 
 Labels = Mapping[str, str]
 Rows = Iterable[tuple[Labels, float]]

@@ -16,7 +16,14 @@ from tactile_rt.daemon.items import Contact, Decision, Item, Opened, SourceChunk
 from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.drivers.device_source import device_of
-from tactile_rt.stream import NS_PER_S, ConfigError, Source, TactileError, concatenate
+from tactile_rt.stream import (
+    NS_PER_S,
+    ConfigError,
+    Source,
+    SpecMismatch,
+    TactileError,
+    concatenate,
+)
 
 __all__ = ["ModelPart", "file_stamp", "model_path"]
 
@@ -86,6 +93,12 @@ class ModelPart(Part):
         self._classifier = None
         self._touch(False, time.monotonic_ns())
 
+    def _mended(self) -> bool:
+        """Whether the source is of another array by now, or the model another file."""
+        opened = self._hub.streams().get(self.config.source)
+        tried = None if opened is None else (opened.spec, file_stamp(self.file))
+        return self._refused is None or tried not in (None, self._refused[0])
+
     def _load(self) -> None:
         """Make the classifier; without a source, at least see whether there is a model."""
         self._opened = self._hub.streams().get(self.config.source)
@@ -109,6 +122,9 @@ class ModelPart(Part):
                 deadline_s=config.deadline_ms / 1e3 or None, late=config.late,
                 providers=config.providers,
             )  # fmt: skip
+        except SpecMismatch as error:
+            self._refused = (tried, SpecMismatch(f"source {opened.source}: {error}"))
+            raise self._refused[1] from None
         except TactileError as error:
             self._refused = (tried, error)
             raise

@@ -1,4 +1,8 @@
-"""A supervised thread: it starts, works, breaks, waits and starts again, and always says why."""
+"""A supervised thread: it starts, works, breaks, waits and starts again, and always says why.
+
+What no further try can mend, an array that is another than the one that was asked for, is not tried
+again: the part has failed, until what it failed of has changed.
+"""
 
 import abc
 import threading
@@ -9,7 +13,7 @@ from typing import Protocol
 
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.health import PartState
-from tactile_rt.stream import TactileError
+from tactile_rt.stream import SpecMismatch, TactileError
 
 __all__ = ["Part", "Report", "reason_of"]
 
@@ -94,6 +98,10 @@ class Part(abc.ABC):
     def _release(self) -> None:  # noqa: B027
         """Let go of everything; after every `_work`."""
 
+    def _mended(self) -> bool:
+        """Whether what it failed of has changed, so that it is worth another try."""
+        return False
+
     def _up(self) -> None:
         """It works."""
         self._turn("running", "")
@@ -103,11 +111,13 @@ class Part(abc.ABC):
             self._starts += 1
             began = time.monotonic()
             self._set("starting", self._reason)
-            why = ""
+            why, state = "", "waiting"
             try:
                 self._work()
             except Exception as error:
                 why = reason_of(error)
+                if isinstance(error, SpecMismatch):
+                    state = "failed"
                 error.__traceback__ = None  # it holds everything that was at hand
             self._busy_ns = time.monotonic_ns()
             try:
@@ -121,14 +131,17 @@ class Part(abc.ABC):
             if time.monotonic() - began > STEADY_S:
                 self._pause_s = self.limits.retry_first_s
             if not self._stop.is_set():
-                self._turn("waiting", why)
+                self._turn(state, why)
                 self._stop.wait(self._pause_s)
+                while state == "failed" and not (self._stop.is_set() or self._mended()):
+                    self._stop.wait(self.limits.retry_last_s)
                 self._pause_s = min(2 * self._pause_s, self.limits.retry_last_s)
         self._turn("stopped" if self._stop.is_set() else "ended", "")
 
     def _turn(self, state: str, reason: str) -> None:
         self._set(state, reason)
-        self._report(self.name, state, reason, "warning" if state == "waiting" else "info")
+        level = {"waiting": "warning", "failed": "error"}.get(state, "info")
+        self._report(self.name, state, reason, level)
 
     def _set(self, state: str, reason: str) -> None:
         if state != self._state:

@@ -5,7 +5,6 @@ import threading
 import time
 from typing import Any
 
-from tactile_rt.calibration import CalibratedSource, load_calibration
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, SourceConfig
 from tactile_rt.daemon.health import SourceState
@@ -144,14 +143,8 @@ class SourcePart(Part):
     def _open(self) -> Source:
         self._opening = True
         try:
-            stream = open_source(self.config.url)
-            if self.config.calibration:
-                try:
-                    stream = CalibratedSource(stream, load_calibration(self.config.calibration))
-                except BaseException:
-                    stream.close()
-                    raise
-            return stream
+            config = self.config
+            return open_source(config.url, calibration=config.calibration, array=config.array)
         finally:
             self._opening = False
 

@@ -171,7 +171,8 @@ class Codec(abc.ABC, Generic[Packet]):
         tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
         status_bits: What each bit of the status means when set, by the number of the bit.
         cannot_detect: The losses and damages that this protocol cannot show, in a sentence.
-        spec: What the samples are; None until the device has described itself.
+        spec: What the samples are; None until the device has described itself. Whoever knows it
+            beforehand sets it, and the device is then not asked.
         stats: Counts of the frames that have come so far.
     """
 

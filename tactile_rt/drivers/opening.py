@@ -9,21 +9,77 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from tactile_rt.calibration import CalibratedSource, load_calibration
+from tactile_rt.calibration import (
+    CalibratedSource,
+    Calibration,
+    declare,
+    declared,
+    load_calibration,
+)
 from tactile_rt.drivers.codec import CanCodec, Codec, SerialCodec, codec_class
 from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
 from tactile_rt.drivers.links import CanLink, Link, SerialLink, SlcanLink
 from tactile_rt.settings import no_such, split_url, take_options
-from tactile_rt.stream import ConfigError, Source
+from tactile_rt.stream import ArraySpec, ConfigError, Source
 
 __all__ = [
     "CanOptions",
+    "Prepared",
     "SerialOptions",
     "make_codec",
     "open_line",
     "prepare_can",
     "prepare_serial",
 ]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A source that can be opened, and what is known of it before it is.
+
+    Attributes:
+        spec: The array that the samples will be of; None if only the device can tell.
+        open: Function that opens the source.
+        told: Whether a device that would have been asked what array it is has been told instead;
+            the samples are of that array before any calibration.
+    """
+
+    spec: ArraySpec | None
+    open: Callable[[], Source]
+    told: bool = False
+
+    def calibrated(self, calibration: Calibration) -> "Prepared":
+        """The same, its samples corrected.
+
+        Raises:
+            SpecMismatch: they are of another device.
+        """
+        spec = self.spec and calibration.output_spec(self.spec)
+        opened = self._then(lambda source: CalibratedSource(source, calibration))
+        return Prepared(spec, opened, self.told)
+
+    def declared(self, array: ArraySpec) -> "Prepared":
+        """The same as a source of this array, see `calibration.declare`.
+
+        Raises:
+            SpecMismatch: it cannot be of it.
+        """
+        if self.told:
+            return self
+        known = self.spec
+        spec = declared(known, array).output_spec(known) if known else array
+        return Prepared(spec, self._then(lambda source: declare(source, array)))
+
+    def _then(self, change: Callable[[Source], Source]) -> Callable[[], Source]:
+        def opened() -> Source:
+            source = self.open()
+            try:
+                return change(source)
+            except BaseException:
+                source.close()
+                raise
+
+        return opened
 
 
 @dataclass(frozen=True)
@@ -81,12 +137,18 @@ def make_codec(wire: str, name: str, fields: dict[str, str]) -> Codec[Any]:
     return made
 
 
-def prepare_serial(target: str, fields: dict[str, str]) -> Callable[[], Source]:
+def prepare_serial(target: str, fields: dict[str, str], array: ArraySpec | None = None) -> Prepared:
     """What opens the device on a serial port.
 
+    Args:
+        target: the port.
+        fields: the options as written.
+        array: of a device that would be asked what it is; it is not asked then.
+
     Raises:
-        ConfigError: wrong options. What is returned raises `SourceError` if the port cannot be
-            opened, or the device does not send.
+        ConfigError: wrong options. To open what is returned raises `SourceError` if the port
+            cannot be opened, or the device does not send.
+        SpecMismatch: the calibration is of another device.
     """
     if not target:
         raise ConfigError("serial: needs a port, e.g. serial:///dev/ttyUSB0?codec=bota")
@@ -98,15 +160,21 @@ def prepare_serial(target: str, fields: dict[str, str]) -> Callable[[], Source]:
     def connect() -> Link[Any]:
         return SerialLink(target, baud, parity, options.dtr)
 
-    return _prepared(connect, kind, own, options, target, fields)
+    return _prepared(connect, kind(own), options, target, fields, array)
 
 
-def prepare_can(target: str, fields: dict[str, str]) -> Callable[[], Source]:
+def prepare_can(target: str, fields: dict[str, str], array: ArraySpec | None = None) -> Prepared:
     """What opens the device on a CAN bus.
 
+    Args:
+        target: interface and channel, ``socketcan:can0``.
+        fields: the options as written.
+        array: of a device that would be asked what it is; it is not asked then.
+
     Raises:
-        ConfigError: wrong options. What is returned raises `SourceError` if the bus cannot be
-            opened, or the device does not send.
+        ConfigError: wrong options. To open what is returned raises `SourceError` if the bus cannot
+            be opened, or the device does not send.
+        SpecMismatch: the calibration is of another device.
     """
     from can import VALID_INTERFACES
 
@@ -132,7 +200,7 @@ def prepare_can(target: str, fields: dict[str, str]) -> Callable[[], Source]:
             return SlcanLink(channel, bitrate, fd)
         return CanLink(interface, channel, bitrate, fd, data_bitrate)
 
-    return _prepared(connect, kind, own, options, target, fields)
+    return _prepared(connect, kind(own), options, target, fields, array)
 
 
 def open_line(url: str) -> Link[Any]:
@@ -170,34 +238,32 @@ def _kind(wire: str, target: str, fields: dict[str, str]) -> type[Codec[Any]]:
 
 def _prepared(
     connect: Callable[[], Link[Any]],
-    kind: type[Codec[Any]],
-    own: Any,
+    codec: Codec[Any],
     options: DeviceOptions,
     name: str,
     fields: dict[str, str],
-) -> Callable[[], Source]:
-    """Reads the files that codec and calibration are described in; what it returns opens the line.
+    array: ArraySpec | None,
+) -> Prepared:
+    """Reads the file that the calibration is described in; what it returns opens the line.
 
     Args:
         connect: opens the line.
-        kind: the codec.
-        own: its options.
+        codec: of the device.
         options: of the device.
         name: of the device, for messages.
         fields: all options as written.
+        array: of a device that would be asked what it is; None: it is asked.
     """
-    codec = kind(own)
-    calibration = load_calibration(options.calibration) if options.calibration else None
-    written = {k: v for k, v in fields.items() if k in kind.Options.__dataclass_fields__}
+    written = {k: v for k, v in fields.items() if k in codec.Options.__dataclass_fields__}
+    told = array if codec.spec is None else None
+    if told is not None:
+        codec.spec = told
+        written["array"] = told.to_json()  # without it a recording's packets say nothing
 
     def opened() -> Source:
-        source = DeviceSource(connect, codec, options, name, written)
-        if calibration is None:
-            return source
-        try:
-            return CalibratedSource(source, calibration)
-        except BaseException:
-            source.close()
-            raise
+        return DeviceSource(connect, codec, options, name, written)
 
-    return opened
+    prepared = Prepared(codec.spec, opened, told is not None)
+    if not options.calibration:
+        return prepared
+    return prepared.calibrated(load_calibration(options.calibration))

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from tactile_rt.calibration import declare
 from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.drivers.codec import codec_class
 from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
@@ -208,6 +209,7 @@ class Loop:
 
         Raises:
             SourceError: the source, the device or the driver broke.
+        SpecMismatch: what the codec carries cannot be the source's array.
         """
         with self._tee, self._device:
             url = f"{self._device.url}&clock={self._clock}&start_s={START_S:g}"
@@ -217,7 +219,8 @@ class Loop:
                 self._device.wait(0)  # if the source broke, that is why
                 raise
             with driver:
-                self._driver = driver
+                # What the codec calls its elements and channels are the source's all the same.
+                driver = self._driver = declare(driver, self._tee.spec)
                 classifier = Classifier(self._model, driver.spec)
                 while True:
                     chunk = driver.read(WAIT_S)

@@ -6,7 +6,7 @@ learnt relative to the whisker's length.
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from tactile_rt.files import write_whole
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.sensor_spec import CHANNEL_FLOOR
 from tactile_rt.stream import ConfigError
-from tactile_rt.sweep_set import contacts_of
+from tactile_rt.sweep_set import SweepManifest, contacts_of
 
 __all__ = [
     "ContactConfig",
@@ -265,8 +265,14 @@ def load_contacts(checkpoint: Path, data: SweepSet | None = None) -> ContactNetw
         raise ConfigError(
             f"{checkpoint} is no network of `tactile-rt locate train`: {reason}"
         ) from None
-    if data is not None and data.manifest.spec.elements != elements:
-        raise ConfigError(f"{checkpoint} is of another array than the sweeps: train one on them")
+    if data is not None:
+        _check_loads(data.manifest)
+        made = stored.get("made_for")  # an early one knows its elements alone
+        if elements != data.manifest.spec.elements or made not in (None, _made_for(data.manifest)):
+            raise ConfigError(
+                f"{checkpoint} is of another array than the sweeps, or of another sample period: "
+                "train one on them"
+            )
     return network.eval()
 
 
@@ -282,6 +288,7 @@ def _save(
         "config": asdict(config),
         "shapes": {k: torch.from_numpy(v) for k, v in asdict(shapes).items()},
         "elements": list(data.manifest.spec.elements),
+        "made_for": _made_for(data.manifest),
     }
     write_whole(checkpoint, lambda file: torch.save(stored, file))
 
@@ -289,11 +296,27 @@ def _save(
 def _shares(data: SweepSet, shapes: WhiskerShapes) -> Floats:
     """(sweep, sample, element) distance as share of the length; NaN where nothing is touched."""
     contacts, elements = contacts_of(data.sweeps), data.manifest.spec.elements
-    if data.manifest.spec.units != UNITS:
-        raise ConfigError(f"the set's channels are in {data.manifest.spec.units}, not {UNITS}")
+    _check_loads(data.manifest)
     if len(shapes) != len(elements):
         raise ConfigError(f"{len(shapes)} whisker shapes for a set of {len(elements)} whiskers")
     return np.asarray(contacts / shapes.length, dtype=np.float32)
+
+
+def _check_loads(manifest: SweepManifest) -> None:
+    """Raise a `ConfigError` where what whiskers measure is not force and moment at the base."""
+    spec = manifest.spec
+    if spec.units != UNITS:
+        given = ", ".join(f"{c} ({u})" for c, u in zip(spec.channels, spec.units, strict=True))
+        raise ConfigError(
+            f"where along a whisker it touches is told by all three forces and moments at its base "
+            f"(N, N m); the sweeps of {spec.name!r} have {given}"
+        )
+
+
+def _made_for(manifest: SweepManifest) -> str:
+    """The array and the sample period, as text."""
+    spec = replace(manifest.spec, name="", rate_hz=1.0)
+    return f"{manifest.period_ns} {spec.to_json()}"
 
 
 def _loss(network: ContactNetwork, felt: Felt, truth: Floats, at: NDArray[np.int64]) -> Tensor:

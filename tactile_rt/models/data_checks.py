@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.datasets import SweepSet, frame_of
+from tactile_rt.models.ead import EADConfig
 from tactile_rt.stream import ArraySpec, RecordingError, SpecMismatch
 from tactile_rt.sweep_set import WITHHELD, SweepManifest, object_path
 
@@ -15,7 +16,8 @@ __all__ = ["check_array", "check_sets", "check_split", "trained_on"]
 
 
 def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManifest) -> None:
-    """A set that a checkpoint is to be used on is of the array that it was made for.
+    """A set that a checkpoint is to be used on is of the array that it was made for, and its
+    samples are so far apart that steps are of as many.
 
     Raises:
         SpecMismatch: otherwise.
@@ -23,6 +25,14 @@ def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManif
     spec = ArraySpec.from_json(saved["spec"])
     if differences := spec.differences(manifest.spec, ("name", "rate_hz")):
         raise SpecMismatch(f"{checkpoint} was made for another array: {differences[0]}")
+    channels = len(spec.channels)
+    taken, given = EADConfig(**saved["network"]).frame[0], frame_of(manifest)[0]
+    if taken != given:
+        raise SpecMismatch(
+            f"{checkpoint} takes steps of {taken // channels} samples, and of the set, with one "
+            f"every {manifest.period_ns / 1e6:g} ms, a step has {given // channels}: name a set of "
+            "the sample period that it was trained at"
+        )
 
 
 def trained_on(checkpoint: Path, saved: Mapping[str, Any], data: Path | None = None) -> Path:

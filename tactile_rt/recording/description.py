@@ -146,7 +146,7 @@ def describe(
         return about
     options = {
         # A recording is read elsewhere than where its options were written.
-        name: str(Path(value).resolve()) if value and Path(value).is_file() else value
+        name: str(Path(value).resolve()) if _is_file(value) else value
         for name, value in device.codec_options.items()
     }
     return replace(
@@ -154,3 +154,10 @@ def describe(
         codec_options=options, clock=device.options.clock,
         calibration=source.calibration if isinstance(source, CalibratedSource) else None,
     )  # fmt: skip
+
+
+def _is_file(value: str) -> bool:
+    try:
+        return bool(value) and Path(value).is_file()
+    except OSError:  # too long a name: an array's JSON
+        return False

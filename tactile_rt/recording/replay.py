@@ -19,10 +19,10 @@ from typing import Any
 
 import numpy as np
 
-from tactile_rt.calibration import CalibratedSource
+from tactile_rt.classifier.array_file import read_array
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples
-from tactile_rt.drivers.opening import make_codec
+from tactile_rt.drivers.opening import Prepared, make_codec
 from tactile_rt.recording.layout import SAMPLES, WIRE, Packet
 from tactile_rt.recording.reader import MAGIC, Recording
 from tactile_rt.settings import take_options
@@ -68,10 +68,10 @@ def open_replay(target: str, fields: dict[str, str]) -> Source:
         ConfigError: no such file, a wrong option, or the extra is not installed.
         RecordingError: the file is damaged.
     """
-    return prepare_replay(target, fields)()
+    return prepare_replay(target, fields).open()
 
 
-def prepare_replay(target: str, fields: dict[str, str]) -> Callable[[], Source]:
+def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
     """What opens a recording, or one object of a sweep set, as a stream.
 
     Raises:
@@ -85,8 +85,11 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Callable[[], Source]:
         (sweeps,) = take_options(what, fields, SweepOptions)
         _check_speed(what, sweeps.speed)
         spec, manifest = _sweep_spec(path)
-        return partial(
-            ReplaySource, spec, lambda _: _sweep_chunks(path, manifest, sweeps), sweeps.speed
+        return Prepared(
+            spec,
+            partial(
+                ReplaySource, spec, lambda _: _sweep_chunks(path, manifest, sweeps), sweeps.speed
+            ),
         )
     fields = dict(fields)
     channel = fields.pop("from", SAMPLES)
@@ -97,8 +100,11 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Callable[[], Source]:
         _check_speed(what, options.speed)
         if options.codec:
             raise ConfigError(f"{what}: codec= is for from=wire; samples are decoded already")
-        return partial(
-            ReplaySource, about.spec, lambda stats: _recorded(recording, stats), options.speed
+        return Prepared(
+            about.spec,
+            partial(
+                ReplaySource, about.spec, lambda stats: _recorded(recording, stats), options.speed
+            ),
         )
     if channel != WIRE:
         raise ConfigError(f"{what}: from must be samples or wire, not {channel!r}")
@@ -110,16 +116,29 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Callable[[], Source]:
     )  # fmt: skip
     _check_speed(what, options.speed)
     own = {k: v for k, v in fields.items() if k not in ReplayOptions.__dataclass_fields__}
-    if options.codec in ("", about.codec):
+    same = options.codec in ("", about.codec)
+    if same:
         own = {**about.codec_options, **own}
+    array = _array_of(own.pop("array", ""))
     codec = make_codec(about.wire, options.codec or about.codec, own)
+    codec.spec = codec.spec or array
 
     def opened() -> Source:
         decoding = _Decoding(str(path), codec, recording.packets(), about.clock)
-        source = ReplaySource(decoding.spec, decoding.chunks, options.speed)
-        return source if about.calibration is None else CalibratedSource(source, about.calibration)
+        return ReplaySource(decoding.spec, decoding.chunks, options.speed)
 
-    return opened
+    prepared = Prepared(codec.spec, opened)
+    if about.calibration is not None:
+        prepared = prepared.calibrated(about.calibration)
+    # What a device said of itself is among the packets.
+    return replace(prepared, spec=about.spec) if same and not prepared.spec else prepared
+
+
+def _array_of(text: str) -> ArraySpec | None:
+    """What a device was said to be when it was recorded: JSON; of earlier releases, its file."""
+    if not text:
+        return None
+    return ArraySpec.from_json(text) if text.startswith("{") else read_array(Path(text))
 
 
 def _check_file(path: Path) -> None:

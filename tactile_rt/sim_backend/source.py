@@ -203,9 +203,7 @@ class SimSource(PacedSource):
         self._sensor = Sensor(options, spec, options.seed, described)
         self._transducer = Transducer(described, spec.elements) if described else None
         self._feels_turns = options.base_turns or bool(described and described.feels_turns)
-        if options.base_turns:
-            spec = replace(spec, channels=spec.channels + TURNS, units=(*spec.units, "rad", "rad"))
-        super().__init__(spec, options.pace)
+        super().__init__(_spec(self._animals, options), options.pace)
         self._options = options
         self._objects = _objects(options) or [promised_object(name) for name in CATEGORIES]
         self._rng = np.random.default_rng(options.seed)
@@ -223,10 +221,12 @@ class SimSource(PacedSource):
         self._order: list[int] = []
 
     @staticmethod
-    def check(array: str, options: SimOptions) -> None:
-        """Raise the `ConfigError` that opening it would raise."""
-        _check_turns(load_animals(array or "mouse"), options)
+    def check(array: str, options: SimOptions) -> ArraySpec:
+        """The array that it would be; raises the `ConfigError` that opening it would raise."""
+        animals = load_animals(array or "mouse")
+        _check_turns(animals, options)
         _objects(options)
+        return _spec(animals, options)
 
     def close(self) -> None:
         super().close()
@@ -308,6 +308,14 @@ class SimSource(PacedSource):
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)
         now = start_ns + round(self._sent * SAMPLE_MS * 1e6)
         self.passes.append(Pass(now, target.name, target.category, sweep))
+
+
+def _spec(animals: tuple[WhiskerArray, ...], options: SimOptions) -> ArraySpec:
+    """What the samples are."""
+    spec = device_spec(animals)
+    if not options.base_turns:
+        return spec
+    return replace(spec, channels=spec.channels + TURNS, units=(*spec.units, "rad", "rad"))
 
 
 def _check_turns(animals: tuple[WhiskerArray, ...], options: SimOptions) -> None:

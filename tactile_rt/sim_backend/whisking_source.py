@@ -18,7 +18,7 @@ from tactile_rt.sim_backend.source import CHUNK_SAMPLES, PacedSource, check_pace
 from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import Drive, Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream
+from tactile_rt.stream import ArraySpec, Chunk, ConfigError, EndOfStream
 
 __all__ = ["WhiskingOptions", "WhiskingSource"]
 
@@ -141,9 +141,10 @@ class WhiskingSource(PacedSource):
         self.commands: list[tuple[int, Whisking]] = [(0, options.whisking)]
 
     @staticmethod
-    def check(array: str, options: WhiskingOptions) -> None:
-        """Raise the `ConfigError` that opening it would raise."""
-        WhiskingSource(array, options).close()
+    def check(array: str, options: WhiskingOptions) -> ArraySpec:
+        """The array that it would be; raises the `ConfigError` that opening it would raise."""
+        with WhiskingSource(array, options) as source:
+            return source.spec
 
     def set_whisking(self, frequency_hz: float, amplitude_rad: float, offset_rad: float) -> None:
         """Whisk like this from the next sample that is not yet simulated on; from any thread.

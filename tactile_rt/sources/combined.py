@@ -17,7 +17,7 @@ combined:robot_head.toml, which reads
 import contextlib
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.drivers.opening import Prepared
 from tactile_rt.settings import convert, read_toml, refusal
 from tactile_rt.sources.opening import check_source, open_source
 from tactile_rt.stream import (
@@ -75,12 +76,12 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 _READING: ContextVar[tuple[str, ...]] = ContextVar("_READING", default=())
 
 
-def prepare_combined(path: str, fields: dict[str, str]) -> Callable[[], Source]:
+def prepare_combined(path: str, fields: dict[str, str]) -> Prepared:
     """What opens the arrays that a TOML file lists.
 
     Raises:
         ConfigError: the file cannot be read, is not of the layout above, or a URL in it is wrong.
-            What is returned raises `SourceError` if one of the devices cannot be opened.
+            To open what is returned raises `SourceError` if one of the devices cannot be opened.
     """
     if not path:
         raise ConfigError("combined: needs a file, e.g. combined:head.toml")
@@ -94,10 +95,11 @@ def prepare_combined(path: str, fields: dict[str, str]) -> Callable[[], Source]:
     if place in above:
         raise ConfigError(f"{path} combines itself")
     within = _READING.set((*above, place))
+    specs = []
     try:
         for i, part in enumerate(wanted.source):
             try:
-                check_source(part.url)
+                specs.append(check_source(part.url))
             except TactileError as error:
                 raise refusal(nodes, ["source", i, "url"], str(error)) from None
     finally:
@@ -110,7 +112,10 @@ def prepare_combined(path: str, fields: dict[str, str]) -> Callable[[], Source]:
             stack.pop_all()
             return made
 
-    return opened
+    known = [spec for spec in specs if spec is not None]
+    if len(known) < len(specs):
+        return Prepared(None, opened)
+    return Prepared(combine_specs(known, wanted.source, wanted.name, wanted.rate_hz), opened)
 
 
 def combine_specs(

@@ -2,15 +2,17 @@
 
 synthetic:                                    5 whiskers x 6 channels at 1 kHz, without end
 synthetic:35x6?rate_hz=1000&seconds=10&pace=fast&seed=3
+synthetic:mouse                               the array that the package's own model knows
 """
 
 import re
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.classifier.array_file import read_array
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStream, Source
 
 __all__ = ["SyntheticOptions", "SyntheticSource", "synthetic_spec"]
@@ -19,6 +21,7 @@ COLUMNS = 7  # of the grid that the whiskers stand on
 PITCH_M = 0.002
 CHUNK_S = 0.009
 BUMP_S, EVERY_S = 0.3, 1.5  # a bump's length, and from one to the next
+REST_S = 0.6  # before the first, for a tare
 PEAK = {"N": 2e-3, "N m": 2e-5}
 NOISE = 0.005  # of the peak, RMS
 NAMES = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -70,7 +73,8 @@ class SyntheticSource(Source):
     """Half-sine bumps that pass over the array from row to row, with a little noise.
 
     Args:
-        size: ``ELEMENTSxCHANNELS``, e.g. ``35x6``; empty: ``5x6``.
+        size: ``ELEMENTSxCHANNELS``, e.g. ``35x6``; empty: ``5x6``; ``mouse`` for the array of the
+            model that comes with the package.
         options: how fast, how long.
 
     Raises:
@@ -80,18 +84,18 @@ class SyntheticSource(Source):
     Options = SyntheticOptions
 
     def __init__(self, size: str, options: SyntheticOptions) -> None:
-        super().__init__(synthetic_spec(*_numbers(size), options.rate_hz))
+        super().__init__(_spec(size, options))
         self.live = options.pace == "realtime"
         self._rng = np.random.default_rng(options.seed)
         self._left = round(options.seconds * options.rate_hz) if options.seconds else None
         self._peak = np.array([PEAK[unit] for unit in self.spec.units])
-        self._at = np.array([r + c / 10 for r, c in self.spec.grid]) * 0.05  # s; bumps arrive
+        self._at = REST_S + np.array([r + c / 10 for r, c in self.spec.grid]) * 0.05  # s
         self._sent, self._start_ns, self._closed = 0, -1, False
 
     @staticmethod
-    def check(size: str, options: SyntheticOptions) -> None:
-        """Raise the `ConfigError` that opening it would raise."""
-        _numbers(size)
+    def check(size: str, options: SyntheticOptions) -> ArraySpec:
+        """The array that it would be; raises the `ConfigError` that opening it would raise."""
+        return _spec(size, options)
 
     def read(self, timeout: float | None = None) -> Chunk | None:
         n = max(1, round(CHUNK_S * self.spec.rate_hz))
@@ -129,11 +133,20 @@ class SyntheticSource(Source):
         return values
 
 
+def _spec(size: str, options: SyntheticOptions) -> ArraySpec:
+    if size == "mouse":
+        from tactile_rt.classifier.model_file import shipped_model
+
+        return replace(read_array(shipped_model()), rate_hz=options.rate_hz)
+    return synthetic_spec(*_numbers(size), options.rate_hz)
+
+
 def _numbers(size: str) -> tuple[int, int]:
     """(elements, channels) of ``35x6``."""
     found = re.fullmatch(r"(\d{1,4})x([1-6])", size or "5x6")
     if not found or int(found[1]) == 0:
         raise ConfigError(
-            f"synthetic:{size} is not a size: ELEMENTSxCHANNELS, e.g. 35x6; at most 9999x6"
+            f"synthetic:{size} is not a size: ELEMENTSxCHANNELS, e.g. 35x6, at most 9999x6; or "
+            "mouse"
         )
     return int(found[1]), int(found[2])

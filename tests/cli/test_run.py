@@ -130,6 +130,33 @@ def test_a_model_that_cannot_be_used_is_one_line(call, bad_models, wrong, said, 
 
 
 @pytest.mark.parametrize(
+    "source",
+    [
+        "serial:///dev/none?codec=bota",
+        "can:virtual:none?codec=xela",
+        "serial:///dev/none?codec=ascii_line&columns=A0.fx",
+        "synthetic:30x6",
+        "sim:rat",
+        "whisking:mouse",
+    ],
+)
+def test_a_model_of_another_array_is_refused_before_a_device_is_looked_for(refused, source):
+    said = refused("run", "--source", source)
+    assert said.startswith(f"tactile-rt: {source}: {shipped_model()} was made for another array")
+    assert "; name a model of this array" in said
+
+
+def test_a_source_is_run_as_the_array_that_it_is_said_to_be(call, refused, tmp_path):
+    """A synthetic plate of thirty whiskers, said to be the mouse's by the model's own file."""
+    source = f"synthetic:30x6?pace=fast&seconds=2&array={shipped_model()}"
+    code, out, _ = call("run", "--source", source)
+    steps = [json.loads(line)["step"] for line in out.splitlines()]
+    assert code == 0 and steps[:3] == [1, 2, 3]
+    said = refused("run", "--source", source.replace("30x6", "8x6"))
+    assert "elements: the array 'mouse-right' has 30 (A0, A1," in said and "synthetic 8" in said
+
+
+@pytest.mark.parametrize(
     ("source", "said"),
     [
         ("simm:mouse", "did you mean sim:?"),

@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.config import EXAMPLE, Config, config_text, is_loopback
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.settings import find_lines
 from tactile_rt.stream import ConfigError
+from tactile_rt.testing import small_spec
 from tests.helpers.refusals import refusal
 
 DATA = Path(__file__).parent / "data"
@@ -40,7 +42,7 @@ def test_a_broken_file_is_refused_by_its_golden_message(name, monkeypatch):
 
 
 def test_the_corpus_is_all_there():
-    assert len(BROKEN) >= 131
+    assert len(BROKEN) >= 136
 
 
 def test_a_file_that_is_not_there_or_empty_or_a_folder(tmp_path):
@@ -58,7 +60,7 @@ def test_the_example_is_right_and_shows_the_defaults(tmp_path):
     loaded = load(tmp_path, EXAMPLE)
     check_config(loaded)
     # What is commented out is as right as what is not.
-    named = ("extends", "calibration", "file")  # of files that are not there
+    named = ("extends", "calibration", "array", "file")  # of files that are not there
     lines = [line.removeprefix("# ") for line in EXAMPLE.splitlines()[2:]]
     whole = "\n".join(line for line in lines if not line.startswith(named))
     full = load(tmp_path, whole)
@@ -181,15 +183,60 @@ def test_how_many_steps_there_are_is_the_models_affair(tmp_path, steps):
     from tests.helpers.tiny_model import write_model
 
     write_model(tmp_path / "m.onnx", steps=steps)
-    table = '[[model]]\nfile = "m.onnx"\nmode = "sliding"\nevery = {}\nin_a_row = {}\n'
-    check_config(load(tmp_path, SMALL + table.format(steps, steps)))
+    table = SMALL.replace("synthetic:5x6", "serial:/dev/none?codec=native")  # of any array
+    table += '[[model]]\nfile = "m.onnx"\nmode = "sliding"\nevery = {}\nin_a_row = {}\n'
+    check_config(load(tmp_path, table.format(steps, steps)))
     said = f"expected a whole number <= {steps}, the steps that m.onnx has, got {steps + 1}"
     for key, values in (("every", (steps + 1, 1)), ("in_a_row", (1, steps + 1))):
-        found = refusal_of(tmp_path, SMALL + table.format(*values))
+        found = refusal_of(tmp_path, table.format(*values))
         assert found.endswith(f": model[0].{key}: {said}")
         setting = f"model.0.{key}={steps + 1}"
-        found = refusal_of(tmp_path, SMALL + table.format(1, 1), setting)
+        found = refusal_of(tmp_path, table.format(1, 1), setting)
         assert found == f"--set {setting}: model[0].{key}: {said}"
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "serial:/dev/none?codec=bota",
+        "serial:/dev/none?codec=ascii_line&columns=A0.fx,A0.fy",
+        "can:virtual:none?codec=xela",
+        "can:virtual:none?codec=icub_skin",
+        "synthetic:30x6",
+        "sim:rat",
+        "whisking:mouse",
+        "combined:head.toml",
+    ],
+)
+def test_a_model_that_cannot_fit_its_source_is_refused_beforehand(tmp_path, monkeypatch, url):
+    """Wherever the array is known without the device; with what differs, and what to do."""
+    if url.startswith(("sim:", "whisking:")):
+        pytest.importorskip("mujoco")
+    (tmp_path / "head.toml").write_text(
+        'name = "head"\nrate_hz = 100\n[[source]]\nname = "l"\nurl = "synthetic:2x6"\n'
+    )
+    found = refusal_of(tmp_path, SMALL.replace("synthetic:5x6", url) + "[[model]]\n")
+    assert found.startswith("robot.toml:5: model[0].file: source whiskers: ")
+    assert "mouse24.onnx was made for another array than" in found
+    assert "; name a model of this array" in found
+
+
+def test_a_model_is_held_against_what_its_source_is_said_to_be(tmp_path):
+    (tmp_path / "mouse.onnx").symlink_to(shipped_model())
+    line = SMALL.replace("5x6", "30x6") + "{}[[model]]\n"
+    declaration = 'array = "mouse.onnx"\n'
+    check_config(load(tmp_path, line.format(declaration)))
+    found = refusal_of(tmp_path, line.format(""))
+    assert found.endswith(
+        f"if the sensor is the model's array, declare it: array={shipped_model()}"
+    )
+    for unknown in ("serial:/dev/none?codec=native", "can:virtual:none?codec=native"):
+        check_config(load(tmp_path, line.replace("synthetic:30x6", unknown).format("")))
+    # of a device that only itself can tell, what it is said to be counts
+    (tmp_path / "three.json").write_text(small_spec().to_json())
+    told = line.replace("synthetic:30x6", "serial:/dev/none?codec=native")
+    found = refusal_of(tmp_path, told.format('array = "three.json"\n'))
+    assert "was made for another array than 'small'" in found
 
 
 def test_what_is_shown_says_the_same_but_for_secrets(tmp_path):

@@ -1,15 +1,20 @@
 """The daemon as a whole, on real lines: arrays on ptys, models, consumers, and what goes wrong."""
 
+import io
 import json
 import shutil
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from tactile_rt.calibration import Calibration, save_calibration
 from tactile_rt.classifier.classifier import Classifier
+from tactile_rt.cli.top import picture
 from tactile_rt.daemon import publishers
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.clock import Clock
@@ -27,6 +32,7 @@ from tactile_rt.daemon.items import (
 )
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.lock import AlreadyRunning, Locks
+from tactile_rt.daemon.metrics import exposition
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError, SourceError
@@ -222,11 +228,12 @@ def test_decisions_are_those_of_the_classifier_alone(robot, tmp_path, monkeypatc
     alone = Classifier(model, SPEC)
     expected = [d for chunk in chunks for d in alone.push(chunk)]
     monkeypatch.setattr(
-        "tactile_rt.daemon.source_part.open_source", lambda url: ArraySource(SPEC, chunks)
+        "tactile_rt.daemon.source_part.open_source", lambda url, **more: ArraySource(SPEC, chunks)
     )
     over = threading.Event()
     daemon, spy = robot(
-        source("a", "synthetic:") + f'[[model]]\nfile = "{model}"\n', on_over=over.set
+        source("a", "serial:none?codec=native") + f'[[model]]\nfile = "{model}"\n',
+        on_over=over.set,
     )
     assert over.wait(PATIENCE_S)
     daemon.stop()
@@ -274,7 +281,7 @@ def test_a_source_that_breaks_is_opened_again_and_its_counts_add_up(robot, monke
                 raise SourceError("the cable is loose")
             return super().read(timeout)
 
-    def open_it(url):
+    def open_it(url, **more):
         if len(opened) == 3:
             raise SourceError("no such port")
         opened.append(Breaking(SPEC, cut(touching(100), 1000.0)))
@@ -319,6 +326,82 @@ def test_without_a_model_all_else_goes_on_and_it_comes_back(robot, tmp_path):
         until(lambda: daemon.snapshot().models[0].decisions > count)
         kept = seqs(spy, "a")
         assert np.array_equal(kept, kept[0] + np.arange(len(kept)))
+
+
+def renamed(prefix):
+    return replace(SPEC, elements=tuple(f"{prefix}{e}" for e in SPEC.elements))
+
+
+def test_a_model_of_another_array_has_failed_and_is_not_tried_again(robot, tmp_path):
+    """A native device says what it is only when it is opened: nobody could know before."""
+    model = write_model(tmp_path / "m.onnx", spec=renamed("x").to_json())
+    with FakeSerial(touching(60_000), spec=SPEC) as device:
+        daemon, spy = robot(source("a", device.url) + f'[[model]]\nfile = "{model}"\n')
+        until(lambda: spy.told("model.a", "failed"))
+        (event,) = spy.told("model.a", "failed")
+        assert event.level == "error" and not spy.told("model.a", "waiting")
+        assert event.reason.startswith(f"source a: {model} was made for another array than ")
+        assert "elements: lacks xA0, xA1, xA2" in event.reason
+        until(lambda: len(seqs(spy, "a")) > 1000)  # many times the longest pause between tries
+        state = state_of(daemon, "model.a")
+        assert (state.state, state.starts, state.failures) == ("failed", 1, 1)
+        assert f"no decisions: model.a has failed: {event.reason}; acquisition goes on" in (
+            daemon.snapshot().degraded
+        )
+        # and whoever looks at the daemon is told as plainly
+        metrics = exposition(daemon.snapshot()).decode()
+        assert 'tactile_part_state{part="model.a",state="failed"} 1\n' in metrics
+        assert sum('part="model.a"' in x and x.endswith(" 1") for x in metrics.splitlines()
+                   if x.startswith("tactile_part_state")) == 1  # fmt: skip
+        console = Console(file=io.StringIO(), width=1000)
+        console.print(picture(daemon.snapshot(), None))
+        shown = next(
+            x for x in console.file.getvalue().splitlines() if x.split()[:2] == ["a", "failed"]
+        )
+        assert event.reason in shown
+        # Of another file it is worth a try, with or without being told.
+        write_model(model)
+        until(lambda: spy.of(Decision))
+        until(lambda: daemon.snapshot().state == "running")
+    assert len(spy.told("model.a", "failed")) == 1
+
+
+def test_a_source_that_is_not_what_it_should_be_has_failed_until_a_reload(robot, tmp_path):
+    """The same of a calibration of another device: no try can mend it, but another file can."""
+    other, mine = (Calibration.of("cell", spec) for spec in (renamed("x"), SPEC))
+    save_calibration(other, tmp_path / "cell.toml")
+    with FakeSerial(touching(60_000), spec=SPEC) as device:
+        text = source("a", device.url) + 'calibration = "cell.toml"\n'
+        daemon, spy = robot(text)
+        until(lambda: spy.told("source.a", "failed"))
+        until(lambda: daemon.snapshot().state == "degraded")
+        (event,) = spy.told("source.a", "failed")
+        assert event.level == "error"
+        assert event.reason.startswith("calibration of cell is for elements xA0, xA1, xA2; ")
+        assert f"no samples: source.a has failed: {event.reason}" in daemon.snapshot().degraded
+        save_calibration(mine, tmp_path / "cell.toml")
+        assert state_of(daemon, "source.a").starts == 1
+        daemon.reload(configured(tmp_path, text))
+        until(lambda: spy.of(SourceChunk, "a"))
+        until(lambda: daemon.snapshot().state == "running")
+
+
+def test_a_device_is_what_its_configuration_says(robot, tmp_path):
+    """Declared to be the array of the model's file, it is that in all that is told of it."""
+    array = replace(SPEC, name="robot", elements=("left", "middle", "right"), frame="plate")
+    write_model(tmp_path / "m.onnx", spec=array.to_json())
+    columns = ",".join(f"{e}.{c}" for e in SPEC.elements for c in ("fy:N", "mz:N m"))
+    options = {"columns": columns, "rate_hz": "1000"}
+    with FakeSerial(touching(60_000), "ascii_line", options=options) as device:
+        plain = source("a", device.url) + '{}[[model]]\nfile = "m.onnx"\n'
+        with pytest.raises(ConfigError, match=r"source a: .* was made for another array than 'asc"):
+            configured(tmp_path, plain.format(""))
+        daemon, spy = robot(plain.format('array = "m.onnx"\n'))
+        until(lambda: spy.of(Decision))
+        state = daemon.snapshot().sources[0]
+        assert (state.array, state.elements, state.frame) == ("robot", array.elements, "plate")
+        assert state.device is not None and spy.of(Decision)[0].frame == "plate"
+        assert spy.of(Packet)  # of the device behind it
 
 
 def test_a_consumer_that_breaks_or_hangs_harms_itself_alone(robot, tmp_path):
@@ -398,7 +481,7 @@ def test_a_source_that_is_still_being_opened_disturbs_no_other_after_a_reload(ro
         def close(self):
             closed.append(self)
 
-    def open_it(url):
+    def open_it(url, **more):
         if url.endswith("1x1"):
             answers.wait(PATIENCE_S)
             return Late(SPEC, [], live=True)

@@ -185,6 +185,26 @@ def takes(process, number):
     return bool(mask >> (number - 1) & 1)
 
 
+def test_the_example_decides_once_its_model_is_uncommented(folder):
+    """What `config example` prints, with one `# ` less."""
+    printed = subprocess.run(
+        [*RUN, "config", "example"], capture_output=True, text=True, check=True
+    ).stdout
+    (folder / "example.toml").write_text(printed.replace("# [[model]]", "[[model]]"))
+    with subprocess.Popen(
+        [*RUN, "run", str(folder / "example.toml")], stdout=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            published = map(json.loads, process.stdout)
+            found = [next(m for m in published if m["type"] == "decision") for _ in range(3)]
+        finally:
+            process.send_signal(signal.SIGTERM)
+            process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0
+    assert [d["step"] for d in found] == [1, 2, 3]
+    assert found[0]["source"] == "whiskers" and found[0]["label"] in found[0]["probabilities"]
+
+
 def test_a_stream_that_is_over_and_a_time_that_is_up_end_it(folder, monkeypatch, capfd):
     (folder / "robot.toml").write_text(SMALL.replace('options = { file = "out.jsonl" }', ""))
     code, out, err = call(

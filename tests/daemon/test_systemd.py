@@ -223,7 +223,7 @@ def lines_of(log, *words):
 
 def test_a_source_that_hangs_starves_the_watchdog_and_is_told_once(watched, tmp_path, monkeypatch):
     opened = "tactile_rt.daemon.source_part.open_source"
-    monkeypatch.setattr(opened, lambda url: Hanging(small_spec()))
+    monkeypatch.setattr(opened, lambda url, **more: Hanging(small_spec()))
     Hanging.goes_on.set()
     one = '[[source]]\nname = "a"\nurl = "synthetic:"\n'
     _, notifies, told = watched(one + "[limits]\nstall_s = 0.5\n")

@@ -46,6 +46,20 @@ def test_float32_is_bit_equal_over_every_wire(model: Path, wire: str) -> None:
     assert loop.samples == 3000 and loop.decisions == 8
 
 
+def test_a_codec_with_names_of_its_own_carries_any_array_that_fits(model: Path) -> None:
+    """A line of numbers, with the time and what nobody asked for, whose elements are W0, W1, W2."""
+    measured = [f"W{e}.{c}" for e in range(3) for c in ("temperature:degC", "mz:N m", "fy:N")]
+    options = {"columns": ",".join(["count", "time:us", *measured])}
+    report = Loop(touches(), model, codec="ascii_line", options=options).run()
+    assert report.failure == "" and report.identical_samples == 3000
+    assert report.direct == report.wire == report.same_label == 8
+
+
+def test_what_a_codec_cannot_carry_is_refused(model: Path) -> None:
+    with pytest.raises(SpecMismatch, match=r"the array 'small' has 3 \(A0, A1, A2\), bota 1"):
+        Loop(touches(), model, codec="bota").run()
+
+
 def test_what_a_format_rounds_is_not_bit_equal_and_need_not_be(model: Path) -> None:
     report = Loop(touches(), model, options={"format": "int16", "range_n": "0.2"}).run()
     assert not report.exact and report.direct == report.wire == 8
@@ -131,7 +145,7 @@ def test_a_source_that_breaks_is_told(model: Path) -> None:
         ({"clock": "wall"}, "clock must be one of device, host, not 'wall'"),
         ({"clock": "host"}, "not in real time"),
         ({"codec": "nativ"}, "no serial codec 'nativ'"),
-        ({"options": {"range_n": "0"}}, "range_n and range_nm must be above 0"),
+        ({"options": {"range_n": "0"}}, "range_n, range_nm and range_si must be above 0"),
     ],
 )
 def test_what_cannot_be_is_refused(model: Path, further: dict, said: str) -> None:

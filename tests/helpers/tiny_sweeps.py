@@ -31,18 +31,45 @@ def tiny_array(seed: int = 0) -> ArraySpec:
     )
 
 
-def write_tiny_set(folder: Path, objects: int = 6, sweeps: int = 1) -> SweepManifest:
+def plate(rows: int, columns: int, channels: str = "fx fy fz mx my mz") -> ArraySpec:
+    """Whiskers of a robot in rows on a plate, all upright."""
+    cells = tuple((r, c) for r in range(rows) for c in range(columns))
+    names = tuple(channels.split())
+    return ArraySpec(
+        name="plate",
+        elements=tuple(f"{'ABCDE'[r]}{c}" for r, c in cells),
+        grid=cells,
+        positions=tuple((0.0, 0.01 * c, -0.01 * r) for r, c in cells),
+        orientations=((1.0, 0.0, 0.0, 0.0),) * len(cells),
+        channels=names,
+        units=tuple({"f": "N", "m": "N m"}[name[0]] for name in names),
+        rate_hz=1000.0,
+        frame="plate",
+    )
+
+
+def write_tiny_set(
+    folder: Path,
+    objects: int = 6,
+    sweeps: int = 1,
+    spec: ArraySpec | None = None,
+    period_ns: int = 9_000_000,
+    contacts: bool = False,
+) -> SweepManifest:
     """Objects of three categories, every sweep a touch that noise and a category's mean make."""
-    spec, rng = tiny_array(), np.random.default_rng(1)
+    spec, rng = spec or tiny_array(), np.random.default_rng(1)
     split = split_by_object(CATEGORIES, objects, 1, 1)
-    manifest = SweepManifest(spec, 9_000_000, LEAD, CATEGORIES, split)
+    recipe = {"contacts": True} if contacts else {}
+    manifest = SweepManifest(spec, period_ns, LEAD, CATEGORIES, split, recipe=recipe)
     manifest.write(folder)
-    unit = np.array([1e-4] * 3 + [1e-6] * 3)
+    unit = np.array([{"N": 1e-4, "N m": 1e-6}[u] for u in spec.units])
     means = np.random.default_rng(2).normal(size=(len(CATEGORIES), *spec.shape)) * unit
     for name in manifest.names():
         values = (
             means[manifest.label(name)] + rng.normal(size=(sweeps, SAMPLES, *spec.shape)) * unit
         )
         values[:, :LEAD] = 0
-        write_object(folder, name, values.astype(np.float32), {})
+        where = np.full(values.shape[:3], np.nan, np.float32)
+        where[:, LEAD:] = 0.01  # of the base, m
+        write_object(folder, name, values.astype(np.float32), {}, where if contacts else None)
     return manifest

@@ -32,7 +32,6 @@ from tactile_rt.drivers.codecs.native_common import (
     check_ranges,
     pack_valid,
     quantise,
-    read_array,
 )
 from tactile_rt.stream import Chunk, ConfigError
 
@@ -55,15 +54,12 @@ class NativeOptions:
     Attributes:
         format: Number format that an emulated device sends, ``float32`` or ``int16``. A host takes
             both.
-        array: JSON file of an array (`tactile-rt describe` writes one) for devices that do not
-            describe themselves.
         range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
             can tell.
         range_si: The largest reading of channels of other units that it can tell.
     """
 
     format: str = "float32"
-    array: str = ""
     range_n: float = RANGE_N
     range_nm: float = RANGE_NM
     range_si: float = RANGE_SI
@@ -104,7 +100,7 @@ class NativeSerial(SerialCodec):
     cannot_detect = ""
 
     def __init__(self, options: NativeOptions) -> None:
-        super().__init__(read_array(options.array))
+        super().__init__(None)
         self._format = FORMATS[options.format]
         self._ranges = options.range_n, options.range_nm, options.range_si
         self._described: DeviceDescription | None = None

@@ -45,7 +45,6 @@ from tactile_rt.drivers.codecs.native_common import (
     check_ranges,
     pack_valid,
     quantise,
-    read_array,
 )
 from tactile_rt.stream import Chunk, ConfigError
 
@@ -66,7 +65,6 @@ class NativeCanOptions:
             samples in both.
         format: Number format that an emulated device sends, ``float32`` or ``int16``. A host takes
             both.
-        array: JSON file of an array for devices that do not describe themselves.
         range_n, range_nm: The largest force (N) and moment (N m) that an emulated device's int16
             can tell.
         range_si: The largest reading of channels of other units that it can tell.
@@ -75,7 +73,6 @@ class NativeCanOptions:
     base: int = 0x100
     fd: bool = False
     format: str = "int16"
-    array: str = ""
     range_n: float = RANGE_N
     range_nm: float = RANGE_NM
     range_si: float = RANGE_SI
@@ -108,7 +105,7 @@ class NativeCan(CanCodec):
     cannot_detect = "65,536 samples lost in succession look like none lost"
 
     def __init__(self, options: NativeCanOptions) -> None:
-        super().__init__(read_array(options.array))
+        super().__init__(None)
         self._base, self._fd = options.base, options.fd
         self._float32 = options.format == "float32"
         self._ranges = options.range_n, options.range_nm, options.range_si

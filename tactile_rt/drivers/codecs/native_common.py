@@ -1,15 +1,13 @@
 """What the native protocol says on every line: see docs/native-protocol.md."""
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.settings import convert, make_node, read_text
-from tactile_rt.stream import SPEC_VERSION, ArraySpec, ConfigError
+from tactile_rt.stream import ArraySpec, ConfigError
 
 __all__ = [
     "FORMATS",
@@ -24,7 +22,6 @@ __all__ = [
     "check_ranges",
     "pack_valid",
     "quantise",
-    "read_array",
     "unpack_valid",
 ]
 
@@ -127,32 +124,6 @@ def quantise(values: NDArray[np.float32], scale: tuple[float, ...]) -> NDArray[n
     """Values as counts, rounded to the nearest and saturated."""
     counts = np.rint(np.nan_to_num(values.astype(np.float64) / scale))
     return np.clip(counts, -32767, 32767).astype(np.int16)
-
-
-def read_array(path: str) -> ArraySpec | None:
-    """The array that a file describes; None without a path.
-
-    Raises:
-        ConfigError: it cannot be read or is not one.
-    """
-    if not path:
-        return None
-    text = read_text(Path(path))
-    try:
-        return ArraySpec.from_json(text)
-    except ConfigError as error:
-        _explain(text, path)
-        raise ConfigError(f"{path}: {error}") from None
-
-
-def _explain(text: str, path: str) -> None:
-    """Raise what is wrong with the array in words, if it is a key or its value."""
-    try:
-        fields = msgspec.json.decode(text, type=dict[str, Any])
-    except msgspec.MsgspecError:
-        raise ConfigError(f"{path}: not JSON, as `tactile-rt describe` writes it") from None
-    if fields.pop("version", None) == SPEC_VERSION:
-        convert(make_node(fields, path, 0, Path()), ArraySpec)
 
 
 def check_ranges(*ranges: float) -> None:

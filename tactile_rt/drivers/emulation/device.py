@@ -61,7 +61,8 @@ class EmulatedDevice:
     @property
     def url(self) -> str:
         """What `open_source` opens: the line, the codec and its options."""
-        query = urlencode({"codec": self._name, **self._options})
+        # a + is a + in our URLs, not the space that web forms make of it
+        query = urlencode({"codec": self._name, **self._options}, quote_via=quote)
         return f"{quote(self.emulator.address, safe=':/')}?{query}"
 
     def unplug(self) -> None:

@@ -44,7 +44,8 @@ def checkpoint_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, dict[s
         ConfigError: the stimuli are of another array.
     """
     model, saved = load_checkpoint(path)
-    stimuli.check(ArraySpec.from_json(saved["spec"]), str(path))
+    timing = model.timing
+    stimuli.check(ArraySpec.from_json(saved["spec"]), timing.steps, timing.substeps, str(path))
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     name = path.resolve().parent.name if path.stem in ("best", "last") else path.stem
     return network_layers(model, stimuli, name, sha256), saved

@@ -20,6 +20,7 @@ OUTPUT = "output"
 LEAST_PEARSON = {"fp32": 0.9999}
 REDUCED_PEARSON = 0.98  # of any other precision
 LARGEST_DIFFERENCE = 1e-5
+FLAT = 1e-6  # an RDM that spans less says nothing: of two classes the output's may be all zeros
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,8 @@ class LayerFidelity:
 
     Attributes:
         layer: The name of the layer; `OUTPUT` is what the model decides with.
-        pearson: The correlation of the two RDMs of the layer; NaN if one has none.
+        pearson: The correlation of the two RDMs of the layer; NaN if one has none, or both are
+            flat.
         difference: The largest difference between the two (6, unit) responses, as a share of the
             reference's largest response where that is above 1; infinite for another number of
             units.
@@ -104,10 +106,12 @@ def _compared(name: str, a: np.ndarray, b: np.ndarray, precision: str) -> LayerF
     if a.shape != b.shape:
         return LayerFidelity(name, float("nan"), float("inf"), False)
     one, other = rdm(a), rdm(b)
-    r = float(pearson(one, other))
+    flat = np.ptp(one) < FLAT and np.ptp(other) < FLAT
+    r = float("nan") if flat else float(pearson(one, other))
     difference = float(np.abs(a - b).max() / max(1.0, np.abs(a).max()))
     bar = LEAST_PEARSON.get(precision, REDUCED_PEARSON)
-    same = r >= bar or not (np.isfinite(one).all() or np.isfinite(other).all())
+    none = not (np.isfinite(one).all() or np.isfinite(other).all())
+    same = r >= bar or none or flat
     near = difference <= LARGEST_DIFFERENCE or precision != "fp32"
     return LayerFidelity(name, r, difference, bool(same and near and np.isfinite(difference)))
 

@@ -19,7 +19,7 @@ from tactile_rt.stream import ArraySpec, ConfigError
 __all__ = ["SHIPPED", "STEPS", "SUBSTEPS", "StimuliInput", "read_stimuli"]
 
 SHIPPED = Path(__file__).parents[2] / "assets" / "six_stimuli.npz"
-STEPS, SUBSTEPS = 22, 5
+STEPS, SUBSTEPS, PERIOD_MS = 22, 5, 9
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,20 +49,32 @@ class StimuliInput:
         """(6, element, channel) float32: the tare."""
         return np.zeros_like(self.sigma)
 
-    def check(self, spec: ArraySpec, model: str) -> None:
-        """Hold the input against the array that a model was trained on.
+    def check(self, spec: ArraySpec, steps: int, substeps: int, model: str) -> None:
+        """Hold the input against what a model was trained on.
+
+        Args:
+            spec: the model's array.
+            steps, substeps: of its windows.
+            model: for messages.
 
         Raises:
-            ConfigError: they differ in elements, channels or units.
+            ConfigError: they differ in elements, channels or units, or in the cut of a window.
         """
-        for what in ("elements", "channels", "units"):
+        make = "make its input with `tactile-rt whisk OUT.npz --array ...`, for --stimuli"
+        only = "only a model of base forces and moments can be compared with barrel cortex"
+        for what, do in (("elements", make), ("channels", only), ("units", only)):
             ours, theirs = getattr(self, what), getattr(spec, what)
             if ours != theirs:
                 raise ConfigError(
                     f"{self.name} has the {what} {_few(ours)}, but {model} was trained on "
-                    f"{_few(theirs)}: make its input with `tactile-rt whisk OUT.npz --array ...` "
-                    "and name it with --stimuli"
+                    f"{_few(theirs)}: {do}"
                 )
+        if (steps, substeps) != (STEPS, SUBSTEPS):
+            raise ConfigError(
+                f"{model} takes {steps} steps of {substeps} samples, but the stimuli are {STEPS} "
+                f"of {SUBSTEPS}, a sample every {PERIOD_MS} ms: only a model trained on sweeps "
+                f"with period_ms = {PERIOD_MS} can be compared with barrel cortex"
+            )
 
     def raw(self) -> NDArray[np.float64]:
         """The control: the loads themselves, mean over time, (6, element * channel), SI."""

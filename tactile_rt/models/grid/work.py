@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.files import write_whole
+from tactile_rt.models.augmentation import build
 from tactile_rt.models.data_checks import check_sets, check_split
 from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.ead import count_parameters
@@ -119,6 +120,9 @@ class Workbench:
         self.splits = SweepSet.read(self.data, "train"), SweepSet.read(self.data, "validation")
         self.test = SweepSet.read(self.data, "test")
         check_sets(self.data, (*self.splits, self.test))
+        for task in grid.tasks():
+            if task.cell is not None:  # an array that cannot be augmented so is told now
+                build(grid.config(task, self.data).augmentation, self.test.manifest.spec)
         self._windows = {key: self._cut(d) for key, d in (("clean", CLEAN), ("noisy", RATED))}
 
     def do(self, task: Task, report: Callable[..., None] = lambda _: None) -> Outcome:

@@ -2,6 +2,7 @@
 
 import hashlib
 import itertools
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -34,6 +35,7 @@ from tactile_rt.models.alignment.fidelity import (  # noqa: E402
     export_layers,
     fidelity_check,
 )
+from tactile_rt.models.alignment.layers import Layers  # noqa: E402
 from tactile_rt.models.alignment.onnx_activations import onnx_layers  # noqa: E402
 from tactile_rt.models.alignment.stimuli_input import read_stimuli  # noqa: E402
 from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
@@ -259,3 +261,21 @@ def changed_to(record, **changes):
     from dataclasses import replace
 
     return replace(record, **changes)
+
+
+def test_an_rdm_that_says_nothing_is_not_compared():
+    """Of two classes the patterns of the output are all alike or opposite: an RDM of rounding."""
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.3, 1.5, size=(6, 22, 1))
+    rounded = 1e-8 * rng.normal(size=(2, 6, 22, 2))
+    a, b = (
+        Layers(n, {"encoder.0": trace}, {"encoder.0": 0}, np.float32(depth * (1, -0.97) + error), 1)
+        for n, error, trace in zip("ab", rounded, [rng.normal(size=(6, 22, 9))] * 2, strict=True)
+    )
+    check, rows = fidelity_check(a, b)
+    assert check.verdict == "pass" and "least alike encoder.0" in check.why
+    output = next(row for row in rows if row.layer == "output")
+    assert output.kept and np.isnan(output.pearson)
+    # one that is not flat any more is compared, and found to be another
+    turned = replace(b, logits=b.logits * np.float32([1, -1]))
+    assert not next(r for r in compare(a, turned) if r.layer == "output").kept

@@ -295,7 +295,8 @@ function nothing(s) {
   $("empty-card").hidden = !empty;
   if (!empty) return;
   const words = { starting: "is being opened", waiting: "cannot be opened, and is tried again",
-    ended: "is over", stopped: "was stopped" };
+    failed: "is not what it should be, and is not tried again", ended: "is over",
+    stopped: "was stopped" };
   $("empty").replaceChildren(...s.sources.map(({ part }) => make("li",
     `${part.name.slice(7)} ${words[part.state] || part.state}${part.reason ? ": " + part.reason : ""}`)));
 }
@@ -356,7 +357,7 @@ function parts(s) {
   $("parts").replaceChildren(...lines.map(([part, about, worry]) => {
     const row = make("tr"), state = make("td", part.state);
     const good = part.state === "running" && !worry;
-    state.className = "dot " + (good ? "good" : part.state === "waiting" || part.state === "stalled" ? "bad" : "warn");
+    state.className = "dot " + (good ? "good" : ["waiting", "stalled", "failed"].includes(part.state) ? "bad" : "warn");
     const again = part.failures ? `broke ${part.failures} ×` : "";
     row.append(make("td", part.name.replace(".", " ")), state,
       make("td", [part.state === "running" ? "" : part.reason, again, about].filter(Boolean).join("; ")));

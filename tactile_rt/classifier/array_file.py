@@ -1,0 +1,49 @@
+"""An array from a file: as `tactile-rt describe` writes it, or that which a model was made for."""
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from tactile_rt.settings import convert, make_node, read_text
+from tactile_rt.stream import SPEC_VERSION, ArraySpec, ConfigError
+
+__all__ = ["read_array"]
+
+
+def read_array(path: Path) -> ArraySpec:
+    """The array that a file describes.
+
+    Args:
+        path: the JSON of an `ArraySpec`; or an ``.onnx`` model, whose array it then is.
+
+    Raises:
+        ConfigError: it cannot be read, or is no array.
+        ModelError: the model cannot be read.
+    """
+    if path.suffix == ".onnx":
+        # Not before: a stream without a model needs no onnxruntime.
+        from tactile_rt.classifier.model_file import read_model
+
+        return read_model(path)[0].array
+    text = read_text(path)
+    if path.suffix == ".toml":
+        raise ConfigError(
+            f"{path}: not JSON: of whiskers to be simulated, `tactile-rt describe sim:{path} --out "
+            f"{path.stem}.json` writes the array"
+        )
+    try:
+        return ArraySpec.from_json(text)
+    except ConfigError as error:
+        _explain(text, path)
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def _explain(text: str, path: Path) -> None:
+    """Raise what is wrong with the array in words, if it is a key or its value."""
+    try:
+        fields = msgspec.json.decode(text, type=dict[str, Any])
+    except msgspec.MsgspecError:
+        raise ConfigError(f"{path}: not JSON, as `tactile-rt describe` writes it") from None
+    if fields.pop("version", None) == SPEC_VERSION:
+        convert(make_node(fields, str(path), 0, Path()), ArraySpec)

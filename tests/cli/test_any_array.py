@@ -1,0 +1,142 @@
+"""`probe`, `grid`, `align` and `locate` on an array that is not the mouse's: they work, or say in
+one line why not."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tactile_rt.sweep_set import SweepManifest
+from tests.helpers.tiny_sweeps import plate, write_tiny_set
+
+for module in ("torch", "lightning", "onnx", "matplotlib"):
+    pytest.importorskip(module)
+
+ROBOT = plate(2, 4)
+TINY = ("--encoder", "gru", "--attender", "none", "--width", "0.0625", "--epochs", 1, "--batch", 4,
+        "--precision", "fp32")  # fmt: skip
+
+
+@pytest.fixture
+def trained(call, tmp_path):
+    """A tiny network on a tiny set: (the set, best.pt)."""
+
+    def train(spec=ROBOT, name="robot", **more):
+        data, run = tmp_path / name, tmp_path / f"{name}-run"
+        write_tiny_set(data, spec=spec, **more)
+        code, _, err = call("train", data, run, *TINY)
+        assert code == 0, err
+        return data, run / "best.pt"
+
+    return train
+
+
+def felt(path, spec, seed=0):
+    """What `tactile-rt whisk` would write of this array."""
+    from tactile_rt.models.alignment.rdm import STIMULI
+
+    values = np.random.default_rng(seed).normal(size=(6, 110, *spec.shape)) * 1e-4
+    np.savez(
+        path, stimuli=np.array(STIMULI), values=values.astype(np.float32),
+        elements=np.array(spec.elements), channels=np.array(spec.channels),
+        units=np.array(spec.units),
+    )  # fmt: skip
+    return path
+
+
+@pytest.mark.parametrize(
+    ("spec", "period_ns", "turned"),
+    [
+        (ROBOT, 9_000_000, True),
+        (plate(1, 1, "fx fy fz"), 9_000_000, False),
+        (plate(1, 5, "my mz"), 12_500_000, False),
+    ],
+    ids=["2 x 4 x 6", "1 x 1 x 3", "1 x 5 x 2"],
+)
+def test_probe_and_grid_take_any_array(call, refused, trained, tmp_path, spec, period_ns, turned):
+    data, best = trained(spec, period_ns=period_ns)
+    code, _, err = call("probe", best, tmp_path / "probed", "--epochs", 2)
+    assert code == 0 and "validation top-1" in err
+    plan = tmp_path / "grid.toml"
+    head = f'data = "{data}"\nupdates = 2\nbatch = 4\nseeds = 1\nwidth = 0.0625\n'
+    cell = '[[cell]]\nencoder = "gru"\n'
+    views = '[[cell]]\nencoder = "resnet18"\nobjective = "simclr"\naugmentation = "{}"\n'
+    plan.write_text(head + cell + views.format("image"))
+    code, _, err = call("grid", plan, tmp_path / "out", "--processes", 1)
+    assert code == 0 and "svm, seed 0" in err and "resnet18 simclr image, seed 0: top-1" in err
+    plan.write_text(head + cell + views.format("tactile"))
+    if turned:
+        assert call("grid", plan, tmp_path / "turned", "--processes", 1)[0] == 0
+        return
+    # What cannot be done with the array is said before anything is trained.
+    said = refused("grid", plan, tmp_path / "other", "--processes", 1)
+    assert "cannot be mirrored and turned (augmentation 'tactile')" in said
+
+
+def test_a_network_is_not_used_at_another_sample_period(refused, trained, tmp_path):
+    _, best = trained()
+    other = tmp_path / "other"
+    write_tiny_set(other, spec=ROBOT, period_ns=12_500_000)
+    for command in (("probe", best, tmp_path / "p", "--data", other),
+                    ("export", best, tmp_path / "x.onnx", "--data", other)):  # fmt: skip
+        said = refused(*command)
+        assert f"{best} takes steps of 5 samples" in said and "every 12.5 ms, a step has 4" in said
+
+
+def test_align_takes_any_array_with_its_own_stimuli(call, refused, trained, tmp_path):
+    _, best = trained()
+    model = tmp_path / "robot.onnx"
+    assert call("export", best, model)[0] == 0
+    stimuli = felt(tmp_path / "robot.npz", ROBOT)
+    for file in (best, model):
+        said = refused("align", "decode", file)
+        assert f"but {file} was trained on A0, A1, A2, A3, ... (8): make its input with" in said
+        code, out, _ = call("align", "decode", file, "--stimuli", stimuli)
+        assert code == 0 and "raw sensor" in out and "encoder.laye" in out
+    code, out, _ = call("align", "gate", model, "--reference", best, "--stimuli", stimuli)
+    assert code == 0 and out.startswith("fidelity: pass")
+
+
+def test_align_says_of_what_it_cannot_compare(call, refused, trained, tmp_path):
+    slow = trained(ROBOT, "slow", period_ns=12_500_000)[1]
+    onnx = tmp_path / "slow.onnx"
+    assert call("export", slow, onnx)[0] == 0
+    stimuli = felt(tmp_path / "robot.npz", ROBOT)
+    for file in (slow, onnx):
+        said = refused("align", "decode", file, "--stimuli", stimuli)
+        assert f"{file} takes 22 steps of 4 samples, but the stimuli are 22 of 5" in said
+    moments = trained(plate(2, 4, "my mz"), "moments")[1]
+    said = refused("align", "decode", moments, "--stimuli", stimuli)
+    assert "has the channels fx, fy, fz, mx, ... (6), but" in said
+    assert "only a model of base forces and moments" in said
+
+
+def test_locate_wants_all_loads_of_the_array_that_it_was_trained_on(refused, tmp_path):
+    from tactile_rt.classifier.contact_point import WhiskerShapes
+    from tactile_rt.models import contact_regression as regression
+    from tactile_rt.models.datasets import SweepSet
+
+    checkpoint = tmp_path / "locate.pt"
+    whole = tmp_path / "whole"
+    write_tiny_set(whole, spec=ROBOT, contacts=True)
+    column = np.full(8, 0.02)
+    shapes = WhiskerShapes(column, column * 0, column * 3e-3, column * 3e-3, column * 1e11)
+    sets = [SweepSet.read(whole, split) for split in ("train", "validation")]
+    regression.train_contacts(
+        *sets, shapes, regression.ContactConfig(hidden=4, epochs=1), checkpoint
+    )
+    regression.load_contacts(checkpoint, sets[0])
+    moments = tmp_path / "moments"
+    write_tiny_set(moments, spec=plate(2, 4, "mx my mz"), contacts=True)
+    said = refused("locate", "eval", checkpoint, moments)
+    assert "the sweeps of 'plate' have mx (N m), my (N m), mz (N m)" in said
+    # The same names do not make it the same array, nor the same loads at another time.
+    moved = tmp_path / "moved"
+    places = ((0.5, 0.0, 0.0), *ROBOT.positions[1:])
+    write_tiny_set(moved, spec=replace(ROBOT, positions=places), contacts=True)
+    slow = tmp_path / "slow"
+    write_tiny_set(slow, spec=ROBOT, period_ns=10_000_000, contacts=True)
+    for other in (moved, slow):
+        assert SweepManifest.read(other).spec.elements == ROBOT.elements
+        said = refused("locate", "eval", checkpoint, other)
+        assert "of another array than the sweeps, or of another sample period" in said
