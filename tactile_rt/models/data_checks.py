@@ -122,8 +122,8 @@ def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
                     "not finite: delete the file and sweep again"
                 )
         for name, at in first.items():
-            if not sweeps.values[at].any():
-                continue  # a miss is like any other miss
+            if not np.ptp(sweeps.values[at], axis=0).any():
+                continue  # a miss is like any other miss, also above a magnet
             key = hashlib.blake2b(sweeps.values[at].tobytes()).digest()
             twin, where = seen.setdefault(key, (name, number))
             if where != number:

@@ -10,6 +10,11 @@ from tactile_rt.classifier.model_file import load_model
 from tactile_rt.sweep_set import SweepManifest, object_path, read_object, write_object
 from tests.helpers.tiny_sweeps import write_tiny_set
 
+pytest.importorskip("torch")
+
+from tactile_rt.models.data_checks import check_sets
+from tactile_rt.models.datasets import SweepSet
+
 
 @pytest.fixture
 def folder(tmp_path):
@@ -101,6 +106,13 @@ def test_an_object_on_two_sides_under_two_names(folder, unfit):
     values, _ = read_object(folder, "cube-0")
     rewrite(folder, "cube-1", lambda _: values)
     assert "cube-1 is cube-0 by another name, on another side of the split" in unfit()
+
+
+def test_sweeps_in_which_nothing_is_felt_are_no_twins_also_in_a_field(folder):
+    field = np.full((1, 136, 30, 6), 5e-3, dtype=np.float32)
+    for name in ("cube-0", "cube-1", "cone-2"):
+        rewrite(folder, name, lambda _: field)
+    check_sets(folder, [SweepSet.read(folder, "train"), SweepSet.read(folder, "validation")])
 
 
 def test_good_data_is_trained_on_and_exported_wherever_it_lies_then(folder, tmp_path, call):
