@@ -221,6 +221,18 @@ def test_a_model_that_cannot_fit_its_source_is_refused_beforehand(tmp_path, monk
     assert "; name a model of this array" in found
 
 
+def test_so_is_one_of_another_array_than_a_recording(tmp_path):
+    for extra in ("mcap", "onnx"):
+        pytest.importorskip(extra)
+    from tests.helpers.tiny_model import write_model
+
+    write_model(tmp_path / "m.onnx")
+    played = SMALL.replace("synthetic:5x6", f"replay:{shipped_model().with_name('demo.mcap')}")
+    check_config(load(tmp_path, played + "[[model]]\n"))
+    found = refusal_of(tmp_path, played + '[[model]]\nfile = "m.onnx"\n')
+    assert "m.onnx was made for another array than 'mouse-right'" in found
+
+
 def test_a_model_is_held_against_what_its_source_is_said_to_be(tmp_path):
     (tmp_path / "mouse.onnx").symlink_to(shipped_model())
     line = SMALL.replace("5x6", "30x6") + "{}[[model]]\n"
