@@ -115,11 +115,15 @@ class Project:
         return f"sim:{self.array}?{urlencode(asked, safe=',')}"
 
     def unseen(self) -> tuple[str, ...]:
-        """Objects that the model has never met; without a model, one of every category."""
+        """Objects that the model has never met, as a ``sim:`` URL calls them.
+
+        Without a model, those that the sweeps hold out.
+        """
+        objects = choose_objects(self.recipe().objects)
+        names: Sequence[str] = objects.split["test"]
         if self.model.exists():
-            found = read_model(self.model)[0].provenance.get("unseen_objects", [])
-            return tuple(map(str, found))
-        return choose_objects(self.recipe().objects).categories
+            names = list(map(str, read_model(self.model)[0].provenance.get("unseen_objects", [])))
+        return tuple(objects.target(name) for name in names)
 
     def full_scale(self, codec: str) -> dict[str, str]:
         """Options of a codec whose format rounds: the largest readings of the array's sensor."""

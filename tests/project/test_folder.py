@@ -1,22 +1,27 @@
 """A new project: what is in it, and what it refuses."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 pytest.importorskip("mujoco")
+pytest.importorskip("trimesh")
 pytest.importorskip("torch")
 pytest.importorskip("matplotlib")
 
+import trimesh
+
 from tactile_rt.daemon.loading import load_config
-from tactile_rt.project.budget import Budget, read_budget, write_budget
+from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized, write_budget
 from tactile_rt.project.folder import KINDS, Project, new_project
 from tactile_rt.project.making import make
 from tactile_rt.project.report import confused
 from tactile_rt.sim_backend.arrays.files import load_array
+from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.transducer import device_spec
-from tactile_rt.sources.opening import check_source
+from tactile_rt.sources.opening import check_source, open_source
 from tactile_rt.stream import ConfigError
 from tests.helpers.source_tree import ROOT
 
@@ -37,7 +42,7 @@ def test_a_new_project_is_ready_to_be_made(project: Project) -> None:
     assert load_config(project.folder / "robot.toml").config.model[0].file == str(project.model)
     line = project.line()
     assert (line.wire, line.port, line.codec) == ("serial", "/tmp/mine", "native")
-    assert project.unseen() == KINDS
+    assert {name.rpartition("-")[0] for name in project.unseen()} == set(KINDS)
     check_source(project.source_url(project.unseen()))
 
 
@@ -55,6 +60,23 @@ def test_full_scale_of_a_codec_that_rounds_is_the_sensor_s(tmp_path: Path) -> No
     assert magnets.full_scale("native") == {"range_si": "0.0079"}
     assert magnets.full_scale("bota") == {}
     assert new_project(tmp_path / "loads").full_scale("native") == {}
+
+
+def test_one_s_own_meshes_are_swept_by_the_device_too(project: Project) -> None:
+    for kind, extents in (("box", (20, 30, 40)), ("slab", (40, 40, 10))):
+        (project.folder / "things" / kind).mkdir(parents=True)
+        for number in range(4):
+            file = project.folder / "things" / kind / f"{number}.stl"
+            trimesh.creation.box(extents=extents).export(file)
+    sweeps = project.folder / "sweeps.toml"
+    text = sweeps.read_text().replace('"shapes"', '"things"').replace("per_category = 200", "")
+    sweeps.write_text(re.sub(r"categories = .*", 'categories = ["box", "slab"]', text))
+    recipe = sized(project.recipe(), budget_sweeps(project, 60))
+    assert len(describe_set(recipe).names()) == 8
+    unseen = project.unseen()
+    assert len(unseen) == 2 and all(Path(file).is_file() for file in unseen)
+    with open_source(project.source_url(unseen, pace="fast")) as source:
+        assert len(source.spec.elements) == 8
 
 
 def test_what_cannot_begin_is_one_line(refused, tmp_path: Path) -> None:

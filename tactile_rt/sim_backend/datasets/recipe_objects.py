@@ -76,6 +76,10 @@ class ShapeObjects:
         """An object by its name."""
         return load_object(name)
 
+    def target(self, name: str) -> str:
+        """What a ``sim:`` URL calls an object: its name."""
+        return name
+
 
 @dataclass(frozen=True)
 class MeshObjects:
@@ -173,6 +177,10 @@ class MeshObjects:
             ConfigError: its mesh is broken.
         """
         return self._set.load(self._names[name])
+
+    def target(self, name: str) -> str:
+        """What a ``sim:`` URL calls an object: its mesh file."""
+        return str(self._set.path(self._names[name]))
 
 
 def choose_objects(choice: ObjectChoice) -> ShapeObjects | MeshObjects:
