@@ -45,6 +45,9 @@ CLIP = {"N": 5e-3, "N m": 5e-6}
 SCALE = {"N": 1e-5, "N m": 1e-7}
 CHANNEL_FLOOR = {"N": 2e-6, "N m": 1e-8}
 SILENT = 0.2  # that least, of the noise of a sensor that is described
+# Of the drift: an offset that has wandered for ten seconds since the tare (by 0.6 of its spread, if
+# it forgets in a minute) is then no contact that never ends, also of the worst of dozens.
+WANDERED = 1.5
 ROUNDING = 1 / math.sqrt(12)  # standard deviation of a rounding error, in steps
 
 
@@ -266,8 +269,9 @@ def channel_limits(
         rounding = np.array([c.resolution for c in sensor.channels]) * ROUNDING
         noise = np.hypot(sensor.noise(), rounding) * _averaged(sensor.rate_hz, period_ns)
         clip = np.array([c.range for c in sensor.channels])
+        drift = np.array([c.drift for c in sensor.channels])
         # Below its step a sensor at rest reads the same for ever, and is not as quiet as that.
-        floor = np.maximum(SILENT * noise, rounding)
+        floor = np.maximum(np.maximum(SILENT * noise, rounding), WANDERED * drift)
         return ChannelLimits(*(a.astype(np.float32) for a in (noise, floor, clip, 2 * noise)))
     if unknown := sorted(set(spec.units) - set(RATED_NOISE)):
         raise ConfigError(

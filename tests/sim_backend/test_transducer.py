@@ -11,7 +11,9 @@ from hypothesis import strategies as st
 from scipy.signal import welch
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec
+from tactile_rt.classifier.contact import ContactDetector
+from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec, channel_limits
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.sensor import Sensor, SensorModel
 from tactile_rt.sim_backend.transducer import Transducer, device_spec, dipole_field
@@ -133,6 +135,27 @@ def test_magnets_are_streamed_as_their_device_would() -> None:
     steps = (read.values / np.array([2.42e-7, 1.5e-7, 1.5e-7])).astype(np.float64)
     assert abs(steps - np.rint(steps)).max() < 0.01
     assert abs(read.values - quiet.mean(axis=0)).max() > 1e-5, "it is touched"
+
+
+def test_every_touch_of_a_sensor_that_drifts_begins_and_ends() -> None:
+    with open_source(f"sim:{MAGNETS}?pace=fast&sweeps=6&seed=1") as source:
+        period_ns = round(1e9 / source.spec.rate_hz)
+        sensor = load_animals(str(MAGNETS))[0].sensor
+        limits = channel_limits(source.spec, sensor, period_ns)
+        detector = ContactDetector(source.spec.shape, limits.floor)
+        resampler = Resampler(period_ns, source.spec.rate_hz)
+        begun = []
+        for chunk in source:
+            out = resampler.push(chunk)
+            for k in range(0 if out is None else len(out)):
+                assert out is not None
+                if detector.update(out.values[k], out.valid[k]):
+                    begun.append(int(out.t_ns[k]))
+        passes = [p.start_ns for p in source.passes]
+    assert len(passes) == 6
+    ends = [*passes[1:], np.inf]
+    assert all(any(a < t < b for t in begun) for a, b in zip(passes, ends, strict=True))
+    assert not detector.contact
 
 
 @pytest.mark.parametrize(
