@@ -220,6 +220,13 @@ class SensorSpec:
         rows = [self.sensitivity(name) for name in ("", *self.matrix)]
         return self.magnet is not None or any(row[:, 6:].any() for row in rows)
 
+    @property
+    def noise_bandwidth_hz(self) -> float:
+        """The width of the spectrum of white noise that is in a sample, Hz."""
+        passed = self.rate_hz / 2
+        # what a first-order low-pass lets through
+        return min(passed, self.bandwidth_hz * math.pi / 2) if self.bandwidth_hz else passed
+
     def sensitivity(self, whisker: str) -> NDArray[np.float64]:
         """(channel, load) reading per N, N m and rad of a whisker, in the order of `LOADS`."""
         if whisker in self.matrix:
@@ -229,10 +236,8 @@ class SensorSpec:
 
     def noise(self) -> NDArray[np.float64]:
         """(channel,) standard deviation of the white noise of one of the device's samples."""
-        passed = self.rate_hz / 2
-        if self.bandwidth_hz:  # what a first-order low-pass lets through
-            passed = min(passed, self.bandwidth_hz * math.pi / 2)
-        return np.array([c.noise_density for c in self.channels]) * math.sqrt(passed)
+        density = np.array([c.noise_density for c in self.channels])
+        return density * math.sqrt(self.noise_bandwidth_hz)
 
 
 class ChannelLimits(NamedTuple):

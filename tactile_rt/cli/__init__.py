@@ -21,6 +21,7 @@ def main() -> None:
     # `--help` is instant and a robot never imports torch.
     from tactile_rt.cli import (  # noqa: F401
         align,
+        array,
         bench,
         calibrate,
         daemon,

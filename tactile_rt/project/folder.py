@@ -6,6 +6,7 @@ robot.toml       the device and the model of `tactile-rt run robot.toml`
 test_robot.py    your robot's own code, driven by the device that does not exist yet
 README.md        the commands, in order
 model.onnx, array.json, report/, build/        what `tactile-rt make` makes
+fit.json         what `tactile-rt array fit` has measured of the device
 """
 
 from collections.abc import Sequence
@@ -97,6 +98,11 @@ class Project:
     def report(self) -> Path:
         """The folder of the report card."""
         return self.folder / "report"
+
+    @property
+    def fit(self) -> Path:
+        """How far the device is from its description, if `tactile-rt array fit` has looked."""
+        return self.folder / "fit.json"
 
     def recipe(self) -> SweepRecipe:
         """What is to be swept past the array; its numbers of objects and sweeps are the most.

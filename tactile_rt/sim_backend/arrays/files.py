@@ -39,6 +39,7 @@ from tactile_rt.settings import (
     convert,
     hint,
     named,
+    parse_toml,
     read_csv,
     read_toml,
 )
@@ -117,8 +118,12 @@ def load_animals(name: str) -> tuple[WhiskerArray, ...]:
     return read_animals(path) if path.suffix.lower() in ARRAY_FILES else (species_array(name),)
 
 
-def read_animals(path: Path) -> tuple[WhiskerArray, ...]:
+def read_animals(path: Path, text: str | None = None) -> tuple[WhiskerArray, ...]:
     """Read the array, or the several animals, of a .csv or .toml file.
+
+    Args:
+        path: of the file.
+        text: what is about to be written to it, of a .toml file; None: what is in it.
 
     Raises:
         ConfigError: one line that names the file, the line or whisker, the column, and what to do.
@@ -126,7 +131,7 @@ def read_animals(path: Path) -> tuple[WhiskerArray, ...]:
     if path.suffix.lower() == ".csv":
         whiskers = _csv_whiskers(path)
         return (WhiskerArray(path.stem, whiskers, centred_mount(whiskers)),)
-    return _toml_animals(path)
+    return _toml_animals(path, read_toml(path) if text is None else parse_toml(text, str(path)))
 
 
 def _csv_whiskers(path: Path) -> tuple[Whisker, ...]:
@@ -136,8 +141,7 @@ def _csv_whiskers(path: Path) -> tuple[Whisker, ...]:
     return _distinct(path, whiskers)
 
 
-def _toml_animals(path: Path) -> tuple[WhiskerArray, ...]:
-    nodes = read_toml(path)
+def _toml_animals(path: Path, nodes: SettingNode) -> tuple[WhiskerArray, ...]:
     file: _File = convert(nodes, _File)
     if bool(file.animal) == bool(file.whisker):
         raise ConfigError(f"{path}: needs [[whisker]] tables or [[animal]] tables, one of the two")

@@ -1,0 +1,99 @@
+"""`tactile-rt array fit`: a device measured, and its description brought to that."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.stream import ConfigError, concatenate
+
+if TYPE_CHECKING:
+    from tactile_rt.sim_backend.measuring.findings import ArrayFinding
+    from tactile_rt.sim_backend.measuring.gains import KnownLoad
+
+array = typer.Typer(help="An array's own file.", no_args_is_help=True)
+app.add_typer(array, name="array")
+
+
+@array.callback()
+def _array() -> None:
+    """An array's own file: what it says, and what the device does."""
+
+
+@array.command()
+def fit(
+    recording: Annotated[str, typer.Argument(help="An .mcap file, or the URL of a source.")],
+    described: Annotated[Path, typer.Option("--array", help="The array's .toml file.")],
+    out: Annotated[
+        Path | None, typer.Option(help="Write the file, brought to what was measured, here.")
+    ] = None,
+    in_place: Annotated[bool, typer.Option("--in-place", help="Change the array's file.")] = False,
+    known: Annotated[
+        list[str] | None,
+        typer.Option(help="WHISKER=NEWTON@MM: a load held across a whisker, so far from its base."),
+    ] = None,
+    seconds: Annotated[
+        float, typer.Option(min=1, max=3600, help="Read at most so many seconds.")
+    ] = 600.0,
+) -> None:
+    """Measure an array from rest and plucks; show how far it is from its description.
+
+    Record the array untouched for a minute or two, then bend each whisker and
+    let it go, three times or more, with some seconds between.
+    """
+    if in_place and out:
+        raise ConfigError("--out and --in-place: choose one of the two")
+    check_output(out)
+    loads = [_known(text) for text in known or ()]
+    try:
+        with starting():
+            from tactile_rt.project.device import keep_fit
+            from tactile_rt.sim_backend.measuring.fitting import fit_array, read_described
+    except ModuleNotFoundError as error:
+        raise needs("sim", error) from None
+    from tactile_rt.calibration.taring import record
+    from tactile_rt.files import write_whole
+    from tactile_rt.sources.opening import open_source
+
+    url = f"replay:{recording}?speed=0" if Path(recording).is_file() else recording
+    with starting():
+        source = open_source(url)
+    with source:
+        read_described(described, source.spec)  # a mistake is told before the reading
+        chunks = record(source, seconds)
+        fitted = fit_array(described, source.spec, concatenate(chunks), loads)
+    _show(fitted.findings, Console())
+    if target := described if in_place else out:
+        write_whole(target, lambda file: file.write(fitted.text.encode()))
+        values = sum(len(f.edits) for f in fitted.findings)
+        typer.echo(f"{target}: {values} values brought to what was measured")
+    else:
+        typer.echo("not written: --in-place changes the array's file, --out FILE makes another")
+    keep_fit(described, recording, fitted.findings, in_place)
+
+
+def _known(text: str) -> "KnownLoad":
+    from tactile_rt.sim_backend.measuring.gains import KnownLoad
+
+    name, _, load = text.partition("=")
+    force, _, place = load.partition("@")
+    try:
+        return KnownLoad(name, float(force), float(place))
+    except ValueError:
+        raise ConfigError(
+            f"--known {text}: write WHISKER=NEWTON@MM, A0=0.001@20 for a mN, 20 mm from the base"
+        ) from None
+
+
+def _show(findings: "list[ArrayFinding]", console: Console) -> None:
+    table = Table("quantity", "unit", "described", "measured", "ratio", box=None)
+    for f in findings:
+        table.add_row(*map(escape, f.words()))
+    console.print(table)
+    for f in findings:
+        if f.note:
+            console.print(f"{escape(f.what)}: {escape(f.note)}", soft_wrap=True)

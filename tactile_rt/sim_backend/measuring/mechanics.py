@@ -1,0 +1,193 @@
+"""How whiskers swing when they are let go, beside what their description predicts.
+
+A resonance tells the ratio of stiffness to mass alone. Masses are easily known (length, thickness,
+density), so the stiffness is what is brought to the measurement: Young's modulus, or the mount's
+where that gives more than the whisker bends. Damping likewise.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+from scipy.optimize import brentq
+
+from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, PLAUSIBLE, SOFTEST_MOUNT, Whisker
+from tactile_rt.sim_backend.measuring.findings import (
+    MEDIAN,
+    ArrayFinding,
+    Figure,
+    change,
+    listed,
+    pooled,
+)
+from tactile_rt.sim_backend.measuring.ringing import HEARD, Ring
+from tactile_rt.sim_backend.rods.rod import Rod, make_rod
+
+__all__ = ["compare_whiskers"]
+
+LINKS = 20
+FEWEST = 3  # plucks of a whisker
+HZ_OFF, RATIO_OFF = 0.005, 0.03  # by the modes above the first, and the size of the swing
+APART = 1.1  # by so much a whisker must be off most to have a line of its own
+FURTHEST = 100.0  # the factor by which a description may be wrong
+COLUMNS = {field: column for column, field in OPTIONAL.items()}
+TOO_FAST = "as described too fast for {:.4g} samples a second"
+NOT_FREE = "no pluck that ends in a free swing"
+UNITS = {
+    "young_modulus": "Pa",
+    "mount_stiffness": "N m/rad",
+    "damping_ratio": "",
+    "mount_damping": "N m s/rad",
+}
+
+
+def compare_whiskers(
+    whiskers: Sequence[Whisker],
+    rings: Mapping[str, Sequence[Ring]],
+    rate_hz: float,
+    tables: Mapping[str, tuple[int, Mapping[str, Any]]],
+) -> tuple[list[ArrayFinding], dict[str, Whisker]]:
+    """Resonance and damping of every plucked whisker, and what of their description that changes.
+
+    Args:
+        whiskers: as they are described.
+        rings: their free swings, by name.
+        rate_hz: of the samples.
+        tables: of each whisker the number of its table in the array's file, and what is in it.
+
+    Returns:
+        What was found, and the whiskers by name, those that were measured as stiff as they are.
+    """
+    by_name = {w.name: w for w in whiskers}
+    fitted = dict(by_name)
+    findings: list[ArrayFinding] = []
+    found: dict[str, dict[str, Figure]] = {field: {} for field in UNITS}
+    silent: dict[str, list[str]] = {}
+    for whisker in whiskers:
+        heard, of, rod = rings.get(whisker.name, ()), f"of {whisker.name}", _rod(whisker)
+        if not heard:
+            fast = rod.resonance_hz > HEARD * rate_hz
+            silent.setdefault(TOO_FAST.format(rate_hz) if fast else NOT_FREE, []).append(
+                whisker.name
+            )
+            continue
+        if note := _unmeasured(rod, heard, rate_hz):
+            findings.append(ArrayFinding(f"resonance {of}", "Hz", rod.resonance_hz, None, note))
+            continue
+        hz = _figure([r.hz for r in heard], [r.hz_error for r in heard], HZ_OFF)
+        ratio = _figure([r.ratio for r in heard], [r.ratio_error for r in heard], RATIO_OFF)
+        findings.append(ArrayFinding(f"resonance {of}", "Hz", rod.resonance_hz, hz))
+        findings.append(ArrayFinding(f"damping ratio {of}", "", rod.wanted_ratio, ratio))
+        stiffness, damping = _softest(whisker)
+        solved = _solved(whisker, stiffness, hz)
+        if solved is None:
+            note = "no value of it alone makes the whisker swing like this"
+            now = getattr(whisker, stiffness)
+            findings.append(ArrayFinding(f"{COLUMNS[stiffness]} {of}", "", now, None, note))
+            continue
+        found[stiffness][whisker.name] = solved
+        fitted[whisker.name] = _changed(whisker, stiffness, solved.value)
+        found[damping][whisker.name] = _damping(fitted[whisker.name], damping, ratio)
+    for why, names in silent.items():
+        findings.append(ArrayFinding("resonance", "Hz", None, None, f"{why}: {listed(names)}"))
+    for field, figures in found.items():
+        findings += _brought(field, figures, by_name, tables)
+    return findings, fitted
+
+
+def _unmeasured(rod: Rod, heard: Sequence[Ring], rate_hz: float) -> str:
+    """Why nothing is said of a whisker that swings; empty: there is no reason."""
+    if rod.resonance_hz > HEARD * rate_hz:
+        at = float(np.median([ring.hz for ring in heard]))
+        return f"{TOO_FAST.format(rate_hz)}: what swings at {at:.3g} Hz may be an alias"
+    return f"{len(heard)} plucks, and {FEWEST} are needed" if len(heard) < FEWEST else ""
+
+
+def _changed(whisker: Whisker, field: str, value: float) -> Whisker:
+    changed: dict[str, Any] = {field: value}
+    return replace(whisker, **changed)
+
+
+def _rod(whisker: Whisker) -> Rod:
+    return make_rod(whisker, LINKS, 1)
+
+
+def _figure(values: Sequence[float], errors: Sequence[float], off: float) -> Figure:
+    """The median of several plucks, which may all be off by a share of it."""
+    scatter = max(float(np.std(values, ddof=1)), math.sqrt(np.mean(np.square(errors))))
+    half = float(stats.t.ppf(0.975, len(values) - 1)) * MEDIAN * scatter / math.sqrt(len(values))
+    value = float(np.median(values))
+    half = math.hypot(half, off * value)
+    return Figure(value, max(value - half, 0.0), value + half)
+
+
+def _softest(whisker: Whisker) -> tuple[str, str]:
+    """Which stiffness the resonance depends on most, and the damping that goes with it."""
+    if whisker.mount_stiffness:
+        stiffer = {
+            field: _rod(_changed(whisker, field, 1.1 * getattr(whisker, field))).resonance_hz
+            for field in ("young_modulus", "mount_stiffness")
+        }
+        if stiffer["mount_stiffness"] > stiffer["young_modulus"]:
+            return "mount_stiffness", "mount_damping"
+    return "young_modulus", "damping_ratio"
+
+
+def _solved(whisker: Whisker, field: str, hz: Figure) -> Figure | None:
+    """The values of a stiffness with which a whisker swings as was measured; None: none does."""
+    now = getattr(whisker, field)
+    least, most = PLAUSIBLE.get(COLUMNS[field], (SOFTEST_MOUNT, math.inf))
+    ends = (math.log(max(least / now, 1 / FURTHEST)), math.log(min(most / now, FURTHEST)))
+
+    def off(log: float, target: float) -> float:
+        return _rod(_changed(whisker, field, now * math.exp(log))).resonance_hz - target
+
+    targets = (hz.value, max(hz.low, hz.value / 2), hz.high)
+    if not all(off(ends[0], target) < 0 < off(ends[1], target) for target in targets):
+        return None
+    return Figure(*(now * math.exp(brentq(off, *ends, args=(t,), xtol=1e-6)) for t in targets))
+
+
+def _damping(whisker: Whisker, field: str, wanted: Figure) -> Figure:
+    """The values of a damping with which a whisker does as was measured: they add up."""
+    unit = {"damping_ratio": 0.01, "mount_damping": 1e-9}[field]
+    none, some = (_rod(_changed(whisker, field, v)).wanted_ratio for v in (0.0, unit))
+    value, low, high = (max((v - none) / (some - none), 0.0) * unit for v in wanted)
+    return Figure(value, low, high)
+
+
+def _brought(
+    field: str,
+    figures: Mapping[str, Figure],
+    whiskers: Mapping[str, Whisker],
+    tables: Mapping[str, tuple[int, Mapping[str, Any]]],
+) -> list[ArrayFinding]:
+    """What is written of a field: for most whiskers in [defaults], and in tables of their own."""
+    column, unit = COLUMNS[field], UNITS[field]
+    usual = [n for n in figures if column not in tables[n][1] and figures[n].low > 0]
+    own = [n for n in figures if n not in usual]
+    findings = []
+    if usual:
+        figure, strange = pooled([figures[n] for n in usual], APART)
+        own += [usual[k] for k in strange]
+        value, note = getattr(whiskers[usual[0]], field), f"of {len(usual) - len(strange)} whiskers"
+        edits = change(("defaults", column), value, figure, f", {note}")
+        findings.append(ArrayFinding(column, unit, value, figure, note, edits))
+    by_table: dict[int, list[str]] = {}
+    for name in own:
+        by_table.setdefault(tables[name][0], []).append(name)
+    for number, names in by_table.items():
+        figure = figures[names[0]]
+        if len(names) > 1 and all(
+            figures[n].value for n in names
+        ):  # a whisker and its mirror image
+            figure, _ = pooled([figures[n] for n in names], math.inf)
+        value = getattr(whiskers[names[0]], field) if column in tables[names[0]][1] else None
+        edits = change(("whisker", number, column), value, figure)
+        findings.append(
+            ArrayFinding(f"{column} of {listed(names)}", unit, value, figure, "", edits)
+        )
+    return findings

@@ -1,0 +1,127 @@
+"""`tactile-rt array fit`: what it shows, what it writes, what it refuses."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("mujoco")
+pytest.importorskip("numba")
+pytest.importorskip("mcap")
+
+from tactile_rt.project.device import read_fit
+from tactile_rt.project.folder import Project, new_project
+from tactile_rt.sim_backend.arrays.files import load_array
+from tests.helpers.plucked import plucked
+from tests.helpers.recordings import write
+from tests.helpers.source_tree import ROOT
+
+PAGE = ROOT / "docs" / "your-array.md"
+pytestmark = pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
+
+
+@pytest.fixture(scope="module")
+def device(tmp_path_factory) -> tuple[Path, Path]:
+    """The page's array, read fast enough to hear it, and plucks of a noisier and stiffer one."""
+    folder: Path = tmp_path_factory.mktemp("device")
+    array = new_project(folder / "whiskers").array
+    (sensor,) = re.findall(r"```toml\n(.*?)```", PAGE.read_text("utf-8"), re.S)
+    sensor = sensor.replace("rate_hz = 100", "rate_hz = 500")
+    array.write_text(array.read_text().replace("[defaults]", f"{sensor}\n[defaults]", 1))
+    real = folder / "real.toml"
+    text = array.read_text().replace("noise_density = 2e-9", "noise_density = 3e-9")
+    text = text.replace("2.9e9", "4.1e9").replace("damping_ratio = 0.05", "damping_ratio = 0.03")
+    real.write_text(text)
+    spec, chunk = plucked(real, ("A0",), rest_s=20, angle=1.2)
+    return array, write(folder / "plucks.mcap", [chunk], spec)
+
+
+@pytest.fixture
+def project(device, tmp_path: Path, monkeypatch) -> Project:
+    """The page's project, where the page's commands are given."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "plucks.mcap").symlink_to(device[1])
+    made = new_project(tmp_path / "whiskers")
+    made.array.write_text(device[0].read_text())
+    return Project(Path("whiskers"))
+
+
+def page_commands() -> list[list[str]]:
+    (block,) = re.findall(r"```console\n(.*?)```", PAGE.read_text("utf-8"), re.S)
+    return [shlex.split(line)[1:] for line in re.findall(r"^\$ (.*array fit.*)", block, re.M)]
+
+
+def test_the_page_s_commands_measure_and_then_write(project: Project, call) -> None:
+    look, change = page_commands()
+    before = project.array.read_text()
+    code, out, err = call(*look)
+    assert (code, err) == (0, "")
+    assert out.endswith("--in-place changes the array's file, --out FILE makes another\n")
+    assert project.array.read_text() == before
+    shown = {" ".join(line.split()[:4]) for line in out.splitlines()}
+    assert {"rate Hz 500 500", "resolution of my N", "resonance of A0 Hz"} <= shown
+    code, out, err = call(*change)
+    assert (code, err) == (0, "")
+    assert re.search(r"whiskers/array.toml: \d values brought to what was measured\n$", out)
+    array = load_array(str(project.array))
+    assert array.sensor is not None
+    assert [c.noise_density for c in array.sensor.channels] == pytest.approx([3e-9] * 2, rel=0.1)
+    assert array.whiskers[0].young_modulus == pytest.approx(4.1e9, rel=0.05)
+    assert array.whiskers[0].damping_ratio == pytest.approx(0.03, rel=0.25)
+
+
+def test_the_report_card_shows_the_table(project: Project, call) -> None:
+    pytest.importorskip("torch")
+    pytest.importorskip("matplotlib")
+    from tactile_rt.project.report import device_section
+
+    assert device_section(project) == ""
+    call(*page_commands()[0])
+    section = device_section(project)
+    assert "<h2>How far the device is from its description</h2>" in section
+    assert re.search(r"<td>resonance of A0</td><td>Hz</td><td>[\d.]+</td><td>[\d.]+ \+- ", section)
+    assert "<li>gain: left: a known load tells it" in section
+    assert "has not been changed" in section
+    fit = read_fit(project)
+    assert fit is not None
+    assert fit.recording == "plucks.mcap"
+    project.fit.write_text("{")
+    with pytest.raises(Exception, match=r"fit.json is damaged .* run `array fit` again"):
+        read_fit(project)
+
+
+def test_another_file_is_written_whole_and_nothing_kept(project: Project, call, tmp_path) -> None:
+    alone = tmp_path / "alone.toml"
+    alone.write_text(project.array.read_text())
+    out = tmp_path / "fitted.toml"
+    code, said, _ = call(
+        "array", "fit", "replay:plucks.mcap?speed=0", "--array", alone, "--out", out
+    )
+    assert code == 0
+    assert "fitted.toml: " in said
+    assert load_array(str(out)).whiskers[0].young_modulus == pytest.approx(4.1e9, rel=0.05)
+    assert not (tmp_path / "fit.json").exists()
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        "alone.toml", "fitted.toml", "plucks.mcap", "whiskers",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["plucks.mcap", "--array", "nothing.toml"], "nothing.toml: no such file"),
+        (["nothing.mcap", "--array", "whiskers/array.toml"], "is no source"),
+        (["plucks.mcap", "--array", "whiskers/robot.toml"], "whiskers/robot.toml"),
+        (["plucks.mcap", "--array", "whiskers/array.toml", "--in-place", "--out", "a"], "choose"),
+        (["plucks.mcap", "--array", "whiskers/array.toml", "--out", "no/a"], "no folder no"),
+        (["plucks.mcap", "--array", "whiskers/array.toml", "--known", "A0=1"], "WHISKER=NEWTON@MM"),
+        (["plucks.mcap", "--array", "whiskers/array.toml", "--known", "A0=1@x"], "A0=0.001@20"),
+        (["plucks.mcap", "--array", "whiskers/array.toml", "--known", "Q=1e-3@9"], "no such"),
+    ],
+)  # fmt: skip
+def test_a_mistake_is_one_line(project: Project, refused, words, said) -> None:
+    before = project.array.read_text()
+    assert said in refused("array", "fit", *words)
+    assert project.array.read_text() == before
+    assert not project.fit.exists()
