@@ -5,12 +5,11 @@ and refused unless it is the file with just these numbers changed.
 """
 
 import re
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tactile_rt.settings import find_lines
+from tactile_rt.settings import find_lines, parse_toml
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Edit", "edited", "rounded"]
@@ -52,7 +51,7 @@ def edited(path: Path, text: str, edits: Sequence[Edit]) -> str:
     """
     ending = "\r\n" if "\r\n" in text else "\n"
     text = text.replace("\r\n", "\n")
-    wanted = tomllib.loads(text)
+    wanted = parse_toml(text, str(path)).plain()
     for edit in edits:
         at: Any = wanted
         for part in edit.path[:-1]:
@@ -60,8 +59,8 @@ def edited(path: Path, text: str, edits: Sequence[Edit]) -> str:
         at[edit.path[-1]] = edit.value
         text = _with(text, edit)
         try:
-            same = tomllib.loads(text) == wanted
-        except tomllib.TOMLDecodeError:
+            same = parse_toml(text, str(path)).plain() == wanted
+        except ConfigError:
             same = False
         if not same:
             raise ConfigError(

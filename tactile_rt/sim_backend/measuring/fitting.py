@@ -1,11 +1,10 @@
 """An array's file brought to what a recording of the device tells."""
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tactile_rt.settings import read_text, read_toml
+from tactile_rt.settings import parse_toml, read_text, read_toml
 from tactile_rt.sim_backend.arrays.editing import edited
 from tactile_rt.sim_backend.arrays.files import load_array, read_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
@@ -98,7 +97,7 @@ def fit_array(
 
 def _tables(text: str) -> dict[str, tuple[int, Mapping[str, Any]]]:
     """The number and the content of every whisker's table, by its name in the stream."""
-    file = tomllib.loads(text)
+    file = parse_toml(text, "array").plain()
     sides = ("R.", "L.") if file.get("mirror") else ("",)
     return {
         f"{side}{values['whisker'].strip()}": (number, values)
