@@ -5,7 +5,7 @@ sweeps.toml      what touches them, and how
 robot.toml       the device and the model of `tactile-rt run robot.toml`
 test_robot.py    your robot's own code, driven by the device that does not exist yet
 README.md        the commands, in order
-model.onnx, array.json, report/, build/        what `tactile-rt make` makes
+model.onnx, report/, build/  what `tactile-rt make` makes
 fit.json         what `tactile-rt array fit` has measured of the device
 """
 

@@ -25,7 +25,8 @@ from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, promised_object
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.remarks import ringing
-from tactile_rt.sim_backend.sensor import Sensor, SensorModel
+from tactile_rt.sim_backend.sensor import Sensor
+from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, usual_distance
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation, check_sweep, draw_simulation
 from tactile_rt.sim_backend.transducer import Transducer, device_spec, sensor_of

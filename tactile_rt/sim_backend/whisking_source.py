@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.objects.catalogue import load_object
-from tactile_rt.sim_backend.sensor import Sensor, SensorModel
+from tactile_rt.sim_backend.sensor import Sensor
+from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.source import CHUNK_SAMPLES, PacedSource, check_pace
 from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import Drive, Whisking

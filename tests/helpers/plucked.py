@@ -7,7 +7,8 @@ import numpy as np
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.rods.world import RodWorld
-from tactile_rt.sim_backend.sensor import Sensor, SensorModel
+from tactile_rt.sim_backend.sensor import Sensor
+from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.transducer import Transducer, device_spec
 from tactile_rt.stream import ArraySpec, Chunk
 

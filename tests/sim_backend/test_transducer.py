@@ -15,7 +15,8 @@ from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec, channel_limits
 from tactile_rt.sim_backend.arrays.files import load_animals
-from tactile_rt.sim_backend.sensor import Sensor, SensorModel
+from tactile_rt.sim_backend.sensor import Sensor
+from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.transducer import Transducer, device_spec, dipole_field
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, ConfigError, concatenate

@@ -29,7 +29,8 @@ from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove
 from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObjects, choose_objects
 from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
-from tactile_rt.sim_backend.sensor import Sensor, SensorModel
+from tactile_rt.sim_backend.sensor import Sensor
+from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.transducer import FASTEST_HZ, Transducer, device_spec, sensor_of
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS

@@ -29,7 +29,7 @@ from tactile_rt.sim_backend.datasets.recipes import (
     SweepRecipe,
 )
 from tactile_rt.sim_backend.randomisation import Randomisation
-from tactile_rt.sim_backend.sensor import SensorModel
+from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import usual_distance
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.stream import ConfigError

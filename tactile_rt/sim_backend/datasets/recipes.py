@@ -33,7 +33,7 @@ import numpy as np
 
 from tactile_rt.settings import no_such
 from tactile_rt.sim_backend.randomisation import Randomisation
-from tactile_rt.sim_backend.sensor import SensorModel
+from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
 from tactile_rt.stream import ConfigError

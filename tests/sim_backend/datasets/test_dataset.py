@@ -36,7 +36,7 @@ from tactile_rt.sim_backend.datasets.recipes import (
 )
 from tactile_rt.sim_backend.objects.catalogue import load_object, make_object
 from tactile_rt.sim_backend.randomisation import Randomisation
-from tactile_rt.sim_backend.sensor import SensorModel
+from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, UNITS
