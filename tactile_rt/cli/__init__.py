@@ -33,6 +33,7 @@ def main() -> None:
         hil,
         locate,
         model,
+        objects,
         project,
         record,
         replay,

@@ -59,6 +59,12 @@ def view(
         float, typer.Option(help="Turn of its way about z, -60 to 60 degrees.")
     ] = 0.0,
     climb: Annotated[float, typer.Option(help="Rise of its way, -60 to 60 degrees.")] = 0.0,
+    up: Annotated[str, typer.Option(help="Of a mesh file: y or z. Default: z, in glTF y.")] = "",
+    hull: Annotated[bool, typer.Option("--hull", help="Of a mesh: its convex hull only.")] = False,
+    surface_error: Annotated[
+        float, typer.Option(help="How far its pieces may be from a mesh of 40 mm, mm.")
+    ] = 0.1,
+    max_pieces: Annotated[int, typer.Option(help="Of a mesh: into how many at most.")] = 1024,
     profile: Annotated[
         str, typer.Option(help="How finely: realtime, dataset (finer), accurate, mujoco.")
     ] = "dataset",
@@ -73,6 +79,7 @@ def view(
         with starting():
             from tactile_rt.sim_backend.arrays.files import load_animals
             from tactile_rt.sim_backend.objects.catalogue import load_object
+            from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
             from tactile_rt.sim_backend.sweep import Sweep, usual_distance
             from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
             from tactile_rt.sim_backend.views.camera import VIEWS
@@ -114,7 +121,8 @@ def view(
         if not math.isfinite(value):
             raise ConfigError(f"--{option} must be a finite number, not {value}")
 
-    animals, thing = load_animals(array), load_object(target)
+    mesh = MeshDetail(surface_error_mm=surface_error, max_pieces=max_pieces, hull=hull, up=up)
+    animals, thing = load_animals(array), load_object(target, mesh)
     spec = world_spec(animals)
     sweep = Sweep(
         size_mm=size,

@@ -46,6 +46,12 @@ def whisk(
     asymmetry: Annotated[float, typer.Option(help="Fraction of a cycle spent protracting.")] = 0.5,
     phase: Annotated[float, typer.Option(help="At the start, degrees; 0: fully retracted.")] = 0.0,
     duration: Annotated[float, typer.Option(help="Seconds.")] = 1.5,
+    up: Annotated[str, typer.Option(help="Of a mesh file: y or z. Default: z, in glTF y.")] = "",
+    hull: Annotated[bool, typer.Option("--hull", help="Of a mesh: its convex hull only.")] = False,
+    surface_error: Annotated[
+        float, typer.Option(help="How far its pieces may be from a mesh of 40 mm, mm.")
+    ] = 0.1,
+    max_pieces: Annotated[int, typer.Option(help="Of a mesh: into how many at most.")] = 1024,
     profile: Annotated[
         str, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
     ] = "dataset",
@@ -64,6 +70,7 @@ def whisk(
             from tactile_rt.sim_backend.arrays.files import load_array
             from tactile_rt.sim_backend.arrays.whiskers import rotation
             from tactile_rt.sim_backend.objects.catalogue import load_object
+            from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
             from tactile_rt.sim_backend.stimuli import STIMULI, Surface, whisk_against, write_input
             from tactile_rt.sim_backend.trajectories import Whisk, base_angles, read_trajectory
             from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
@@ -94,7 +101,8 @@ def whisk(
             raise ConfigError(f"--size must be above 0 and below 1000 mm, not {size:g}")
         if not math.isfinite(yaw):
             raise ConfigError(f"--yaw must be a number of degrees, not {yaw}")
-        thing = load_object(target)
+        mesh = MeshDetail(surface_error_mm=surface_error, max_pieces=max_pieces, hull=hull, up=up)
+        thing = load_object(target, mesh)
         at = np.array(_three(position, "--position")) * mirror
         turn = rotation("z", np.radians(yaw))
         pieces[thing.name] = tuple(p.vertices * size @ turn.T + at for p in thing.pieces)

@@ -117,7 +117,8 @@ class Project:
 
     def source_url(self, objects: Sequence[str], seed: int = 0, **options: object) -> str:
         """The URL of the simulated array with these objects, as its device would deliver it."""
-        asked = {"objects": ",".join(objects), "seed": seed, **options}
+        meshes = choose_objects(self.recipe().objects).mesh_options
+        asked = {"objects": ",".join(objects), "seed": seed, **meshes, **options}
         return f"sim:{self.array}?{urlencode(asked, safe=',')}"
 
     def unseen(self) -> tuple[str, ...]:

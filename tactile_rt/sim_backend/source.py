@@ -23,6 +23,7 @@ import numpy as np
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, promised_object
+from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.remarks import ringing
 from tactile_rt.sim_backend.sensor import Sensor
@@ -103,15 +104,16 @@ class PacedSource(Source):
 
 
 @dataclass(frozen=True)
-class SimOptions(SensorModel, Randomisation):
+class SimOptions(SensorModel, Randomisation, MeshDetail):
     """What the simulated array meets, what its sensors make of it, how it differs from the design.
 
     The fields of `SensorModel` are options too; left out, the sensors are perfect. So are those of
-    `Randomisation`, whose array is drawn afresh for every sweep.
+    `Randomisation`, whose array is drawn afresh for every sweep, and those of `MeshDetail`, which
+    hold for all mesh files named.
 
     Attributes:
         objects: Comma-separated names (``mug-50``), categories (``mug``: its first instance) or
-            mesh files (.obj, .stl, .ply, .glb), drawn in random order; empty: all categories.
+            mesh files (see `mesh_files`), drawn in random order; empty: all categories.
         sweeps: The number of different objects that pass before the stream ends; 0: endless.
         repeat: The number of sweeps of the same object in succession.
         seed: The seed of the drawn objects, sweep parameters, arrays and sensor imperfections; the
@@ -150,6 +152,7 @@ class SimOptions(SensorModel, Randomisation):
     def __post_init__(self) -> None:
         SensorModel.__post_init__(self)
         Randomisation.__post_init__(self)
+        MeshDetail.__post_init__(self)
         if self.profile not in PROFILES:
             raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
         check_pace(self.pace)
@@ -331,4 +334,4 @@ def _check_turns(animals: tuple[WhiskerArray, ...], options: SimOptions) -> None
 
 def _objects(options: SimOptions) -> list[Callable[[], TactileObject]]:
     """The objects that the options name, each made when it comes by; none: all categories."""
-    return [promised_object(name) for name in options.objects.split(",") if name]
+    return [promised_object(name, options) for name in options.objects.split(",") if name]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.objects.catalogue import load_object
+from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.source import CHUNK_SAMPLES, PacedSource, check_pace
@@ -27,10 +28,11 @@ LARGEST_MM = 1e3  # of an object and its position
 
 
 @dataclass(frozen=True)
-class WhiskingOptions(SensorModel):
+class WhiskingOptions(SensorModel, MeshDetail):
     """How the array whisks at first, against what, and what its sensors make of it.
 
-    The fields of `SensorModel` are options too and concern the loads; angles are true.
+    The fields of `SensorModel` are options too and concern the loads; angles are true. So are those
+    of `MeshDetail`, for an object from a mesh file.
 
     Attributes:
         frequency_hz: The whisking cycles per second, Hz.
@@ -61,7 +63,8 @@ class WhiskingOptions(SensorModel):
     pace: str = "realtime"
 
     def __post_init__(self) -> None:
-        super().__post_init__()
+        SensorModel.__post_init__(self)
+        MeshDetail.__post_init__(self)
         check_pace(self.pace)
         if self.profile not in PROFILES:
             raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
@@ -208,5 +211,5 @@ def _pieces(options: WhiskingOptions, left: bool) -> tuple[NDArray[np.float64], 
         return ()
     at = np.array(options.position) * (-1.0 if left else 1.0, 1.0, 1.0)
     turn = rotation("z", np.radians(options.yaw_deg))
-    pieces = load_object(options.object).pieces
+    pieces = load_object(options.object, options).pieces
     return tuple(p.vertices * options.size_mm @ turn.T + at for p in pieces)

@@ -28,6 +28,7 @@ from tactile_rt.sim_backend.datasets.recipes import (
     SweepChoice,
     SweepRecipe,
 )
+from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import usual_distance
@@ -56,6 +57,12 @@ class _Objects(msgspec.Struct):
     validation: float | None = None
     test: float | None = None
     per_withheld: int = 0
+    without_source: str = ""
+    only_source: str = ""
+    surface_error_mm: float = STANDARD.surface_error_mm
+    max_pieces: int = STANDARD.max_pieces
+    hull: bool = STANDARD.hull
+    up: str = STANDARD.up
 
 
 class _Range(msgspec.Struct):
@@ -207,6 +214,14 @@ def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
                 validation=counted(objects.validation, 0.1, 4),
                 test=counted(objects.test, 0.1, 12),
                 per_withheld=objects.per_withheld,
+                without_source=objects.without_source,
+                only_source=objects.only_source,
+                mesh=MeshDetail(
+                    surface_error_mm=objects.surface_error_mm,
+                    max_pieces=objects.max_pieces,
+                    hull=objects.hull,
+                    up=objects.up,
+                ),
             ),
             sweeps=SweepChoice(
                 **{n: _choice(nodes, n, file.sweeps, usual[n]) for n in PARAMETERS},

@@ -4,9 +4,9 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tactile_rt.settings import no_such
 from tactile_rt.sim_backend.datasets.recipes import SHAPES, ObjectChoice
@@ -80,13 +80,19 @@ class ShapeObjects:
         """What a ``sim:`` URL calls an object: its name."""
         return name
 
+    @property
+    def mesh_options(self) -> dict[str, Any]:
+        """Nothing: they are no meshes."""
+        return {}
+
 
 @dataclass(frozen=True)
 class MeshObjects:
     """Objects out of a folder of meshes, see `object_sets`.
 
     Which of them are held out depends on their names alone, so that a folder that grows moves few
-    from one side to the other.
+    from one side to the other. Those that the folder says are of one shape stay together, and count
+    as one.
 
     Raises:
         ConfigError: no such folder, a category is not in it, or has too few objects for the split.
@@ -97,10 +103,10 @@ class MeshObjects:
     @cached_property
     def _set(self) -> "ObjectSet":
         from tactile_rt.sim_backend.objects.object_sets import (
-            open_objects,  # CoACD is slow to import
+            open_objects,  # what cuts meshes is slow to import
         )
 
-        return open_objects(Path(self.choice.source))
+        return open_objects(Path(self.choice.source), self.choice.mesh)
 
     @cached_property
     def _names(self) -> dict[str, str]:
@@ -111,11 +117,26 @@ class MeshObjects:
         return names
 
     @cached_property
-    def _by_category(self) -> dict[str, list[str]]:
-        found: dict[str, list[str]] = {}
-        # A mixed order that is the same on every machine.
-        for name in sorted(self._names, key=lambda n: (zlib.crc32(n.encode()), n)):
-            found.setdefault(self._set.categories[self._names[name]], []).append(name)
+    def _by_category(self) -> dict[str, list[list[str]]]:
+        """The objects of each category, those of one shape together."""
+        origins, left, only = self._set.origins, self.choice.without_source, self.choice.only_source
+        sources = {name: origin.source for name, origin in origins.items()}
+        for source in filter(None, (left, only)):
+            if source not in sources.values():
+                raise ConfigError(no_such("source", source, sorted(set(sources.values()))))
+        alike: dict[str, dict[str, list[str]]] = {}
+        for name, own in sorted(self._names.items()):
+            if not left or sources.get(own) != left:
+                shapes = alike.setdefault(self._set.categories[own], {})
+                shape = origins[own].shape if own in origins else ""
+                shapes.setdefault(shape or own, []).append(name)
+        found = {}
+        for category, shapes in alike.items():
+            groups = list(shapes.values())
+            if only:
+                groups = [g for g in groups if {sources.get(self._names[n]) for n in g} == {only}]
+            if groups:  # in a mixed order that is the same on every machine
+                found[category] = sorted(groups, key=lambda g: (zlib.crc32(g[0].encode()), g))
         return found
 
     @cached_property
@@ -136,24 +157,32 @@ class MeshObjects:
         """Object names per split."""
         sides: dict[str, list[str]] = {split: [] for split in SPLITS}
         for category in self.categories:
-            names = self._by_category[category][: self.choice.per_category or None]
+            groups = self._by_category[category][: self.choice.per_category or None]
+            if self.choice.only_source:
+                sides["test"] += chain.from_iterable(groups)
+                continue
             validation, test = (
-                _count(n, len(names)) for n in (self.choice.validation, self.choice.test)
+                _count(n, len(groups)) for n in (self.choice.validation, self.choice.test)
             )
-            train = len(names) - validation - test
+            train = len(groups) - validation - test
             if train < 1:
                 raise ConfigError(
-                    f"{self.choice.source}: {category} has {len(names)} objects, too few to hold "
+                    f"{self.choice.source}: {category} has {len(groups)} objects, too few to hold "
                     f"out {validation} for validation and {test} for test: leave it out of "
                     "objects.categories, or hold out fewer"
                 )
-            ends = (0, train, train + validation, len(names))
+            ends = (0, train, train + validation, len(groups))
             for side, (start, stop) in zip(SPLITS, pairwise(ends), strict=True):
-                sides[side] += names[start:stop]
+                sides[side] += chain.from_iterable(groups[start:stop])
         split = {key: tuple(names) for key, names in sides.items()}
         if self.withheld:
             count = self.choice.per_withheld or None
-            split[WITHHELD] = tuple(n for c in self.withheld for n in self._by_category[c][:count])
+            split[WITHHELD] = tuple(
+                name
+                for category in self.withheld
+                for group in self._by_category[category][:count]
+                for name in group
+            )
         return split
 
     @property
@@ -181,6 +210,11 @@ class MeshObjects:
     def target(self, name: str) -> str:
         """What a ``sim:`` URL calls an object: its mesh file."""
         return str(self._set.path(self._names[name]))
+
+    @property
+    def mesh_options(self) -> dict[str, Any]:
+        """What a ``sim:`` URL says of mesh files, for them to be the same objects."""
+        return self._set.detail.differing()
 
 
 def choose_objects(choice: ObjectChoice) -> ShapeObjects | MeshObjects:

@@ -32,6 +32,7 @@ from typing import Any
 import numpy as np
 
 from tactile_rt.settings import no_such
+from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep
@@ -97,6 +98,11 @@ class ObjectChoice:
             fraction.
         per_withheld: The number of objects of every withheld category; 0: 12, or all that the
             folder has.
+        without_source: Objects of a folder from this source, as its `objects.csv` has it, are left
+            out; empty: none.
+        only_source: Objects of a folder from this source only, all of them held out for a test,
+            without those that are like one from elsewhere; empty: of all sources.
+        mesh: The way in which meshes become pieces, of a folder of them.
     """
 
     source: str = SHAPES
@@ -106,6 +112,9 @@ class ObjectChoice:
     validation: float = 4
     test: float = 12
     per_withheld: int = 0
+    without_source: str = ""
+    only_source: str = ""
+    mesh: MeshDetail = STANDARD
 
     def check(self) -> None:
         """Raise a ConfigError for values that cannot be."""
@@ -309,7 +318,8 @@ class SweepRecipe:
         objects = {
             key: list(value) if isinstance(value, tuple) else value
             for key, value in asdict(self.objects).items()
-        }
+            if key != "mesh" and (value or not key.endswith("_source"))
+        } | self.objects.mesh.differing()
         sweeps = {name: _written(getattr(self.sweeps, name)) for name in PARAMETERS}
         top = {f.name: getattr(self, f.name) for f in fields(self)}
         if not self.contacts:  # unsaid, as in sets of releases that knew of none

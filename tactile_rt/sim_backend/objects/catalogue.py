@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from tactile_rt.sim_backend.objects.meshes import MESH_SUFFIXES, load_mesh
+from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
+from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
+from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.shapes import furniture, outdoors, tools, vehicles, vessels
 from tactile_rt.sim_backend.objects.solids import TactileObject, normalised
 from tactile_rt.stream import ConfigError
@@ -77,18 +79,18 @@ def make_object(category: str, index: int) -> TactileObject:
     return TactileObject(f"{category}-{index}", category, normalised(_BUILDERS[category](rng)))
 
 
-def load_object(target: str) -> TactileObject:
+def load_object(target: str, detail: MeshDetail = STANDARD) -> TactileObject:
     """The object named "mug-17" or "mug" (the same as "mug-0"), or the one in a mesh file."""
-    return promised_object(target)()
+    return promised_object(target, detail)()
 
 
-def promised_object(target: str) -> Callable[[], TactileObject]:
+def promised_object(target: str, detail: MeshDetail = STANDARD) -> Callable[[], TactileObject]:
     """What gives the object that `load_object` would, made when it is first asked for.
 
     That a name means nothing, or that a mesh cannot be used, is told at once: a mesh is read here.
     """
     if Path(target).suffix or "/" in target or "\\" in target:
-        mesh = load_mesh(Path(target))
+        mesh = load_mesh(Path(target), detail)
         return lambda: mesh
     match = re.fullmatch(r"(.+)-(\d+)", target)
     category, index = (match[1], int(match[2])) if match else (target, 0)

@@ -2,8 +2,7 @@
 
 Both surfaces are cut into tiles; the distance from each tile's middle, and from each vertex, to the
 other surface is exact (point to triangle). So the largest distance is missed only where it falls
-between the points: by about TILE^2 / (8 r) where a surface has radius of curvature r (0.006 mm for
-r = 5 mm at 40 mm), and never by more than a tile.
+between the points, which are TILE apart, or farther on a surface of more than `MOST_POINTS` tiles.
 """
 
 from collections.abc import Sequence
@@ -11,10 +10,22 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
+from manifold3d import Manifold
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import cKDTree
 
-__all__ = ["Deviation", "TriangleSurface", "deviation", "gap", "shuffled", "tiles"]
+from tactile_rt.sim_backend.objects.manifolds import surface_of
+
+__all__ = [
+    "FACES",
+    "TILE",
+    "Deviation",
+    "TriangleSurface",
+    "deviation",
+    "shuffled",
+    "some",
+    "tiles",
+]
 
 Floats = NDArray[np.float64]
 
@@ -23,8 +34,10 @@ NEAR = 4  # tiles looked at for each point; all that could be nearer, for the fa
 BATCH = 64
 FACES = 24  # of a piece looked at together
 NEEDLE = 1e-6  # triangles lower than this, in largest extents, have no normal to speak of
-TOUCHING = 1e-7  # pieces nearer to each other than this leave no gap
-OUTWARD = 1e-4  # how far outside its face a point is tested for lying in another piece
+INSIDE = 1e-5  # what is nearer to the surface than this counts wherever it lies
+RAY = np.array([2.1, 0.13, 0.37])  # out of the unit box, along no axis
+MOST_POINTS = 20_000  # looked at, of either surface
+TIE = 1e-9  # tiles as near as each other
 
 
 @dataclass(frozen=True)
@@ -32,15 +45,10 @@ class Deviation:
     """Distances between a mesh and the outside of pieces, in fractions of the largest extent.
 
     Attributes:
-        points: The (n, 3) points measured at: the mesh's, then those of the outside of the pieces.
-        gaps: The (n,) distance of each point to the other surface; large where the mesh has faces
-            buried in its own inside, too.
-        missed: The farthest that the mesh is from the outside of the pieces.
-        beyond: The farthest that the outside of the pieces is from the mesh.
+        missed: The farthest that the mesh is from the pieces' surfaces.
+        beyond: The farthest that the pieces' surfaces are from the mesh, outside what it encloses.
     """
 
-    points: Floats
-    gaps: Floats
     missed: float
     beyond: float
 
@@ -71,6 +79,7 @@ class TriangleSurface:
     Attributes:
         tiles: The (n, 3, 3) corners of the tiles that the surface is cut into.
         middles: The (n, 3) centroids of the tiles.
+        normals: The (n, 3) unit normals of the tiles; of those without an area, zero.
         points: The (m, 3) middles, and the corners that the surface came with.
         reach: The farthest that a point of a tile is from its tile's middle.
     """
@@ -81,20 +90,39 @@ class TriangleSurface:
         corners = np.unique(triangles.reshape(-1, 3), axis=0)
         self.points = np.concatenate([self.middles, corners])
         self.reach = float(np.linalg.norm(self.tiles - self.middles[:, None], axis=2).max())
+        across = np.cross(*np.diff(self.tiles, axis=1).transpose(1, 0, 2))
+        self.normals = across / np.maximum(np.linalg.norm(across, axis=1, keepdims=True), 1e-300)
         self._tree = cKDTree(self.middles)
 
-    def bound(self, points: Floats) -> tuple[Floats, NDArray[np.intp]]:
-        """(n,) distances to the nearest middle, at most `reach` too large, and whose it is."""
-        away, tile = self._tree.query(points)
-        return away, tile
+    def about(self, points: Floats) -> Floats:
+        """(n,) distance of points (n, 3) to the surface, at most `reach` too large, and rarely."""
+        _, near = self._tree.query(points, k=np.arange(1, min(NEAR, len(self.tiles)) + 1))
+        best: Floats = np.min([_gap(self.tiles[tile], points) for tile in near.T], axis=0)
+        return best
+
+    def behind(self, points: Floats) -> NDArray[np.bool_]:
+        """(n,) whether points (n, 3) lie on the inner side of the nearest tile.
+
+        Of several tiles that meet in the nearest point, the one that is seen most from above tells.
+        """
+        _, near = self._tree.query(points, k=np.arange(1, min(NEAR, len(self.tiles)) + 1))
+        least, height = np.full(len(points), np.inf), np.zeros(len(points))
+        for tile in near.T:
+            way = points - trimesh.triangles.closest_point(self.tiles[tile], points)
+            away = np.linalg.norm(way, axis=1)
+            above = np.einsum("ij,ij->i", way, self.normals[tile])
+            better = (away < least - TIE) | ((away < least + TIE) & (abs(above) > abs(height)))
+            height[better] = above[better]
+            least = np.minimum(least, away)
+        behind: NDArray[np.bool_] = height < 0
+        return behind
 
     def distance(self, points: Floats) -> Floats:
         """(n,) distance of points (n, 3) to the surface.
 
-        Exact for the farthest points; for others at most `reach` too large, and rarely that.
+        Exact for the farthest points; for others as `about`.
         """
-        _, near = self._tree.query(points, k=np.arange(1, min(NEAR, len(self.tiles)) + 1))
-        best: Floats = np.min([gap(self.tiles[tile], points) for tile in near.T], axis=0)
+        best = self.about(points)
         floor, exact = 0.0, np.zeros(len(points), bool)
         while True:
             unsure = np.flatnonzero(~exact & (best > floor))
@@ -105,53 +133,56 @@ class TriangleSurface:
             found = self._tree.query_ball_point(points[some], best[some] + self.reach)
             counts = [len(ball) for ball in found]
             tile = np.concatenate(found).astype(int)
-            gaps = gap(self.tiles[tile], points[some].repeat(counts, axis=0))
+            gaps = _gap(self.tiles[tile], points[some].repeat(counts, axis=0))
             best[some] = np.minimum.reduceat(gaps, np.cumsum([0, *counts[:-1]]))
             exact[some] = True
             floor = max(floor, float(best[some].max()))
 
 
-def deviation(drawn: TriangleSurface, pieces: Sequence[trimesh.Trimesh]) -> Deviation:
-    """Distance between a surface and the outside of the union of convex pieces.
+def deviation(
+    drawn: TriangleSurface, pieces: Sequence[trimesh.Trimesh], solids: Sequence[Manifold] = ()
+) -> Deviation:
+    """Distance between a surface and convex pieces.
 
     Args:
         drawn: of largest extent 1.
-        pieces: convex, in the same frame. What of a piece lies inside another is not outside.
+        pieces: convex, in the same frame.
+        solids: what the surface encloses. What of a piece lies inside them is not its outside.
     """
-    parts = [_broad(tiles(piece.triangles)) for piece in pieces]
-    owner = np.repeat(np.arange(len(pieces)), [len(part) for part in parts])
-    every = np.concatenate(parts)
-    across = np.cross(every[:, 1] - every[:, 0], every[:, 2] - every[:, 0])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    made = TriangleSurface(every[~_inside(every.mean(axis=1) + OUTWARD * across, pieces, owner)])
-    missed, beyond = made.distance(drawn.points), drawn.distance(made.middles)
-    # a tile is outside if its middle is; a point that lies in no piece may be nearest to any tile
-    far = np.flatnonzero(missed > missed.max() / 2)
-    far = far[~_inside(drawn.points[far], pieces)]
-    if len(far):
-        missed[far] = np.minimum(missed[far], TriangleSurface(every).distance(drawn.points[far]))
-    points = np.concatenate([drawn.points, made.middles])
-    gaps = np.concatenate([missed, beyond])
-    return Deviation(points, gaps, float(missed.max()), float(beyond.max()))
+    made = TriangleSurface(_broad(np.concatenate([piece.triangles for piece in pieces])))
+    missed = made.distance(some(drawn.points))
+    points = some(made.middles)
+    away = drawn.about(points)
+    far = np.flatnonzero(away > INSIDE)
+    far = far[~_inside(points[far], solids)]
+    away[far] = drawn.distance(points[far]) if len(far) else 0.0
+    beyond = float(away[away <= INSIDE].max(initial=0.0))
+    for k in far[np.argsort(-away[far])].tolist():  # the nearest tile may have told the wrong side
+        if not _enclosed(points[k], solids):
+            beyond = max(beyond, float(away[k]))
+            break
+    return Deviation(float(missed.max()), beyond)
 
 
-def _inside(
-    points: Floats, pieces: Sequence[trimesh.Trimesh], owner: NDArray[np.intp] | None = None
-) -> NDArray[np.bool_]:
-    """(n,) whether points (n, 3) lie in a piece, other than their owner (n,) if they have one."""
-    columns = np.ascontiguousarray(points.T)
+def some(points: Floats) -> Floats:
+    """Not too many of them, of all parts."""
+    return points[:: 1 + len(points) // MOST_POINTS]
+
+
+def _enclosed(point: Floats, solids: Sequence[Manifold]) -> bool:
+    """Whether a ray from a point leaves one of the solids once more than it enters it."""
+    begin, end = point.tolist(), (point + RAY).tolist()
+    return any(len(solid.ray_cast(begin, end)) % 2 for solid in solids)
+
+
+def _inside(points: Floats, solids: Sequence[Manifold]) -> NDArray[np.bool_]:
+    """(n,) whether points (n, 3) lie in a solid, as its nearest tile has it."""
     inside = np.zeros(len(points), bool)
-    for j, piece in enumerate(pieces):
-        near = ~inside if owner is None else ~inside & (owner != j)
-        for column, low, high in zip(columns, *piece.bounds, strict=True):
-            near &= (column >= low) & (column <= high)
-        index = np.flatnonzero(near)
-        planes = shuffled(ConvexHull(piece.vertices).equations)
-        for k in range(0, len(planes), FACES):  # few points are inside many of them
-            some = planes[k : k + FACES]
-            out = some[:, :3] @ columns[:, index] > TOUCHING - some[:, 3:]
-            index = index[~out.any(axis=0)]
-        inside[index] = True
+    for solid in solids:
+        low, high = np.split(np.array(solid.bounding_box()), 2)
+        near = np.flatnonzero(~inside & ((points > low) & (points < high)).all(axis=1))
+        if len(near):
+            inside[near] = TriangleSurface(surface_of(solid).triangles).behind(points[near])
     return inside
 
 
@@ -167,7 +198,7 @@ def _broad(triangles: Floats) -> Floats:
     return broad
 
 
-def gap(triangles: Floats, points: Floats) -> Floats:
+def _gap(triangles: Floats, points: Floats) -> Floats:
     """(n,) distance of points (n, 3), each to its own of the triangles (n, 3, 3)."""
     nearest = trimesh.triangles.closest_point(triangles, points)
     away: Floats = np.linalg.norm(points - nearest, axis=1)

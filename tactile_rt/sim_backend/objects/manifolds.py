@@ -6,9 +6,8 @@ import manifold3d
 import numpy as np
 import trimesh
 from manifold3d import Manifold
-from numpy.typing import NDArray
 
-__all__ = ["bodies_of", "faces_of", "in_unit_box", "outer_solid", "surface_of"]
+__all__ = ["bodies_of", "outer_solid", "surface_of"]
 
 
 def bodies_of(mesh: trimesh.Trimesh) -> list[Manifold]:
@@ -28,30 +27,12 @@ def outer_solid(bodies: Sequence[Manifold]) -> Manifold:
     return Manifold.batch_boolean(shells, manifold3d.OpType.Add)
 
 
-def in_unit_box(solid: Manifold) -> Manifold:
-    """The solid moved and scaled: centred at the origin, of largest extent 1."""
-    low, high = np.split(np.array(solid.bounding_box()), 2)
-    return solid.translate(list(-(low + high) / 2)).scale([1 / float((high - low).max())] * 3)
-
-
 def surface_of(solid: Manifold) -> trimesh.Trimesh:
     """The solid's surface."""
     arrays = solid.to_mesh64()
     return trimesh.Trimesh(
         arrays.vert_properties[:, :3].copy(), arrays.tri_verts.astype(np.int64), process=False
     )
-
-
-def faces_of(solid: Manifold, original: int) -> NDArray[np.float64]:
-    """(n, 3, 3) those faces of a solid that came from one of those it was made of."""
-    arrays = solid.to_mesh64()
-    faces = np.zeros(len(arrays.tri_verts), bool)
-    for k, run in enumerate(arrays.run_original_id):
-        faces[arrays.run_index[k] // 3 : arrays.run_index[k + 1] // 3] = run == original
-    triangles: NDArray[np.float64] = arrays.vert_properties[:, :3][
-        arrays.tri_verts[faces].astype(np.int64)
-    ]
-    return triangles
 
 
 def _turned(body: Manifold) -> Manifold:

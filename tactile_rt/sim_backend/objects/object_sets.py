@@ -4,28 +4,56 @@ Two layouts, told apart by what is there:
 
     ShapeNetCore    <synset>/<object id>/models/model_normalized.obj, and taxonomy.json beside them,
                     whose names the categories get (else they are called by their synset)
-    plain           <category>/<object>.obj (or .stl, .ply, .glb)
+    plain           <category>/<object>.obj (or another of `mesh_files.MESH_SUFFIXES`), and
+                    perhaps objects.csv, which says which are alike and where they are from
 
 ShapeNet's meshes (Chang et al. 2015) are y-up and mostly sheets that enclose nothing. The published
-sweeps took such ones through a convex decomposition of their voxels (Chung et al. 2025); here they
-are remeshed. In a plain folder a mesh that is not closed is skipped, unless said otherwise.
+sweeps took such ones through a convex decomposition of their voxels (Chung et al. 2025); here the
+sheets become thin plates.
 """
 
 import json
 import re
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
-from tactile_rt.sim_backend.objects.meshes import MESH_SUFFIXES, MeshDetail, load_mesh
+import msgspec
+
+from tactile_rt.settings import check_columns, convert, read_csv
+from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
+from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
+from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.solids import TactileObject
 from tactile_rt.stream import ConfigError
 
-__all__ = ["ObjectSet", "SetReport", "open_objects"]
+__all__ = ["FOLDER_TABLE", "ObjectSet", "Origin", "SetReport", "open_objects"]
 
 SHAPENET_FILE = Path("models") / "model_normalized.obj"
 TAXONOMY = "taxonomy.json"
+FOLDER_TABLE = "objects.csv"
+
+
+class Origin(msgspec.Struct, frozen=True):
+    """What a folder's `objects.csv` says of an object, in the columns of these names.
+
+    Attributes:
+        shape: The same for objects of a category that are variants, mirror images or copies of one
+            thing; empty: no other is like it.
+        source: The repository that it is from.
+        licence: The SPDX name of the licence that it comes under.
+    """
+
+    shape: str = ""
+    source: str = ""
+    licence: str = ""
+
+
+class _Row(Origin, frozen=True, kw_only=True):
+    category: str
+    name: str
 
 
 @dataclass(frozen=True)
@@ -51,15 +79,15 @@ class ObjectSet:
     Attributes:
         folder: The folder that the objects are in.
         paths: The file of every object, by its name ``category/object``, in alphabetical order.
-        detail: The fineness in which meshes are cut, and what becomes of those that are not closed.
-        y_up: Whether the files are y-up; None: as their format has it.
+        detail: The fineness in which meshes are told apart into pieces, and which way is up.
+        origins: The source and the shape of objects, by their names, as far as they are known.
         skipped: The names of objects found broken so far, and why each is.
     """
 
     folder: Path
     paths: dict[str, Path]
-    detail: MeshDetail = field(default_factory=MeshDetail)
-    y_up: bool | None = None
+    detail: MeshDetail = STANDARD
+    origins: dict[str, Origin] = field(default_factory=dict)
     skipped: dict[str, str] = field(default_factory=dict)
 
     @cached_property
@@ -90,17 +118,22 @@ class ObjectSet:
         """
         path = self.path(name)
         try:
-            found = load_mesh(path, self.detail, y_up=self.y_up)
+            found = load_mesh(path, self.detail)
         except ConfigError as error:
             self.skipped[name] = str(error)
             raise
         return replace(found, name=name.replace("/", "-"), category=self.categories[name])
 
-    def check(self) -> SetReport:
-        """Load every object once: how many can be used, how well, and why the others cannot."""
+    def check(self, progress: Callable[[str], None] = lambda name: None) -> SetReport:
+        """Load every object once: how many can be used, how well, and why the others cannot.
+
+        Args:
+            progress: told of every object before it is loaded.
+        """
         errors: dict[str, float] = {}
         made_by: Counter[str] = Counter()
         for name in self.names:
+            progress(name)
             try:
                 found = self.load(name)
             except ConfigError:
@@ -111,13 +144,12 @@ class ObjectSet:
         return SetReport(dict(sorted(made_by.items())), errors, skipped)
 
 
-def open_objects(where: str | Path, detail: MeshDetail | None = None) -> ObjectSet:
+def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
     """The objects in a folder.
 
     Args:
         where: the folder, of either layout.
-        detail: how meshes are cut; by default to 0.1 mm at 40 mm, and meshes that are not closed
-            are remeshed in a ShapeNet folder and skipped in a plain one.
+        detail: how meshes become pieces; in a ShapeNet folder y is up, unless it says otherwise.
 
     Raises:
         ConfigError: no such folder, or none of the two layouts.
@@ -130,8 +162,7 @@ def open_objects(where: str | Path, detail: MeshDetail | None = None) -> ObjectS
         called = _taxonomy(folder)
         named = [(called.get(p.parents[2].name, p.parents[2].name), p.parents[1].name, p)
                  for p in shapenet]  # fmt: skip
-        detail = detail or MeshDetail(broken="remesh")
-        return ObjectSet(folder, _named(folder, named), detail, y_up=True)
+        return ObjectSet(folder, _named(folder, named), replace(detail, up=detail.up or "y"))
     plain = sorted(p for p in folder.glob("[!.]*/[!.]*") if p.suffix.lower() in MESH_SUFFIXES)
     if not plain:
         raise ConfigError(
@@ -139,7 +170,7 @@ def open_objects(where: str | Path, detail: MeshDetail | None = None) -> ObjectS
             f"{', '.join(MESH_SUFFIXES[1:])}), or ShapeNet's synset/id/{SHAPENET_FILE.as_posix()}"
         )
     named = [(p.parent.name, p.stem, p) for p in plain]
-    return ObjectSet(folder, _named(folder, named), detail or MeshDetail())
+    return ObjectSet(folder, _named(folder, named), detail, _origins(folder))
 
 
 def _named(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, Path]:
@@ -154,6 +185,18 @@ def _named(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, Path]:
             )
         paths[name] = path
     return dict(sorted(paths.items()))
+
+
+def _origins(folder: Path) -> dict[str, Origin]:
+    """What the folder's table says of its objects, if it has one."""
+    path = folder / FOLDER_TABLE
+    if not path.exists():
+        return {}
+    table = read_csv(path)
+    known = ("category", "name", *Origin.__struct_fields__)
+    check_columns(table, known, known[:2])
+    rows: list[_Row] = [convert(row, _Row) for row in table.rows]
+    return {f"{_safe(row.category)}/{_safe(row.name)}": row for row in rows}
 
 
 def _safe(name: str) -> str:

@@ -23,7 +23,7 @@ VIEWS: dict[str, tuple[float, float]] = {
     "top": (90.0, -90.0),
     "oblique": (26.0, -27.0),
 }
-MARGIN = 1.6  # around the framed points: room for the object and for arrows
+MARGIN = 1.15  # around the framed points: room for arrows
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ def framing(
 
     Args:
         view: one of `VIEWS`.
-        points: (n, 3) world, mm: the whiskers at rest.
+        points: (n, 3) world, mm: the whiskers at rest, and what they touch.
         orthographic: see `Camera`.
         aspect: width of the picture over its height.
         left: whether these are whiskers of the animal's left side: the view's mirror image.

@@ -19,7 +19,7 @@ __all__ = ["Film", "camera_of"]
 def camera_of(
     footage: Footage, view: str, orthographic: bool = False, aspect: float = 1.5
 ) -> Camera:
-    """The camera of a named view, on the whiskers as they are in the first moment.
+    """The camera of a named view, on the whiskers at rest and on what presses them most.
 
     Raises:
         ConfigError: no such view.
@@ -27,7 +27,10 @@ def camera_of(
     dressed = Dressed(footage.model, footage.spec)
     footage.restore(0, dressed.data)
     left = all(x < 0 for x, _, _ in footage.spec.positions)
-    return framing(view, dressed.points(), orthographic, aspect, left)
+    whiskers = dressed.points()
+    footage.restore(footage.strongest, dressed.data)
+    points = np.concatenate([whiskers, dressed.object_points()])
+    return framing(view, points, orthographic, aspect, left)
 
 
 class Film:

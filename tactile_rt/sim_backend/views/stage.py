@@ -5,6 +5,7 @@ import importlib
 import os
 import sys
 import warnings
+from itertools import product
 from types import TracebackType
 from typing import Any, Self
 
@@ -54,6 +55,7 @@ class Dressed:
         whiskers = [geom for geoms in self.links for geom in geoms]
         self._others = np.setdiff1d(np.arange(model.ngeom), whiskers)
         moved = (model.geom_contype[self._others] & OBJECT_BIT) > 0
+        self._moved = self._others[moved]
         self._colours = np.where(moved[:, None], OBJECT, HEAD)
         self._radii = model.geom_size[:, 0].copy()
         self._whiskers = np.array(whiskers)
@@ -71,6 +73,16 @@ class Dressed:
         axes = self.data.geom_xmat[self._whiskers].reshape(-1, 3, 3)[:, :, 2]
         middle = self.data.geom_xpos[self._whiskers]
         return np.concatenate([middle - half * axes, middle + half * axes])
+
+    def object_points(self) -> NDArray[np.float64]:
+        """(n, 3) corners of boxes round what is swept past, in the world, mm, as posed."""
+        boxes = self.model.geom_aabb[self._moved].reshape(-1, 2, 3)
+        corners = np.array(list(product((-1.0, 1.0), repeat=3)))
+        local = boxes[:, 0, None] + corners * boxes[:, 1, None]
+        frames = self.data.geom_xmat[self._moved].reshape(-1, 3, 3)
+        places = np.einsum("nij,nkj->nki", frames, local) + self.data.geom_xpos[self._moved, None]
+        points: NDArray[np.float64] = places.reshape(-1, 3)
+        return points
 
     def thicken(self, extent_mm: float) -> None:
         """Draw whiskers thick enough for a picture of this height; thick ones as they are."""

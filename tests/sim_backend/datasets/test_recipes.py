@@ -3,6 +3,7 @@ import tomllib
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -347,6 +348,8 @@ def test_what_does_not_exist_is_found_when_the_set_is_described(tmp_path, text, 
 class FakeFolder:
     """What `object_sets.open_objects` gives for a folder of two categories, one object broken."""
 
+    origins: ClassVar[dict[str, Any]] = {}
+
     def __init__(self, sizes: dict[str, int]) -> None:
         self.categories = {f"{c}/{i:x}": c for c, n in sizes.items() for i in range(n)}
         self.names = tuple(self.categories)
@@ -359,7 +362,7 @@ class FakeFolder:
 @pytest.fixture
 def folder(monkeypatch: pytest.MonkeyPatch):
     def use(sizes: dict[str, int]) -> None:
-        module = SimpleNamespace(open_objects=lambda path: FakeFolder(sizes))
+        module = SimpleNamespace(open_objects=lambda path, mesh: FakeFolder(sizes))
         monkeypatch.setitem(sys.modules, "tactile_rt.sim_backend.objects.object_sets", module)
 
     return use

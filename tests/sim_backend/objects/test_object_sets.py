@@ -12,25 +12,20 @@ import pytest
 pytest.importorskip("manifold3d")
 
 import trimesh
+from manifold3d import Manifold, OpType
 from scipy.spatial import ConvexHull
 
 from tactile_rt.sim_backend.datasets.dataset import describe_set, make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.objects import meshes
-from tactile_rt.sim_backend.objects.meshes import MeshDetail, load_mesh
+from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
+from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.object_sets import open_objects
 from tactile_rt.stream import ConfigError
 from tactile_rt.sweep_set import SweepManifest
 from tests.helpers import mesh_truth
 
 MM = 40.0  # largest extent that errors are given at
-
-
-@pytest.fixture(autouse=True)
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Pieces are kept for this test only."""
-    monkeypatch.setenv("TACTILE_RT_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
 
 
 def saved(mesh: trimesh.Trimesh, path: Path) -> Path:
@@ -98,15 +93,16 @@ def test_pieces_are_within_a_tenth_of_a_millimetre(name: str, tmp_path: Path) ->
     if name in ("bowl", "torus"):  # and not much nearer
         assert max(beyond, outside, deep) >= 0.5 * thing.surface_error
     assert all(p.is_convex and p.is_watertight and p.volume > 0 for p in thing.pieces)
-    assert thing.made_by == "cut"
+    assert thing.made_by == "pieces"
 
 
 def test_flat_faced_shapes_are_cut_exactly(tmp_path: Path) -> None:
     thing = load_mesh(saved(mesh_truth.bracket(), tmp_path / "bracket.stl"))
     assert len(thing.pieces) == 2
-    assert sum(p.volume for p in thing.pieces) * MM**3 == pytest.approx(
-        (40 * 20 * 6 + 6 * 20 * 24) * (MM / 40) ** 3, rel=1e-5
+    together = Manifold.batch_boolean(
+        [Manifold.hull_points(np.array(p.vertices)) for p in thing.pieces], OpType.Add
     )
+    assert together.volume() * MM**3 == pytest.approx(40 * 20 * 6 + 6 * 20 * 24, rel=1e-5)
 
 
 def test_a_limit_on_pieces_widens_the_error_and_says_so(tmp_path: Path) -> None:
@@ -128,7 +124,7 @@ def test_pieces_are_cut_once(tmp_path: Path, cache: Path, monkeypatch: pytest.Mo
         raise AssertionError("cut again")
 
     with monkeypatch.context() as patched:
-        patched.setattr(meshes, "cut_solid", never)
+        patched.setattr(meshes, "SolidPieces", never)
         again = load_mesh(path)
         moved = load_mesh(shutil.copy(path, tmp_path / "other.stl"))  # its content counts
     for one in (again, moved):
@@ -149,17 +145,14 @@ def test_without_a_place_to_keep_pieces_they_are_cut(
     assert len(load_mesh(path).pieces) == 2
 
 
-@pytest.mark.slow
-def test_open_sheets_are_refused_remeshed_or_wrapped(tmp_path: Path) -> None:
+def test_sheets_become_plates_that_stand(tmp_path: Path) -> None:
     path = saved(mesh_truth.sheet_chair(), tmp_path / "chair.obj")
-    with pytest.raises(ConfigError, match=r"chair\.obj: not watertight"):
-        load_mesh(path)
-    remeshed = load_mesh(path, MeshDetail(broken="remesh"), y_up=True)
-    assert remeshed.made_by == "remeshed"
-    assert MM * remeshed.surface_error < 2.0
-    extents = np.ptp([c for p in remeshed.pieces for c in p.bounds], axis=0)
-    assert extents[2] == pytest.approx(1.0)  # y-up in the file: it stands
-    assert load_mesh(path, MeshDetail(broken="hull")).made_by == "hull"
+    chair = load_mesh(path, MeshDetail(up="y"))
+    assert chair.made_by == "plates"
+    assert MM * chair.surface_error < 0.25
+    extents = np.ptp([c for p in chair.pieces for c in p.bounds], axis=0)
+    assert extents[2] == pytest.approx(1.0, abs=0.01)  # y is up in the file
+    assert load_mesh(path, MeshDetail(hull=True)).made_by == "hull"
 
 
 # folders
@@ -190,7 +183,7 @@ def test_a_shapenet_folder(shapenet: Path) -> None:
     tall = np.ptp([c for p in thing.pieces for c in p.bounds], axis=0)
     assert tall[2] == pytest.approx(20 / 40, abs=1e-3)  # its y, 20 mm of 40, is up
     report = objects.check()
-    assert report.made_by == {"cut": 2}
+    assert report.made_by == {"pieces": 2}
     assert set(report.surface_error) == {"chair/a1", "chair/b2"}
     assert list(report.skipped) == ["bottle/c3"] and "no triangles" in report.skipped["bottle/c3"]
 

@@ -1,0 +1,82 @@
+"""`tactile-rt objects get`, `check`: what is swept past the whiskers, from elsewhere."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tactile_rt.cli.app import app, needs, progress_bar, starting
+
+objects = typer.Typer(help="Objects that others made.", no_args_is_help=True)
+app.add_typer(objects, name="objects")
+
+
+@objects.callback()
+def _objects() -> None:
+    """Objects that others made: get those of a list, and see how well they can be used."""
+
+
+@objects.command()
+def get(
+    wanted: Annotated[str, typer.Argument(metavar="LIST", help="real, or a .csv file.")],
+    folder: Annotated[Path, typer.Argument(help="Where they are put: FOLDER/CATEGORY/NAME.ply.")],
+    clones: Annotated[
+        Path | None,
+        typer.Option("--from", help="A folder of clones, instead of GitHub."),
+    ] = None,
+) -> None:
+    """Get the objects of a list into a folder, every file checked by its hash.
+
+    Called again it goes on with what is missing. Exit code 1 if anything is.
+    """
+    try:
+        with starting():
+            from tactile_rt.sim_backend.objects.object_lists import get_objects, read_list
+    except ModuleNotFoundError as error:
+        raise needs("sim", error) from None
+    listed = read_list(wanted)
+    console = Console(stderr=True)
+    with progress_bar(console, "getting", total=len(listed), counted=True) as update:
+        missing = get_objects(listed, folder, clones, lambda name: update(advance=1))
+    for name, why in missing.items():
+        console.print(f"[red]{escape(name)}[/]: {escape(why)}", soft_wrap=True, highlight=False)
+    licences = sorted({thing.files[0].licence for thing in listed})
+    kinds = len({thing.files[0].category for thing in listed})
+    typer.echo(
+        f"{len(listed) - len(missing)} of {len(listed)} objects of {kinds} kinds are in {folder}; "
+        f"licences: {', '.join(licences)}, see objects.csv"
+    )
+    raise typer.Exit(1 if missing else 0)
+
+
+@objects.command()
+def check(
+    folder: Annotated[Path, typer.Argument(help="CATEGORY/OBJECT.stl, or ShapeNetCore's layout.")],
+) -> None:
+    """Load every object of a folder once: how many can be used, how near, and why others cannot.
+
+    Exit code 1 if some cannot.
+    """
+    try:
+        with starting():
+            from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
+            from tactile_rt.sim_backend.objects.object_sets import open_objects
+    except ModuleNotFoundError as error:
+        raise needs("sim", error) from None
+    found = open_objects(folder)
+    console = Console(stderr=True)
+    with progress_bar(console, "loading", total=len(found.names), counted=True) as update:
+        report = found.check(lambda name: update(advance=1))
+    table = Table("kind", "objects", "usable", "worst, mm of 40", box=None, header_style="bold")
+    for kind in dict.fromkeys(found.categories.values()):
+        names = [name for name in found.names if found.categories[name] == kind]
+        errors = [report.surface_error[n] for n in names if n in report.surface_error]
+        worst = f"{SIZE_MM * max(errors):.2f}" if errors else "-"
+        table.add_row(escape(kind), str(len(names)), str(len(errors)), worst)
+    Console().print(table)
+    for why in report.skipped.values():
+        console.print(escape(why), soft_wrap=True, highlight=False)
+    raise typer.Exit(1 if report.skipped else 0)
