@@ -46,7 +46,7 @@ class Repository:
 REPOSITORIES = (
     *(
         Repository(
-            f"KayKit-Game-Assets/KayKit-{pack}", r".*/obj/(?P<name>[^/]+)\.obj", "CC0-1.0", "y"
+            f"KayKit-Game-Assets/KayKit-{pack}", r".*/obj/(.*/)?(?P<name>[^/]+)\.obj", "CC0-1.0", "y"
         )
         for pack in (
             "City-Builder-Bits-1.0", "Dungeon-Remastered-1.0", "Furniture-Bits-1.0",
@@ -75,7 +75,7 @@ KINDS = {
     "barrel": r"barrel\w*|Barrel\w+|keg\w*|bucket_\w+",
     "bed": r"bed_\w+",
     "bench": r"bench\w*|pallet|Pallet\w+",
-    "book": r"book_\w+|menu",
+    "book": r"book_\d|book_s\w+|menu",
     "bottle": r"bottle_\w+|ketchup|mustard|\w*mustard_bottle|\w*bleach_cleanser|\w*windex_bottle"
     r"|shampoo|conditioner|cleanser|repellent|magic_clean|glue_\d|correction_fluid",
     "bowl": r"bowl|bowl_small|\w*_bowl|stew_bowl|024_bowl",
@@ -84,7 +84,7 @@ KINDS = {
     r"|Primitive_Cube",
     "cabinet": r"cabinet_\w+|kitchencabinet\w*|kitchencounter_\w+|fridge_[AB]|oven|stove_\w+"
     r"|dumpster",
-    "can": r"\d+_\w+_can|Can_\w|potato_chip_\d|trash_\w",
+    "can": r"\d+_\w+_can|Can_\w|potato_chip_\d",
     "candle": r"candle\w*|torch\w*",
     "car": r"car_(hatchback|police|sedan|stationwagon|taxi)|spacetruck|spacetruck_large"
     r"|spacetruck_trailer",
@@ -99,7 +99,7 @@ KINDS = {
     "food": r"food_\w+",
     "grave": r"grave_\w+|gravemarker_\w|gravestone|plaque\w*|shrine\w*|crypt",
     "hammer": r"048_hammer|\w+_hammer\w*|035_power_drill|power_drill",
-    "hill": r"hill_\w+|hills_[ABC]|mountain_[ABC]|mountain_[ABC]_grass|rubble_\w+|terrain_\w+",
+    "hill": r"hill_\w+|hills_[ABC]|mountain_[ABC]|mountain_[ABC]_grass(_trees)?|hills_[ABC]_trees",
     "house": r"building_[A-H]_withoutBase|building_(home_[AB]|church|tavern|barracks|market"
     r"|blacksmith"
     r"|lumbermill|mine|castle|archeryrange|watermill)_blue|basemodule_\w|tent",
@@ -110,23 +110,26 @@ KINDS = {
     "pan": r"pan_\w+|027_skillet|pot_\w+|stew_pot|028_skillet_lid|lid_\w+",
     "picture": r"pictureframe_\w+",
     "pillar": r"pillar\w*|column\w*|Pillar_\w|Primitive_Pillar|fence_pillar\w*",
-    "plane": r"072-\w_toy_airplane",
+    "skull": r"\w*skull\w*|bone_\w|ribcage",
+    "slope": r"Primitive_Slope\w*|terrain_\w+|hex_grass_sloped\w*",
+    "tile": r"hex_\w+|floor_\w+|Floor\w*|Primitive_Floor\w*",
+    "toy plane": r"072-\w_toy_airplane",
+    "tool": r"042_adjustable_wrench|scissors|037_scissors|038_padlock|key\w*|\w*stapler_\d",
     "plate": r"plate|plate_\w+|\w+_plate|\w+_plate_\d|029_plate|cuttingboard|coin\w*|Coin_\w",
-    "pumpkin": r"pumpkin_\w+|skull\w*",
-    "rock": r"rock_\w+|rocks_\w|resource_stone|bone_\w",
+    "pumpkin": r"pumpkin_\w+",
+    "rock": r"rock_\w+|rocks_\w|resource_stone|rubble_\w+",
     "screwdriver": r"\w+_screwdriver",
     "shelf": r"shelf_\w+|shelves|bookcase\w*",
     "spoon": r"\w*spoon|\w*fork|\w*knife|\w*spatula",
-    "stairs": r"stairs\w*|Primitive_Stairs\w*|Primitive_Slope\w*",
+    "stairs": r"stairs\w*|Primitive_Stairs\w*",
     "stool": r"chair_stool\w*|stool",
     "table": r"table_\w+|kitchentable_\w+",
     "tower": r"building_tower_(A|B|base|catapult|cannon)_blue|watertower|building_windmill_blue"
     r"|windturbine_\w+|structure_\w+|lander_\w|drill_structure",
     "tree": r"tree\w+|cactus_\w+|bush",
     "wall": r"wall\w*|Wall\w*|Primitive_Wall\w*|Primitive_Window|Primitive_Doorway|arch\w*",
-    "wrench": r"042_adjustable_wrench|scissors|037_scissors|038_padlock|key\w*",
 }
-LEAST = 4  # objects of other shape in a kind that is kept
+ENOUGH = 8  # shapes in a kind that can be learnt
 
 
 def main() -> None:
@@ -168,16 +171,16 @@ def main() -> None:
                 for path, content in files.items()
             ]
     shapes = Counter(kind for kind, _ in {(k, s) for (k, _), s in shape.items()})
-    kept = [row for row in rows if shapes[row["category"]] >= LEAST]
-    kept.sort(key=lambda row: (row["category"], row["name"], row["path"]))
+    rows.sort(key=lambda row: (row["category"], row["name"], row["path"]))
     with asked.out.open("w", newline="") as file:
-        table = csv.DictWriter(file, list(kept[0]), lineterminator="\n")
+        table = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         table.writeheader()
-        table.writerows(kept)
+        table.writerows(rows)
     for kind, number in sorted(shapes.items()):
         total = sum(k == kind for k, _ in shape)
         print(f"{kind:12s} {total:3d} objects, {number:3d} shapes")  # noqa: T201
-    print(f"{sum(n >= 8 for n in shapes.values())} kinds of 8 shapes or more, {len(shapes)} in all")  # noqa: T201
+    enough = sum(number >= ENOUGH for number in shapes.values())
+    print(f"{enough} kinds of {ENOUGH} shapes or more, {len(shapes)} in all")  # noqa: T201
 
 
 def _short(repository: Repository) -> str:

@@ -35,8 +35,8 @@ COMMIT = "0123456789abcdef0123456789abcdef01234567"
 def listed(path: Path, rows: list[dict[str, str]]) -> Path:
     """A list of these rows; what they leave out is as in most."""
     usual = {
-        "category": "box", "repository": "some/shapes", "commit": COMMIT, "licence": "CC0-1.0", "up": "y",
-        "scale": "0.01", "shape": "",
+        "category": "box", "repository": "some/shapes", "commit": COMMIT, "licence": "CC0-1.0",
+        "up": "y", "scale": "0.01", "shape": "",
     }  # fmt: skip
     with path.open("w", newline="") as file:
         table = csv.DictWriter(file, COLUMNS)
