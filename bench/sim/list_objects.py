@@ -46,7 +46,10 @@ class Repository:
 REPOSITORIES = (
     *(
         Repository(
-            f"KayKit-Game-Assets/KayKit-{pack}", r".*/obj/(.*/)?(?P<name>[^/]+)\.obj", "CC0-1.0", "y"
+            f"KayKit-Game-Assets/KayKit-{pack}",
+            r".*/obj/(.*/)?(?P<name>[^/]+)\.obj",
+            "CC0-1.0",
+            "y",
         )
         for pack in (
             "City-Builder-Bits-1.0", "Dungeon-Remastered-1.0", "Furniture-Bits-1.0",

@@ -110,6 +110,9 @@ class Sensor:
         bias = np.hypot(per_channel(model.bias_force, model.bias_moment), said("offset", drawn))
         self.bias = bias * self._rng["bias"].standard_normal(spec.shape)
         self.dead = self._rng["dead"].random(len(spec.elements)) < model.dead_probability
+        rows = sorted({row for row, _ in spec.grid})
+        broken = self._rng["dead"].random(len(rows)) < model.dead_row_probability
+        self.dead |= np.isin([row for row, _ in spec.grid], np.array(rows)[broken])
         self.saturated = 0
         self.dropped = 0
         # of the last sample: when it was taken, drift and flicker of spread 1, load behind the

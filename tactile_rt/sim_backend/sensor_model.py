@@ -6,6 +6,7 @@ from tactile_rt.stream import ConfigError
 
 __all__ = ["SensorModel"]
 
+DEAD = ("dead_probability", "dead_row_probability")
 LARGEST = 1e6  # of any value: beyond it time stamps and single precision overflow
 
 
@@ -37,6 +38,8 @@ class SensorModel:
         dead_probability: The probability of each element to be dead, drawn once. A dead element
             reads its bias (0 without one) for ever; its ``valid`` stays True, because a robot does
             not know.
+        dead_row_probability: The probability of each row of the grid to be dead as a whole, drawn
+            once.
         resolution_force, resolution_moment: The quantisation step, N and N m; readings round to the
             nearest.
         range_force, range_moment: The largest reading of either sign, where the sensor saturates, N
@@ -73,6 +76,7 @@ class SensorModel:
     hysteresis_force: float = 0.0
     hysteresis_moment: float = 0.0
     dead_probability: float = 0.0
+    dead_row_probability: float = 0.0
     range_force: float = 0.0
     range_moment: float = 0.0
     resolution_force: float = 0.0
@@ -87,7 +91,7 @@ class SensorModel:
             if not 0 <= value <= LARGEST:
                 bound = f"at most {LARGEST:g}" if value > 0 else "0 or more"
                 raise ConfigError(f"{name} must be {bound}, not {value}")
-        for name in ("crosstalk_channels", "crosstalk_elements", "dead_probability"):
+        for name in ("crosstalk_channels", "crosstalk_elements", *DEAD):
             if getattr(self, name) > 1:
                 raise ConfigError(f"{name} must lie between 0 and 1, not {getattr(self, name)}")
         if self.drop_probability >= 1:

@@ -122,8 +122,9 @@ class SimOptions(SensorModel, Randomisation, MeshDetail):
         pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
         size_mm, speed_mm_s, yaw_deg, height_mm, distance_mm, gap_mm: The parameters of every sweep,
             see `sweep.Sweep`; left out, the size is 40 mm and the others are drawn anew each time.
-        roll_deg, pitch_deg, heading_deg, climb_deg, ramp_ms, head_moves: The parameters of every
-            sweep, see `sweep.Sweep`; 0 if left out.
+        roll_deg, pitch_deg, heading_deg, climb_deg, ramp_ms, head_moves, surface_friction, shake_g,
+            shake_hz: The parameters of every sweep, see `sweep.Sweep`; left out, it is level, as
+            fast at once and not shaken.
         base_turns: Two more channels, ``turn_y`` and ``turn_z``: by how much the base of a whisker
             whose mount gives is turned about the element's y and z, rad. They are the truth: the
             sensor's imperfections leave them alone.
@@ -147,6 +148,9 @@ class SimOptions(SensorModel, Randomisation, MeshDetail):
     climb_deg: float | None = None
     ramp_ms: float | None = None
     head_moves: float | None = None
+    surface_friction: float | None = None
+    shake_g: float | None = None
+    shake_hz: float | None = None
     base_turns: bool = False
 
     def __post_init__(self) -> None:

@@ -50,6 +50,11 @@ class Sweep:
             acceleration begins and ends at nothing.
         head_moves: 1: the head moves past an object that stands still, and its whiskers feel its
             acceleration; 0: the object moves.
+        surface_friction: The friction of the object's surface, as a multiple of what the whiskers'
+            description says.
+        shake_g: The amplitude of the acceleration with which the head is shaken along (1, 1, 1), as
+            a robot's that walks or flies, in multiples of the Earth's (9.80665 m/s^2).
+        shake_hz: The frequency of that, Hz.
 
     Raises:
         ConfigError: a value that cannot be.
@@ -67,6 +72,9 @@ class Sweep:
     climb_deg: float = 0.0
     ramp_ms: float = 0.0
     head_moves: float = 0.0
+    surface_friction: float = 1.0
+    shake_g: float = 0.0
+    shake_hz: float = 30.0
 
     def __post_init__(self) -> None:
         for name in (f.name for f in fields(self)):
@@ -97,6 +105,9 @@ LIMITS = {
     "climb_deg": (-60.0, 60.0),
     "ramp_ms": (0.0, 1e4),
     "head_moves": (0.0, 1.0),
+    "surface_friction": (0.0, 10.0),
+    "shake_g": (0.0, 5.0),
+    "shake_hz": (0.1, 200.0),  # samples are a millisecond apart
 }
 
 

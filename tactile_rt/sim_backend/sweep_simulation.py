@@ -1,6 +1,7 @@
 """A sweep, simulated: the world, the motion, the base loads at 1 kHz."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from typing import Protocol
 
@@ -28,6 +29,8 @@ __all__ = ["SweepSimulation", "World", "check_sweep", "draw_simulation"]
 
 FAR_MM = 200.0  # where the object is when the way to first contact is measured
 DRAWS = 20  # tries to draw parameters with which an object meets the array at all
+G = 9.80665e-3  # mm/ms^2
+SHAKEN_IN_MS = 50.0  # in which shaking grows to its whole
 CLEAR_MM = 5.0  # how far past the last whisker a sweep goes on
 
 Floats = NDArray[np.float64]
@@ -35,8 +38,9 @@ Floats = NDArray[np.float64]
 
 def check_sweep(sweep: Sweep, profile: Profile) -> None:
     """Raise a `ConfigError` if the profile's engine cannot step such a sweep."""
-    if sweep.head_moves and engine_of(profile) == "mujoco":
-        raise ConfigError("head_moves: MuJoCo's world has a head that stands still")
+    for name in ("head_moves", "shake_g"):
+        if getattr(sweep, name) and engine_of(profile) == "mujoco":
+            raise ConfigError(f"{name}: MuJoCo's world has a head that stands still")
 
 
 class World(Protocol):
@@ -102,6 +106,7 @@ class SweepSimulation:
     ) -> None:
         check_sweep(sweep, profile)
         animals = array if isinstance(array, tuple) else (array,)
+        animals = tuple(_on_surface(animal, sweep.surface_friction) for animal in animals)
         whiskers = [w for animal in animals for w in animal.whiskers]
         straight = [line for a in animals for line in centrelines(a.whiskers, a.mount)]
         outward = faces_right(animals, straight)
@@ -121,7 +126,8 @@ class SweepSimulation:
             front = min(points[:, 1].min() for points in shape)
             way = FAR_MM + front - max(line[:, 1].max() for line in lines)
         start[1] += sweep.gap_mm - way
-        self._simulated = np.flatnonzero(met | whole)
+        self.reached = int(met.sum())
+        self._simulated = np.flatnonzero(met | whole | bool(sweep.shake_g))
         self._elements = len(whiskers)
         self._animals, self._profile = animals, profile
         felt = self._felt = [whiskers[i] for i in self._simulated]
@@ -214,14 +220,22 @@ class SweepSimulation:
 
     def _shaken(self, samples: int) -> Floats | None:
         """(n, 3) acceleration of the head in the samples just begun, mm/ms^2; None: it has none."""
-        ramp = self._sweep.ramp_ms
+        sweep, ramp = self._sweep, self._sweep.ramp_ms
         first = (self._samples - samples) * SAMPLE_MS
-        if not self._sweep.head_moves or first >= ramp:
+        moves = bool(sweep.head_moves) and first < ramp
+        if not moves and not sweep.shake_g:
             return None
-        x = np.minimum((first + (np.arange(samples) + 0.5) * SAMPLE_MS) / ramp, 1.0)
-        # the head goes against the object's way: of x^3 - x^4 / 2, the second derivative
-        rate = self._sweep.speed_mm_s * 1e-3 * (6 * x - 6 * x**2) / ramp
-        return np.outer(rate, -self._ahead)
+        times = first + (np.arange(samples) + 0.5) * SAMPLE_MS
+        shaken = np.zeros((samples, 3))
+        if moves:
+            x = np.minimum(times / ramp, 1.0)
+            # the head goes against the object's way: of x^3 - x^4 / 2, the second derivative
+            shaken += np.outer(sweep.speed_mm_s * 1e-3 * (6 * x - 6 * x**2) / ramp, -self._ahead)
+        if sweep.shake_g:
+            grown = np.minimum(times / SHAKEN_IN_MS, 1.0)
+            wave = grown * np.sin(2 * np.pi * sweep.shake_hz * 1e-3 * times)
+            shaken += np.outer(sweep.shake_g * G * wave, np.ones(3) / np.sqrt(3))
+        return shaken
 
     def turns(self) -> Floats:
         """(sample, element, 2) turns of bases that give, about the elements' y and z, rad.
@@ -282,6 +296,14 @@ def _beside(
     nearest = shape[:, 0].min() if right else shape[:, 0].max()
     x = face + (sweep.distance_mm if right else -sweep.distance_mm) - nearest
     return np.array([x, FAR_MM, sweep.height_mm])
+
+
+def _on_surface(animal: WhiskerArray, friction: float) -> WhiskerArray:
+    """The array on a surface of so many times the friction."""
+    if friction == 1:
+        return animal
+    whiskers = tuple(replace(w, friction=w.friction * friction) for w in animal.whiskers)
+    return replace(animal, whiskers=whiskers)
 
 
 def _roots(animals: Sequence[WhiskerArray]) -> Floats:

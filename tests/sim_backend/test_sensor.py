@@ -33,6 +33,7 @@ EVERYTHING = SensorModel(
     hysteresis_force=2e-6,
     hysteresis_moment=2e-8,
     dead_probability=0.2,
+    dead_row_probability=0.5,
     range_force=2e-4,
     range_moment=2e-6,
     resolution_force=1e-6,
@@ -522,3 +523,18 @@ def test_a_chunk_of_which_nothing_is_left_gives_none() -> None:
 def test_what_cannot_be_is_refused(given: dict[str, float], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         SensorModel(**given)
+
+
+def test_whole_rows_die() -> None:
+    rows = {row for row, _ in SPEC.grid}
+    counts = []
+    for seed in range(300):
+        dead = Sensor(SensorModel(dead_row_probability=0.3), SPEC, seed).dead
+        of_row = {row: {bool(d) for d, (r, _) in zip(dead, SPEC.grid, strict=True) if r == row}
+                  for row in rows}  # fmt: skip
+        assert all(len(both) == 1 for both in of_row.values())
+        counts.append(sum(True in both for both in of_row.values()))
+    assert np.mean(counts) == pytest.approx(0.3 * len(rows), rel=0.15)
+    alone = SensorModel(dead_probability=0.3)
+    both = SensorModel(dead_probability=0.3, dead_row_probability=1e-9)
+    assert (Sensor(alone, SPEC, 4).dead == Sensor(both, SPEC, 4).dead).all()

@@ -230,8 +230,8 @@ def fingerprint(target: TactileObject) -> str:
 def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> SweepRecord:
     """Make one sweep of a set, by itself.
 
-    A drawn sweep that misses the array or turns unstable is drawn again, up to 20 times; one of
-    the combinations of given values stays.
+    A drawn sweep that misses the array, that too few whiskers reach or that turns unstable is drawn
+    again, up to 20 times; one of the combinations of given values stays.
 
     Args:
         recipe: the set.
@@ -248,10 +248,14 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
     ideal = load_animals(recipe.array)
     draws = recipe.rng(target.name, index, RANDOMISATION)
     animals = tuple(recipe.randomisation.draw(draws, animal) for animal in ideal)
-    for _ in range(1 if recipe.sweeps.keeps_misses else DRAWS):
+    most = 1 if recipe.sweeps.keeps_misses else DRAWS
+    for tries in range(most):
         shared = recipe.rng(target.name, recipe.sweeps.draw_index(index), SHARED)
         sweep = recipe.sweeps.draw(rng, index, shared)
         simulation = SweepSimulation(animals, target, sweep, profile)
+        last = tries == most - 1
+        if simulation.reached < recipe.sweeps.least_whiskers and not last:
+            continue
         made = _simulated(recipe, simulation) if simulation.touches else None
         if made is not None:
             break

@@ -85,8 +85,12 @@ class _Sweeps(msgspec.Struct):
     climb_deg: float | _Range | None = None
     ramp_ms: float | _Range | None = None
     head_moves: float | _Range | None = None
+    surface_friction: float | _Range | None = None
+    shake_g: float | _Range | None = None
+    shake_hz: float | _Range | None = None
     draws: int = 1
     held_out_draws: int = 0
+    least_whiskers: int = 1
 
 
 class _File(msgspec.Struct):
@@ -227,6 +231,7 @@ def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
                 **{n: _choice(nodes, n, file.sweeps, usual[n]) for n in PARAMETERS},
                 draws=file.sweeps.draws,
                 held_out_draws=file.sweeps.held_out_draws,
+                least_whiskers=file.sweeps.least_whiskers,
             ),
             sensor=file.sensor,
             randomisation=file.randomisation,

@@ -54,6 +54,7 @@ SHAPES = "shapes"
 MOST_OBJECTS = 100_000
 LARGEST = 1e4  # of any of the sweep's parameters: beyond it is a slip of the pen
 POSITIVE = ("size_mm", "speed_mm_s")  # of the sweep's parameters; a gap may also be 0
+LATER = ("surface_friction", "shake_g", "shake_hz")  # parameters that older sets do not name
 LONGEST_MS = 600_000.0
 
 
@@ -141,6 +142,8 @@ class SweepChoice:
         draws: The number of sweeps of every combination of the `Each` values.
         held_out_draws: The number of further sweeps of each combination, marked by a `draw` of
             `draws` and above.
+        least_whiskers: The least number of whiskers that can reach the object as it goes by; sweeps
+            that fewer reach are drawn again.
     """
 
     size_mm: Choice = 40.0
@@ -155,8 +158,12 @@ class SweepChoice:
     climb_deg: Choice = 0.0
     ramp_ms: Choice = 0.0
     head_moves: Choice = 0.0
+    surface_friction: Choice = 1.0
+    shake_g: Choice = 0.0
+    shake_hz: Choice = 30.0
     draws: int = 1
     held_out_draws: int = 0
+    least_whiskers: int = 1
 
     def check(self) -> None:
         """Raise a ConfigError for values that cannot be."""
@@ -164,6 +171,10 @@ class SweepChoice:
             raise ConfigError(f"sweeps.draws must be at least 1, not {self.draws}")
         if self.held_out_draws < 0:
             raise ConfigError(f"sweeps.held_out_draws must be 0 or more, not {self.held_out_draws}")
+        if self.least_whiskers < 1:
+            raise ConfigError(
+                f"sweeps.least_whiskers must be at least 1, not {self.least_whiskers}"
+            )
         for name in PARAMETERS:
             choice = getattr(self, name)
             if isinstance(choice, Between) and not choice.low <= choice.high:
@@ -221,7 +232,8 @@ class SweepChoice:
         return Sweep(**values)
 
 
-PARAMETERS = tuple(f.name for f in fields(SweepChoice) if not f.name.endswith("draws"))
+COUNTS = ("draws", "held_out_draws", "least_whiskers")
+PARAMETERS = tuple(f.name for f in fields(SweepChoice) if f.name not in COUNTS)
 
 
 def _each(choice: Choice) -> tuple[float, ...]:
@@ -320,7 +332,13 @@ class SweepRecipe:
             for key, value in asdict(self.objects).items()
             if key != "mesh" and (value or not key.endswith("_source"))
         } | self.objects.mesh.differing()
-        sweeps = {name: _written(getattr(self.sweeps, name)) for name in PARAMETERS}
+        # unsaid what sets of older releases did not know, where it changes nothing
+        sweeps = {
+            name: _written(getattr(self.sweeps, name))
+            for name in PARAMETERS
+            if name not in LATER or getattr(self.sweeps, name) != getattr(SweepChoice, name)
+        }
+        least = self.sweeps.least_whiskers
         top = {f.name: getattr(self, f.name) for f in fields(self)}
         if not self.contacts:  # unsaid, as in sets of releases that knew of none
             del top["contacts"]
@@ -330,6 +348,7 @@ class SweepRecipe:
             "sweeps": {
                 "draws": self.sweeps.draws,
                 "held_out_draws": self.sweeps.held_out_draws,
+                **({"least_whiskers": least} if least > 1 else {}),
                 **sweeps,
             },
             "sensor": _differing_from_default(self.sensor),

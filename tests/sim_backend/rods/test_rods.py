@@ -261,6 +261,39 @@ def test_a_head_that_moves_feels_what_the_object_s_motion_gives_and_its_own_acce
     assert abs(off).max() < 0.05 * abs(calm).max()
 
 
+def test_a_shaken_whisker_weighs_what_its_mass_does_in_the_shaking() -> None:
+    """Slowly shaken, every base holds mass times acceleration, whether it touches or not."""
+    mouse = load_array("mouse")
+    sweep = Sweep(gap_mm=30.0, shake_g=0.5, shake_hz=5.0)
+    loads = SweepSimulation(mouse, make_object("mug", 3), sweep, PROFILES["dataset"]).advance(400)
+    for k in (0, 5, 29):
+        whisker = mouse.whiskers[k]
+        s = np.linspace(0, whisker.length, 2001)
+        section = np.pi * (whisker.radius(s) * 1e-3) ** 2
+        mass = np.trapezoid(whisker.density(s) * section, s * 1e-3)  # kg
+        size = np.linalg.norm(loads[200:, k, :3], axis=1)
+        assert size.max() == pytest.approx(mass * 0.5 * 9.80665, rel=0.1)
+        assert size.argmax() % 100 == pytest.approx(
+            50, abs=5
+        )  # a quarter of 200 ms, twice a period
+
+
+def test_a_surface_has_a_friction_of_its_own() -> None:
+    slippery = tuple(replace(w, friction=0.0) for w in load_array("mouse").whiskers)
+    one, other = (
+        SweepSimulation(array, make_object("mug", 3), sweep, PROFILES["realtime"]).advance(300)
+        for array, sweep in (
+            (load_array("mouse"), Sweep(surface_friction=0.0)),
+            (replace(load_array("mouse"), whiskers=slippery), Sweep()),
+        )
+    )
+    np.testing.assert_array_equal(one, other)
+    rough = SweepSimulation(
+        load_array("mouse"), make_object("mug", 3), Sweep(), PROFILES["realtime"]
+    ).advance(300)
+    assert abs(rough - one).max() > 0.02 * abs(one).max()
+
+
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize("name", ["mouse A0", "mouse C2", "long nitinol"])
 def test_a_gap_is_that_of_the_curve_and_not_of_its_chords(name: str, side: int) -> None:
