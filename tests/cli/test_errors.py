@@ -267,3 +267,40 @@ def test_a_model_is_evaluated_only_on_what_it_was_made_for(
     assert "a sample every 1000000 ns" in refused("eval", changed, sweep_set)
     changed = tiny_model(provenance={"unseen_objects": ["mug-2"]})
     assert "may have been trained on objects" in refused("eval", changed, sweep_set)
+
+
+def test_a_model_is_evaluated_on_fewer_kinds_and_on_objects_from_elsewhere(
+    tiny_model, refused, call, sweep_set, tmp_path
+):
+    """Labels are the model's, by their names; objects of another source were never trained on."""
+    import json
+    import shutil
+
+    from tactile_rt.classifier.model_file import read_model
+    from tactile_rt.sweep_set import SweepManifest
+
+    path = tiny_model()
+    kinds = read_model(path)[0].labels
+    own = SweepManifest.read(sweep_set).categories
+    assert kinds == own
+    more = tiny_model(labels=("anvil", *reversed(own[1:])))
+    assert f"does not know {own[0]} of" in refused("eval", more, sweep_set)
+    # Whatever the network says, each of its sayings is right under one of these namings.
+    values, figures = [], tmp_path / "figures.json"
+    for label in own:
+        shifted = own[own.index(label) :] + own[: own.index(label)]
+        model = tiny_model(labels=shifted)
+        assert call("eval", model, sweep_set, "--quick", "--json", figures)[0] == 0
+        rows = json.loads(figures.read_text())
+        values.append({row["name"]: row["value"] for row in rows}["models.top-1"])
+    assert sum(values) == pytest.approx(100)
+    elsewhere = tmp_path / "elsewhere"
+    shutil.copytree(sweep_set, elsewhere)
+    file = elsewhere / "manifest.json"
+    manifest = json.loads(file.read_text())
+    manifest["recipe"]["objects"]["from"] = "/some/meshes"
+    file.write_text(json.dumps(manifest))
+    trained = {"unseen_objects": ["mug-2"], "sweep_set": {"objects": {"from": "shapes"}}}
+    model = tiny_model(provenance=trained)
+    assert "may have been trained on objects" in refused("eval", model, sweep_set)
+    assert call("eval", model, elsewhere, "--quick")[0] == 0
