@@ -1,5 +1,6 @@
 """The application that every command adds itself to, and what commands share."""
 
+import logging
 import os
 import signal
 import sys
@@ -32,6 +33,7 @@ __all__ = [
 
 USER_ERROR, INTERRUPTED = 2, 130  # exit codes
 A_DAY_S = 86_400.0
+SLOW_WORK = "tactile_rt.sim_backend.objects"  # a logger
 
 Model = Annotated[
     Path | None, typer.Option(help="An .onnx model; default: the one that comes with the package.")
@@ -62,7 +64,11 @@ def _options(
         False, "--version", callback=_version, is_eager=True, help="Print the version."
     ),
 ) -> None:
-    pass
+    if sys.stderr.isatty():  # what takes seconds says so; a log file keeps clean
+        said = logging.getLogger(SLOW_WORK)
+        said.addHandler(logging.StreamHandler())
+        said.setLevel(logging.INFO)
+        said.propagate = False
 
 
 @contextmanager

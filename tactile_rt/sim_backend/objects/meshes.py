@@ -42,7 +42,7 @@ __all__ = ["load_mesh"]
 
 Floats = NDArray[np.float64]
 
-log = logging.getLogger("tactile_rt.sim_backend")
+log = logging.getLogger("tactile_rt.sim_backend.objects")
 
 RECIPE = 4  # of the pieces; raised when the same file would become others
 DIGITS = 7  # of a largest extent: corners nearer than 4e-6 mm at 40 mm are one
@@ -59,7 +59,7 @@ FLAPS = 1e-4  # of area (largest extent squared) of what hangs on a solid withou
 SMALL_HOLE = 0.05  # of which this is the length round it is damage, not an opening
 LONGEST_LOOP = 64  # of edges round a hole that is looked at
 FLUSH = 0.999  # so parallel (cosine) to a neighbour is a face that got lost
-MANY = 20_000  # triangles that take some seconds
+MANY = 2000  # triangles that take some seconds
 
 
 def load_mesh(path: Path, detail: MeshDetail = STANDARD) -> TactileObject:
@@ -88,11 +88,15 @@ def load_mesh(path: Path, detail: MeshDetail = STANDARD) -> TactileObject:
         with np.errstate(all="ignore"):  # parts without a volume have no centre
             pieces = _pieces(mesh, detail)
         write_pieces(key, pieces)
-        error, took = SIZE_MM * pieces.surface_error, time.monotonic() - began
-        log.info(
-            "%s: %d triangles to %d pieces within %.2f mm at 40 mm, in %.1f s",
-            path, faces, len(pieces.meshes), error, took,
-        )  # fmt: skip
+        if faces > MANY:
+            error, took = SIZE_MM * pieces.surface_error, time.monotonic() - began
+            log.info(
+                "%s: %d pieces within %.2f mm at 40 mm, %.1f s",
+                path,
+                len(pieces.meshes),
+                error,
+                took,
+            )
     return TactileObject(path.stem, path.stem, pieces.meshes, pieces.surface_error, pieces.made_by)
 
 
@@ -105,9 +109,9 @@ def _pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> Pieces:
     bodies, sheet = _simplified(*_bodies_and_sheet(_mended(mesh)), SIMPLER * tolerance)
     if len(bodies) > detail.max_pieces:
         bodies = [outer_solid(bodies)]
-    parts: list[SolidPieces | SheetPieces] = [SolidPieces(body) for body in bodies]
-    if len(sheet.faces):
-        parts.append(SheetPieces(sheet, half=tolerance))
+    solids = [SolidPieces(body) for body in bodies]
+    sheets = [SheetPieces(sheet, half=tolerance)] if len(sheet.faces) else []
+    parts: list[SolidPieces | SheetPieces] = [*solids, *sheets]
     allowed = JOINED * tolerance
     for part in parts:
         part.join(allowed)
@@ -115,11 +119,14 @@ def _pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> Pieces:
         allowed *= WIDER
         for part in parts:
             part.join(allowed)
-    corners = [piece for part in parts for piece in part.corners]
+    corners = [piece for plates in sheets for piece in plates.corners()]
+    left = sum(map(len, solids))
+    for solid in solids:
+        left -= len(solid)
+        corners += solid.corners(spare=max(0, detail.max_pieces - len(corners) - left - len(solid)))
     pieces = tuple(_piece(c) for c in corners)
     error = deviation(drawn, pieces, bodies).largest
-    whole = len(pieces) == len(bodies) and not len(sheet.faces)
-    made_by = "plates" if len(sheet.faces) else "bodies" if whole else "pieces"
+    made_by = "plates" if sheets else "bodies" if len(pieces) == len(bodies) else "pieces"
     return Pieces(pieces, error, made_by)
 
 

@@ -31,7 +31,7 @@ class _Patch:
 
 
 class SheetPieces:
-    """The plates of a sheet: `join` them, then take their `corners`.
+    """The plates of a sheet: `join` them, then ask for their `corners`.
 
     Args:
         sheet: any surface, in the unit box.
@@ -57,7 +57,6 @@ class SheetPieces:
         self._tolerance = tolerance
         self._joining.join(self._joined)
 
-    @property
     def corners(self) -> list[Floats]:
         """The (n, 3) corners of each plate."""
         mesh, plates = self._mesh, []

@@ -34,7 +34,7 @@ MOST_VOIDS = 2000  # looked at
 
 
 class SolidPieces:
-    """The pieces of a solid: `join` them, then take their `corners`.
+    """The pieces of a solid: `join` them, then ask for their `corners`.
 
     Args:
         solid: in the unit box.
@@ -64,13 +64,16 @@ class SolidPieces:
             self._joining = Joining(self._faces(), areas, neighbours)
         self._joining.join(self._joined)
 
-    @property
-    def corners(self) -> list[Floats]:
-        """The (n, 3) corners of each piece, those of the pieces in the middle at the end."""
+    def corners(self, spare: int) -> list[Floats]:
+        """The (n, 3) corners of each piece, those of the pieces in the middle at the end.
+
+        Args:
+            spare: so many pieces there may be in the middle.
+        """
         if self._joining is None:
             return [self._mesh.vertices]
         outer = [p for p in self._joining.patches if _hull(p) is not None]
-        return outer + self._middle(outer)
+        return outer + self._middle(outer, spare)
 
     def _faces(self) -> list[Floats]:
         """The piece behind each face, as deep as it can be."""
@@ -115,12 +118,12 @@ class SolidPieces:
             points = points[depth > self._tolerance]
         return len(points) == 0
 
-    def _middle(self, outer: list[Floats]) -> list[Floats]:
+    def _middle(self, outer: list[Floats], spare: int) -> list[Floats]:
         """Pieces that fill what others leave empty."""
         union = Manifold.batch_boolean([Manifold.hull_points(p) for p in outer], OpType.Add)
-        voids, pieces = (self._solid - union).decompose(), []
+        voids, pieces = (self._solid - union).decompose(), list[Floats]()
         for _ in range(MOST_VOIDS):
-            if not voids:
+            if not voids or len(pieces) == spare:
                 break
             void = voids.pop()
             if void.volume() < max(VOID, VOID_DEPTH * void.surface_area()):

@@ -274,3 +274,15 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path) -> None:
 def test_cutting_says_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     load_mesh(save(channel(), tmp_path / "gutter.ply"))
     assert capfd.readouterr() == ("", "")
+
+
+def test_what_takes_seconds_says_so_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = save(mesh_truth.blob(4), tmp_path / "lump.ply")
+    with caplog.at_level("INFO", "tactile_rt.sim_backend.objects"):
+        load_mesh(path)
+        before, after = (record.getMessage() for record in caplog.records)
+        assert before == f"{path}: 5120 triangles to pieces; this takes some seconds, once"
+        assert after.startswith(f"{path}: ") and " pieces within 0." in after
+        caplog.clear()
+        load_mesh(path)
+    assert not caplog.records

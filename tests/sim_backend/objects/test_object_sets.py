@@ -107,6 +107,8 @@ def test_flat_faced_shapes_are_cut_exactly(tmp_path: Path) -> None:
 
 def test_a_limit_on_pieces_widens_the_error_and_says_so(tmp_path: Path) -> None:
     path = saved(mesh_truth.torus(14, 6), tmp_path / "torus.ply")
+    some = load_mesh(saved(mesh_truth.mug(), tmp_path / "mug.ply"), MeshDetail(max_pieces=30))
+    assert len(some.pieces) <= 30
     few = load_mesh(path, MeshDetail(max_pieces=6))
     assert len(few.pieces) <= 6
     assert MM * few.surface_error > 0.1
