@@ -55,6 +55,7 @@ SIMPLER, JOINED = 0.4, 0.55
 WIDER, WIDEST = 1.25, 0.2  # distances that are tried where the pieces allowed are too few
 MOST_FACES = 6000  # of all bodies and the sheet together, where there are more
 LEAST_FACES = 400  # that each of them may keep
+GONE = 5e-3  # so far from what is left is a face that simplification took away: 0.2 mm at 40 mm
 FLAPS = 1e-4  # of area (largest extent squared) of what hangs on a solid without having volume
 SMALL_HOLE = 0.05  # of which this is the length round it is damage, not an opening
 LONGEST_LOOP = 64  # of edges round a hole that is looked at
@@ -213,7 +214,15 @@ def _simplified(
         least = max(LEAST_FACES, round(share * body.num_tri()))
         found = _solid(simplified(surface_of(body), tolerance, least))
         simpler += found or [body]
-    return simpler, simplified(sheet, tolerance, max(LEAST_FACES, round(share * len(sheet.faces))))
+    fewer = simplified(sheet, tolerance, max(LEAST_FACES, round(share * len(sheet.faces))))
+    if len(fewer.faces) < len(sheet.faces):  # a large face at a border may have gone altogether
+        places = np.concatenate([sheet.triangles, sheet.triangles_center[:, None]], axis=1)
+        away = TriangleSurface(fewer.triangles).distance(places.reshape(-1, 3)).reshape(-1, 4)
+        gone = sheet.faces[away.max(axis=1) > GONE]
+        joined = trimesh.util.append_faces([fewer.vertices, sheet.vertices], [fewer.faces, gone])
+        fewer = trimesh.Trimesh(*joined, process=False)
+        fewer.remove_unreferenced_vertices()
+    return simpler, fewer
 
 
 def _solid(part: Any) -> list[Manifold]:

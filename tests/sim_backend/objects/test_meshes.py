@@ -286,3 +286,20 @@ def test_what_takes_seconds_says_so_once(tmp_path: Path, caplog: pytest.LogCaptu
         caplog.clear()
         load_mesh(path)
     assert not caplog.records
+
+
+def test_no_large_face_is_lost_where_small_ones_go(tmp_path: Path) -> None:
+    """A cloth of 9,800 triangles, rippled, and a sail of two at its border."""
+    x, y = np.meshgrid(np.linspace(0, 1, 71), np.linspace(0, 1, 71))
+    z = 0.02 * np.sin(9 * x) * np.sin(7 * y)
+    at = np.arange(71 * 71).reshape(71, 71)
+    a, b, c, d = (part.ravel() for part in (at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    corners = np.stack([x.ravel(), y.ravel(), z.ravel()], 1)
+    n = len(corners)
+    sail = [[0, 1, n], [70 * 71, n + 1, n + 2]]
+    corners = np.vstack([corners, [-1, -1, 0.5], [-1, 2, 0.5], [0, 1.01, 1]])
+    cloth = trimesh.Trimesh(corners, np.vstack([faces, sail]), process=False)
+    thing = load_mesh(save(cloth, tmp_path / "cloth.ply"))
+    assert len(thing.pieces) < 1024
+    within(thing, cloth, 0.4)
