@@ -7,7 +7,7 @@ piece, an L two boxes, and a smooth hollow facets as wide as the tolerance allow
 empty in the middle of the solid is filled at last; no whisker gets there.
 
 Decompositions that cut a whole in two, by the best of many planes, again and again (CoACD, Wei et
-al. 2022), take some twenty times as long.
+al. 2022), try what costs more; see docs/decisions/0025.
 """
 
 import numpy as np
