@@ -22,10 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.files import write_whole
+from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.sensor_spec import ChannelLimits, SensorSpec, channel_limits
 from tactile_rt.stream import ArraySpec, ConfigError, RecordingError
 
 __all__ = [
+    "OUTLIERS",
     "SPLITS",
     "WITHHELD",
     "SweepManifest",
@@ -45,8 +47,11 @@ SET_VERSION = 2
 READABLE = (1, 2)  # version 1 knew neither withheld categories nor objects out of files
 MANIFEST, SKIPPED = "manifest.json", "skipped.json"
 CONTACTS = "contacts"  # in an object's file, and in the recipe that asks for them
+FAULTS = "faults"  # in the recipe, see `sensor_faults`
 SPLITS = ("train", "validation", "test")
-WITHHELD = "withheld"  # a further split: categories that training never sees, labelled -1
+# Further splits, of categories that are labelled -1: training never sees the first, and may learn
+# from the second what to refuse.
+WITHHELD, OUTLIERS = "withheld", "outliers"
 
 
 @dataclass(frozen=True)
@@ -60,7 +65,7 @@ class SweepManifest:
         categories: The names of the classes; a label is an index into them.
         split: The object names of each split, each ``category-index`` unless `category_of` has it.
         recipe: What made the set (profile, seed, sweeps per object ...), for provenance.
-        withheld: The categories of the split "withheld".
+        withheld: The categories of the splits "withheld" and "outliers".
         category_of: The category of objects whose name does not tell it.
         versions: The versions of what made the set (mujoco, numpy, ...).
         settings: The settings of the simulation profile.
@@ -81,6 +86,18 @@ class SweepManifest:
     versions: dict[str, str] = field(default_factory=dict)
     settings: dict[str, float | str] = field(default_factory=dict)
     sensor: SensorSpec | None = None
+
+    @property
+    def faults(self) -> SensorFaults:
+        """What training draws to be wrong with the sensor.
+
+        Raises:
+            RecordingError: the recipe says it in a way that cannot be.
+        """
+        try:
+            return msgspec.convert(self.recipe.get(FAULTS, {}), SensorFaults)
+        except (msgspec.ValidationError, ConfigError) as error:
+            raise RecordingError(f"{MANIFEST} is damaged: {error}") from None
 
     @property
     def limits(self) -> ChannelLimits:
@@ -198,7 +215,7 @@ class Sweeps:
 
     Attributes:
         values: The (sweep, sample, element, channel) float32 loads, SI, on the set's period.
-        labels: The (sweep,) int64 index into the manifest's categories; -1: withheld from training.
+        labels: The (sweep,) int64 index into the manifest's categories; -1: of none of them.
         objects: The (sweep,) names of the objects; sweeps of one object share the name.
         contacts: The (sweep, sample, element) float32 arc length (m) from the whisker's base to
             where it touches, NaN where it does not; None: the set was made without.

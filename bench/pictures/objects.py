@@ -1,10 +1,10 @@
-"""Draw docs/objects.png: three instances of every category, to see that each is what it says.
+"""Draw docs/objects.png: three instances of every category, to see that each is what it says; and
+docs/objects-varied.png: six of each of any plan.
 
 Orthographic view from above and to one side, z-buffered here because a painter's sort
-(matplotlib's) tears pieces that touch. Run: python -m bench.pictures.objects [--out FILE]
+(matplotlib's) tears pieces that touch. Run: python -m bench.pictures.objects
 """
 
-import argparse
 from pathlib import Path
 
 import matplotlib
@@ -17,6 +17,7 @@ from PIL import Image
 
 from tactile_rt.sim_backend.objects.catalogue import (
     CATEGORIES,
+    VARIED,
     WITHHELD,
     TactileObject,
     make_object,
@@ -24,7 +25,6 @@ from tactile_rt.sim_backend.objects.catalogue import (
 
 Floats = npt.NDArray[np.float64]
 
-INSTANCES, ACROSS = 3, 4  # instances a category, categories a row
 PIXELS, FINE = 170, 3  # side of a picture, and how many times finer it is drawn before averaging
 SPAN = 1.38  # width of a picture in object sizes
 LIGHT = np.array([0.35, 0.45, 0.82])  # in view axes: right, up, toward the viewer
@@ -77,19 +77,25 @@ def render(thing: TactileObject, yaw: float, pitch: float) -> Floats:
     return np.flipud(fine.mean(axis=(1, 3)))
 
 
-def sheet(out: Path) -> None:
-    """Write the contact sheet."""
-    kinds = [(c, c) for c in CATEGORIES] + [(c, f"{c} (withheld)") for c in WITHHELD]
-    rows = -(-len(kinds) // ACROSS)
+def sheet(out: Path, kinds: dict[str, str], instances: int, across: int) -> None:
+    """Write a contact sheet.
+
+    Args:
+        out: the picture.
+        kinds: the title of every category.
+        instances: of each category.
+        across: how many categories stand side by side.
+    """
+    rows = -(-len(kinds) // across)
     figure, panels = plt.subplots(
-        rows, ACROSS, figsize=(ACROSS * INSTANCES * 1.3, rows * 1.6), dpi=110
+        rows, across, figsize=(across * instances * 1.3, rows * 1.6), dpi=110
     )
     for panel in panels.flat:
         panel.axis("off")
-    for panel, (category, title) in zip(panels.T.flat, kinds, strict=False):
+    for panel, (category, title) in zip(panels.T.flat, kinds.items(), strict=False):
         pictures = [
             render(make_object(category, i), np.radians(-58 + 8 * i), np.radians(24))
-            for i in range(INSTANCES)
+            for i in range(instances)
         ]
         panel.imshow(np.hstack(pictures), cmap="gray", vmin=0, vmax=1)
         panel.set_title(title, fontsize=13, loc="left")
@@ -98,7 +104,12 @@ def sheet(out: Path) -> None:
     Image.open(out).convert("L").save(out, optimize=True)  # half the size without colour
 
 
+def main() -> None:
+    """Draw both sheets."""
+    known = {c: c for c in CATEGORIES}
+    sheet(Path("docs/objects.png"), known | {c: f"{c} (withheld)" for c in WITHHELD}, 3, 4)
+    sheet(Path("docs/objects-varied.png"), {VARIED + c: c for c in CATEGORIES}, 6, 2)
+
+
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/objects.png"))
-    sheet(parser.parse_args().out)
+    main()

@@ -20,9 +20,10 @@ def sweep(
     recipe: Annotated[
         str | None,
         typer.Option(
-            help="What to make: default24, mouse12, paper-lowvar-highfi, paper-highvar-lowfi, or "
-            "a TOML file. Without it the folder's own, or else default24. The paper's come to 16 "
-            "and 312 sweeps of an object, as its code does; its table's totals are other numbers."
+            help="What to make: wide24, default24, mouse12, paper-lowvar-highfi, "
+            "paper-highvar-lowfi, or a TOML file. Without it the folder's own, or else wide24. The "
+            "paper's come to 16 and 312 sweeps of an object, as its code does; its table's totals "
+            "are other numbers."
         ),
     ] = None,
     objects: Annotated[int | None, typer.Option(help="Objects of every category.")] = None,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
+from tactile_rt.evidence.model_windows import stepped
 from tactile_rt.evidence.records import Record
 from tactile_rt.evidence.robustness import measure_robustness, rated_amount, robustness_records
 from tactile_rt.models import evaluation
@@ -56,7 +57,8 @@ def evaluate_model(
         SpecMismatch: the model was made for another array than the set's.
         ModelError, RecordingError: a file cannot be read.
     """
-    run, card = _runner(model)
+    session, card = load_model(model)
+    run = stepped(session, card)
     test = _labelled(SweepSet.read(data, "test"), card.labels, model, data)
     differences = card.array.differences(test.manifest.spec, ignore=("name", "rate_hz"))
     if differences:
@@ -188,27 +190,6 @@ def _from_elsewhere(test: SweepSet, card: ModelCard) -> bool:
     trained: Any = card.provenance.get("sweep_set", {})
     source = trained.get("objects", {}).get("from") if isinstance(trained, dict) else None
     return source is not None and test.manifest.recipe.get("objects", {}).get("from") != source
-
-
-def _runner(model: Path) -> tuple[evaluation.Step, Any]:
-    """The model file as a function of windows, stepped as on a robot."""
-    session, card = load_model(model)
-    names = [o.name for o in session.get_outputs()]
-
-    def run(
-        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
-    ) -> NDArray[np.float32]:
-        feed: dict[str, NDArray[Any]] = {"offset": offset, "sigma": sigma}
-        feed |= {s.name: np.zeros((len(samples), *s.shape), dtype=s.dtype) for s in card.state}
-        logits = []
-        for t in range(samples.shape[1]):
-            feed["samples"] = samples[:, t]
-            out = dict(zip(names, session.run(None, feed), strict=True))
-            feed |= {s.name: out[f"{s.name}_next"] for s in card.state}
-            logits.append(out["logits"] / np.float32(card.temperature))
-        return np.stack(logits, axis=1)
-
-    return run, card
 
 
 def _accuracy(

@@ -41,11 +41,17 @@ def conditions(data: SweepSet) -> dict[str, Disturbance]:
         "noise at twice the rated": Disturbance(noise=2.0),
         f"offset of {rated_amount(data, OFFSET / 4)} after the tare": Disturbance(offset=0.25),
         f"offset of {rated_amount(data, OFFSET)} after the tare": Disturbance(offset=1.0),
+        f"drift of {rated_amount(data, OFFSET)} in a window": Disturbance(drift=1.0),
         "gain error of 20 % per whisker": Disturbance(gain=0.2),
     }
     if whiskers > 1:
         dead = max(1, whiskers // 5)
         found[f"{dead} dead whisker{'s' if dead > 1 else ''}"] = Disturbance(dead=dead)
+    if data.manifest.spec.grid_shape[0] > 1:
+        found["a dead row of whiskers"] = Disturbance(rows=1)
+    channels = data.manifest.spec.channels
+    if any(name.endswith("x") and f"{name[:-1]}y" in channels for name in channels):
+        found["x and y connected the wrong way round"] = Disturbance(swapped=True)
     return found
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from tactile_rt.models.datasets import SweepSet, frame_of
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.stream import ArraySpec, RecordingError, SpecMismatch
-from tactile_rt.sweep_set import WITHHELD, SweepManifest, object_path
+from tactile_rt.sweep_set import OUTLIERS, WITHHELD, SweepManifest, object_path
 
 __all__ = ["check_array", "check_sets", "check_split", "trained_on"]
 
@@ -82,7 +82,7 @@ def check_split(folder: Path, manifest: SweepManifest) -> None:
                     "on it would mean nothing; make the set anew"
                 )
             side[name] = split
-            if split != WITHHELD and manifest.label(name) < 0:
+            if split not in (WITHHELD, OUTLIERS) and manifest.label(name) < 0:
                 raise RecordingError(
                     f"{folder}: {name} of {split!r} is of the withheld category "
                     f"{manifest.category(name)!r}, which has no label to train on"

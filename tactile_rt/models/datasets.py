@@ -30,8 +30,6 @@ __all__ = [
 
 NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0)  # of the rated noise, at which training finds onsets
 CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others are in between
-GAIN_ERROR = 0.1
-DROPOUT = 0.05  # of whole whiskers
 JITTER = 5  # samples either side of the onset
 
 
@@ -106,7 +104,8 @@ class TrainingBatches:
     """Epochs of augmented training windows, each drawn afresh from (seed, epoch).
 
     A third of the windows are clean, a third carry the rated sensor noise, and a third a level
-    drawn between; every whisker's gain is off by a few percent, and some whiskers are dead.
+    drawn between; what else is wrong with the sensor is drawn as the set's recipe says, or else as
+    `SensorFaults` does.
 
     Raises:
         ConfigError: not even one batch of sweeps with a touch.
@@ -114,6 +113,7 @@ class TrainingBatches:
 
     def __init__(self, data: SweepSet, batch: int, seed: int) -> None:
         self._data, self._batch, self._seed = data, batch, seed
+        self._faults = data.manifest.faults
         starts = data.noisy_starts
         # Too faint to be found at its noise level: learn it from where it is found without.
         self._starts = np.where(starts < 0, starts[0], starts)  # (level, sweep)
@@ -153,9 +153,15 @@ class TrainingBatches:
         rest = values[:, : data.manifest.lead].mean(axis=1) if data.manifest.lead else 0.0
         samples = windows(values, start, data.timing)
         samples -= np.asarray(rest, dtype=np.float32)[..., None, None, :, :]
-        gain = 1 + GAIN_ERROR * rng.normal(size=(n, 1, 1, elements, 1)).astype(np.float32)
-        alive = rng.random((n, 1, 1, elements, 1)) >= DROPOUT
+        faults = self._faults
+        gain = 1 + faults.gain * rng.normal(size=(n, 1, 1, elements, 1)).astype(np.float32)
+        alive = rng.random((n, 1, 1, elements, 1)) >= faults.dead
+        if faults.dead_row:
+            rows = np.array(data.manifest.spec.grid)[:, 0]
+            alive &= (rng.random((n, rows.max() + 1)) >= faults.dead_row)[:, None, None, rows, None]
         samples = samples * (gain * alive)
+        if faults.offset or faults.drift:
+            samples += self._wandered(n, rng)
         noise = data.noise * level[:, None, None]  # (batch, 1, channel)
         samples += noise[:, None, None] * rng.normal(size=samples.shape).astype(np.float32)
         # The tare: a mean and a spread over the quiet samples that happened to come before.
@@ -170,3 +176,16 @@ class TrainingBatches:
             torch.from_numpy(sigma.astype(np.float32)),
             torch.from_numpy(data.sweeps.labels[at]),
         )
+
+    def _wandered(self, n: int, rng: np.random.Generator) -> NDArray[np.float32]:
+        """(n, step, sub-step, element, channel) what has come to the readings since their tare."""
+        data, timing = self._data, self._data.timing
+        course = np.arange(1, timing.samples + 1) / timing.samples
+        there = np.zeros((n, timing.samples, *data.manifest.spec.shape), dtype=np.float32)
+        for most, over in (
+            (self._faults.offset, np.ones_like(course)),
+            (self._faults.drift, course),
+        ):
+            size = most * rng.random((n, 1, 1)) * data.noise
+            there += (size * rng.normal(size=(n, *there.shape[2:])))[:, None] * over[:, None, None]
+        return there.reshape(n, timing.steps, timing.substeps, *there.shape[2:])

@@ -7,7 +7,7 @@ Predictions are (sweep, step, class) posteriors; a sweep in which no contact was
 decision, and counts as wrong everywhere.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,6 +36,7 @@ __all__ = [
     "fused_accuracy",
     "hits",
     "predict",
+    "run_windows",
 ]
 
 # samples (batch, step, sub-step, element, channel), offset and sigma (batch, element, channel), SI
@@ -55,8 +56,12 @@ class Disturbance:
         noise: The white noise on every stored sample, in units of the rated noise.
         gain: The standard deviation of every whisker's relative gain error.
         dead: The number of whiskers, drawn at random, that read zero throughout.
+        rows: The number of rows of the grid, drawn at random, whose whiskers all do.
         offset: The size of a constant that appears with the contact, after the tare, in units of
             `OFFSET`; a sign is drawn for every whisker and channel.
+        drift: The size that a linear drift from the contact on has reached at the window's end, in
+            units of `OFFSET`; a sign is drawn as for the offset.
+        swapped: Whether the channels of x and of y are connected the wrong way round.
         rest: The number of stored samples of silence before each sweep, for the tare; a robot has
             them, the sweeps have only a short lead.
 
@@ -67,11 +72,14 @@ class Disturbance:
     noise: float = 0.0
     gain: float = 0.0
     dead: int = 0
+    rows: int = 0
     offset: float = 0.0
+    drift: float = 0.0
+    swapped: bool = False
     rest: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("noise", "gain", "dead", "offset", "rest"):
+        for name in ("noise", "gain", "dead", "rows", "offset", "drift", "rest"):
             if not getattr(self, name) >= 0:  # which NaN is not either
                 raise ConfigError(f"{name} is {getattr(self, name)}, must not be negative")
 
@@ -91,6 +99,13 @@ class Disturbance:
         if self.dead:
             rank = rng.permuted(np.tile(np.arange(elements), (n, 1)), axis=1)
             values = values * (rank >= self.dead)[:, None, :, None]
+        if self.rows:
+            grid = np.array(data.manifest.spec.grid)[:, 0]
+            rank = rng.permuted(np.tile(np.unique(grid), (n, 1)), axis=1)
+            gone = (grid == rank[:, : self.rows, None]).any(axis=1)
+            values = values * ~gone[:, None, :, None]
+        if self.swapped:
+            values = values[..., _x_for_y(data.manifest.spec.channels)]
         if self.noise:
             noise = rng.normal(size=values.shape).astype(np.float32)
             values = values + noise * data.noise * np.float32(self.noise)
@@ -100,15 +115,27 @@ class Disturbance:
         self, samples: NDArray[np.float32], data: SweepSet, rng: np.random.Generator
     ) -> NDArray[np.float32]:
         """What the network sees, of (sweep, step, sub-step, element, channel) SI."""
-        if not self.offset:
-            return samples
-        size = OFFSET * data.noise * np.float32(self.offset)
-        sign = rng.choice(np.array([-1, 1], dtype=np.float32), (len(samples), *samples.shape[3:]))
-        there: NDArray[np.float32] = samples + (sign * size)[:, None, None]
-        return there
+        steps, substeps = samples.shape[1:3]
+        course = np.arange(1, steps * substeps + 1, dtype=np.float32) / (steps * substeps)
+        for amount, over_time in ((self.offset, np.ones_like(course)), (self.drift, course)):
+            if amount:
+                size = OFFSET * data.noise * np.float32(amount)
+                shape = (len(samples), *samples.shape[3:])
+                sign = rng.choice(np.array([-1, 1], dtype=np.float32), shape)
+                over = over_time.reshape(steps, substeps, 1, 1)
+                samples = samples + (sign * size)[:, None, None] * over
+        return samples
 
 
 CLEAN = Disturbance()
+
+
+def _x_for_y(channels: Sequence[str]) -> list[int]:
+    """The place of every channel if those that end in x and in y are mistaken for one another."""
+    other = {"x": "y", "y": "x"}
+    swapped = [name[:-1] + other.get(name[-1], name[-1]) for name in channels]
+    return [channels.index(name if name in channels else channels[k])
+            for k, name in enumerate(swapped)]  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -147,18 +174,31 @@ def predict(
     """
     if noise_level:
         disturbance = replace(disturbance, noise=noise_level)
+    logits, found = run_windows(data, run, seed, batch, disturbance)
+    raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    posterior: NDArray[np.float32] = raised / raised.sum(axis=-1, keepdims=True)
+    posterior[~found] = np.nan
+    return posterior
+
+
+def run_windows(
+    data: SweepSet, run: Step, seed: int = 0, batch: int = 64, disturbance: Disturbance = CLEAN
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """What `run` makes of every sweep's window, and (sweep,) whether a contact was detected.
+
+    Args:
+        data, run, seed, batch, disturbance: as `predict` takes them; what `run` gives need not be
+            logits.
+    """
     rng = np.random.default_rng(seed)
-    parts = []
+    parts, detected = [], []
     for i in range(0, len(data.sweeps), batch):
         values = disturbance.of_samples(data.sweeps.values[i : i + batch], data, rng)
         found = find_onsets(values, data.floor)
         cut = disturbance.of_windows(windows(values, found.start, data.timing), data, rng)
-        logits = run(cut, found.offset, found.sigma)
-        posterior = np.exp(logits - logits.max(axis=-1, keepdims=True))
-        posterior /= posterior.sum(axis=-1, keepdims=True)
-        posterior[found.start < 0] = np.nan
-        parts.append(posterior)
-    return np.concatenate(parts)
+        parts.append(run(cut, found.offset, found.sigma))
+        detected.append(found.start >= 0)
+    return np.concatenate(parts), np.concatenate(detected)
 
 
 def at_temperature(posteriors: NDArray[np.float32], temperature: float) -> NDArray[np.float32]:

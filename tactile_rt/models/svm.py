@@ -18,12 +18,11 @@ from numpy.typing import NDArray
 from sklearn.metrics.pairwise import rbf_kernel
 from sklearn.svm import SVC
 
-from tactile_rt.models.onsets import find_onsets
-
 if TYPE_CHECKING:
     from tactile_rt.models.datasets import SweepSet
+    from tactile_rt.models.evaluation import Disturbance
 
-__all__ = ["FittedSVM", "Predict", "fit", "fit_svm"]
+__all__ = ["PENALTIES", "FittedSVM", "Predict", "fit", "fit_margins", "fit_svm", "window_features"]
 
 MOST_PAIRED = 8000  # sweeps whose kernel, 8 bytes a pair, is kept: half a gigabyte
 PENALTIES = (1.0, 10.0, 100.0, 300.0)  # C
@@ -42,20 +41,54 @@ def fit(features: NDArray[np.float32], labels: NDArray[Any], penalty: float) -> 
     Returns:
         The machine's decisions: (sweep, feature) to (sweep,) labels.
     """
+    machine, seen = _machine(features, labels, penalty)
+
+    def predict(others: NDArray[np.float32]) -> NDArray[Any]:
+        found: NDArray[Any] = machine.predict(seen(others))
+        return found
+
+    return predict
+
+
+def fit_margins(
+    features: NDArray[np.float32], labels: NDArray[np.int64], penalty: float, classes: int
+) -> Predict:
+    """Fit one machine that says how far it is from each decision.
+
+    Args:
+        features, penalty: as `fit` takes them.
+        labels: (sweep,) numbers below `classes`.
+        classes: how many there are, with those that no sweep is of.
+
+    Returns:
+        (sweep, feature) to (sweep, class), one class against all others; -inf of a class that no
+        sweep was of.
+    """
+    machine, seen = _machine(features, labels, penalty)
+
+    def margins(others: NDArray[np.float32]) -> NDArray[Any]:
+        found = np.full((len(others), classes), -np.inf)
+        distance = machine.decision_function(seen(others))
+        if distance.ndim == 1:  # of two classes: from the second
+            distance = np.column_stack([-distance, distance])
+        found[:, machine.classes_] = distance
+        return found
+
+    return margins
+
+
+def _machine(
+    features: NDArray[np.float32], labels: NDArray[Any], penalty: float
+) -> tuple[SVC, Callable[[NDArray[np.float32]], NDArray[np.float32]]]:
+    """A fitted machine, and what it wants to be given for (sweep, feature)."""
     # Of its own gamma, "scale". The kernel is a product of matrices, which libsvm by itself works
     # out pair by pair: dozens of times slower where there are thousands of features.
     gamma = 1.0 / (features.shape[1] * float(features.var()) or 1.0)
     if len(features) > MOST_PAIRED:
-        machine = SVC(C=penalty, gamma=gamma).fit(features, labels)
-        return machine.predict  # type: ignore[no-any-return]
+        return SVC(C=penalty, gamma=gamma).fit(features, labels), lambda others: others
     machine = SVC(C=penalty, kernel="precomputed")
     machine.fit(rbf_kernel(features, gamma=gamma), labels)
-
-    def predict(others: NDArray[np.float32]) -> NDArray[Any]:
-        found: NDArray[Any] = machine.predict(rbf_kernel(others, features, gamma))
-        return found
-
-    return predict
+    return machine, lambda others: rbf_kernel(others, features, gamma)
 
 
 @dataclass(frozen=True)
@@ -72,14 +105,14 @@ class FittedSVM:
 
     def hits(self, data: "SweepSet") -> NDArray[np.bool_]:
         """(sweep,) whether each is right; one without an onset is not."""
-        x, usable = _features(data)
+        x, usable = window_features(data)
         right: NDArray[np.bool_] = (self.predict(x) == data.sweeps.labels) & usable
         return right
 
 
 def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
     """Fit one machine per penalty and keep the best on the validation sweeps."""
-    x, usable = _features(train)
+    x, usable = window_features(train)
     tried = [
         FittedSVM(
             fit(x[usable], train.sweeps.labels[usable], c),
@@ -91,14 +124,26 @@ def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
     return max(tried, key=lambda one: one.hits(validation).mean())
 
 
-def _features(data: "SweepSet") -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """(sweep, step * element * channel) compressed loads, and whether there was an onset."""
+def window_features(
+    data: "SweepSet", disturbance: "Disturbance | None" = None
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """(sweep, step * element * channel) compressed loads, and whether there was an onset.
+
+    Args:
+        data: the sweeps.
+        disturbance: what is wrong with the sensor; None: nothing.
+    """
     # Imported here: it brings torch, which whoever only writes a set's card does without.
-    from tactile_rt.models.datasets import windows
+    from tactile_rt.models.evaluation import CLEAN, run_windows
 
     limits = data.manifest.limits
-    found = find_onsets(data.sweeps.values, data.floor)
-    cut = windows(data.sweeps.values, found.start, data.timing) - found.offset[:, None, None]
-    cut = np.clip(cut, -limits.clip, limits.clip)  # (sweep, step, sub-step, element, channel) SI
-    cut = np.sign(cut) * np.log1p(np.abs(cut) / limits.scale)
-    return cut.mean(axis=2).reshape(len(cut), -1), found.start >= 0
+
+    def run(
+        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        cut = np.clip(samples - offset[:, None, None], -limits.clip, limits.clip)
+        cut = np.sign(cut) * np.log1p(np.abs(cut) / limits.scale)
+        out: NDArray[np.float32] = cut.mean(axis=2).reshape(len(cut), -1)
+        return out
+
+    return run_windows(data, run, disturbance=disturbance or CLEAN)

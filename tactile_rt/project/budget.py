@@ -18,7 +18,7 @@ from tactile_rt.project.folder import Project
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.datasets.dataset import simulate_sweep
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
-from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
+from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.stream import ConfigError
 
@@ -102,7 +102,7 @@ def budget_sweeps(project: Project, seconds: float) -> Budget:
     while draws > 1 and sweeps < kinds * ENOUGH * draws:
         draws -= 1
     of_a_kind = max(FEWEST, int(sweeps / kinds / draws))
-    if recipe.objects.source != SHAPES:  # a folder's own objects: all of them, swept less often
+    if not recipe.objects.generated:  # a folder's own objects: all of them, swept less often
         chosen = recipe.objects
         most = max(1, int(sweeps / max(1, sum(map(len, objects.split.values())))))
         return Budget(described(project), chosen.per_category, 0, 0, min(recipe.sweeps.draws, most))

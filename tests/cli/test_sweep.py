@@ -76,7 +76,7 @@ def test_a_set_is_made_gone_on_with_described_and_checked(call, recipe, tmp_path
     [
         (("--recipe", "tiny"), "no recipe 'tiny'; there are default24,"),
         (("--recipe", "none.toml"), "none.toml: no such file"),
-        (("--objects", 2), "2 objects cannot be split with 4 for validation and 13 for test"),
+        (("--objects", 2), "2 objects cannot be split with 4 for validation and 12 for test"),
         (("--sweeps", 0), "sweeps.draws must be at least 1, not 0"),
         (("--validation", 0), "objects.validation must be a whole number"),
         (("--engine", "spark"), "no engine 'spark'; there are processes, ray"),

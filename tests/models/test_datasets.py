@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -152,3 +154,42 @@ def test_sweeps_without_a_touch_are_left_out_and_too_few_are_refused() -> None:
     assert sorted(drawn(TrainingBatches(sweeps(values), 2, seed=0))[3]) == [0, 2, 3, 5]
     with pytest.raises(ConfigError, match="a batch of 5 is more than the 4 sweeps"):
         TrainingBatches(sweeps(values), 5, seed=0)
+
+
+def with_faults(values: np.ndarray, **faults: float) -> SweepSet:
+    """Silent of all that is drawn, but for these."""
+    data = sweeps(values)
+    recipe = {"faults": {"gain": 0.0, "dead": 0.0, **faults}}
+    return replace(data, manifest=replace(data.manifest, recipe=recipe))
+
+
+def test_a_row_of_whiskers_dies_as_a_whole_and_as_often_as_said() -> None:
+    data = with_faults(touches(60), dead_row=0.3)
+    spec = replace(SPEC, grid=((0, 0), (0, 1), (1, 0), (1, 1)))
+    data = replace(data, manifest=replace(data.manifest, spec=spec))
+    samples = drawn(TrainingBatches(data, 20, seed=0), epochs=10)[0]
+    # what a dead whisker reads is noise
+    touching = np.abs(samples).reshape(len(samples), -1, ELEMENTS, CHANNELS)
+    dead = (np.median(touching, axis=1) < 10 * RATED).all(axis=2)  # (window, element)
+    assert np.array_equal(dead[:, 0], dead[:, 1]) and np.array_equal(dead[:, 2], dead[:, 3])
+    assert dead.mean(axis=0) == pytest.approx(0.3, abs=0.06)
+    assert not np.array_equal(dead[:, 0], dead[:, 2])
+
+
+def test_what_has_come_since_the_tare_is_constant_or_grows_and_is_not_tared_away() -> None:
+    values = touches(60)
+    still, grown = (
+        drawn(TrainingBatches(with_faults(values, **{name: 3.0}), 20, seed=0), epochs=8)
+        for name in ("offset", "drift")
+    )
+    for samples, offset, _, labels in (still, grown):
+        clean = (offset == 0).all(axis=(1, 2))
+        assert clean.mean() == pytest.approx(1 / 3, abs=0.05), "the tare knows nothing of it"
+        true = 100.0 * RATED * (1 + labels[clean, None, None])  # of `touches`
+        late = samples[clean].reshape(clean.sum(), -1, ELEMENTS, CHANNELS)[:, 60:100]
+        error = (late - true[:, None]) / RATED
+        # evenly drawn from nothing to 3 of the rated noise: 3 over the root of three
+        size = 3 / np.sqrt(3) * (1.0 if samples is still[0] else 80 / 110)
+        assert error.std() == pytest.approx(size, rel=0.2)
+        slope = np.ptp(error, axis=1).mean()
+        assert slope < 1e-2 if samples is still[0] else slope > 0.2

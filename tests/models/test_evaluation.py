@@ -165,7 +165,9 @@ def test_a_decision_counts_from_when_it_stays_right() -> None:
 # ---- what goes wrong with a sensor
 
 
-def seen_by(disturbance: Disturbance, values: np.ndarray, seed: int = 0) -> tuple[np.ndarray, ...]:
+def seen_by(
+    disturbance: Disturbance, values: np.ndarray, spec: ArraySpec = SPEC, seed: int = 0
+) -> tuple[np.ndarray, ...]:
     """The windows, offsets and sigmas that a network is given."""
     seen: list[tuple[np.ndarray, ...]] = []
 
@@ -173,7 +175,9 @@ def seen_by(disturbance: Disturbance, values: np.ndarray, seed: int = 0) -> tupl
         seen.append((samples.copy(), offset, sigma))
         return np.zeros((len(samples), MOUSE.steps, 2), dtype=np.float32)
 
-    evaluation.predict(a_set(values), run, disturbance=disturbance, seed=seed)
+    data = a_set(values)
+    data = replace(data, manifest=replace(data.manifest, spec=spec))
+    evaluation.predict(data, run, disturbance=disturbance, seed=seed)
     return tuple(np.concatenate(part) for part in zip(*seen, strict=True))
 
 
@@ -198,6 +202,32 @@ def test_dead_whiskers_are_silent_and_as_many_as_said() -> None:
     assert len({tuple(row) for row in dead}) > 10, "others in every sweep"
 
 
+def test_a_dead_row_is_dead_as_a_whole() -> None:
+    values = sweeps(40)
+    values[:, 20:] += np.float32(1e-9)
+    spec = replace(SPEC, grid=tuple((i // 2, i % 2) for i in range(ELEMENTS)))
+    samples, *_ = seen_by(Disturbance(rows=1), values, spec)
+    dead = (samples == 0).all(axis=(1, 2, 4)).reshape(len(samples), -1, 2)
+    assert (dead.all(axis=2).sum(axis=1) == 1).all() and (dead.sum(axis=(1, 2)) == 2).all()
+    assert len({tuple(row) for row in dead[..., 0]}) == ELEMENTS // 2, "another in every sweep"
+
+
+def test_a_drift_begins_with_the_contact_and_reaches_its_size_at_the_end() -> None:
+    values = sweeps(70)
+    clean, there = seen_by(Disturbance(), values), seen_by(Disturbance(drift=0.5), values)
+    added = (there[0] - clean[0]).astype(np.float64)  # (sweep, step, sub-step, element, channel)
+    size = 0.5 * evaluation.OFFSET * NOISE
+    assert np.allclose(np.abs(added[:, -1, -1]), size, rtol=1e-2)
+    assert np.abs(added[:, 0, 0]).max() < 0.02 * size.max()
+    assert np.array_equal(there[1], clean[1])
+
+
+def test_swapped_wires_exchange_x_and_y_of_forces_and_of_moments() -> None:
+    values = sweeps(30)
+    clean, there = seen_by(Disturbance(), values)[0], seen_by(Disturbance(swapped=True), values)[0]
+    assert np.array_equal(there, clean[..., [1, 0, 2, 4, 3, 5]])
+
+
 def test_a_gain_error_scales_all_of_a_whisker_alike() -> None:
     # Detected alike, because the steps are far above every threshold.
     values = np.zeros((30, 150, ELEMENTS, 6), dtype=np.float32)
@@ -220,7 +250,7 @@ def test_noise_is_the_rated_one_and_repeats_with_its_seed() -> None:
 
 
 def test_a_sensor_cannot_be_better_than_ideal() -> None:
-    for field in ("noise", "gain", "dead", "offset"):
+    for field in ("noise", "gain", "dead", "rows", "offset", "drift"):
         with pytest.raises(ConfigError, match=f"{field} is -1"):
             replace(Disturbance(), **{field: -1})
 

@@ -27,7 +27,7 @@ from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_
 from tactile_rt.sim_backend.datasets.inventory import write_sums, written_sum
 from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove_leftovers
 from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObjects, choose_objects
-from tactile_rt.sim_backend.datasets.recipes import SHAPES, SweepRecipe
+from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
@@ -66,8 +66,9 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
     heads = [(animal.whiskers, animal.mount) for animal in animals]
     morphology = repr(heads if len(heads) > 1 else heads[0])
     # Said in full: a later release may know more categories.
-    chosen = replace(recipe.objects, categories=objects.categories, withheld=objects.withheld)
-    of_meshes = () if recipe.objects.source == SHAPES else ("manifold3d",)
+    withheld, outliers = objects.withheld, recipe.objects.outliers
+    chosen = replace(recipe.objects, categories=objects.categories, withheld=withheld)
+    of_meshes = () if recipe.objects.generated else ("manifold3d",)
     packages = ("mujoco", "numpy", "scipy", "trimesh", *of_meshes)
     return SweepManifest(
         spec=device_spec(animals),
@@ -77,7 +78,7 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
         categories=objects.categories,
         split=objects.split,
         recipe=replace(recipe, objects=chosen).to_dict(),
-        withheld=objects.withheld,
+        withheld=(*withheld, *outliers),
         category_of=objects.category_of,
         versions={
             "tactile_rt": VERSION,
@@ -132,7 +133,7 @@ def make_sweeps(
         outcomes = run_processes(work, todo, processes or os.cpu_count() or 1)
     for name, failure in outcomes:
         if failure is not None:
-            if recipe.objects.source == SHAPES:  # there are no broken ones among them
+            if recipe.objects.generated:  # there are no broken ones among them
                 raise TactileError(f"{name} cannot be made: {failure}")
             skipped[name] = failure
             write_skipped(folder, skipped)

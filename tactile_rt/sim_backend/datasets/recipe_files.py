@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import msgspec
 
+from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.settings import (
     SettingNode,
     convert,
@@ -19,6 +20,7 @@ from tactile_rt.settings import (
 )
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.datasets.recipes import (
+    GENERATED,
     PARAMETERS,
     SHAPES,
     Between,
@@ -44,7 +46,7 @@ __all__ = [
     "shipped_recipes",
 ]
 
-DEFAULT_RECIPE = "default24"
+DEFAULT_RECIPE = "wide24"
 
 Text = Annotated[str, msgspec.Meta(min_length=1)]
 
@@ -53,6 +55,7 @@ class _Objects(msgspec.Struct):
     source: Text = msgspec.field(name="from", default=SHAPES)
     categories: tuple[str, ...] = ()
     withheld: tuple[str, ...] = ()
+    outliers: tuple[str, ...] = ()
     per_category: int | None = None
     validation: float | None = None
     test: float | None = None
@@ -106,6 +109,7 @@ class _File(msgspec.Struct):
     sweeps: _Sweeps = msgspec.field(default_factory=_Sweeps)
     sensor: SensorModel = msgspec.field(default_factory=SensorModel)
     randomisation: Randomisation = msgspec.field(default_factory=Randomisation)
+    faults: SensorFaults = msgspec.field(default_factory=SensorFaults)
 
 
 def shipped_recipes() -> tuple[str, ...]:
@@ -195,7 +199,9 @@ def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
             usual["distance_mm"] = usual_distance(animals)
     period_ms = period_ms if file.period_ms is None else file.period_ms
     lead_ms, length_ms = _usual_lengths(period_ms)
-    all_of_it = objects.source != SHAPES  # a folder's own counts; the published split is 8 : 1 : 1
+    all_of_it = (
+        objects.source not in GENERATED
+    )  # a folder's own counts; the published split is 8 : 1 : 1
 
     def counted(given: float | None, of_a_folder: float, of_shapes: float) -> float:
         return (of_a_folder if all_of_it else of_shapes) if given is None else given
@@ -211,9 +217,10 @@ def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
             length_ms=length_ms if file.length_ms is None else file.length_ms,
             contacts=file.contacts,
             objects=ObjectChoice(
-                source=_absolute(objects.source, folder) if all_of_it else SHAPES,
+                source=_absolute(objects.source, folder) if all_of_it else objects.source,
                 categories=objects.categories,
                 withheld=objects.withheld,
+                outliers=objects.outliers,
                 per_category=int(counted(objects.per_category, 0, 60)),
                 validation=counted(objects.validation, 0.1, 4),
                 test=counted(objects.test, 0.1, 12),
@@ -235,6 +242,7 @@ def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
             ),
             sensor=file.sensor,
             randomisation=file.randomisation,
+            faults=file.faults,
         )
     except ConfigError as error:  # how its parts fit together
         raise ConfigError(f"{nodes.where}: {error}") from None

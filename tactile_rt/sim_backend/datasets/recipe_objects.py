@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tactile_rt.settings import no_such
-from tactile_rt.sim_backend.datasets.recipes import SHAPES, ObjectChoice
+from tactile_rt.sim_backend.datasets.recipes import VARIED_SHAPES, ObjectChoice
 from tactile_rt.sim_backend.objects import catalogue as shapes
-from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
+from tactile_rt.sim_backend.objects.catalogue import VARIED, TactileObject, load_object
 from tactile_rt.stream import ConfigError
-from tactile_rt.sweep_set import SPLITS, WITHHELD, split_by_object
+from tactile_rt.sweep_set import OUTLIERS, SPLITS, WITHHELD, split_by_object
 
 if TYPE_CHECKING:
     from tactile_rt.sim_backend.objects.object_sets import ObjectSet
@@ -37,13 +37,15 @@ class ShapeObjects:
     def categories(self) -> tuple[str, ...]:
         """Names of the classes, in the order of their labels."""
         _check(self.choice.categories, (*shapes.CATEGORIES, *shapes.WITHHELD))
-        known = (c for c in shapes.CATEGORIES if c not in self.choice.withheld)
+        unknown = (*self.choice.withheld, *self.choice.outliers)
+        known = (c for c in shapes.CATEGORIES if c not in unknown)
         return self.choice.categories or tuple(known)
 
     @cached_property
     def withheld(self) -> tuple[str, ...]:
         """Names of the categories that training never sees."""
-        _check(self.choice.withheld, (*shapes.CATEGORIES, *shapes.WITHHELD))
+        unknown = (*self.choice.withheld, *self.choice.outliers)
+        _check(unknown, (*shapes.CATEGORIES, *shapes.WITHHELD))
         return self.choice.withheld or (shapes.WITHHELD if self.choice.per_withheld else ())
 
     @cached_property
@@ -56,16 +58,29 @@ class ShapeObjects:
                 f"{choice.per_category} objects cannot be split with {validation} for validation "
                 f"and {test} for test: each side needs at least one"
             )
-        split = split_by_object(self.categories, choice.per_category, validation, test)
-        if self.withheld:
-            count = choice.per_withheld or PER_WITHHELD
-            split[WITHHELD] = tuple(f"{c}-{i}" for i in range(count) for c in self.withheld)
+        split = split_by_object(
+            [self._prefix + c for c in self.categories], choice.per_category, validation, test
+        )
+        count = choice.per_withheld or PER_WITHHELD
+        for key, categories in ((WITHHELD, self.withheld), (OUTLIERS, choice.outliers)):
+            if categories:
+                split[key] = tuple(
+                    f"{self._prefix}{c}-{i}" for i in range(count) for c in categories
+                )
         return split
 
     @property
+    def _prefix(self) -> str:
+        """What the names of all objects begin with."""
+        return VARIED if self.choice.source == VARIED_SHAPES else ""
+
+    @property
     def category_of(self) -> dict[str, str]:
-        """Nothing: the names tell."""
-        return {}
+        """Category of every object whose name does not tell it."""
+        if not self._prefix:
+            return {}
+        names = (name for names in self.split.values() for name in names)
+        return {name: name[len(self._prefix) : name.rindex("-")] for name in names}
 
     @property
     def skipped(self) -> dict[str, str]:
@@ -144,12 +159,14 @@ class MeshObjects:
         """Names of the classes, in the order of their labels."""
         known = tuple(sorted(self._by_category))
         _check(self.choice.categories, known)
-        return self.choice.categories or tuple(c for c in known if c not in self.withheld)
+        unknown = (*self.withheld, *self.choice.outliers)
+        return self.choice.categories or tuple(c for c in known if c not in unknown)
 
     @cached_property
     def withheld(self) -> tuple[str, ...]:
         """Names of the categories that training never sees."""
-        _check(self.choice.withheld, tuple(sorted(self._by_category)))
+        unknown = (*self.choice.withheld, *self.choice.outliers)
+        _check(unknown, tuple(sorted(self._by_category)))
         return self.choice.withheld
 
     @cached_property
@@ -175,14 +192,15 @@ class MeshObjects:
             for side, (start, stop) in zip(SPLITS, pairwise(ends), strict=True):
                 sides[side] += chain.from_iterable(groups[start:stop])
         split = {key: tuple(names) for key, names in sides.items()}
-        if self.withheld:
-            count = self.choice.per_withheld or None
-            split[WITHHELD] = tuple(
-                name
-                for category in self.withheld
-                for group in self._by_category[category][:count]
-                for name in group
-            )
+        count = self.choice.per_withheld or None
+        for key, categories in ((WITHHELD, self.withheld), (OUTLIERS, self.choice.outliers)):
+            if categories:
+                split[key] = tuple(
+                    name
+                    for category in categories
+                    for group in self._by_category[category][:count]
+                    for name in group
+                )
         return split
 
     @property
@@ -219,7 +237,7 @@ class MeshObjects:
 
 def choose_objects(choice: ObjectChoice) -> ShapeObjects | MeshObjects:
     """What a recipe's choice of objects comes to."""
-    return ShapeObjects(choice) if choice.source == SHAPES else MeshObjects(choice)
+    return ShapeObjects(choice) if choice.generated else MeshObjects(choice)
 
 
 def _count(wanted: float, of: int) -> int:

@@ -9,7 +9,7 @@
     period_ms = 9             # of the stored samples; 1 keeps the simulator's own 1 kHz
     contacts = true           # keep where each whisker touches, too; left out, it is not kept
     [objects]
-    from = "shapes"           # the parametric ones, or a folder of meshes
+    from = "shapes"           # the parametric ones, "varied-shapes", or a folder of meshes
     per_category = 60
     [sweeps]
     draws = 12                # for every combination of the `each` values
@@ -31,6 +31,7 @@ from typing import Any
 
 import numpy as np
 
+from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.settings import no_such
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.randomisation import Randomisation
@@ -40,8 +41,10 @@ from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
 from tactile_rt.stream import ConfigError
 
 __all__ = [
+    "GENERATED",
     "PARAMETERS",
     "SHAPES",
+    "VARIED_SHAPES",
     "Between",
     "Choice",
     "Each",
@@ -50,7 +53,8 @@ __all__ = [
     "SweepRecipe",
 ]
 
-SHAPES = "shapes"
+SHAPES, VARIED_SHAPES = "shapes", "varied-shapes"
+GENERATED = (SHAPES, VARIED_SHAPES)  # sources of objects; any other is a folder
 MOST_OBJECTS = 100_000
 LARGEST = 1e4  # of any of the sweep's parameters: beyond it is a slip of the pen
 POSITIVE = ("size_mm", "speed_mm_s")  # of the sweep's parameters; a gap may also be 0
@@ -89,15 +93,18 @@ class ObjectChoice:
     """Which objects, and who is held out.
 
     Attributes:
-        source: The origin of the objects: "shapes" (the parametric ones) or a folder of meshes.
+        source: The origin of the objects: "shapes" (the parametric ones, each kind of one plan),
+            "varied-shapes" (of any plan) or a folder of meshes.
         categories: The names of the classes; empty: all that there are.
         withheld: The categories of the extra split "withheld", which is for open-set tests: their
             objects are in no other split. Empty: none, or `catalogue.WITHHELD` if `per_withheld`
             asks for some.
+        outliers: The categories of the extra split "outliers": unknown things, too, but ones that a
+            model may learn to refuse; those of `withheld` test whether it does.
         per_category: The number of objects of every category; 0: all that the folder has.
         validation, test: The numbers of objects of every category that are held out; below 1 a
             fraction.
-        per_withheld: The number of objects of every withheld category; 0: 12, or all that the
+        per_withheld: The number of objects of every category of these two; 0: 12, or all that the
             folder has.
         without_source: Objects of a folder from this source, as its `objects.csv` has it, are left
             out; empty: none.
@@ -109,6 +116,7 @@ class ObjectChoice:
     source: str = SHAPES
     categories: tuple[str, ...] = ()
     withheld: tuple[str, ...] = ()
+    outliers: tuple[str, ...] = ()
     per_category: int = 60
     validation: float = 4
     test: float = 12
@@ -117,12 +125,18 @@ class ObjectChoice:
     only_source: str = ""
     mesh: MeshDetail = STANDARD
 
+    @property
+    def generated(self) -> bool:
+        """Whether the objects are parametric ones and not a folder's."""
+        return self.source in GENERATED
+
     def check(self) -> None:
         """Raise a ConfigError for values that cannot be."""
-        both = sorted(set(self.categories) & set(self.withheld))
-        if both:
-            raise ConfigError(f"objects.withheld: {both[0]!r} is also one of the categories")
-        whole = self.source == SHAPES
+        for key, others in (("withheld", "categories"), ("outliers", "categories withheld")):
+            for other in others.split():
+                if both := sorted(set(getattr(self, key)) & set(getattr(self, other))):
+                    raise ConfigError(f"objects.{key}: {both[0]!r} is also one of the {other}")
+        whole = self.generated
         if self.per_withheld < 0:
             raise ConfigError(f"objects.per_withheld must be 0 or more, not {self.per_withheld}")
         for name in ("per_category", "validation", "test"):
@@ -252,7 +266,7 @@ def _ends(choice: Choice) -> tuple[float, ...]:
 
 
 OBJECTS, SWEEPS = ObjectChoice(), SweepChoice()
-PERFECT, UNVARIED = SensorModel(), Randomisation()
+PERFECT, UNVARIED, USUAL_FAULTS = SensorModel(), Randomisation(), SensorFaults()
 
 
 @dataclass(frozen=True)
@@ -273,6 +287,8 @@ class SweepRecipe:
         sensor: What the sensors make of the loads; perfect ones unless it says otherwise.
         randomisation: The way the array of each sweep differs from its description; not at all
             unless it says so.
+        faults: What training draws to be wrong with the sensor, each time that it takes a sweep; no
+            file of the set has any of it.
 
     Raises:
         ConfigError: values that cannot be, or contradict each other.
@@ -290,6 +306,7 @@ class SweepRecipe:
     sweeps: SweepChoice = SWEEPS
     sensor: SensorModel = PERFECT
     randomisation: Randomisation = UNVARIED
+    faults: SensorFaults = USUAL_FAULTS
 
     def __post_init__(self) -> None:
         _check_recipe(self)
@@ -330,7 +347,7 @@ class SweepRecipe:
         objects = {
             key: list(value) if isinstance(value, tuple) else value
             for key, value in asdict(self.objects).items()
-            if key != "mesh" and (value or not key.endswith("_source"))
+            if key != "mesh" and (value or not key.endswith(("_source", "outliers")))
         } | self.objects.mesh.differing()
         # unsaid what sets of older releases did not know, where it changes nothing
         sweeps = {
@@ -340,8 +357,11 @@ class SweepRecipe:
         }
         least = self.sweeps.least_whiskers
         top = {f.name: getattr(self, f.name) for f in fields(self)}
-        if not self.contacts:  # unsaid, as in sets of releases that knew of none
-            del top["contacts"]
+        faults = _differing_from_default(self.faults)
+        # unsaid, as in sets of releases that knew of none
+        for key, told in (("contacts", self.contacts), ("faults", faults)):
+            if not told:
+                del top[key]
         return {
             **top,
             "objects": {"from": objects.pop("source"), **objects},
@@ -353,10 +373,13 @@ class SweepRecipe:
             },
             "sensor": _differing_from_default(self.sensor),
             "randomisation": _differing_from_default(self.randomisation),
+            **({"faults": faults} if faults else {}),
         }
 
 
-def _differing_from_default(settings: SensorModel | Randomisation) -> dict[str, float]:
+def _differing_from_default(
+    settings: SensorModel | Randomisation | SensorFaults,
+) -> dict[str, float]:
     default = type(settings)()
     return {k: v for k, v in asdict(settings).items() if v != getattr(default, k)}
 

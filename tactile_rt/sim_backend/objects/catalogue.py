@@ -1,6 +1,7 @@
 """What is swept past the whiskers: a named thing made of convex pieces.
 
-`make_object` draws the n-th mug, bottle, ...; `load_object` also takes a mesh file.
+`make_object` draws the n-th mug, bottle, ...; `load_object` also takes a mesh file. "mug-17" is of
+the one plan that its kind has; "varied-mug-17" is of any plan, see `shapes.varied`.
 """
 
 import difflib
@@ -17,11 +18,13 @@ from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.shapes import furniture, outdoors, tools, vehicles, vessels
-from tactile_rt.sim_backend.objects.solids import TactileObject, normalised
+from tactile_rt.sim_backend.objects.shapes import varied as varied_shapes
+from tactile_rt.sim_backend.objects.solids import TactileObject, normalised, stretched
 from tactile_rt.stream import ConfigError
 
 __all__ = [
     "CATEGORIES",
+    "VARIED",
     "WITHHELD",
     "TactileObject",
     "load_object",
@@ -68,15 +71,35 @@ _UNKNOWN: dict[str, _Builder] = {
 
 _BUILDERS = _KNOWN | _UNKNOWN
 
+VARIED = "varied-"  # before the name of a kind
+PLAIN_SHARE = 0.25  # of the varied ones are of the one plan, stretched
+STRETCH = 1.25  # at most, across against along and up
+
 CATEGORIES: tuple[str, ...] = tuple(sorted(_KNOWN))  # for training
 WITHHELD: tuple[str, ...] = tuple(sorted(_UNKNOWN))  # never trained: what is new to a classifier
 
 
 def make_object(category: str, index: int) -> TactileObject:
-    """Instance `index` (0 or more) of a category: the same one every time, everywhere."""
-    _check(category, index)
+    """Instance `index` (0 or more) of a category: the same one every time, everywhere.
+
+    Args:
+        category: "mug", say, or "varied-mug".
+        index: which.
+
+    Raises:
+        ConfigError: no such category, or a negative index.
+    """
+    kind = _check(category, index)
+    # crc32 because hash() of a string differs from one process to the next
     rng = np.random.default_rng([zlib.crc32(category.encode()), index])
-    return TactileObject(f"{category}-{index}", category, normalised(_BUILDERS[category](rng)))
+    build = _BUILDERS[kind]
+    if kind == category:
+        pieces = build(rng)
+    else:
+        plain = rng.random() < PLAIN_SHARE
+        pieces = build(rng) if plain else varied_shapes.BUILDERS.get(kind, build)(rng)
+        pieces = stretched(pieces, STRETCH ** rng.uniform(-1, 1, 3))
+    return TactileObject(f"{category}-{index}", kind, normalised(pieces))
 
 
 def load_object(target: str, detail: MeshDetail = STANDARD) -> TactileObject:
@@ -98,15 +121,17 @@ def promised_object(target: str, detail: MeshDetail = STANDARD) -> Callable[[], 
     return cache(partial(make_object, category, index))
 
 
-def _check(category: str, index: int) -> None:
-    if category not in _BUILDERS:
-        near = difflib.get_close_matches(category, _BUILDERS, n=1, cutoff=0.3)
+def _check(category: str, index: int) -> str:
+    """The kind of thing of a category, which must exist."""
+    kind = category.removeprefix(VARIED)
+    if kind not in _BUILDERS:
+        near = difflib.get_close_matches(kind, _BUILDERS, n=1, cutoff=0.3)
         hint = f" (did you mean {near[0]!r}?)" if near else ""
         raise ConfigError(
             f"no object called {category!r}{hint}; there are {', '.join(CATEGORIES)}; "
-            f"{', '.join(WITHHELD)} (withheld from training); "
+            f"{', '.join(WITHHELD)} (withheld from training); each also with {VARIED!r} before it; "
             f"and mesh files ending in {', '.join(MESH_SUFFIXES)}"
         )
     if index < 0:
         raise ConfigError(f"object {category}-{index}: the index must be 0 or more")
-    # crc32 because hash() of a string differs from one process to the next
+    return kind

@@ -41,6 +41,20 @@ def normalised(pieces: Sequence[trimesh.Trimesh]) -> tuple[trimesh.Trimesh, ...]
     )
 
 
+def moved(points: Points, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Points:
+    """(n, 3) points moved by so much."""
+    there: Points = points + np.array([x, y, z])
+    return there
+
+
+def stretched(pieces: Sequence[trimesh.Trimesh], factors: npt.ArrayLike) -> list[trimesh.Trimesh]:
+    """The pieces made longer or shorter along x, y and z by positive factors."""
+    return [
+        trimesh.Trimesh(piece.vertices * np.asarray(factors), piece.faces, process=False)
+        for piece in pieces
+    ]
+
+
 def hull(*points: npt.ArrayLike) -> trimesh.Trimesh:
     """Convex hull of one or more (n, 3) groups of points."""
     solid: trimesh.Trimesh = trimesh.convex.convex_hull(np.vstack(points))

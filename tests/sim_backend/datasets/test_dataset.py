@@ -27,6 +27,7 @@ from tactile_rt.sim_backend.datasets.dataset import (
 )
 from tactile_rt.sim_backend.datasets.inventory import check_sums
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe, recipe_of_set
+from tactile_rt.sim_backend.datasets.recipe_objects import ShapeObjects
 from tactile_rt.sim_backend.datasets.recipes import (
     Between,
     Each,
@@ -381,7 +382,9 @@ def test_a_finished_set_starts_no_process(finished: Path, monkeypatch: pytest.Mo
 def test_an_object_that_cannot_be_made_is_listed_and_not_tried_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(dataset, "SHAPES", "meshes")  # among which there are broken ones
+    # as if of meshes, among which there are broken ones
+    monkeypatch.setattr(dataset, "choose_objects", ShapeObjects)
+    monkeypatch.setattr(ObjectChoice, "generated", False)
     monkeypatch.setattr(
         dataset, "run_processes", lambda work, names, processes: [(n, "no volume") for n in names]
     )

@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
+from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import (
+    DEFAULT_RECIPE,
     read_recipe,
     recipe_from_dict,
     recipe_of_set,
@@ -22,6 +24,7 @@ from tactile_rt.sim_backend.datasets.recipe_files import (
 )
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.datasets.recipes import (
+    PARAMETERS,
     Between,
     Each,
     ObjectChoice,
@@ -265,6 +268,52 @@ def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
     assert recipe_of_set(manifest.recipe, manifest.categories) == recipe
 
 
+def test_varied_shapes_and_unknown_kinds_to_learn_from(tmp_path: Path) -> None:
+    recipe = read_recipe(
+        write(
+            tmp_path / "mine.toml",
+            """
+            [objects]
+            from = "varied-shapes"
+            categories = ["mug"]
+            withheld = ["goblet"]
+            outliers = ["jack"]
+            per_category = 3
+            validation = 1
+            test = 1
+            per_withheld = 1
+            [faults]
+            dead_row = 0.25
+            drift = 2
+            """,
+        )
+    )
+    assert recipe.faults == SensorFaults(dead_row=0.25, drift=2)
+    manifest = describe_set(recipe)
+    assert manifest.split == {
+        "train": ("varied-mug-0",),
+        "validation": ("varied-mug-1",),
+        "test": ("varied-mug-2",),
+        "withheld": ("varied-goblet-0",),
+        "outliers": ("varied-jack-0",),
+    }
+    kinds = {n: (manifest.category(n), manifest.label(n)) for n in manifest.names()}
+    assert kinds["varied-mug-1"] == ("mug", 0)
+    assert kinds["varied-goblet-0"] == ("goblet", -1)
+    assert kinds["varied-jack-0"] == ("jack", -1)
+    assert manifest.faults == recipe.faults
+    assert recipe_of_set(manifest.recipe, manifest.categories) == recipe
+
+
+def test_the_default_set_is_of_varied_shapes_in_a_wide_world() -> None:
+    recipe = read_recipe(DEFAULT_RECIPE)
+    assert (recipe.name, recipe.objects.source) == ("wide24", "varied-shapes")
+    assert recipe.sweeps.least_whiskers == 5
+    drawn = [name for name in PARAMETERS if isinstance(getattr(recipe.sweeps, name), Between)]
+    assert set(PARAMETERS) - set(drawn) == {"ramp_ms", "head_moves"}
+    assert recipe.faults.dead_row and recipe.faults.offset and recipe.faults.drift
+
+
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
@@ -314,6 +363,9 @@ def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
         ("[objects]\ncategories = 'mug'", "objects.categories: expected a list, got 'mug'"),
         ("[objects]\ncategories = ['a', 'a']", "objects.categories: 'a' is there twice"),
         ("[objects]\ncategories = ['mug']\nwithheld = ['mug']", "'mug' is also one of the cat"),
+        ("[objects]\nwithheld = ['jack']\noutliers = ['jack']", "'jack' is also one of the withh"),
+        ("[faults]\ndead_row = 2", "dead_row must be between 0 and 1, not 2"),
+        ("[faults]\ndrift = -1", "drift must be between 0 and 100, not -1"),
         ("[objects]\ntest = 0.5", "objects.test must be a whole number, at least 1, not 0.5"),
         ("[objects]\nvalidation = 0", "objects.validation must be a whole number, at least 1"),
         ("\nseed = = 1", r"mine.toml:2: not TOML: "),
@@ -331,6 +383,7 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(tmp_path, text, complain
     ("text", "complaint"),
     [
         ("[objects]\ncategories = ['mugs']", r"no category 'mugs'; did you mean mug\?"),
+        ("[objects]\noutliers = ['jacks']", r"no category 'jacks'; did you mean jack"),
         ("[objects]\nwithheld = ['goblets']", r"no category 'goblets'; did you mean goblet"),
         ("[objects]\nper_category = 16", "16 objects cannot be split with 4 .* and 12 for test"),
         ("array = 'moose'", "no simulated array 'moose': did you mean mouse"),

@@ -11,6 +11,7 @@ pytest.importorskip("trimesh")
 
 from tactile_rt.sim_backend.objects.catalogue import (
     CATEGORIES,
+    VARIED,
     WITHHELD,
     TactileObject,
     load_object,
@@ -242,6 +243,42 @@ def test_there_is_a_gap_behind_the_handle() -> None:
         row = [inside(mug, (x, 0, 0.02)) for x in np.arange(0.5, -0.5, -0.004)]
         # from outside: handle, gap, wall, cavity, wall
         assert (np.diff(np.array(row, int)) == 1).sum() >= 2
+
+
+@pytest.mark.parametrize("category", KINDS)
+def test_a_varied_one_is_of_its_kind_solid_and_whole(category: str) -> None:
+    for index in range(MANY):
+        thing = drawn(VARIED + category, index)
+        assert (thing.name, thing.category) == (f"{VARIED}{category}-{index}", category)
+        assert len(thing.pieces) <= 64
+        for piece in thing.pieces:
+            assert piece.is_convex and piece.is_watertight and piece.volume > 0, thing.name
+        low, high = extents(thing)
+        np.testing.assert_allclose(low + high, 0, atol=1e-9)
+        assert (high - low).max() == pytest.approx(1)
+        boxes = np.array([p.bounds for p in thing.pieces])
+        reached, todo = {0}, [0]
+        while todo:
+            lowest, highest = boxes[todo.pop()]
+            near = ((boxes[:, 0] <= highest + 1e-9) & (boxes[:, 1] >= lowest - 1e-9)).all(axis=1)
+            new = set(np.flatnonzero(near).tolist()) - reached
+            reached |= new
+            todo += new
+        assert len(reached) == len(boxes), f"{thing.name} falls apart"
+
+
+@pytest.mark.parametrize("category", ["chair", "table", "house", "car", "lamp", "bottle", "mug"])
+def test_varied_ones_differ_by_far_more_than_those_of_one_plan(category: str) -> None:
+    def spread(prefix: str) -> float:
+        """Over the share of the bounding box that things fill, and over its sides."""
+        shapes = [drawn(prefix + category, i) for i in range(MANY)]
+        filled = [
+            sum(p.volume for p in s.pieces) / np.ptp(extents(s), axis=0).prod() for s in shapes
+        ]
+        sides = np.array([np.ptp(extents(s), axis=0) for s in shapes])
+        return float(np.std(np.log(filled)) + np.log(sides).std(axis=0).sum())
+
+    assert spread(VARIED) > 1.5 * spread("")
 
 
 def test_load_object_takes_a_name_with_or_without_an_index() -> None:

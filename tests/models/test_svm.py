@@ -1,0 +1,27 @@
+"""Support vector machines that say how far they are from a decision."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sklearn")
+
+from tactile_rt.models.svm import fit, fit_margins
+
+
+def blobs(classes: list[int], n: int = 60) -> tuple[np.ndarray, np.ndarray]:
+    """(sweep, feature) values about a corner each, and their labels."""
+    rng = np.random.default_rng(0)
+    labels = np.repeat(classes, n)
+    corners = 3 * rng.normal(size=(10, 5))
+    return (corners[labels] + rng.normal(size=(len(labels), 5))).astype(np.float32), labels
+
+
+@pytest.mark.parametrize("classes", [[0, 1, 2, 5], [1, 3]])
+def test_the_largest_margin_is_the_decision(classes: list[int]) -> None:
+    x, y = blobs(classes)
+    margins = fit_margins(x, y, 10.0, classes=7)(x)
+    assert margins.shape == (len(x), 7)
+    assert np.mean(margins.argmax(axis=1) == fit(x, y, 10.0)(x)) > 0.99
+    missing = [k for k in range(7) if k not in classes]
+    assert np.isneginf(margins[:, missing]).all()
+    assert np.isfinite(margins[:, classes]).all()
