@@ -1,3 +1,5 @@
+import json
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +79,58 @@ def test_a_hollow_solid_survives_each_format(tmp_path: Path, suffix: str) -> Non
         assert piece.is_convex and piece.is_watertight and piece.volume > 0
     assert not inside(thing, (0, 0, 0.05)), "the channel was filled"
     assert inside(thing, (0, 0, -0.15)) and inside(thing, (0, 0.2, 0.1))
+
+
+def test_a_hollow_solid_survives_draco(tmp_path: Path) -> None:
+    draco = pytest.importorskip("DracoPy")
+    mesh = channel()
+    name = "KHR_draco_mesh_compression"
+    packed = draco.encode(
+        mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), quantization_bits=16
+    )
+    packed += b"\0" * (-len(packed) % 4)
+    told = {
+        "asset": {"version": "2.0"},
+        "extensionsUsed": [name],
+        "extensionsRequired": [name],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "buffers": [{"byteLength": len(packed)}],
+        "bufferViews": [{"buffer": 0, "byteLength": len(packed)}],
+        "accessors": [
+            {
+                "componentType": 5126,
+                "count": len(mesh.vertices),
+                "type": "VEC3",
+                "min": mesh.bounds[0].tolist(),
+                "max": mesh.bounds[1].tolist(),
+            },
+            {"componentType": 5125, "count": mesh.faces.size, "type": "SCALAR"},
+        ],
+        "meshes": [
+            {
+                "primitives": [
+                    {
+                        "attributes": {"POSITION": 0},
+                        "indices": 1,
+                        "extensions": {name: {"bufferView": 0, "attributes": {"POSITION": 0}}},
+                    }
+                ]
+            }
+        ],
+    }
+    text = json.dumps(told).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(packed), b"BIN\0") + packed
+    path = tmp_path / "packed.glb"
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    packed_one = load_mesh(path, MeshDetail(up="z"))
+    plain = load_mesh(save(mesh, tmp_path / "plain.stl"))
+    assert packed_one.made_by == plain.made_by
+    volumes = [sum(piece.volume for piece in one.pieces) for one in (packed_one, plain)]
+    assert volumes[0] == pytest.approx(volumes[1], rel=1e-3)
 
 
 @pytest.mark.parametrize("suffix", [".obj", ".ply", ".glb"])

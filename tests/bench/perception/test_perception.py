@@ -1,0 +1,180 @@
+"""The benchmark: its data keep what they promise, its figures are right, its page says them."""
+
+import csv
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+pytest.importorskip("sklearn")
+
+from bench.perception.area import OBJECTS, BenchmarkResults
+from bench.perception.data import FILE, SOURCE, SPLITS, Data, load, pack
+from bench.perception.methods import Method, joined, of_kinds
+from bench.perception.page import write_page
+from bench.perception.scores import accuracy_by_source, score
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.evaluation import Disturbance
+from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
+from tactile_rt.sweep_set import OUTLIERS, WITHHELD, write_object
+from tests.helpers.source_tree import ROOT
+
+LIST = ROOT / "tactile_rt/sim_backend/objects/lists/real.csv"
+
+
+@pytest.fixture(scope="module")
+def data() -> Data:
+    return load()
+
+
+def test_it_is_small_and_has_kinds_and_objects_enough(data: Data) -> None:
+    assert FILE.stat().st_size <= 5e6
+    assert len(data.kinds) >= 25
+    unknown = {o.category for o in data.origins.values() if o.split in (OUTLIERS, WITHHELD)}
+    assert len(unknown) >= 20 and not unknown & set(data.kinds)
+    both = [
+        {o.category for o in data.origins.values() if o.split == split}
+        for split in (OUTLIERS, WITHHELD)
+    ]
+    assert not both[0] & both[1]
+    shared = {o.category for o in data.origins.values() if o.split == SOURCE}
+    assert len(shared) >= 8 and shared <= set(data.kinds)
+    for split in ("train", "validation", "test"):
+        assert {o.category for o in data.origins.values() if o.split == split} == set(data.kinds)
+    assert all(o.licence in ("MIT", "CC0-1.0") for o in data.origins.values())
+    assert all(len(data.sets[split].sweeps) for split in SPLITS)
+
+
+def test_no_shape_is_on_two_sides_and_the_held_out_source_only_on_one(data: Data) -> None:
+    with LIST.open() as file:
+        shape = {
+            f"{row['category']}-{row['name']}": (row["category"], row["shape"] or row["name"])
+            for row in csv.DictReader(file)
+        }
+    sides = defaultdict(set)
+    for name, origin in data.origins.items():
+        sides[shape[name]].add(origin.split)
+    assert {k: v for k, v in sides.items() if len(v) > 1} == {}
+    held_out = {o.source for o in data.origins.values() if o.split == SOURCE}
+    assert len(held_out) == 1
+    elsewhere = {o.source for o in data.origins.values() if o.split not in (SOURCE, WITHHELD)}
+    assert not held_out & elsewhere
+
+
+def test_its_recipes_are_those_that_made_it(data: Data) -> None:
+    folder = ROOT / "bench/perception/recipes"
+    recipe = read_recipe(str(folder / "real27.toml"))
+    assert recipe.objects.categories == data.kinds
+    told = {o.category for o in data.origins.values() if o.split == OUTLIERS}
+    assert set(recipe.objects.outliers) == told
+    stored = data.sets["train"].manifest.recipe
+    assert stored["sweeps"] == recipe.to_dict()["sweeps"]
+
+
+def test_what_is_packed_is_what_was_felt_to_a_tenth_of_the_noise(
+    data: Data, tmp_path: Path
+) -> None:
+    origins = data.origins
+    few = {
+        split: [n for n, o in origins.items() if o.split == split][:2] for split in SPLITS
+    }  # two objects of each split
+    manifest = data.sets["train"].manifest
+    names = [n for split in SPLITS for n in few[split]]
+    small = replace(
+        manifest,
+        split={split: tuple(few[split]) for split in SPLITS},
+        category_of={n: origins[n].category for n in names},
+        withheld=tuple({origins[n].category for n in few[OUTLIERS] + few[WITHHELD]}),
+    )
+    small.write(tmp_path)
+    rng = np.random.default_rng(0)
+    felt = {}
+    for name in names:
+        split = data.sets[origins[name].split].sweeps
+        felt[name] = split.values[split.objects == name] * np.float32(1.1)
+        felt[name] += (1e-7 * rng.normal(size=felt[name].shape)).astype(np.float32)
+        write_object(tmp_path, name, felt[name], {})
+    path = tmp_path / "packed.xz"
+    path.write_bytes(
+        pack(
+            {split: (tmp_path, split) for split in SPLITS},
+            {n: (origins[n].source, origins[n].licence) for n in names},
+        )
+    )
+    back = load(path)
+    assert {n: o.split for n, o in back.origins.items()} == {n: origins[n].split for n in names}
+    for name in names:
+        there = back.sets[origins[name].split].sweeps
+        step = 0.1 * manifest.limits.noise
+        error = np.abs(there.values[there.objects == name] - felt[name]) / step
+        assert error.max() <= 0.51
+        expected = (
+            data.kinds.index(origins[name].category) if origins[name].category in data.kinds else -1
+        )
+        assert set(there.labels[there.objects == name]) == {expected}
+
+
+def oracle(data: Data, wrong: set[str] = frozenset()) -> Method:  # type: ignore[assignment]
+    """Knows all that is known, but takes the objects of some sources for the next kind."""
+
+    def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> np.ndarray:
+        n, k = len(sweeps.sweeps), len(data.kinds)
+        labels = sweeps.sweeps.labels.copy()
+        source = [data.origins[name].source for name in sweeps.sweeps.objects.tolist()]
+        labels[np.isin(source, list(wrong))] += 1
+        out = np.full((n, k), 0.1 / (k - 1), dtype=np.float32)
+        out[np.arange(n), labels % k] = 0.9
+        out[labels < 0] = 1 / k
+        return out
+
+    return Method("oracle", "the answers", data.kinds, posteriors)
+
+
+def test_an_oracle_is_right_and_one_that_errs_on_a_source_is_found_out(data: Data) -> None:
+    test = data.sets["test"]
+    best = score(oracle(data), test, data)
+    figures = (best.top1, best.top5, best.macro, best.two, best.four, *best.at.values())
+    assert all((f.value, f.low, f.high) == (1, 1, 1) for f in figures)
+    assert best.auroc.value == 1
+    assert best.calibration.value == pytest.approx(0.1, abs=1e-6)
+    source = next(iter(data.origins.values())).source
+    share = np.mean([data.origins[n].source == source for n in test.sweeps.objects.tolist()])
+    erring = oracle(data, {source})
+    assert score(erring, test, data).top1.value == pytest.approx(1 - share)
+    by_source = accuracy_by_source(erring, test, data)
+    assert by_source[source].value == 0
+    assert all(value.value == 1 for name, value in by_source.items() if name != source)
+
+
+def test_sets_are_joined_by_the_names_of_their_kinds(data: Data) -> None:
+    test = data.sets["test"]
+    reverse = data.kinds[::-1]
+    turned = of_kinds(test, reverse)
+    assert [reverse[k] for k in turned.sweeps.labels] == [data.kinds[k] for k in test.sweeps.labels]
+    some = of_kinds(test, ("zebra", data.kinds[3]))
+    assert set(some.sweeps.labels) == {1}
+    assert len(some.sweeps) == (test.sweeps.labels == 3).sum()
+    both = joined([test, turned], data.kinds)
+    assert np.array_equal(both.sweeps.labels, np.tile(test.sweeps.labels, 2))
+
+
+def test_the_page_says_what_was_measured(data: Data, tmp_path: Path) -> None:
+    method = oracle(data)
+    figures = score(method, data.sets["test"], data)
+    robust = {"a dead row of whiskers": figures.top1}
+    by_source = {"someone/things": figures.top1}
+    measured = BenchmarkResults(
+        data, {OBJECTS: {method: figures}}, {method: by_source}, {method: robust}
+    )
+    write_page(measured, tmp_path / "page.md")
+    page = (tmp_path / "page.md").read_text()
+    assert data.digest in page
+    assert "| oracle | the answers | 27 | 100.0 (100-100) |" in page
+    assert "| a dead row of whiskers | 100.0 (100-100) |" in page
+    assert "| things | 100.0 (100-100) |" in page
+    for line in page.splitlines():
+        if line.startswith("|"):
+            assert line.endswith("|")
