@@ -23,6 +23,7 @@ AREAS = {
     "inference": "",
     "daemon": "train",
     "align": "",
+    "perception": "train",
 }
 
 

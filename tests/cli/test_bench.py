@@ -17,7 +17,7 @@ from tactile_rt.evidence.records import Record
 def test_an_unknown_area_lists_the_areas(call):
     code, _, err = call("bench", "speed")
     assert code == 2
-    assert "there are sim, drivers, models, inference, daemon, align" in err
+    assert "there are sim, drivers, models, inference, daemon, align, perception" in err
     assert err.count("\n") == 1
 
 

@@ -12,7 +12,7 @@ pytest.importorskip("torch")
 pytest.importorskip("sklearn")
 
 from bench.perception.area import OBJECTS, BenchmarkResults
-from bench.perception.data import FILE, SOURCE, SPLITS, Data, load, pack
+from bench.perception.data import FILE, SOURCE, SPLITS, Data, Part, load, pack
 from bench.perception.methods import Method, joined, of_kinds
 from bench.perception.page import write_page
 from bench.perception.scores import accuracy_by_source, score
@@ -74,7 +74,7 @@ def test_its_recipes_are_those_that_made_it(data: Data) -> None:
     assert stored["sweeps"] == recipe.to_dict()["sweeps"]
 
 
-def test_what_is_packed_is_what_was_felt_to_a_tenth_of_the_noise(
+def test_what_is_packed_is_what_was_felt_to_a_fifth_of_the_noise(
     data: Data, tmp_path: Path
 ) -> None:
     origins = data.origins
@@ -98,17 +98,17 @@ def test_what_is_packed_is_what_was_felt_to_a_tenth_of_the_noise(
         felt[name] += (1e-7 * rng.normal(size=felt[name].shape)).astype(np.float32)
         write_object(tmp_path, name, felt[name], {})
     path = tmp_path / "packed.xz"
-    path.write_bytes(
-        pack(
-            {split: (tmp_path, split) for split in SPLITS},
-            {n: (origins[n].source, origins[n].licence) for n in names},
-        )
-    )
+    parts = [Part(split, tmp_path, split) for split in SPLITS]
+    parts.append(Part("test", tmp_path, "test", wide=True))
+    told = {n: (origins[n].source, origins[n].licence) for n in names}
+    path.write_bytes(pack(parts, told))
     back = load(path)
     assert {n: o.split for n, o in back.origins.items()} == {n: origins[n].split for n in names}
+    assert np.array_equal(back.wide["test"].sweeps.values, back.sets["test"].sweeps.values)
+    assert not len(back.wide[SOURCE].sweeps)
     for name in names:
         there = back.sets[origins[name].split].sweeps
-        step = 0.1 * manifest.limits.noise
+        step = 0.2 * manifest.limits.noise
         error = np.abs(there.values[there.objects == name] - felt[name]) / step
         assert error.max() <= 0.51
         expected = (
@@ -166,15 +166,22 @@ def test_the_page_says_what_was_measured(data: Data, tmp_path: Path) -> None:
     figures = score(method, data.sets["test"], data)
     robust = {"a dead row of whiskers": figures.top1}
     by_source = {"someone/things": figures.top1}
-    measured = BenchmarkResults(
-        data, {OBJECTS: {method: figures}}, {method: by_source}, {method: robust}
+    results = BenchmarkResults(
+        data,
+        scores={OBJECTS: {method: figures}},
+        by_source={method: by_source},
+        robust={method: robust},
+        generator={method: {"60 mm/s": figures.top1}},
+        digest="0123abc",
     )
-    write_page(measured, tmp_path / "page.md")
+    write_page(results, tmp_path / "page.md")
     page = (tmp_path / "page.md").read_text()
     assert data.digest in page
     assert "| oracle | the answers | 27 | 100.0 (100-100) |" in page
     assert "| a dead row of whiskers | 100.0 (100-100) |" in page
     assert "| things | 100.0 (100-100) |" in page
+    assert "| 60 mm/s | 100.0 (100-100) |" in page
+    assert "0123abc" in page
     for line in page.splitlines():
         if line.startswith("|"):
             assert line.endswith("|")

@@ -1,0 +1,1 @@
+"""realtouch: what a model makes of real things that it never touched. See `docs/benchmark.md`."""

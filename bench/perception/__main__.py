@@ -1,0 +1,40 @@
+"""Run the benchmark, and write its page.
+
+python -m bench.perception [--folder FOLDER] [--model FILE.onnx ...] [--page FILE] [--quick]
+
+FOLDER (data/realtouch) is where the sweeps of generated objects are, and are made if they are not,
+and where networks are trained; quick needs none, and leaves out what does. A model file is tested
+on the kinds that it knows.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from bench.perception.area import FOLDER, measure, records_of
+from bench.perception.page import PAGE, write_page
+from tactile_rt.evidence.records import show
+
+
+def main() -> int:
+    """Measure, show, and write the page if all was measured."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--folder", type=Path, default=FOLDER)
+    parser.add_argument("--model", type=Path, action="append", default=[])
+    parser.add_argument("--page", type=Path, default=PAGE)
+    parser.add_argument("--quick", action="store_true")
+    given = parser.parse_args()
+    results = measure(given.quick, given.folder, tuple(given.model), print)
+    show(records_of(results), Console())
+    if not given.quick:
+        write_page(results, given.page)
+        print(given.page)  # noqa: T201
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

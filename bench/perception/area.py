@@ -1,0 +1,175 @@
+"""Benchmark area `perception`: real things that no model here has touched.
+
+Quick: the shipped model and what learns from the real sweeps in a minute, from the data in the
+checkout alone. Whole: also what learns from generated objects, and networks.
+"""
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bench.perception.data import NAME, SOURCE, Data, load
+from bench.perception.generator import measured, rows
+from bench.perception.methods import GENERATED, Method, baselines, joined, onnx_model
+from bench.perception.scores import Figures, accuracy_by_source, robustness, score
+from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.evidence.records import Record
+from tactile_rt.evidence.robustness import conditions
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.evaluation import Interval
+from tactile_rt.sim_backend.datasets.dataset import make_sweeps
+from tactile_rt.sim_backend.datasets.recipe_files import DEFAULT_RECIPE, read_recipe
+from tactile_rt.sweep_set import SPLITS, Sweeps
+
+__all__ = [
+    "ALL",
+    "ELSEWHERE",
+    "FOLDER",
+    "OBJECTS",
+    "SHARED",
+    "SHARED_WIDE",
+    "WIDE",
+    "BenchmarkResults",
+    "measure",
+    "records_of",
+    "run",
+]
+
+FOLDER = Path("data") / NAME
+OBJECTS, ELSEWHERE, WIDE = "held-out objects", "held-out source", "both, in the wide world"
+SHARED, SHARED_WIDE = "kinds that are also generated", "these kinds, in the wide world"
+ALL = "all real objects of these kinds"
+
+
+@dataclass(frozen=True)
+class BenchmarkResults:
+    """All that was measured.
+
+    Attributes:
+        data: What it was measured on.
+        scores: By test and method (name, taught).
+        by_source: Top-1 on the held-out objects and the held-out source together, by source.
+        robust: Top-1 on the held-out objects by condition.
+        generator: Top-1 on generated objects by what is changed, of those that know them.
+        digest: SHA-256 over the sweeps of generated objects, empty if they were not used.
+    """
+
+    data: Data
+    scores: dict[str, dict[Method, Figures]]
+    by_source: dict[Method, dict[str, Interval]]
+    robust: dict[Method, dict[str, Interval]]
+    generator: dict[Method, dict[str, Interval]]
+    digest: str = ""
+
+
+def run(quick: bool) -> list[Record]:
+    """Measure the shipped model and the baselines."""
+    return records_of(measure(quick, FOLDER))
+
+
+def measure(
+    quick: bool,
+    folder: Path,
+    models: tuple[Path, ...] = (),
+    progress: Callable[[str], None] = lambda line: None,
+) -> BenchmarkResults:
+    """Measure the shipped model, others, and the baselines.
+
+    Args:
+        quick: leave out what needs sweeps of generated objects, or trains a network.
+        folder: of both.
+        models: further model files.
+        progress: told of what is measured next.
+    """
+    data, generated, digest = load(), None, ""
+    recipe, there = read_recipe(DEFAULT_RECIPE), folder / DEFAULT_RECIPE
+    if not quick:
+        for name in make_sweeps(recipe, there, splits=SPLITS[:2]):
+            progress(name)
+        generated = SweepSet.read(there, "train"), SweepSet.read(there, "validation")
+        digest = _digest(generated)
+    held_out = _together([data.sets["test"], data.sets[SOURCE]])
+    generated_kinds = recipe.objects.categories
+    wide = _together([data.wide["test"], data.wide[SOURCE]])
+    tests = {
+        OBJECTS: data.sets["test"],
+        ELSEWHERE: data.sets[SOURCE],
+        WIDE: wide,
+        SHARED: _of(held_out, generated_kinds),
+        SHARED_WIDE: _of(wide, generated_kinds),
+        ALL: _of(_together([data.sets[split] for split in (*SPLITS, SOURCE)]), generated_kinds),
+    }
+    shipped = shipped_model()
+    methods = [
+        *baselines(data, shipped, generated, None if quick else folder / "runs"),
+        *(onnx_model(path) for path in (shipped, *models)),
+    ]
+    changed = {} if quick else rows(folder, progress)
+    results = BenchmarkResults(data, {test: {} for test in tests}, {}, {}, {}, digest)
+    for method in methods:
+        progress(f"{method.name}, taught by {method.taught}")
+        of = [SHARED, SHARED_WIDE]
+        if set(data.kinds) <= set(method.kinds):
+            of = [OBJECTS, ELSEWHERE, WIDE, *of]
+        if method.taught == GENERATED:  # real objects that it has not seen are all there are
+            of.append(ALL)
+        for test in of:
+            results.scores[test][method] = score(method, tests[test], data)
+        on = tests[of[0]]
+        results.robust[method] = {} if quick else robustness(method, on, conditions(on))
+        if changed and (found := measured(method, changed)):
+            results.generator[method] = found
+        results.by_source[method] = accuracy_by_source(
+            method, held_out if of[0] == OBJECTS else tests[SHARED], data
+        )
+    return results
+
+
+def records_of(results: BenchmarkResults) -> list[Record]:
+    """The figures that matter most as records; `page` has all of them."""
+    found = []
+    for test, scores in results.scores.items():
+        for method, one in scores.items():
+            figures = {
+                "top-1": one.top1,
+                "four sweeps fused": one.four,
+                "calibration error": one.calibration,
+                "known against unknown (AUROC)": one.auroc,
+            }
+            found += [
+                Record(
+                    f"perception.{method.name}, {figure}",
+                    100 * value.value,
+                    "%",
+                    "",
+                    f"{test}; taught by {method.taught}; {len(method.kinds)} kinds",
+                    f"95 % interval {100 * value.low:.0f} to {100 * value.high:.0f}, by object",
+                )
+                for figure, value in figures.items()
+            ]
+    return found
+
+
+def _together(sets: list[SweepSet]) -> SweepSet:
+    """Splits of one set as one."""
+    return joined(sets, sets[0].manifest.categories)
+
+
+def _of(data: SweepSet, kinds: tuple[str, ...]) -> SweepSet:
+    """The sweeps of these kinds, labelled as they were."""
+    wanted = [k for k, name in enumerate(data.manifest.categories) if name in kinds]
+    at = np.flatnonzero(np.isin(data.sweeps.labels, wanted))
+    sweeps = data.sweeps
+    taken = Sweeps(sweeps.values[at], sweeps.labels[at], sweeps.objects[at])
+    return replace(data, sweeps=taken)
+
+
+def _digest(sets: tuple[SweepSet, ...]) -> str:
+    """SHA-256 over the loads, object by object."""
+    digest = hashlib.sha256()
+    for one in sets:
+        digest.update(np.ascontiguousarray(one.sweeps.values, dtype="<f4").tobytes())
+    return digest.hexdigest()

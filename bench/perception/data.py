@@ -1,0 +1,161 @@
+"""The data of the benchmark: what the mouse's whiskers felt of real things, in one small file.
+
+Loads are stored in steps of a fifth of the rated noise, which no model can tell from none; what is
+in the file is the data, to the bit, whoever runs the benchmark on whatever machine. `make` has made
+it from `recipes/` and the list of real objects.
+
+    python -m bench.perception.data FILE    # what is in it: objects by kind, source and licence
+"""
+
+import hashlib
+import io
+import lzma
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.sweep_set import OUTLIERS, WITHHELD, SweepManifest, Sweeps
+
+__all__ = ["FILE", "NAME", "SOURCE", "SPLITS", "VERSION", "Data", "Part", "load", "pack"]
+
+NAME, VERSION = "realtouch", 1
+FILE = Path(__file__).parent / "data" / f"{NAME}-{VERSION}.xz"
+SOURCE = "source"  # known kinds from a source that no other split has anything of
+SPLITS = ("train", "validation", "test", SOURCE, OUTLIERS, WITHHELD)
+STEP = 0.2  # of the rated noise
+
+
+class _Origin(msgspec.Struct, frozen=True):
+    """Where an object is from."""
+
+    category: str
+    split: str
+    source: str
+    licence: str
+
+
+@dataclass(frozen=True)
+class Part:
+    """Some of the file's sweeps.
+
+    Attributes:
+        split: The split that they go to.
+        folder: The sweep set that they come from.
+        there: Their split in that set.
+        wide: Whether the objects lie in any way, and are of any size and speed.
+    """
+
+    split: str
+    folder: Path
+    there: str
+    wide: bool = False
+
+
+@dataclass(frozen=True)
+class Data:
+    """The benchmark's data.
+
+    Attributes:
+        sets: The sweeps of every split of `SPLITS`, labelled by `kinds`; -1 of the last two.
+        wide: The same objects of the splits "test" and "source" in the wide world.
+        origins: Kind, split, source and licence of every object.
+        digest: SHA-256 of the file.
+    """
+
+    sets: dict[str, SweepSet]
+    wide: dict[str, SweepSet]
+    origins: dict[str, _Origin]
+    digest: str
+
+    @cached_property
+    def kinds(self) -> tuple[str, ...]:
+        """The known kinds, in the order of their labels."""
+        return self.sets["train"].manifest.categories
+
+
+def pack(parts: Sequence[Part], origins: dict[str, tuple[str, str]]) -> bytes:
+    """The file's content.
+
+    Args:
+        parts: what it is made of, the training split first.
+        origins: source and licence by the name of the object.
+    """
+    manifest = SweepManifest.read(parts[0].folder)
+    step = (manifest.limits.noise * STEP).astype(np.float64)
+    values, objects, wide, told = [], [], [], {}
+    for part in parts:
+        data = SweepSet.read(part.folder, part.there)
+        wide.append(np.full(len(data.sweeps), part.wide))
+        values.append(np.round(data.sweeps.values / step).astype(np.int32))
+        objects.append(data.sweeps.objects)
+        for name in dict.fromkeys(data.sweeps.objects.tolist()):
+            source, licence = origins[name]
+            category = data.manifest.category(name)
+            told[name] = _Origin(category, part.split, source, licence)
+    steps = np.diff(np.concatenate(values), axis=1, prepend=0)
+    if np.abs(steps).max() > np.iinfo(np.int16).max:
+        raise ValueError("a load rises by more than 16 bits hold")
+    # whisker by whisker: what one channel does in time is what compresses
+    arrays = {
+        "steps": np.ascontiguousarray(steps.astype(np.int16).transpose(0, 2, 3, 1)),
+        "objects": np.concatenate(objects),
+        "wide": np.concatenate(wide),
+        "step": step,
+        "manifest": np.frombuffer(msgspec.json.encode(replace(manifest, split={}, category_of={})),
+                                  dtype=np.uint8),
+        "origins": np.frombuffer(msgspec.json.encode(told), dtype=np.uint8),
+    }  # fmt: skip
+    raw = io.BytesIO()
+    np.savez(raw, **arrays)
+    return lzma.compress(raw.getvalue(), preset=9)
+
+
+def load(path: Path = FILE) -> Data:
+    """Read the data."""
+    content = path.read_bytes()
+    with np.load(io.BytesIO(lzma.decompress(content))) as arrays:
+        steps, objects, step, wide = (arrays[k] for k in ("steps", "objects", "step", "wide"))
+        manifest = msgspec.json.decode(arrays["manifest"].tobytes(), type=SweepManifest)
+        origins = msgspec.json.decode(arrays["origins"].tobytes(), type=dict[str, _Origin])
+    values = (steps.transpose(0, 3, 1, 2).cumsum(axis=1, dtype=np.int32) * step).astype(np.float32)
+    split = {s: tuple(n for n, o in origins.items() if o.split == s) for s in SPLITS}
+    category_of = {name: origin.category for name, origin in origins.items()}
+    manifest = replace(manifest, split=split, category_of=category_of)
+    known = manifest.categories
+    labels = {n: known.index(o.category) if o.category in known else -1 for n, o in origins.items()}
+    limits = manifest.limits
+
+    def taken(name: str, world: bool) -> SweepSet:
+        at = np.flatnonzero(np.isin(objects, list(split[name])) & (wide == world))
+        own: NDArray[np.str_] = objects[at]
+        numbers = np.array([labels[o] for o in own.tolist()], dtype=np.int64)
+        return SweepSet(manifest, Sweeps(values[at], numbers, own), limits.noise, limits.floor)
+
+    sets = {name: taken(name, False) for name in SPLITS}
+    everywhere = {name: taken(name, True) for name in ("test", SOURCE)}
+    return Data(sets, everywhere, origins, hashlib.sha256(content).hexdigest())
+
+
+def main() -> int:
+    """Print what the file holds."""
+    data = load(Path(sys.argv[1]) if len(sys.argv) > 1 else FILE)
+    for split in SPLITS:
+        mine = [o for o in data.origins.values() if o.split == split]
+        print(f"{split}: {len(data.sets[split].sweeps)} sweeps of {len(mine)} objects")  # noqa: T201
+        kinds = Counter(o.category for o in mine)
+        print("   ", ", ".join(f"{k} {n}" for k, n in sorted(kinds.items())))  # noqa: T201
+        for (source, licence), n in sorted(Counter((o.source, o.licence) for o in mine).items()):
+            print(f"    {n} of {source}, {licence}")  # noqa: T201
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,234 @@
+"""What is compared: every method as its posteriors over the kinds that it knows.
+
+Whatever a method has to choose (a penalty, a rate, how sure to be) it chooses by the validation
+split of what it learns from, each for itself.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.perception.data import Data
+from tactile_rt.classifier.model_file import load_model
+from tactile_rt.evidence.model_windows import stepped
+from tactile_rt.export.release import fit_temperature
+from tactile_rt.models import evaluation
+from tactile_rt.models.checkpoints import load_checkpoint, run_on
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.evaluation import CLEAN, Disturbance
+from tactile_rt.models.svm import PENALTIES, fit_margins, window_features
+from tactile_rt.models.training.config import TrainingConfig
+from tactile_rt.models.training.loop import train
+from tactile_rt.sweep_set import Sweeps
+
+__all__ = ["GENERATED", "REAL", "Method", "baselines", "joined", "of_kinds", "onnx_model"]
+
+Floats = NDArray[np.float32]
+REAL, GENERATED, BOTH = "real", "generated", "generated + real"
+RATES = (1e-3, 2e-3, 5e-3)  # of the GRU, of which validation chooses
+UPDATES = 3000  # of the GRU
+REPEATS = 3  # of the real sweeps beside the generated ones, which are more
+STRENGTHS = (0.003, 0.01, 0.03, 0.1, 0.3)  # inverse, of the head's regularisation
+QUARTERS = ((3, 22), (3, 9), (9, 15), (15, 22))  # steps whose means the linear head takes
+
+
+@dataclass(frozen=True)
+class Method:
+    """One method.
+
+    Attributes:
+        name: What it is.
+        taught: What it has learnt from.
+        kinds: The kinds that it tells apart.
+        posteriors: The posteriors (sweep, kind) of a set's sweeps under a disturbance; NaN where it
+            finds no contact.
+    """
+
+    name: str
+    taught: str
+    kinds: tuple[str, ...]
+    posteriors: Callable[[SweepSet, Disturbance], Floats]
+
+
+def baselines(
+    data: Data, shipped: Path, generated: tuple[SweepSet, SweepSet] | None, runs: Path | None
+) -> Iterator[Method]:
+    """The methods that every model is compared with.
+
+    Args:
+        data: of the benchmark.
+        shipped: the model whose encoder gets a new head.
+        generated: training and validation sweeps of generated objects; None leaves out what needs
+            them.
+        runs: where networks are trained, and found trained; None leaves them out.
+    """
+    real = data.sets["train"], data.sets["validation"]
+    yield _guess(data.kinds)
+    counts = np.bincount(real[0].sweeps.labels, minlength=len(data.kinds)).astype(float)
+    yield _majority(data.kinds, counts)
+    if generated:
+        yield _svm(GENERATED, *generated)
+    yield _svm(REAL, *real)
+    if runs and generated:
+        yield _gru(GENERATED, *generated, runs)
+    if runs:
+        yield _gru(REAL, *real, runs)
+    if runs and generated:
+        kinds = tuple(dict.fromkeys((*data.kinds, *generated[0].manifest.categories)))
+        both = joined([generated[0], *[real[0]] * REPEATS], kinds)
+        yield _gru(BOTH, both, joined([real[1]], kinds), runs)
+    yield _headed(shipped, *real)
+
+
+def onnx_model(path: Path) -> Method:
+    """A model file, as it is."""
+    session, card = load_model(path)
+    run = stepped(session, card)
+    taught = card.provenance.get("sweep_set", {})
+    source = taught.get("objects", {}).get("from", "?") if isinstance(taught, dict) else "?"
+    learnt = GENERATED if source in ("shapes", "varied-shapes") else source
+
+    def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
+        return evaluation.predict(sweeps, run, disturbance=disturbance)[:, -1]
+
+    return Method(path.stem, learnt, tuple(card.labels), posteriors)
+
+
+def of_kinds(data: SweepSet, kinds: tuple[str, ...]) -> SweepSet:
+    """The sweeps of the kinds that are among these, labelled by them."""
+    known = data.manifest.categories
+    number = np.array([kinds.index(k) if k in kinds else -1 for k in known])
+    at = np.flatnonzero(data.sweeps.labels >= 0)
+    at = at[number[data.sweeps.labels[at]] >= 0]
+    found = _taken(data, at, number[data.sweeps.labels[at]])
+    return replace(found, manifest=replace(found.manifest, categories=kinds))
+
+
+def joined(sets: list[SweepSet], kinds: tuple[str, ...]) -> SweepSet:
+    """Sets of one array as one, labelled by these kinds."""
+    parts = [of_kinds(one, kinds) for one in sets]
+    whole = Sweeps(
+        np.concatenate([p.sweeps.values for p in parts]),
+        np.concatenate([p.sweeps.labels for p in parts]),
+        np.concatenate([p.sweeps.objects for p in parts]),
+    )
+    return replace(parts[0], sweeps=whole)
+
+
+def _taken(data: SweepSet, at: NDArray[np.int64], labels: NDArray[np.int64]) -> SweepSet:
+    sweeps = data.sweeps
+    return replace(data, sweeps=Sweeps(sweeps.values[at], labels, sweeps.objects[at]))
+
+
+def _guess(kinds: tuple[str, ...]) -> Method:
+    def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
+        drawn = np.random.default_rng(0).dirichlet(np.ones(len(kinds)), len(sweeps.sweeps))
+        return drawn.astype(np.float32)
+
+    return Method("chance", "nothing", kinds, posteriors)
+
+
+def _majority(kinds: tuple[str, ...], counts: NDArray[np.float64]) -> Method:
+    always = (counts / counts.sum()).astype(np.float32)
+
+    def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
+        return np.tile(always, (len(sweeps.sweeps), 1))
+
+    return Method("most frequent kind", REAL, kinds, posteriors)
+
+
+def _calibrated(
+    name: str, taught: str, validation: SweepSet, uncalibrated: Callable[..., Floats]
+) -> Method:
+    """A method whose temperature the validation sweeps choose."""
+    temperature = fit_temperature(uncalibrated(validation, CLEAN), validation.sweeps.labels)
+
+    def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
+        return evaluation.at_temperature(uncalibrated(sweeps, disturbance), temperature)
+
+    return Method(name, taught, validation.manifest.categories, posteriors)
+
+
+def _best(candidates: list[Callable[..., Floats]], validation: SweepSet) -> Callable[..., Floats]:
+    """The one that decides most of the validation sweeps rightly."""
+    labels = validation.sweeps.labels
+    return max(candidates, key=lambda one: evaluation.hits(one(validation, CLEAN), labels).mean())
+
+
+def _softmax(margins: NDArray[Any], usable: NDArray[np.bool_]) -> Floats:
+    raised = np.exp(margins - margins.max(axis=1, keepdims=True))
+    out: Floats = (raised / raised.sum(axis=1, keepdims=True)).astype(np.float32)
+    out[~usable] = np.nan
+    return out
+
+
+def _svm(taught: str, training: SweepSet, validation: SweepSet) -> Method:
+    x, usable = window_features(training)
+    classes = len(training.manifest.categories)
+
+    def candidate(penalty: float) -> Callable[..., Floats]:
+        margins = fit_margins(x[usable], training.sweeps.labels[usable], penalty, classes)
+
+        def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
+            features, found = window_features(sweeps, disturbance)
+            return _softmax(margins(features), found)
+
+        return posteriors
+
+    best = _best([candidate(penalty) for penalty in PENALTIES], validation)
+    return _calibrated("SVM", taught, validation, best)
+
+
+def _gru(taught: str, training: SweepSet, validation: SweepSet, runs: Path) -> Method:
+    def candidate(rate: float) -> Callable[..., Floats]:
+        config = TrainingConfig(
+            data=taught, encoder="gru", width=0.25, learning_rate=rate, epochs=1000, updates=UPDATES
+        )
+        folder = runs / f"gru-{taught.replace(' ', '')}-{rate:g}"
+        best = folder / "best.pt"
+        if not (folder / "done").exists():
+            best = train(config, folder, splits=(training, validation))
+            (folder / "done").touch()
+        run = run_on(load_checkpoint(best)[0])
+
+        def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
+            return evaluation.predict(sweeps, run, disturbance=disturbance)[:, -1]
+
+        return posteriors
+
+    best = _best([candidate(rate) for rate in RATES], validation)
+    return _calibrated("GRU", taught, validation, best)
+
+
+def _headed(shipped: Path, training: SweepSet, validation: SweepSet) -> Method:
+    from sklearn.linear_model import LogisticRegression
+    from sklearn.preprocessing import StandardScaler
+
+    session, card = load_model(shipped)
+    run = stepped(session, card, "embedding")
+
+    def features(sweeps: SweepSet, disturbance: Disturbance) -> tuple[Floats, NDArray[np.bool_]]:
+        steps, found = evaluation.run_windows(sweeps, run, disturbance=disturbance)
+        return np.concatenate([steps[:, a:b].mean(axis=1) for a, b in QUARTERS], axis=1), found
+
+    x, usable = features(training, CLEAN)
+    scaler, classes = StandardScaler().fit(x[usable]), len(training.manifest.categories)
+
+    def candidate(strength: float) -> Callable[..., Floats]:
+        head = LogisticRegression(C=strength, max_iter=500)
+        head.fit(scaler.transform(x[usable]), training.sweeps.labels[usable])
+
+        def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
+            there, found = features(sweeps, disturbance)
+            margins = np.full((len(there), classes), -np.inf)
+            margins[:, head.classes_] = head.decision_function(scaler.transform(there))
+            return _softmax(margins, found)
+
+        return posteriors
+
+    best = _best([candidate(strength) for strength in STRENGTHS], validation)
+    return _calibrated(f"{shipped.stem} + linear head", f"generated, then {REAL}", validation, best)

@@ -1,0 +1,110 @@
+"""The figures of one method on one test: all from its posteriors, all with intervals by object."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.perception.data import Data
+from bench.perception.methods import Method, of_kinds
+from tactile_rt.models import evaluation
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.evaluation import CLEAN, Disturbance, Interval
+from tactile_rt.sweep_set import WITHHELD
+
+__all__ = ["COVERAGES", "Figures", "accuracy_by_source", "robustness", "score"]
+
+COVERAGES = (50, 80, 95)  # percent of the sweeps that are decided, the surest first
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What a method reaches on a test.
+
+    Attributes:
+        top1, top5: The shares of the sweeps whose kind is the most probable one, or of the five.
+        macro: The mean over kinds of the share that is right.
+        two, four: The shares of pairs and of fours of sweeps of one object that are right when
+            their posteriors are fused.
+        calibration: The expected calibration error, 15 bins.
+        at: The accuracy of the surest sweeps, by the percentage that is decided.
+        auroc: How well the largest posterior tells known kinds from the withheld ones.
+    """
+
+    top1: Interval
+    top5: Interval
+    macro: Interval
+    two: Interval
+    four: Interval
+    calibration: Interval
+    at: dict[int, Interval]
+    auroc: Interval
+
+
+def score(method: Method, test: SweepSet, data: Data) -> Figures:
+    """A method's figures on the sweeps of the kinds that it knows."""
+    known = of_kinds(test, method.kinds)
+    labels, objects = known.sweeps.labels, known.sweeps.objects
+    posteriors = method.posteriors(known, CLEAN)
+    unknown = data.sets[WITHHELD]
+    there = method.posteriors(unknown, CLEAN)
+
+    def over(statistic: Callable[[NDArray[np.int64]], float]) -> Interval:
+        return evaluation.bootstrap(statistic, objects)
+
+    right = evaluation.hits(posteriors, labels)
+    sure = np.nan_to_num(posteriors.max(axis=1), nan=0.0)
+    both = np.concatenate([sure, np.nan_to_num(there.max(axis=1), nan=0.0)])
+
+    def area(at: NDArray[np.int64]) -> float:
+        mine = at < len(known.sweeps)
+        return evaluation.auroc(both[at[mine]], both[at[~mine]])
+
+    return Figures(
+        top1=evaluation.accuracy(right, objects),
+        top5=evaluation.accuracy(evaluation.hits(posteriors, labels, 5), objects),
+        macro=over(lambda at: _macro(right[at], labels[at])),
+        two=evaluation.fused_accuracy(posteriors, labels, objects, 2),
+        four=evaluation.fused_accuracy(posteriors, labels, objects, 4),
+        calibration=over(
+            lambda at: evaluation.expected_calibration_error(posteriors[at], labels[at])
+        ),
+        at={c: over(lambda at, c=c: _surest(right[at], sure[at], c)) for c in COVERAGES},  # type: ignore[misc]
+        auroc=evaluation.bootstrap(area, np.concatenate([objects, unknown.sweeps.objects])),
+    )
+
+
+def accuracy_by_source(method: Method, test: SweepSet, data: Data) -> dict[str, Interval]:
+    """Top-1 on the objects of every source."""
+    known = of_kinds(test, method.kinds)
+    right = evaluation.hits(method.posteriors(known, CLEAN), known.sweeps.labels)
+    source = np.array([data.origins[name].source for name in known.sweeps.objects.tolist()])
+    return {
+        name: evaluation.accuracy(right[source == name], known.sweeps.objects[source == name])
+        for name in sorted(set(source.tolist()))
+    }
+
+
+def robustness(
+    method: Method, test: SweepSet, conditions: dict[str, Disturbance]
+) -> dict[str, Interval]:
+    """Top-1 under every condition."""
+    known = of_kinds(test, method.kinds)
+    return {
+        name: evaluation.accuracy(
+            evaluation.hits(method.posteriors(known, disturbance), known.sweeps.labels),
+            known.sweeps.objects,
+        )
+        for name, disturbance in conditions.items()
+    }
+
+
+def _macro(right: NDArray[np.bool_], labels: NDArray[np.int64]) -> float:
+    return float(np.mean([right[labels == label].mean() for label in np.unique(labels)]))
+
+
+def _surest(right: NDArray[np.bool_], sure: Floats, coverage: int) -> float:
+    decided = np.argsort(-sure, kind="stable")[: max(1, round(coverage / 100 * len(sure)))]
+    return float(right[decided].mean())
