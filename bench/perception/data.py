@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.sweep_set import OUTLIERS, WITHHELD, SweepManifest, Sweeps
 
-__all__ = ["FILE", "NAME", "SOURCE", "SPLITS", "VERSION", "Data", "Part", "load", "pack"]
+__all__ = ["FILE", "NAME", "SOURCE", "SPLITS", "VERSION", "Data", "Portion", "load", "pack"]
 
 NAME, VERSION = "realtouch", 1
 FILE = Path(__file__).parent / "data" / f"{NAME}-{VERSION}.xz"
@@ -43,7 +43,7 @@ class _Origin(msgspec.Struct, frozen=True):
 
 
 @dataclass(frozen=True)
-class Part:
+class Portion:
     """Some of the file's sweeps.
 
     Attributes:
@@ -81,7 +81,7 @@ class Data:
         return self.sets["train"].manifest.categories
 
 
-def pack(parts: Sequence[Part], origins: dict[str, tuple[str, str]]) -> bytes:
+def pack(parts: Sequence[Portion], origins: dict[str, tuple[str, str]]) -> bytes:
     """The file's content.
 
     Args:

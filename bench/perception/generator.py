@@ -19,7 +19,7 @@ from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipes import Between, Choice
 from tactile_rt.sweep_set import Sweeps
 
-__all__ = ["Row", "measured", "rows"]
+__all__ = ["Condition", "measured", "rows"]
 
 RECIPE, FIRST, OBJECTS, DRAWS = "default24", 48, 4, 3
 UPRIGHT = "as taught to mouse24"
@@ -53,10 +53,12 @@ SENSORS = {
 }
 WORST = "a dead row, the worst of them"
 
-Row = tuple[SweepSet, Disturbance]
+Condition = tuple[SweepSet, Disturbance]
 
 
-def rows(folder: Path, progress: Callable[[str], None] = lambda line: None) -> dict[str, list[Row]]:
+def rows(
+    folder: Path, progress: Callable[[str], None] = lambda line: None
+) -> dict[str, list[Condition]]:
     """The sweeps and disturbances of every row; of several the worst is meant.
 
     Args:
@@ -83,7 +85,7 @@ def rows(folder: Path, progress: Callable[[str], None] = lambda line: None) -> d
     return found
 
 
-def measured(method: Method, wanted: dict[str, list[Row]]) -> dict[str, Interval]:
+def measured(method: Method, wanted: dict[str, list[Condition]]) -> dict[str, Interval]:
     """A method's top-1 by row; nothing of one that does not know all of the kinds."""
     kinds = next(iter(wanted.values()))[0][0].manifest.categories
     if not set(kinds) <= set(method.kinds):

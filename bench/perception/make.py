@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-from bench.perception.data import FILE, SOURCE, Part, pack
+from bench.perception.data import FILE, SOURCE, Portion, pack
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import DEFAULT_RECIPE, read_recipe
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
@@ -64,11 +64,11 @@ def _write(folder: Path, objects: Path) -> None:
         for name, origin in open_objects(objects).origins.items()
     }
     one, other = folder / INSTANCES, folder / ANOTHER
-    parts = [Part(split, one, split) for split in ("train", "validation", "test")]
-    parts += [Part(split, one, split) for split in (OUTLIERS, WITHHELD)]
-    parts += [Part(SOURCE, other, "test"), Part(WITHHELD, other, WITHHELD)]
-    parts.append(Part("test", folder / (INSTANCES + WIDE), "test", wide=True))
-    parts.append(Part(SOURCE, folder / (ANOTHER + WIDE), "test", wide=True))
+    parts = [Portion(split, one, split) for split in ("train", "validation", "test")]
+    parts += [Portion(split, one, split) for split in (OUTLIERS, WITHHELD)]
+    parts += [Portion(SOURCE, other, "test"), Portion(WITHHELD, other, WITHHELD)]
+    parts.append(Portion("test", folder / (INSTANCES + WIDE), "test", wide=True))
+    parts.append(Portion(SOURCE, folder / (ANOTHER + WIDE), "test", wide=True))
     content = pack(parts, origins)
     FILE.parent.mkdir(exist_ok=True)
     FILE.write_bytes(content)

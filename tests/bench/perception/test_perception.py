@@ -12,7 +12,7 @@ pytest.importorskip("torch")
 pytest.importorskip("sklearn")
 
 from bench.perception.area import OBJECTS, BenchmarkResults
-from bench.perception.data import FILE, SOURCE, SPLITS, Data, Part, load, pack
+from bench.perception.data import FILE, SOURCE, SPLITS, Data, Portion, load, pack
 from bench.perception.methods import Method, joined, of_kinds
 from bench.perception.page import write_page
 from bench.perception.scores import accuracy_by_source, score
@@ -98,8 +98,8 @@ def test_what_is_packed_is_what_was_felt_to_a_fifth_of_the_noise(
         felt[name] += (1e-7 * rng.normal(size=felt[name].shape)).astype(np.float32)
         write_object(tmp_path, name, felt[name], {})
     path = tmp_path / "packed.xz"
-    parts = [Part(split, tmp_path, split) for split in SPLITS]
-    parts.append(Part("test", tmp_path, "test", wide=True))
+    parts = [Portion(split, tmp_path, split) for split in SPLITS]
+    parts.append(Portion("test", tmp_path, "test", wide=True))
     told = {n: (origins[n].source, origins[n].licence) for n in names}
     path.write_bytes(pack(parts, told))
     back = load(path)
