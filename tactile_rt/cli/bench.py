@@ -23,7 +23,7 @@ AREAS = {
     "inference": "",
     "daemon": "train",
     "align": "",
-    "perception": "train",
+    "perception": "sim,train",
 }
 
 

@@ -13,11 +13,12 @@ pytest.importorskip("sklearn")
 
 from bench.perception.area import OBJECTS, BenchmarkResults
 from bench.perception.data import FILE, SOURCE, SPLITS, Data, Portion, load, pack
+from bench.perception.generator import _without, measured
 from bench.perception.methods import Method, joined, of_kinds
 from bench.perception.page import write_page
 from bench.perception.scores import accuracy_by_source, score
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.evaluation import Disturbance
+from tactile_rt.models.evaluation import CLEAN, Disturbance
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sweep_set import OUTLIERS, WITHHELD, write_object
 from tests.helpers.source_tree import ROOT
@@ -185,3 +186,27 @@ def test_the_page_says_what_was_measured(data: Data, tmp_path: Path) -> None:
     for line in page.splitlines():
         if line.startswith("|"):
             assert line.endswith("|")
+
+
+def test_of_several_conditions_the_worst_counts_and_strangers_are_left_out(data: Data) -> None:
+    test = data.sets["test"]
+    of_row = np.array(test.manifest.spec.grid)[:, 0]
+    without = {row: _without(test, of_row == row) for row in np.unique(of_row)}
+    for row, there in without.items():
+        assert not there.sweeps.values[:, :, of_row == row].any()
+        assert np.array_equal(there.sweeps.values[:, :, of_row != row],
+                              test.sweeps.values[:, :, of_row != row])  # fmt: skip
+    lost = np.unique(of_row)[1]
+
+    def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> np.ndarray:
+        blind = not sweeps.sweeps.values[:, :, of_row == lost].any()
+        return oracle(data).posteriors(sweeps, disturbance) if not blind else np.tile(
+            np.eye(len(data.kinds), dtype=np.float32)[0], (len(sweeps.sweeps), 1)
+        )  # fmt: skip
+
+    method = Method("needs a row", "", data.kinds, posteriors)
+    wanted = {"sound": [(test, CLEAN)], "worst": [(one, CLEAN) for one in without.values()]}
+    found = measured(method, wanted)
+    assert found["sound"].value == 1
+    assert found["worst"].value == pytest.approx(np.mean(test.sweeps.labels == 0))
+    assert measured(replace(method, kinds=data.kinds[1:]), wanted) == {}
