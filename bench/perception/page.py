@@ -60,7 +60,7 @@ RUN_IT = """\
 
 ```bash
 tactile-rt bench perception --quick           # from the checkout alone, in a minute or two
-python -m bench.perception                    # everything, and this page: about two hours
+python -m bench.perception                    # everything, and this page: 90 minutes on two cores
 python -m bench.perception --model MINE.onnx  # a model of your own beside it
 ```
 
