@@ -16,6 +16,7 @@ from rich.console import Console
 from bench.perception.area import FOLDER, measure, records_of
 from bench.perception.page import PAGE, write_page
 from tactile_rt.evidence.records import show
+from tactile_rt.stream import TactileError
 
 
 def main() -> int:
@@ -28,7 +29,11 @@ def main() -> int:
     parser.add_argument("--page", type=Path, default=PAGE)
     parser.add_argument("--quick", action="store_true")
     given = parser.parse_args()
-    results = measure(given.quick, given.folder, tuple(given.model), print)
+    try:
+        results = measure(given.quick, given.folder, tuple(given.model), print)
+    except TactileError as error:
+        print(f"bench.perception: {error}", file=sys.stderr)  # noqa: T201
+        return 2
     show(records_of(results), Console())
     if not given.quick:
         write_page(results, given.page)

@@ -84,6 +84,8 @@ def measure(
         models: further model files.
         progress: told of what is measured next.
     """
+    shipped = shipped_model()
+    files = [onnx_model(path) for path in (shipped, *models)]  # first: one may not be there
     data, generated, digest = load(), None, ""
     recipe, there = read_recipe(DEFAULT_RECIPE), folder / DEFAULT_RECIPE
     if not quick:
@@ -102,11 +104,7 @@ def measure(
         SHARED_WIDE: _of(wide, generated_kinds),
         ALL: _of(_together([data.sets[split] for split in (*SPLITS, SOURCE)]), generated_kinds),
     }
-    shipped = shipped_model()
-    methods = [
-        *baselines(data, shipped, generated, None if quick else folder / "runs"),
-        *(onnx_model(path) for path in (shipped, *models)),
-    ]
+    methods = [*baselines(data, shipped, generated, None if quick else folder / "runs"), *files]
     changed = {} if quick else rows(folder, progress)
     results = BenchmarkResults(data, {test: {} for test in tests}, {}, {}, {}, digest)
     for method in methods:

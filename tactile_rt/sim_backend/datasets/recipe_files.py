@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
+from difflib import get_close_matches
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -184,7 +185,7 @@ def recipe_from_dict(raw: dict[str, Any], where: str = "recipe") -> SweepRecipe:
 def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
     file: _File = convert(nodes, _File)
     objects, array = file.objects, file.array
-    for key in ("categories", "withheld"):
+    for key in ("categories", "withheld", "outliers"):
         names = getattr(objects, key)
         if len(set(names)) < len(names):
             twice = next(n for i, n in enumerate(names) if n in names[:i])
@@ -199,9 +200,13 @@ def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
             usual["distance_mm"] = usual_distance(animals)
     period_ms = period_ms if file.period_ms is None else file.period_ms
     lead_ms, length_ms = _usual_lengths(period_ms)
-    all_of_it = (
-        objects.source not in GENERATED
-    )  # a folder's own counts; the published split is 8 : 1 : 1
+    # a folder's own counts; the published split is 8 : 1 : 1
+    all_of_it = objects.source not in GENERATED
+
+    slip = get_close_matches(objects.source, GENERATED, 1, 0.8)
+    if all_of_it and slip and not Path(_absolute(objects.source, folder)).exists():
+        why = f"no such folder {objects.source!r}; did you mean {slip[0]}?"
+        raise refusal(nodes, ["objects", "from"], why)
 
     def counted(given: float | None, of_a_folder: float, of_shapes: float) -> float:
         return (of_a_folder if all_of_it else of_shapes) if given is None else given

@@ -126,7 +126,8 @@ def _check(category: str, index: int) -> str:
     kind = category.removeprefix(VARIED)
     if kind not in _BUILDERS:
         near = difflib.get_close_matches(kind, _BUILDERS, n=1, cutoff=0.3)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        prefix = VARIED if category.startswith(VARIED) else ""
+        hint = f" (did you mean {prefix + near[0]!r}?)" if near else ""
         raise ConfigError(
             f"no object called {category!r}{hint}; there are {', '.join(CATEGORIES)}; "
             f"{', '.join(WITHHELD)} (withheld from training); each also with {VARIED!r} before it; "

@@ -364,6 +364,8 @@ def test_the_default_set_is_of_varied_shapes_in_a_wide_world() -> None:
         ("[objects]\ncategories = ['a', 'a']", "objects.categories: 'a' is there twice"),
         ("[objects]\ncategories = ['mug']\nwithheld = ['mug']", "'mug' is also one of the cat"),
         ("[objects]\nwithheld = ['jack']\noutliers = ['jack']", "'jack' is also one of the withh"),
+        ("[objects]\nfrom = 'varied-shape'", r"no such folder 'varied-shape'; did you mean varied"),
+        ("[objects]\noutliers = ['jack', 'jack']", "'jack' is there twice; remove one"),
         ("[faults]\ndead_row = 2", "dead_row must be between 0 and 1, not 2"),
         ("[faults]\ndrift = -1", "drift must be between 0 and 100, not -1"),
         ("[objects]\ntest = 0.5", "objects.test must be a whole number, at least 1, not 0.5"),
