@@ -4,25 +4,32 @@ Quick: the shipped model and what learns from the real sweeps in a minute, from 
 checkout alone. Whole: also what learns from generated objects, and networks.
 """
 
-import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from math import isnan
 from pathlib import Path
-
-import numpy as np
 
 from bench.perception.data import NAME, SOURCE, Data, load
 from bench.perception.generator import measured, rows
-from bench.perception.methods import GENERATED, Method, baselines, joined, onnx_model
+from bench.perception.methods import (
+    GENERATED,
+    Method,
+    baselines,
+    digest_of,
+    joined,
+    of_kinds,
+    onnx_model,
+)
 from bench.perception.scores import Figures, accuracy_by_source, robustness, score
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.evidence.records import Record
 from tactile_rt.evidence.robustness import conditions
 from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.disturbances import CLEAN
 from tactile_rt.models.evaluation import Interval
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import DEFAULT_RECIPE, read_recipe
-from tactile_rt.sweep_set import SPLITS, Sweeps
+from tactile_rt.sweep_set import SPLITS, WITHHELD
 
 __all__ = [
     "ALL",
@@ -92,7 +99,7 @@ def measure(
         for name in make_sweeps(recipe, there, splits=SPLITS[:2]):
             progress(name)
         generated = SweepSet.read(there, "train"), SweepSet.read(there, "validation")
-        digest = _digest(generated)
+        digest = digest_of(*generated)
     held_out = _together([data.sets["test"], data.sets[SOURCE]])
     generated_kinds = recipe.objects.categories
     wide = _together([data.wide["test"], data.wide[SOURCE]])
@@ -100,9 +107,11 @@ def measure(
         OBJECTS: data.sets["test"],
         ELSEWHERE: data.sets[SOURCE],
         WIDE: wide,
-        SHARED: _of(held_out, generated_kinds),
-        SHARED_WIDE: _of(wide, generated_kinds),
-        ALL: _of(_together([data.sets[split] for split in (*SPLITS, SOURCE)]), generated_kinds),
+        SHARED: of_kinds(held_out, generated_kinds),
+        SHARED_WIDE: of_kinds(wide, generated_kinds),
+        ALL: of_kinds(
+            _together([data.sets[split] for split in (*SPLITS, SOURCE)]), generated_kinds
+        ),
     }
     methods = [*baselines(data, shipped, generated, None if quick else folder / "runs"), *files]
     changed = {} if quick else rows(folder, progress)
@@ -114,8 +123,11 @@ def measure(
             of = [OBJECTS, ELSEWHERE, WIDE, *of]
         if method.taught == GENERATED:  # real objects that it has not seen are all there are
             of.append(ALL)
-        for test in of:
-            results.scores[test][method] = score(method, tests[test], data)
+        unknown = data.sets[WITHHELD]
+        strange = method.posteriors(unknown, CLEAN), unknown.sweeps.objects
+        for test in of:  # unknown things stand: they are no match for known ones that do not
+            against = None if test in (WIDE, SHARED_WIDE) else strange
+            results.scores[test][method] = score(method, tests[test], against)
         on = tests[of[0]]
         results.robust[method] = {} if quick else robustness(method, on, conditions(on))
         if changed and (found := measured(method, changed)):
@@ -147,6 +159,7 @@ def records_of(results: BenchmarkResults) -> list[Record]:
                     f"95 % interval {100 * value.low:.0f} to {100 * value.high:.0f}, by object",
                 )
                 for figure, value in figures.items()
+                if not isnan(value.value)
             ]
     return found
 
@@ -154,20 +167,3 @@ def records_of(results: BenchmarkResults) -> list[Record]:
 def _together(sets: list[SweepSet]) -> SweepSet:
     """Splits of one set as one."""
     return joined(sets, sets[0].manifest.categories)
-
-
-def _of(data: SweepSet, kinds: tuple[str, ...]) -> SweepSet:
-    """The sweeps of these kinds, labelled as they were."""
-    wanted = [k for k, name in enumerate(data.manifest.categories) if name in kinds]
-    at = np.flatnonzero(np.isin(data.sweeps.labels, wanted))
-    sweeps = data.sweeps
-    taken = Sweeps(sweeps.values[at], sweeps.labels[at], sweeps.objects[at])
-    return replace(data, sweeps=taken)
-
-
-def _digest(sets: tuple[SweepSet, ...]) -> str:
-    """SHA-256 over the loads, object by object."""
-    digest = hashlib.sha256()
-    for one in sets:
-        digest.update(np.ascontiguousarray(one.sweeps.values, dtype="<f4").tobytes())
-    return digest.hexdigest()

@@ -13,7 +13,8 @@ import numpy as np
 from bench.perception.methods import Method, of_kinds
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.evaluation import CLEAN, Disturbance, Interval
+from tactile_rt.models.disturbances import CLEAN, Disturbance
+from tactile_rt.models.evaluation import Interval
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipes import Between, Choice

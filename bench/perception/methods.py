@@ -4,6 +4,7 @@ Whatever a method has to choose (a penalty, a rate, how sure to be) it chooses b
 split of what it learns from, each for itself.
 """
 
+import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,13 +20,23 @@ from tactile_rt.export.release import fit_temperature
 from tactile_rt.models import evaluation
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.evaluation import CLEAN, Disturbance
+from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.svm import PENALTIES, fit_margins, window_features
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.loop import train
+from tactile_rt.sim_backend.datasets import recipes
 from tactile_rt.sweep_set import Sweeps
 
-__all__ = ["GENERATED", "REAL", "Method", "baselines", "joined", "of_kinds", "onnx_model"]
+__all__ = [
+    "GENERATED",
+    "REAL",
+    "Method",
+    "baselines",
+    "digest_of",
+    "joined",
+    "of_kinds",
+    "onnx_model",
+]
 
 Floats = NDArray[np.float32]
 REAL, GENERATED, BOTH = "real", "generated", "generated + real"
@@ -90,7 +101,7 @@ def onnx_model(path: Path) -> Method:
     run = stepped(session, card)
     taught = card.provenance.get("sweep_set", {})
     source = taught.get("objects", {}).get("from", "?") if isinstance(taught, dict) else "?"
-    learnt = GENERATED if source in ("shapes", "varied-shapes") else source
+    learnt = GENERATED if source in recipes.GENERATED else source
 
     def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
         return evaluation.predict(sweeps, run, disturbance=disturbance)[:, -1]
@@ -117,6 +128,14 @@ def joined(sets: list[SweepSet], kinds: tuple[str, ...]) -> SweepSet:
         np.concatenate([p.sweeps.objects for p in parts]),
     )
     return replace(parts[0], sweeps=whole)
+
+
+def digest_of(*sets: SweepSet) -> str:
+    """SHA-256 over the loads, sweep by sweep."""
+    digest = hashlib.sha256()
+    for one in sets:
+        digest.update(np.ascontiguousarray(one.sweeps.values, dtype="<f4"))
+    return digest.hexdigest()
 
 
 def _taken(data: SweepSet, at: NDArray[np.int64], labels: NDArray[np.int64]) -> SweepSet:
@@ -184,11 +203,13 @@ def _svm(taught: str, training: SweepSet, validation: SweepSet) -> Method:
 
 
 def _gru(taught: str, training: SweepSet, validation: SweepSet, runs: Path) -> Method:
+    digest = digest_of(training, validation)  # networks of other data are not these
+
     def candidate(rate: float) -> Callable[..., Floats]:
         config = TrainingConfig(
             data=taught, encoder="gru", width=0.25, learning_rate=rate, epochs=1000, updates=UPDATES
         )
-        folder = runs / f"gru-{taught.replace(' ', '')}-{rate:g}"
+        folder = runs / f"gru-{taught.replace(' ', '')}-{digest[:8]}-{rate:g}"
         best = folder / "best.pt"
         if not (folder / "done").exists():
             best = train(config, folder, splits=(training, validation))

@@ -10,11 +10,12 @@ from bench.perception.data import Data
 from bench.perception.methods import Method, of_kinds
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.evaluation import CLEAN, Disturbance, Interval
-from tactile_rt.sweep_set import WITHHELD
+from tactile_rt.models.disturbances import CLEAN, Disturbance
+from tactile_rt.models.evaluation import Interval
 
 __all__ = ["COVERAGES", "Figures", "accuracy_by_source", "robustness", "score"]
 
+NOTHING = Interval(float("nan"), float("nan"), float("nan"))
 COVERAGES = (50, 80, 95)  # percent of the sweeps that are decided, the surest first
 Floats = NDArray[np.float32]
 
@@ -30,7 +31,8 @@ class Figures:
             their posteriors are fused.
         calibration: The expected calibration error, 15 bins.
         at: The accuracy of the surest sweeps, by the percentage that is decided.
-        auroc: How well the largest posterior tells known kinds from the withheld ones.
+        auroc: How well the largest posterior tells known kinds from the withheld ones; NaN where
+            there are none.
     """
 
     top1: Interval
@@ -43,24 +45,27 @@ class Figures:
     auroc: Interval
 
 
-def score(method: Method, test: SweepSet, data: Data) -> Figures:
-    """A method's figures on the sweeps of the kinds that it knows."""
+def score(
+    method: Method, test: SweepSet, strange: tuple[Floats, NDArray[np.str_]] | None = None
+) -> Figures:
+    """A method's figures on the sweeps of the kinds that it knows.
+
+    Args:
+        method: which.
+        test: the sweeps.
+        strange: its posteriors (sweep, kind) of things of unknown kinds, and the objects (sweep,);
+            None: there are none in this test's world.
+    """
     known = of_kinds(test, method.kinds)
     labels, objects = known.sweeps.labels, known.sweeps.objects
     posteriors = method.posteriors(known, CLEAN)
-    unknown = data.sets[WITHHELD]
-    there = method.posteriors(unknown, CLEAN)
 
     def over(statistic: Callable[[NDArray[np.int64]], float]) -> Interval:
         return evaluation.bootstrap(statistic, objects)
 
     right = evaluation.hits(posteriors, labels)
     sure = np.nan_to_num(posteriors.max(axis=1), nan=0.0)
-    both = np.concatenate([sure, np.nan_to_num(there.max(axis=1), nan=0.0)])
-
-    def area(at: NDArray[np.int64]) -> float:
-        mine = at < len(known.sweeps)
-        return evaluation.auroc(both[at[mine]], both[at[~mine]])
+    area = NOTHING if strange is None else _told_apart(sure, objects, *strange)
 
     return Figures(
         top1=evaluation.accuracy(right, objects),
@@ -72,7 +77,7 @@ def score(method: Method, test: SweepSet, data: Data) -> Figures:
             lambda at: evaluation.expected_calibration_error(posteriors[at], labels[at])
         ),
         at={c: over(lambda at, c=c: _surest(right[at], sure[at], c)) for c in COVERAGES},  # type: ignore[misc]
-        auroc=evaluation.bootstrap(area, np.concatenate([objects, unknown.sweeps.objects])),
+        auroc=area,
     )
 
 
@@ -99,6 +104,19 @@ def robustness(
         )
         for name, disturbance in conditions.items()
     }
+
+
+def _told_apart(
+    sure: Floats, objects: NDArray[np.str_], strange: Floats, others: NDArray[np.str_]
+) -> Interval:
+    """AUROC of the largest posteriors of known things against those of unknown ones."""
+    both = np.concatenate([sure, np.nan_to_num(strange.max(axis=1), nan=0.0)])
+
+    def area(at: NDArray[np.int64]) -> float:
+        mine = at < len(sure)
+        return evaluation.auroc(both[at[mine]], both[at[~mine]])
+
+    return evaluation.bootstrap(area, np.concatenate([objects, others]))
 
 
 def _macro(right: NDArray[np.bool_], labels: NDArray[np.int64]) -> float:

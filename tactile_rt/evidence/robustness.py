@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from tactile_rt.evidence.records import Record
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.evaluation import OFFSET, Disturbance
+from tactile_rt.models.disturbances import OFFSET, Disturbance
 
 __all__ = [
     "Robustness",

@@ -20,7 +20,7 @@ from sklearn.svm import SVC
 
 if TYPE_CHECKING:
     from tactile_rt.models.datasets import SweepSet
-    from tactile_rt.models.evaluation import Disturbance
+    from tactile_rt.models.disturbances import Disturbance
 
 __all__ = ["PENALTIES", "FittedSVM", "Predict", "fit", "fit_margins", "fit_svm", "window_features"]
 
@@ -134,7 +134,8 @@ def window_features(
         disturbance: what is wrong with the sensor; None: nothing.
     """
     # Imported here: it brings torch, which whoever only writes a set's card does without.
-    from tactile_rt.models.evaluation import CLEAN, run_windows
+    from tactile_rt.models.disturbances import CLEAN
+    from tactile_rt.models.evaluation import run_windows
 
     limits = data.manifest.limits
 

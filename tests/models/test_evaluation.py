@@ -12,8 +12,8 @@ from sklearn.metrics import roc_auc_score
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.models import evaluation, onsets
 from tactile_rt.models.datasets import SweepSet, find_onsets
+from tactile_rt.models.disturbances import OFFSET, Disturbance
 from tactile_rt.models.evaluation import (
-    Disturbance,
     accuracy,
     at_temperature,
     auroc,
@@ -185,7 +185,7 @@ def test_an_offset_after_the_tare_is_in_the_windows_and_not_in_the_baseline() ->
     values = sweeps(70)
     clean, there = seen_by(Disturbance(), values), seen_by(Disturbance(offset=0.5), values)
     added = (there[0] - clean[0]).astype(np.float64)
-    size = 0.5 * evaluation.OFFSET * NOISE
+    size = 0.5 * OFFSET * NOISE
     assert np.allclose(np.abs(added), size, rtol=1e-2)
     assert np.ptp(np.sign(added), axis=(1, 2)).max() == 0, "constant within a sweep"
     assert 0.3 < (added > 0).mean() < 0.7
@@ -216,7 +216,7 @@ def test_a_drift_begins_with_the_contact_and_reaches_its_size_at_the_end() -> No
     values = sweeps(70)
     clean, there = seen_by(Disturbance(), values), seen_by(Disturbance(drift=0.5), values)
     added = (there[0] - clean[0]).astype(np.float64)  # (sweep, step, sub-step, element, channel)
-    size = 0.5 * evaluation.OFFSET * NOISE
+    size = 0.5 * OFFSET * NOISE
     assert np.allclose(np.abs(added[:, -1, -1]), size, rtol=1e-2)
     assert np.abs(added[:, 0, 0]).max() < 0.02 * size.max()
     assert np.array_equal(there[1], clean[1])

@@ -13,8 +13,9 @@ from tactile_rt.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.data_checks import check_sets, check_split
 from tactile_rt.models.datasets import SweepSet, windows
+from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.ead import count_parameters
-from tactile_rt.models.evaluation import CLEAN, Disturbance, Step, hits
+from tactile_rt.models.evaluation import Step, hits
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.models.svm import fit_svm

@@ -83,6 +83,22 @@ def extents(thing: TactileObject) -> np.ndarray:
     return np.array([bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)])
 
 
+def hanging_together(thing: TactileObject) -> int:
+    """How many of its pieces are reached from the first by way of bounding boxes that overlap.
+
+    That they do is necessary, and what a misplaced part breaks.
+    """
+    boxes = np.array([p.bounds for p in thing.pieces])
+    reached, todo = {0}, [0]
+    while todo:
+        low, high = boxes[todo.pop()]
+        near = ((boxes[:, 0] <= high + 1e-9) & (boxes[:, 1] >= low - 1e-9)).all(axis=1)
+        new = set(np.flatnonzero(near).tolist()) - reached
+        reached |= new
+        todo += new
+    return len(reached)
+
+
 def test_two_dozen_categories_and_four_withheld_each_in_order() -> None:
     assert (len(CATEGORIES), len(WITHHELD), len(set(KINDS))) == (24, 4, 28)
     assert list(CATEGORIES) == sorted(CATEGORIES)
@@ -126,16 +142,8 @@ def test_it_is_centred_with_largest_extent_one(category: str) -> None:
 @pytest.mark.parametrize("category", KINDS)
 def test_its_pieces_hang_together(category: str) -> None:
     for index in range(MANY):
-        pieces = drawn(category, index).pieces
-        boxes = np.array([p.bounds for p in pieces])
-        reached, todo = {0}, [0]
-        while todo:  # bounding boxes that overlap: necessary, and what a misplaced part breaks
-            low, high = boxes[todo.pop()]
-            near = ((boxes[:, 0] <= high + 1e-9) & (boxes[:, 1] >= low - 1e-9)).all(axis=1)
-            new = set(np.flatnonzero(near).tolist()) - reached
-            reached |= new
-            todo += new
-        assert len(reached) == len(pieces), f"{category}-{index} is in parts"
+        thing = drawn(category, index)
+        assert hanging_together(thing) == len(thing.pieces), f"{category}-{index} is in parts"
 
 
 @pytest.mark.parametrize("category", KINDS)
@@ -256,15 +264,7 @@ def test_a_varied_one_is_of_its_kind_solid_and_whole(category: str) -> None:
         low, high = extents(thing)
         np.testing.assert_allclose(low + high, 0, atol=1e-9)
         assert (high - low).max() == pytest.approx(1)
-        boxes = np.array([p.bounds for p in thing.pieces])
-        reached, todo = {0}, [0]
-        while todo:
-            lowest, highest = boxes[todo.pop()]
-            near = ((boxes[:, 0] <= highest + 1e-9) & (boxes[:, 1] >= lowest - 1e-9)).all(axis=1)
-            new = set(np.flatnonzero(near).tolist()) - reached
-            reached |= new
-            todo += new
-        assert len(reached) == len(boxes), f"{thing.name} falls apart"
+        assert hanging_together(thing) == len(thing.pieces), f"{thing.name} falls apart"
 
 
 @pytest.mark.parametrize("category", ["chair", "table", "house", "car", "lamp", "bottle", "mug"])

@@ -105,7 +105,7 @@ def grapes(rng: Generator) -> list[Trimesh]:
     pieces.append(rod((0, 0, z + berry), (0, 0, 0), 0.5 * wide, 0.85 * wide))
     if rng.random() < 0.8:
         pieces.append(rod((0, 0, 0), (u(-0.1, 0.1), 0, u(0.12, 0.35)), u(0.02, 0.05), sides=8))
-    return pieces[: len(pieces) if len(pieces) < 60 else 60]
+    return pieces[:60]
 
 
 def house(rng: Generator) -> list[Trimesh]:

@@ -1,0 +1,107 @@
+"""What a real sensor does to sweeps that a simulated one does not, to try a model with.
+
+What training draws is `sensor_faults`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.stream import ConfigError
+
+__all__ = ["CLEAN", "OFFSET", "Disturbance"]
+
+OFFSET = 2.0  # a unit of offset that appears after the tare, in units of the rated noise
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """What is wrong with the sensor; each sweep is a draw of its own.
+
+    Attributes:
+        noise: The white noise on every stored sample, in units of the rated noise.
+        gain: The standard deviation of every whisker's relative gain error.
+        dead: The number of whiskers, drawn at random, that read zero throughout.
+        rows: The number of rows of the grid, drawn at random, whose whiskers all do.
+        offset: The size of a constant that appears with the contact, after the tare, in units of
+            `OFFSET`; a sign is drawn for every whisker and channel.
+        drift: The size that a linear drift from the contact on has reached at the window's end, in
+            units of `OFFSET`; a sign is drawn as for the offset.
+        swapped: Whether the channels of x and of y are connected the wrong way round.
+        rest: The number of stored samples of silence before each sweep, for the tare; a robot has
+            them, the sweeps have only a short lead.
+
+    Raises:
+        ConfigError: a negative amount.
+    """
+
+    noise: float = 0.0
+    gain: float = 0.0
+    dead: int = 0
+    rows: int = 0
+    offset: float = 0.0
+    drift: float = 0.0
+    swapped: bool = False
+    rest: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("noise", "gain", "dead", "rows", "offset", "drift", "rest"):
+            if not getattr(self, name) >= 0:  # which NaN is not either
+                raise ConfigError(f"{name} is {getattr(self, name)}, must not be negative")
+
+    def of_samples(
+        self, values: NDArray[np.float32], data: SweepSet, rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """What the detector sees, of (sweep, sample, element, channel) SI."""
+        n, elements = len(values), values.shape[2]
+        if data.manifest.lead:  # what is wrong adds to rest, which is not nothing in a field
+            values = values - values[:, : data.manifest.lead].mean(axis=1, keepdims=True)
+        if self.rest:
+            silence = np.zeros((n, self.rest, *values.shape[2:]), dtype=np.float32)
+            values = np.concatenate([silence, values], axis=1)
+        if self.gain:
+            error = rng.normal(size=(n, 1, elements, 1)).astype(np.float32)
+            values = values * (1 + np.float32(self.gain) * error)
+        if self.dead:
+            rank = rng.permuted(np.tile(np.arange(elements), (n, 1)), axis=1)
+            values = values * (rank >= self.dead)[:, None, :, None]
+        if self.rows:
+            grid = np.array(data.manifest.spec.grid)[:, 0]
+            rank = rng.permuted(np.tile(np.unique(grid), (n, 1)), axis=1)
+            gone = (grid == rank[:, : self.rows, None]).any(axis=1)
+            values = values * ~gone[:, None, :, None]
+        if self.swapped:
+            values = values[..., _x_for_y(data.manifest.spec.channels)]
+        if self.noise:
+            noise = rng.normal(size=values.shape).astype(np.float32)
+            values = values + noise * data.noise * np.float32(self.noise)
+        return values
+
+    def of_windows(
+        self, samples: NDArray[np.float32], data: SweepSet, rng: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """What the network sees, of (sweep, step, sub-step, element, channel) SI."""
+        steps, substeps = samples.shape[1:3]
+        course = np.arange(1, steps * substeps + 1, dtype=np.float32) / (steps * substeps)
+        for amount, over_time in ((self.offset, np.ones_like(course)), (self.drift, course)):
+            if amount:
+                size = OFFSET * data.noise * np.float32(amount)
+                shape = (len(samples), *samples.shape[3:])
+                sign = rng.choice(np.array([-1, 1], dtype=np.float32), shape)
+                over = over_time.reshape(steps, substeps, 1, 1)
+                samples = samples + (sign * size)[:, None, None] * over
+        return samples
+
+
+CLEAN = Disturbance()
+
+
+def _x_for_y(channels: Sequence[str]) -> list[int]:
+    """The place of every channel if those that end in x and in y are mistaken for one another."""
+    other = {"x": "y", "y": "x"}
+    swapped = [name[:-1] + other.get(name[-1], name[-1]) for name in channels]
+    return [channels.index(name if name in channels else channels[k])
+            for k, name in enumerate(swapped)]  # fmt: skip
