@@ -13,7 +13,7 @@ file at every reading.
 
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ __all__ = [
     "Sweeps",
     "contacts_of",
     "has_object",
+    "join_manifests",
     "object_path",
     "read_object",
     "read_skipped",
@@ -195,6 +196,33 @@ class SweepManifest:
             ) from None
         except (msgspec.MsgspecError, UnicodeDecodeError, ConfigError) as error:
             raise RecordingError(f"{path} is damaged: {error}") from None
+
+
+def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
+    """Sets of one array as one, which is the first with the categories and objects of the others.
+
+    Raises:
+        ConfigError: sets of another array, or of another period or lead.
+    """
+    first = manifests[0]
+    for other in manifests[1:]:
+        differing = first.spec.differences(other.spec, ("name", "rate_hz"))
+        if (first.period_ns, first.lead) != (other.period_ns, other.lead):
+            differing = [*differing, "the period of their samples, or how long they rest first"]
+        if differing:
+            names = " and ".join(str(m.recipe.get("name", "?")) for m in (first, other))
+            raise ConfigError(f"the sweep sets {names} cannot be joined: {differing[0]}")
+    split: dict[str, dict[str, None]] = {}  # dictionaries, as sets that keep their order
+    for one in manifests:
+        for side, names_there in one.split.items():
+            split.setdefault(side, {}).update(dict.fromkeys(names_there))
+    return replace(
+        first,
+        categories=tuple(dict.fromkeys(c for one in manifests for c in one.categories)),
+        withheld=tuple(dict.fromkeys(c for one in manifests for c in one.withheld)),
+        split={side: tuple(names) for side, names in split.items()},
+        category_of={name: kind for m in manifests for name, kind in m.category_of.items()},
+    )
 
 
 def _differing(here: dict[str, Any], there: dict[str, Any], prefix: str = "") -> list[str]:

@@ -25,7 +25,7 @@ def run(quick: bool) -> list[Record]:
     quote; the full run makes the very test set that the model's card names.
     """
     _, card = load_model(shipped_model())
-    recipe = recipe_of_set(card.provenance["sweep_set"], card.labels)
+    recipe = recipe_of_set(card.provenance["sweep_set"], card.classes)
     if quick:
         recipe = _few(recipe)
     splits = [s for s in ("test", WITHHELD) if describe_set(recipe).split.get(s)]

@@ -5,27 +5,27 @@ checkout alone. Whole: also what learns from generated objects, and networks.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import isnan
 from pathlib import Path
 
 from bench.perception.data import NAME, SOURCE, Data, load
-from bench.perception.generator import measured, rows
+from bench.perception.generator import UPRIGHT, Condition, measured, rows
 from bench.perception.methods import (
     GENERATED,
     Method,
     baselines,
     digest_of,
-    joined,
     of_kinds,
     onnx_model,
 )
+from bench.perception.promises import Promises, named_faults, promises
 from bench.perception.scores import Figures, accuracy_by_source, robustness, score
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.evidence.records import Record
 from tactile_rt.evidence.robustness import conditions
-from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.disturbances import CLEAN
+from tactile_rt.models.datasets import SweepSet, joined
+from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import Interval
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import DEFAULT_RECIPE, read_recipe
@@ -61,6 +61,8 @@ class BenchmarkResults:
         by_source: Top-1 on the held-out objects and the held-out source together, by source.
         robust: Top-1 on the held-out objects by condition.
         generator: Top-1 on generated objects by what is changed, of those that know them.
+        promises: What became of the promises of each model file, by its name and test.
+        faults: The share of loads that no touch makes that each model file refuses, by their name.
         digest: SHA-256 over the sweeps of generated objects, empty if they were not used.
     """
 
@@ -69,6 +71,8 @@ class BenchmarkResults:
     by_source: dict[Method, dict[str, Interval]]
     robust: dict[Method, dict[str, Interval]]
     generator: dict[Method, dict[str, Interval]]
+    promises: dict[str, dict[str, Promises]] = field(default_factory=dict)
+    faults: dict[str, dict[str, Interval]] = field(default_factory=dict)
     digest: str = ""
 
 
@@ -115,7 +119,7 @@ def measure(
     }
     methods = [*baselines(data, shipped, generated, None if quick else folder / "runs"), *files]
     changed = {} if quick else rows(folder, progress)
-    results = BenchmarkResults(data, {test: {} for test in tests}, {}, {}, {}, digest)
+    results = BenchmarkResults(data, {test: {} for test in tests}, {}, {}, {}, digest=digest)
     for method in methods:
         progress(f"{method.name}, taught by {method.taught}")
         of = [SHARED, SHARED_WIDE]
@@ -124,7 +128,7 @@ def measure(
         if method.taught == GENERATED:  # real objects that it has not seen are all there are
             of.append(ALL)
         unknown = data.sets[WITHHELD]
-        strange = method.posteriors(unknown, CLEAN), unknown.sweeps.objects
+        strange = method.familiarity(unknown), unknown.sweeps.objects
         for test in of:  # unknown things stand: they are no match for known ones that do not
             against = None if test in (WIDE, SHARED_WIDE) else strange
             results.scores[test][method] = score(method, tests[test], against)
@@ -135,7 +139,36 @@ def measure(
         results.by_source[method] = accuracy_by_source(
             method, held_out if of[0] == OBJECTS else tests[SHARED], data
         )
+    for path in (shipped, *models):
+        progress(f"{path.stem}: what it promises")
+        _hold(results, path, tests, data, changed)
     return results
+
+
+def _hold(
+    results: BenchmarkResults,
+    path: Path,
+    tests: dict[str, SweepSet],
+    data: Data,
+    changed: dict[str, list[Condition]],
+) -> None:
+    """Hold a model file to its promises."""
+    on: dict[str, tuple[SweepSet, Disturbance]] = {
+        OBJECTS: (tests[OBJECTS], CLEAN),
+        f"{OBJECTS}, rated noise": (tests[OBJECTS], Disturbance(noise=1)),
+        ELSEWHERE: (tests[ELSEWHERE], CLEAN),
+        "unknown kinds": (data.sets[WITHHELD], CLEAN),
+    }
+    plain = changed[UPRIGHT][0][0] if changed else None
+    if plain:
+        for noise, name in ((0, "generated"), (1, "rated noise"), (2, "twice that")):
+            said = name if not noise else f"generated, {name}"
+            on[said] = plain, Disturbance(noise=noise)
+    found = {name: promises(path, *one) for name, one in on.items()}
+    kept = {name: one for name, one in found.items() if one is not None}
+    if kept:
+        results.promises[path.stem] = kept
+        results.faults[path.stem] = dict(named_faults(path, plain or tests[OBJECTS]))
 
 
 def records_of(results: BenchmarkResults) -> list[Record]:
@@ -166,4 +199,4 @@ def records_of(results: BenchmarkResults) -> list[Record]:
 
 def _together(sets: list[SweepSet]) -> SweepSet:
     """Splits of one set as one."""
-    return joined(sets, sets[0].manifest.categories)
+    return joined([of_kinds(one, one.manifest.categories) for one in sets])

@@ -20,7 +20,7 @@ from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipes import Between, Choice
 from tactile_rt.sweep_set import Sweeps
 
-__all__ = ["Condition", "measured", "rows"]
+__all__ = ["UPRIGHT", "Condition", "measured", "rows"]
 
 RECIPE, FIRST, OBJECTS, DRAWS = "default24", 48, 4, 3
 UPRIGHT = "as taught to mouse24"

@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.perception.data import Data
+from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.evidence.model_windows import stepped
 from tactile_rt.export.release import fit_temperature
 from tactile_rt.models import evaluation
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
-from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.svm import PENALTIES, fit_margins, window_features
 from tactile_rt.models.training.config import TrainingConfig
@@ -33,7 +34,6 @@ __all__ = [
     "Method",
     "baselines",
     "digest_of",
-    "joined",
     "of_kinds",
     "onnx_model",
 ]
@@ -57,12 +57,21 @@ class Method:
         kinds: The kinds that it tells apart.
         posteriors: The posteriors (sweep, kind) of a set's sweeps under a disturbance; NaN where it
             finds no contact.
+        familiar: How sure (sweep,) it is that the things are of kinds that it knows; None: as sure
+            as of the most probable kind.
     """
 
     name: str
     taught: str
     kinds: tuple[str, ...]
     posteriors: Callable[[SweepSet, Disturbance], Floats]
+    familiar: Callable[[SweepSet], Floats] | None = None
+
+    def familiarity(self, sweeps: SweepSet) -> Floats:
+        """How sure (sweep,) it is that things are of kinds that it knows."""
+        if self.familiar is not None:
+            return self.familiar(sweeps)
+        return np.nan_to_num(self.posteriors(sweeps, CLEAN).max(axis=1), nan=0.0)
 
 
 def baselines(
@@ -90,8 +99,8 @@ def baselines(
         yield _gru(REAL, *real, runs)
     if runs and generated:
         kinds = tuple(dict.fromkeys((*data.kinds, *generated[0].manifest.categories)))
-        both = joined([generated[0], *[real[0]] * REPEATS], kinds)
-        yield _gru(BOTH, both, joined([real[1]], kinds), runs)
+        both = joined([of_kinds(one, kinds) for one in (generated[0], *[real[0]] * REPEATS)])
+        yield _gru(BOTH, both, of_kinds(real[1], kinds), runs)
     yield _headed(shipped, *real)
 
 
@@ -106,7 +115,12 @@ def onnx_model(path: Path) -> Method:
     def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
         return evaluation.predict(sweeps, run, disturbance=disturbance)[:, -1]
 
-    return Method(path.stem, learnt, tuple(card.labels), posteriors)
+    def familiar(sweeps: SweepSet) -> Floats:
+        there = evaluation.predict(sweeps, stepped(session, card, refusals=True))[:, -1]
+        return np.nan_to_num(1 - there[:, card.labels.index(UNKNOWN)], nan=0.0)
+
+    refuses = familiar if UNKNOWN in card.refusals else None
+    return Method(path.stem, learnt, card.classes, posteriors, refuses)
 
 
 def of_kinds(data: SweepSet, kinds: tuple[str, ...]) -> SweepSet:
@@ -117,17 +131,6 @@ def of_kinds(data: SweepSet, kinds: tuple[str, ...]) -> SweepSet:
     at = at[number[data.sweeps.labels[at]] >= 0]
     found = _taken(data, at, number[data.sweeps.labels[at]])
     return replace(found, manifest=replace(found.manifest, categories=kinds))
-
-
-def joined(sets: list[SweepSet], kinds: tuple[str, ...]) -> SweepSet:
-    """Sets of one array as one, labelled by these kinds."""
-    parts = [of_kinds(one, kinds) for one in sets]
-    whole = Sweeps(
-        np.concatenate([p.sweeps.values for p in parts]),
-        np.concatenate([p.sweeps.labels for p in parts]),
-        np.concatenate([p.sweeps.objects for p in parts]),
-    )
-    return replace(parts[0], sweeps=whole)
 
 
 def digest_of(*sets: SweepSet) -> str:

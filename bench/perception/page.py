@@ -118,7 +118,41 @@ def write_page(results: BenchmarkResults, path: Path) -> None:
             f"`{DEFAULT_RECIPE}`, whose loads have the SHA-256 `{results.digest}`.",
             "",
         ]
+    if results.promises:
+        lines += [*_promises(results), ""]
     path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def _promises(results: BenchmarkResults) -> list[str]:
+    """What becomes of the models' promises, and which loads they refuse."""
+    lines = [
+        "### Refusals and candidates",
+        "",
+        "A model file may refuse to name a kind, because the object is of none that it knows or "
+        "because no touch makes such loads; and it may promise that the true kind is among its "
+        "candidates at every step of so many touches. *Candidates*: their mean number at the last "
+        "step.",
+        "",
+        "| model | test | promised | kept | candidates | called unknown | refused for the loads |",
+        "|---" * 7 + "|",
+    ]
+    for name, tests in results.promises.items():
+        for test, p in tests.items():
+            promised = "-" if p.coverage != p.coverage else f"{100 * p.coverage:g}"
+            size = "-" if p.size.value != p.size.value else f"{p.size.value:.1f}"
+            cells = (promised, _said(p.kept), size, _said(p.unknown), _said(p.faulty))
+            lines.append(f"| {name} | {test} | {' | '.join(cells)} |")
+    lines += [
+        "",
+        "Loads that no touch makes, refused for what is wrong with them:",
+        "",
+        "| | " + " | ".join(results.faults) + " |",
+        "|---" * (1 + len(results.faults)) + "|",
+    ]
+    for fault in next(iter(results.faults.values())):
+        cells = [_said(found[fault]) for found in results.faults.values()]
+        lines.append(f"| {fault} | {' | '.join(cells)} |")
+    return lines
 
 
 def _contents(data: Data) -> list[str]:

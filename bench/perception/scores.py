@@ -31,8 +31,8 @@ class Figures:
             their posteriors are fused.
         calibration: The expected calibration error, 15 bins.
         at: The accuracy of the surest sweeps, by the percentage that is decided.
-        auroc: How well the largest posterior tells known kinds from the withheld ones; NaN where
-            there are none.
+        auroc: How well its familiarity tells known kinds from the withheld ones; NaN where there
+            are none.
     """
 
     top1: Interval
@@ -53,7 +53,7 @@ def score(
     Args:
         method: which.
         test: the sweeps.
-        strange: its posteriors (sweep, kind) of things of unknown kinds, and the objects (sweep,);
+        strange: its familiarity (sweep,) of things of unknown kinds, and the objects (sweep,);
             None: there are none in this test's world.
     """
     known = of_kinds(test, method.kinds)
@@ -65,7 +65,9 @@ def score(
 
     right = evaluation.hits(posteriors, labels)
     sure = np.nan_to_num(posteriors.max(axis=1), nan=0.0)
-    area = NOTHING if strange is None else _told_apart(sure, objects, *strange)
+    area = NOTHING
+    if strange is not None:
+        area = _told_apart(method.familiarity(known), objects, *strange)
 
     return Figures(
         top1=evaluation.accuracy(right, objects),
@@ -107,13 +109,13 @@ def robustness(
 
 
 def _told_apart(
-    sure: Floats, objects: NDArray[np.str_], strange: Floats, others: NDArray[np.str_]
+    familiar: Floats, objects: NDArray[np.str_], strange: Floats, others: NDArray[np.str_]
 ) -> Interval:
-    """AUROC of the largest posteriors of known things against those of unknown ones."""
-    both = np.concatenate([sure, np.nan_to_num(strange.max(axis=1), nan=0.0)])
+    """AUROC of the familiarity of known things against that of unknown ones."""
+    both = np.concatenate([familiar, strange])
 
     def area(at: NDArray[np.int64]) -> float:
-        mine = at < len(sure)
+        mine = at < len(familiar)
         return evaluation.auroc(both[at[mine]], both[at[~mine]])
 
     return evaluation.bootstrap(area, np.concatenate([objects, others]))

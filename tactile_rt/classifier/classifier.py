@@ -22,7 +22,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.contact import ContactDetector
+from tactile_rt.classifier.decision_rules import CandidateRule, fitting
 from tactile_rt.classifier.exits import IN_A_ROW, Deadline, EarlyExit, Lanes, Policy
+from tactile_rt.classifier.model_card import decided, rated_noise
 from tactile_rt.classifier.model_file import fit_source, load_model
 from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.classifier.stepper import Stepper
@@ -48,10 +50,17 @@ class Classification:
             longer contact are not in it.
         final: Whether this decision is the last one of its window; an episode that a silence of
             the stream cuts short has no final decision.
-        label: The name of the most probable class.
-        labels: (class,) The names of all classes, in the order of `probabilities`.
-        probabilities: (class,) The posterior probability of each class, float32.
+        label: The decision: the name of the most probable class, or a refusal to name one:
+            "unknown" for an object of no class that the model knows, or what is wrong with the
+            loads, see `ModelCard.refusals`.
+        labels: (class,) The names of all classes and then of the refusals, in the order of
+            `probabilities`.
+        probabilities: (class,) The posterior probability of each of them, float32.
         latency_s: The time that the model's step took, s.
+        candidates: The classes that are still possible, the most probable first, by the model's
+            promise for the noise that was measured; empty if it makes none.
+        coverage: The promise: in this share of touches of known kinds the true class is among the
+            candidates at every step; None: there is none.
         late: Whether more work had gathered than the deadline allows.
         embedding: (unit,) What the network's last layer read in the step, float32; None unless the
             classifier was asked for it.
@@ -65,11 +74,18 @@ class Classification:
     labels: tuple[str, ...]
     probabilities: NDArray[np.float32]
     latency_s: float
+    candidates: tuple[str, ...] = ()
+    coverage: float | None = None
     late: bool = False
     embedding: NDArray[np.float32] | None = None
 
+    @property
+    def probability(self) -> float:
+        """The posterior probability of the decision."""
+        return float(self.probabilities[self.labels.index(self.label)])
+
     def top(self, k: int = 5) -> list[tuple[str, float]]:
-        """The k most probable classes with their probabilities."""
+        """The k most probable labels with their probabilities."""
         order = np.argsort(-self.probabilities, kind="stable")[:k]
         return [(self.labels[i], float(self.probabilities[i])) for i in order]
 
@@ -177,6 +193,8 @@ class Classifier:
         self._onset_ns: int | None = None  # None when no episode is under way
         self._decided = False  # the episode has had its final decision
         self._next_seq = 0
+        self._rated = rated_noise(self.card)
+        self._promise: CandidateRule | None = None  # of the episode
 
     def push(self, chunk: Chunk) -> list[Classification]:
         """Take samples as they come from the array, return the decisions that they complete."""
@@ -229,6 +247,10 @@ class Classifier:
         self._sigma = self.detector.sigma
         self._stepper.begin(self._offset[self._order], self._sigma[self._order])
         self._deadline.begin()
+        # Of an element without a tare the noise is not known.
+        known = self._sigma[self.detector.tared] / self._rated
+        noise = float(np.median(known)) if known.size else np.inf
+        self._promise = fitting(self.card.candidates, noise)
 
     def _advance(self, t_ns: int, onset_ns: int) -> Classification | None:
         """Take a step with the samples gathered; the decision that it gives, if any."""
@@ -251,7 +273,7 @@ class Classifier:
         if probabilities is None:
             self._give_up()
             return None
-        best = int(probabilities.argmax())
+        best = decided(self.card, probabilities, step)
         final = step == self.card.steps or self._exit.reached(best, float(probabilities[best]))
         self._decided = self._decided or final
         if late and self._deadline.policy == "skip":
@@ -266,9 +288,18 @@ class Classifier:
             labels=self.card.labels,
             probabilities=probabilities,
             latency_s=latency,
+            candidates=self._candidates(probabilities, step),
+            coverage=self._promise.coverage if self._promise else None,
             late=late,
             embedding=self._stepper.embedding[lane].copy() if self._embeds else None,
         )
+
+    def _candidates(self, probabilities: NDArray[np.float32], step: int) -> tuple[str, ...]:
+        if self._promise is None:
+            return ()
+        classes = self.card.classes
+        left = self._promise.candidates(probabilities[: len(classes)], step)
+        return tuple(classes[k] for k in left)
 
     def _posterior(self, logits: NDArray[np.float32]) -> NDArray[np.float32] | None:
         probabilities: NDArray[np.float32] = logits / self.card.temperature

@@ -5,21 +5,36 @@ They are fitted on sweeps of objects that the network was not trained on, and st
 stored by name, and whoever finds a name that they do not know cannot apply the rule.
 """
 
+from collections.abc import Sequence
 from typing import Literal
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
-__all__ = ["CandidateRule", "UnknownRule", "named"]
+__all__ = [
+    "MASS_ABOVE",
+    "POSTERIOR",
+    "UNKNOWN",
+    "CandidateRule",
+    "UnknownRule",
+    "fitting",
+    "mass_above",
+    "named",
+]
 
 MAX_NAME = 200  # characters
+UNKNOWN = "unknown"  # what is decided of an object of no class that the model knows
+POSTERIOR = "posterior of unknown"  # the score of an `UnknownRule`: of the label `unknown`
+# The score of a `CandidateRule`: how much of the posterior the more probable classes have.
+MASS_ABOVE = "mass above"
 
 
 class UnknownRule(msgspec.Struct, frozen=True):
     """When a step's decision is that the object is of no class that the model knows.
 
     Attributes:
-        score: The name of the score, such as "entropy".
+        score: The name of the score: `POSTERIOR`.
         output: The output of the graph that the score is computed from.
         thresholds: (step,) or (1,) The score above which the object is unknown, by step or for all.
     """
@@ -38,6 +53,10 @@ class UnknownRule(msgspec.Struct, frozen=True):
             return "thresholds must be finite"
         return ""
 
+    def threshold(self, step: int) -> float:
+        """That of a step, counted from 1."""
+        return self.thresholds[step - 1 if len(self.thresholds) > 1 else 0]
+
 
 class CandidateRule(msgspec.Struct, frozen=True):
     """Which classes a step leaves possible, so that the true one is seldom left out.
@@ -45,7 +64,7 @@ class CandidateRule(msgspec.Struct, frozen=True):
     A class is a candidate at a step if its score there is not above the step's quantile.
 
     Attributes:
-        score: The name of the score that every class gets at a step.
+        score: The name of the score that every class gets at a step: `MASS_ABOVE`.
         coverage: The promise: the share of sweeps of unseen objects of which the true class is a
             candidate at every step, in (0, 1).
         quantiles: (step,) The largest score of a candidate, by step.
@@ -76,6 +95,36 @@ class CandidateRule(msgspec.Struct, frozen=True):
         if self.noise is not None and not 0 <= self.noise < np.inf:
             return f"noise is {self.noise:g}, must be 0 or more"
         return ""
+
+    def candidates(self, probabilities: NDArray[np.float32], step: int) -> list[int]:
+        """The classes (indices of `probabilities` (class,)) that a step, from 1, leaves possible.
+
+        The most probable one is first, and always among them.
+        """
+        order = np.argsort(-probabilities, kind="stable")
+        allowed = mass_above(probabilities)[order] <= self.quantiles[step - 1]
+        return [int(k) for k in order[: max(1, int(allowed.sum()))]]
+
+
+def fitting(rules: Sequence[CandidateRule], noise: float) -> CandidateRule | None:
+    """The rule that holds at a noise, in multiples of the rated: the narrowest; None if none is."""
+    known = [r for r in rules if r.score == MASS_ABOVE and (r.noise is None or noise <= r.noise)]
+    return min(known, key=lambda r: np.inf if r.noise is None else r.noise, default=None)
+
+
+def mass_above(probabilities: NDArray[np.float32]) -> NDArray[np.float64]:
+    """(..., class) The share of the posterior that the classes have which are more probable.
+
+    It is 0 for the most probable class, and next to 1 for the least.
+    """
+    p = probabilities.astype(np.float64)
+    p = p / p.sum(axis=-1, keepdims=True)
+    order = np.argsort(-p, axis=-1, kind="stable")
+    ranked = np.take_along_axis(p, order, axis=-1)
+    above = np.cumsum(ranked, axis=-1) - ranked
+    out: NDArray[np.float64] = np.empty_like(above)
+    np.put_along_axis(out, order, above, axis=-1)
+    return out
 
 
 def named(text: str) -> bool:

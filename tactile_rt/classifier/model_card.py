@@ -14,18 +14,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.calibration import declared
-from tactile_rt.classifier.decision_rules import MAX_NAME, CandidateRule, UnknownRule, named
+from tactile_rt.classifier.decision_rules import (
+    MAX_NAME,
+    POSTERIOR,
+    UNKNOWN,
+    CandidateRule,
+    UnknownRule,
+    named,
+)
 from tactile_rt.classifier.onnx_check import MAX_ELEMENTS
+from tactile_rt.sensor_spec import SensorSpec, channel_limits
 from tactile_rt.stream import ArraySpec, ConfigError, ModelError, SpecMismatch
 
 __all__ = [
     "Kind",
     "ModelCard",
     "StateTensor",
+    "decided",
     "element_order",
     "fit_source",
     "one_line",
     "parse_card",
+    "rated_noise",
 ]
 
 CARD_VERSION = 3
@@ -87,6 +97,8 @@ class ModelCard(msgspec.Struct, frozen=True):
         sensor: What is known of the array's sensor (rate, noise, range, ...); empty if nothing.
         unknown: When an object is of no known class; None if the model never says so.
         candidates: Which classes a step leaves possible, one rule for each promise.
+        refusals: The last of the labels, if any: those that name no class, but say that the object
+            is unknown, or what is wrong with the loads.
         loads: Statistics of the loads, tare removed, that training saw: by name a table
             (element, channel), SI.
     """
@@ -114,9 +126,15 @@ class ModelCard(msgspec.Struct, frozen=True):
     probe: tuple[tuple[float, ...], ...] = ()
     embedding: int = 0
     sensor: dict[str, Any] = {}
+    refusals: tuple[str, ...] = ()
     unknown: UnknownRule | None = None
     candidates: tuple[CandidateRule, ...] = ()
     loads: dict[str, tuple[tuple[float, ...], ...]] = {}
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The labels that are classes: those before the refusals."""
+        return self.labels[: len(self.labels) - len(self.refusals)]
 
     @property
     def array(self) -> ArraySpec:
@@ -252,12 +270,47 @@ def parse_card(path: Path, text: str) -> ModelCard:
     for what, rule in {"unknown": card.unknown, **rules}.items():
         if rule is not None and (wrong := rule.fault(card.steps)):
             raise damaged(f"{what}.{wrong}")
+    if card.refusals != card.labels[len(card.labels) - len(card.refusals) :]:
+        raise damaged("refusals are not the last of the labels")
+    if len(card.refusals) == len(card.labels):
+        raise damaged("there are no labels but refusals")
     for what, table in card.loads.items():
         if not named(what):
             raise damaged(f"names of loads must be 1 to {MAX_NAME} printable characters")
         if [len(row) for row in table] != [channels] * elements or not np.isfinite(table).all():
             raise damaged(f"loads.{what} is not {elements} x {channels} finite numbers")
     return card
+
+
+def decided(card: ModelCard, probabilities: NDArray[np.float32], step: int) -> int:
+    """The index of the label that a model decides for.
+
+    Args:
+        card: what it says of itself.
+        probabilities: (class,) of all its labels.
+        step: of the episode, counted from 1.
+    """
+    rule = card.unknown
+    if rule is None or rule.score != POSTERIOR or UNKNOWN not in card.refusals:
+        return int(probabilities.argmax())
+    unknown = card.labels.index(UNKNOWN)
+    if probabilities[unknown] > rule.threshold(step):
+        return unknown
+    others = probabilities.copy()
+    others[unknown] = -1
+    return int(others.argmax())
+
+
+def rated_noise(card: ModelCard) -> NDArray[np.float32]:
+    """(channel,) the rated noise per sample of the array that a model is for, SI.
+
+    Where neither the card nor a unit tells it, that from which the floor is derived.
+    """
+    try:
+        sensor = msgspec.convert(card.sensor, SensorSpec) if card.sensor else None
+        return channel_limits(card.array, sensor, card.period_ns).noise
+    except (ConfigError, msgspec.ValidationError):
+        return np.array(card.floor, dtype=np.float32)
 
 
 def one_line(reason: object) -> str:

@@ -193,7 +193,7 @@ def _score(demo: Demonstration) -> Text:
         text.append(f"{demo.right} of {done} right, {100 * demo.right / done:.0f} %", "bold")
     else:
         text.append("none has passed yet")
-    text.append(f"  (blind guessing: {100 / len(card.labels):.0f} %)\n", GREY)
+    text.append(f"  (blind guessing: {100 / len(card.classes):.0f} %)\n", GREY)
     text.append("latest   ").append_text(_latest(demo.outcomes)).append("\n")
     text.append("latency  ")
     if done:

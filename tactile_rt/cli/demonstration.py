@@ -221,7 +221,7 @@ class Demonstration:
                     self.target.name,
                     self.target.category,
                     decision.label,
-                    float(decision.probabilities.max()),
+                    decision.probability,
                 )
             )
 

@@ -29,7 +29,7 @@ def show(file: File) -> None:
     card, contents, data = read_model(file)
     spec = card.array
     period_ms = card.period_ns / NS_PER_S * 1e3
-    rest = f", ... {card.labels[-1]}" if len(card.labels) > MANY else ""
+    rest = f", ... {card.classes[-1]}" if len(card.classes) > MANY else ""
     state = sum(math.prod(s.shape) for s in card.state)
     opset = contents.opset.get("", contents.opset.get("ai.onnx", 0))
     rows = {
@@ -43,7 +43,8 @@ def show(file: File) -> None:
         "input": f"resampled to {NS_PER_S / card.period_ns:.4g} Hz; a step is {card.substeps} x "
         f"{period_ms:g} ms, an episode {card.steps} steps "
         f"({card.steps * card.substeps * period_ms / 1e3:.3g} s)",
-        "classes": f"{len(card.labels)}: {', '.join(card.labels[:MANY])}{rest}",
+        "classes": f"{len(card.classes)}: {', '.join(card.classes[:MANY])}{rest}",
+        "refusals": ", ".join(card.refusals),
         "embedding": f"{card.embedding} units" if card.embedding else "none before version 3",
         "state": f"{len(card.state)} tensors, {state} values" if card.state else "none",
         "sensor": _pairs(card.sensor),

@@ -36,7 +36,9 @@ def run(
     Fields: type ("classification"); t_ns and onset_ns, times of the last
     sample used and of first contact on the stream's clock; step since onset,
     from 1; final, whether it is the episode's last; label, the most probable
-    class; probabilities of all classes; latency_ms of the model step.
+    class, or a refusal to name one ("unknown"); probabilities of all of them;
+    candidates, the classes that are still possible, with coverage, what the
+    model promises of them; latency_ms of the model step.
 
     A summary goes to stderr. Ctrl-C leaves.
     """
@@ -84,6 +86,8 @@ def run(
                             label: round(float(p), 4)
                             for label, p in zip(d.labels, d.probabilities, strict=True)
                         },
+                        "candidates": d.candidates,
+                        "coverage": d.coverage,
                         "latency_ms": round(1e3 * d.latency_s, 3),
                     }
                     typer.echo(msgspec.json.encode(fields))  # which flushes

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -21,6 +21,13 @@ WAITING = 0.1  # share of an epoch: less says nothing that one could do somethin
 def train(
     data: Annotated[Path, typer.Argument(help="A sweep set.")],
     folder: Annotated[Path, typer.Argument(help="The run; an interrupted one goes on.")],
+    also: Annotated[
+        list[Path] | None, typer.Option(help="A further set to learn from; may be given again.")
+    ] = None,
+    begin: Annotated[
+        Path | None,
+        typer.Option("--from", help="A checkpoint to begin with; its network, other classes."),
+    ] = None,
     recipe: Annotated[
         str, typer.Option(help="See `tactile-rt recipes`; or a TOML file. Options override it.")
     ] = "default",
@@ -88,7 +95,11 @@ def train(
         "precision": precision,
         "seed": seed,
     }
-    given = {name: value for name, value in asked.items() if value is not None}
+    given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
+    if also:
+        given["also"] = tuple(map(str, also))
+    if begin is not None:
+        given = {**training.network_of(begin), **given, "begin": str(begin)}
     config = training.read_recipe(recipe, str(data), **given)
     # Under torchrun every process has the same to say.
     console = Console(stderr=True, quiet=os.environ.get("RANK", "0") != "0")
@@ -197,8 +208,11 @@ def export(
         str, typer.Option(help="step: one step of a stream; window: a whole episode at once.")
     ] = "step",
     data: Annotated[
-        Path | None,
-        typer.Option(help="Where the sweep set it was trained on lies now; default: where it lay."),
+        list[Path] | None,
+        typer.Option(
+            help="Where the sweep set it was trained on lies now; default: where it lay. Of "
+            "several, all."
+        ),
     ] = None,
 ) -> None:
     """Export a trained network as a streaming ONNX step, with everything needed to run it."""
@@ -221,7 +235,7 @@ def export(
             name or model.stem,
             precision,
             "window" if kind == "window" else "step",
-            data,
+            data or (),
         )
     console.print(
         f"{model}: {model.stat().st_size / 1e6:.1f} MB, parity {card.figures['parity']:.1e}, "

@@ -69,12 +69,16 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
             the episode.
         step: The number of the step since onset, from 1.
         final: Whether the step is the last one of its episode.
-        label: The most probable class.
-        probabilities: The probability of each class by its label.
+        label: The decision: the most probable class, or a refusal to name one, such as "unknown".
+        probabilities: The probability of each class, and of each refusal, by its label.
         model_ms: The time that the network took, ms.
         latency_ms: The time from the sample that completed the step until the decision was there,
             ms.
         late: Whether the step took longer than it may.
+        candidates: The classes that are still possible, the most probable first; empty if the model
+            makes no promise.
+        coverage: The promise: in this share of touches of known kinds the true class is among the
+            candidates at every step; null without one.
     """
 
     topic: ClassVar[str] = "decision"
@@ -87,6 +91,8 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
     model_ms: float
     latency_ms: float
     late: bool = False
+    candidates: tuple[str, ...] = ()
+    coverage: float | None = None
 
 
 class ContactMessage(_FromSource, frozen=True, tag="contact", kw_only=True):
@@ -198,6 +204,7 @@ def _decision(item: Decision) -> DecisionMessage:
         },
         model_ms=round(1e3 * d.latency_s, 3),
         latency_ms=round((item.made_ns - item.sample_ns) / 1e6, 3), late=d.late,
+        candidates=d.candidates, coverage=d.coverage,
     )  # fmt: skip
 
 

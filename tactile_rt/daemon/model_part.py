@@ -66,7 +66,7 @@ class ModelPart(Part):
             self.state, self.config.source, str(self.file), self._sha256, self._labels,
             self.box.state, self._decisions, self._final, self._touching,
             newest.label if newest else "",
-            float(newest.probabilities.max()) if newest else 0.0,
+            newest.probability if newest else 0.0,
             self._latency.state, self._step.state, self._late, self._bad_samples,
         )  # fmt: skip
 

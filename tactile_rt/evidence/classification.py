@@ -59,7 +59,7 @@ def evaluate_model(
     """
     session, card = load_model(model)
     run = stepped(session, card)
-    test = _labelled(SweepSet.read(data, "test"), card.labels, model, data)
+    test = _labelled(SweepSet.read(data, "test"), card.classes, model, data)
     differences = card.array.differences(test.manifest.spec, ignore=("name", "rate_hz"))
     if differences:
         raise SpecMismatch(f"{model} was made for another array: " + "; ".join(differences))
@@ -77,7 +77,7 @@ def evaluate_model(
     # What may fail comes first, lest it fail after minutes.
     other = None
     if accurate is not None:
-        other = _labelled(SweepSet.read(accurate, "test"), card.labels, model, accurate)
+        other = _labelled(SweepSet.read(accurate, "test"), card.classes, model, accurate)
     if other and not set(other.sweeps.objects.tolist()) <= set(objects.tolist()):
         raise ConfigError(f"{accurate} tests on other objects than {data}")
     if pictures is not None:
@@ -87,7 +87,7 @@ def evaluate_model(
     clean = evaluation.predict(test, run)
     over_time = evaluation.accuracy_over_time(clean, labels)
     # of objects of the kind that it was trained on
-    bars = {} if _from_elsewhere(test, card) else BARS.get(len(card.labels), {})
+    bars = {} if _from_elsewhere(test, card) else BARS.get(len(card.classes), {})
     records = [
         _accuracy("top-1", clean[:, -1], labels, objects, bars.get("top-1", ""), sample),
         _accuracy("top-5", clean[:, -1], labels, objects, bars.get("top-5", ""), sample, top=5),
@@ -157,8 +157,8 @@ def evaluate_model(
             draw_robustness,
         )
 
-        table = evaluation.confusion(clean[:, -1], labels, len(card.labels))
-        draw_confusion(table, card.labels, pictures / "confusion.png")
+        table = evaluation.confusion(clean[:, -1], labels, len(card.classes))
+        draw_confusion(table, card.classes, pictures / "confusion.png")
         curves = {
             "no sensor noise": over_time,
             f"rated noise ({rated} per sample)": evaluation.accuracy_over_time(noisy, labels),
@@ -166,7 +166,7 @@ def evaluate_model(
         draw_accuracy_over_time(curves, 1e-3 * step_ms, pictures / "accuracy_over_time.png")
         draw_robustness(
             {r.name: r.accuracy for r in robustness},
-            100 / len(card.labels),
+            100 / len(card.classes),
             f"{len(few.sweeps)} sweeps of objects never seen in training",
             pictures / "robustness.png",
         )

@@ -12,18 +12,25 @@ from tactile_rt.models.evaluation import Step
 __all__ = ["stepped"]
 
 
-def stepped(session: ort.InferenceSession, card: ModelCard, output: str = "logits") -> Step:
+def stepped(
+    session: ort.InferenceSession, card: ModelCard, output: str = "logits", refusals: bool = False
+) -> Step:
     """A model file, as `load_model` gives it, as a function of windows.
 
     Args:
         session, card: the model, of kind "step".
         output: which of its outputs: "logits" (divided by the temperature) or "embedding".
+        refusals: whether the logits are to have those of the refusals, too. Without, a posterior is
+            what the model would say had it to name a class.
 
     Returns:
         (samples, offset, sigma) of windows to (batch, step, class or feature).
     """
     names = [o.name for o in session.get_outputs()]
-    divisor = np.float32(card.temperature if output == "logits" else 1.0)
+    divisor, kept = np.float32(1), slice(None)
+    if output == "logits":
+        divisor = np.float32(card.temperature)
+        kept = slice(len(card.labels) if refusals else len(card.classes))
 
     def run(
         samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
@@ -35,7 +42,7 @@ def stepped(session: ort.InferenceSession, card: ModelCard, output: str = "logit
             feed["samples"] = samples[:, t]
             out = dict(zip(names, session.run(None, feed), strict=True))
             feed |= {s.name: out[f"{s.name}_next"] for s in card.state}
-            steps.append(out[output] / divisor)
+            steps.append(out[output][:, kept] / divisor)
         return np.stack(steps, axis=1)
 
     return run

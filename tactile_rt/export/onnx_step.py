@@ -22,6 +22,7 @@ import onnxruntime
 import torch
 from torch import Tensor, nn
 
+from tactile_rt.classifier.decision_rules import CandidateRule, UnknownRule
 from tactile_rt.classifier.model_card import CARD_VERSION, Kind
 from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, StateTensor, load_model
 from tactile_rt.classifier.model_runs import file_outputs, probe_logits
@@ -32,7 +33,7 @@ from tactile_rt.export.windows import window_graph
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.training import TactileClassifier, load_checkpoint
 from tactile_rt.stream import ModelError
-from tactile_rt.sweep_set import SweepManifest
+from tactile_rt.sweep_set import SweepManifest, join_manifests
 from tactile_rt.version import VERSION
 
 __all__ = [
@@ -82,11 +83,12 @@ def export_checkpoint(
     path: Path,
     name: str,
     temperature: float = 1.0,
+    rules: tuple[UnknownRule | None, tuple[CandidateRule, ...]] = (None, ()),
     figures: dict[str, Any] | None = None,
     commands: Sequence[str] = (),
     precision: Precision = "fp32",
     kind: Kind = "step",
-    data: Path | None = None,
+    data: Sequence[Path] = (),
 ) -> ModelCard:
     """Export what `training.train` saved.
 
@@ -95,11 +97,12 @@ def export_checkpoint(
         path: the ``.onnx`` file to write.
         name: of the model.
         temperature: divides the logits at run time.
+        rules: when the model refuses to name a class, and what it promises of candidates.
         figures: measured accuracies to store in the file.
         commands: that remake the file.
         precision: of the weights, and of products with them.
         kind: "step" or "window".
-        data: where the sweep set that it was trained on lies now; default: where it lay.
+        data: where the sweep sets that it was trained on lie now; default: where they lay.
 
     Raises:
         ModelError: the checkpoint cannot be read, or the exported graph misses the parity bar.
@@ -107,14 +110,19 @@ def export_checkpoint(
         RecordingError: there is no set.
     """
     model, saved = load_checkpoint(checkpoint)
-    manifest = SweepManifest.read(trained_on(checkpoint, saved, data))
+    manifests = [SweepManifest.read(folder) for folder in trained_on(checkpoint, saved, data)]
+    manifest = join_manifests(manifests)
+    refusals = tuple(saved.get("refusals", ()))
     card = ModelCard(
         name=name,
         spec=saved["spec"],
         period_ns=manifest.period_ns,
         substeps=model.timing.substeps,
         steps=model.timing.steps,
-        labels=manifest.categories,
+        labels=(*manifest.categories, *refusals),
+        refusals=refusals,
+        unknown=rules[0],
+        candidates=rules[1],
         state=(),
         clip=tuple(model.inputs.clip.tolist()),
         scale=tuple(model.inputs.scale.tolist()),
@@ -126,6 +134,7 @@ def export_checkpoint(
             "training": saved["config"],
             "network": msgspec.json.decode(msgspec.json.encode(saved["network"])),
             "sweep_set": manifest.recipe,
+            **({"also": [other.recipe for other in manifests[1:]]} if manifests[1:] else {}),
             "unseen_objects": list(manifest.split["test"]),
             "commands": list(commands),
             "tactile_rt": VERSION,

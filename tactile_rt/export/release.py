@@ -1,5 +1,6 @@
 """A checkpoint made ready for robots: calibrated on validation sweeps, exported, described."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,12 @@ from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, load_model
 from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.export.precision import Precision
+from tactile_rt.export.promises import fitted_rules
 from tactile_rt.models.data_checks import trained_on
-from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.evaluation import Step, hits, predict
+from tactile_rt.models.datasets import SweepSet, joined, relabelled
+from tactile_rt.models.evaluation import Step, among, hits, predict
 from tactile_rt.models.training import load_checkpoint, run_on
+from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["fit_temperature", "quantisation_figures", "release", "run_file"]
 
@@ -29,14 +32,14 @@ def release(
     name: str,
     precision: Precision = "fp32",
     kind: Kind = "step",
-    data: Path | None = None,
+    data: Sequence[Path] = (),
 ) -> ModelCard:
     """Fit the temperature on the validation split, then export.
 
     What a precision below fp32 costs on validation sweeps is measured and stored.
 
     Args:
-        data: where the sweep set that it was trained on lies now; default: where it lay.
+        data: where the sweep sets that it was trained on lie now; default: where they lay.
 
     Raises:
         ModelError, RecordingError: the checkpoint or its sweep set cannot be read.
@@ -44,17 +47,25 @@ def release(
     """
     model, saved = load_checkpoint(checkpoint)
     config = saved["config"]
-    folder = trained_on(checkpoint, saved, data)
-    validation = SweepSet.read(folder, "validation")
+    folders = trained_on(checkpoint, saved, data)
+    known = tuple(saved["categories"])
+    sets = [
+        relabelled(SweepSet.read(folder, "validation"), known)
+        for folder in folders
+        if SweepManifest.read(folder).split.get("validation")
+    ]
+    validation = joined(sets)
     # Half clean, half at rated noise: what the checkpoint was chosen by, too.
     posteriors = np.concatenate([predict(validation, run_on(model), level) for level in (0.0, 1.0)])
     labels = np.tile(validation.sweeps.labels, 2)
     temperature = fit_temperature(posteriors[:, -1], labels)
+    told = (*known, *saved.get("refusals", ()))
+    unknown, candidates = fitted_rules(sets, run_on(model), temperature, told, len(known))
     recipe = validation.manifest.recipe
-    options = " ".join(
-        f"--{k.replace('_', '-')} {config[k]}"
-        for k in ("attender", "decoder", "width", "epochs", "batch", "learning_rate", "seed")
-    )
+    fields = ("encoder", "attender", "decoder", "width", "epochs", "batch", "learning_rate", "seed")
+    chosen_so = [f"--{key.replace('_', '-')} {config[key]}" for key in fields]
+    chosen_so += [f"--also {folder}" for folder in config.get("also", ())]
+    options = " ".join(chosen_so)
     chosen = "" if precision == "fp32" else f" --precision {precision}"
     chosen += "" if kind == "step" else f" --kind {kind}"
     card = export_checkpoint(
@@ -62,6 +73,7 @@ def release(
         path,
         name,
         temperature=temperature,
+        rules=(unknown, candidates),
         figures={k: v for k, v in saved["metrics"].items() if k.startswith("validation")},
         commands=(
             f"tactile-rt sweep {config['data']} {_sweep_options(recipe)}",
@@ -70,7 +82,7 @@ def release(
         ),
         precision=precision,
         kind=kind,
-        data=folder,
+        data=folders,
     )
     if precision == "fp32":
         return card
@@ -105,9 +117,9 @@ def quantisation_figures(trained: Step, path: Path, sweeps: SweepSet) -> dict[st
         ``quantisation_posterior``, the largest difference of a posterior, and
         ``quantisation_sweeps``, how many that were.
     """
-    file = run_file(path)
+    file, classes = run_file(path), len(sweeps.manifest.categories)
     before, after = (
-        np.concatenate([predict(sweeps, run, level)[:, -1] for level in (0.0, 1.0)])
+        np.concatenate([among(predict(sweeps, run, n)[:, -1], classes) for n in (0.0, 1.0)])
         for run in (trained, file)
     )
     labels = np.tile(sweeps.sweeps.labels, 2)

@@ -1,7 +1,8 @@
 """What is trained and shipped as one, and its checkpoints."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,24 @@ from torch import Tensor, nn
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.inputs import InputStage
 from tactile_rt.sensor_spec import ChannelLimits, channel_limits
-from tactile_rt.stream import ArraySpec, ConfigError, ModelError
+from tactile_rt.stream import ArraySpec, ConfigError, ModelError, SpecMismatch
 from tactile_rt.timing import Timing
 
 __all__ = [
     "TactileClassifier",
+    "begin_from",
+    "labels_of_checkpoint",
     "load_checkpoint",
+    "network_of",
     "reason",
     "run_on",
     "save_whole",
     "untrained",
 ]
+
+
+# of a network's configuration, what a training configuration says
+NETWORK = ("encoder", "attender", "decoder", "width", "readout", "dropout", "graph")
 
 
 class TactileClassifier(nn.Module):
@@ -117,6 +125,55 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
             f"{path} is not a checkpoint of `tactile-rt train`: {reason(error)}"
         ) from None
     return model.eval(), saved
+
+
+def labels_of_checkpoint(saved: dict[str, Any]) -> tuple[str, ...]:
+    """The names of what a checkpoint's network tells apart: categories, then refusals."""
+    return (*saved["categories"], *saved.get("refusals", ()))
+
+
+def network_of(path: Path) -> dict[str, Any]:
+    """What a training configuration says of the network of a checkpoint.
+
+    Raises:
+        ModelError: as `load_checkpoint`.
+    """
+    network = load_checkpoint(path)[1]["network"]
+    return {key: value for key, value in network.items() if key in NETWORK}
+
+
+def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> None:
+    """Give a network that is to be trained the weights of a checkpoint.
+
+    Args:
+        model: of the same network, but that it may tell apart other things.
+        path: of the checkpoint.
+        labels: what the network is to tell apart; it knows those from the beginning that the
+            checkpoint knew by the same name.
+
+    Raises:
+        ModelError: no such checkpoint.
+        SpecMismatch: it is of another array or network.
+    """
+    trained, saved = load_checkpoint(path)
+    there, here = asdict(trained.network.config), asdict(model.network.config)
+    differing = [
+        key for key in here if key not in ("classes", "dropout") and here[key] != there[key]
+    ]
+    if differing or trained.inputs.element.tolist() != model.inputs.element.tolist():
+        why = f"another {differing[0]}" if differing else "another array"
+        raise SpecMismatch(f"{path} cannot be begun with: it is of {why}")
+    known = labels_of_checkpoint(saved)
+    both = [name for name in labels if name in known]
+    to, of = [labels.index(n) for n in both], [known.index(n) for n in both]
+    weights, own = trained.state_dict(), model.state_dict()
+    for name, fresh in own.items():
+        if fresh.shape != weights[name].shape:  # of the last layer: a row for every label
+            fresh[to] = weights[name][of]
+            weights[name] = fresh
+    # what the channels are limited to is the new set's to say
+    kept = {name: own[name] if name.startswith("inputs.") else w for name, w in weights.items()}
+    model.load_state_dict(kept)
 
 
 def untrained(saved: dict[str, Any]) -> TactileClassifier:

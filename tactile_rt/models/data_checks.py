@@ -10,7 +10,13 @@ import numpy as np
 from tactile_rt.models.datasets import SweepSet, frame_of
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.stream import ArraySpec, RecordingError, SpecMismatch
-from tactile_rt.sweep_set import OUTLIERS, WITHHELD, SweepManifest, object_path
+from tactile_rt.sweep_set import (
+    OUTLIERS,
+    WITHHELD,
+    SweepManifest,
+    join_manifests,
+    object_path,
+)
 
 __all__ = ["check_array", "check_sets", "check_split", "trained_on"]
 
@@ -35,35 +41,42 @@ def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManif
         )
 
 
-def trained_on(checkpoint: Path, saved: Mapping[str, Any], data: Path | None = None) -> Path:
-    """The sweep set that a checkpoint was trained on: where it lies now.
+def trained_on(
+    checkpoint: Path, saved: Mapping[str, Any], data: Sequence[Path] = ()
+) -> tuple[Path, ...]:
+    """The sweep sets that a checkpoint was trained on: where they lie now.
 
     Args:
         checkpoint: for messages.
         saved: what is in it.
-        data: the set; default: where it lay when it was trained on.
+        data: the sets; default: where they lay when it was trained on.
 
     Raises:
-        RecordingError: it is not there, or no sweep set.
-        SpecMismatch: it is of another array, or holds other categories.
+        RecordingError: one is not there, or no sweep set.
+        SpecMismatch: one is of another array, or they hold other categories.
+        ConfigError: as `join_manifests`.
     """
-    folder = data or Path(saved["config"]["data"])
-    if data is None and not folder.exists():
-        raise RecordingError(
-            f"{folder}, the sweep set that {checkpoint} was trained on, is not here: name it by "
-            "--data"
-        )
-    manifest = SweepManifest.read(folder)
+    config = saved["config"]
+    folders = tuple(data) or tuple(map(Path, (config["data"], *config.get("also", ()))))
+    for folder in folders:
+        if not data and not folder.exists():
+            raise RecordingError(
+                f"{folder}, a sweep set that {checkpoint} was trained on, is not here: name it by "
+                "--data"
+            )
+    manifest = join_manifests([SweepManifest.read(folder) for folder in folders])
     check_array(checkpoint, saved, manifest)
-    held, classes = list(manifest.categories), saved["network"]["classes"]
+    held = list(manifest.categories)
+    classes = saved["network"]["classes"] - len(saved.get("refusals", ()))
     told = saved.get("categories", held[:classes])  # of an early checkpoint, only how many
     if told != held or len(held) != classes:
         other = ", ".join(sorted({*told} ^ {*held})[:3]) or "the same in another order"
+        there = " and ".join(map(str, folders))
         raise SpecMismatch(
-            f"{checkpoint} tells other categories apart than {folder} holds ({other}): name the "
-            "set that it was trained on by --data"
+            f"{checkpoint} tells other categories apart than {there} holds ({other}): name what "
+            "it was trained on by --data"
         )
-    return folder
+    return folders
 
 
 def check_split(folder: Path, manifest: SweepManifest) -> None:
@@ -107,7 +120,8 @@ def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
                 f"{folder}: sweeps of {sweeps.values.shape[1]} samples are shorter than a window "
                 f"of {data.timing.samples}"
             )
-        wrong = np.flatnonzero((sweeps.labels < 0) | (sweeps.labels >= classes))
+        unknown = np.isin(sweeps.objects, data.manifest.split.get(OUTLIERS, ()))
+        wrong = np.flatnonzero(((sweeps.labels < 0) & ~unknown) | (sweeps.labels >= classes))
         if len(wrong):
             raise RecordingError(
                 f"{object_path(folder, sweeps.objects[wrong[0]])}: label "

@@ -4,8 +4,8 @@ A window is what the classifier would feed the network: it starts where `Contact
 onset on the noisy signal, and carries the tare that the detector had measured by then.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -14,9 +14,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tactile_rt.classifier.decision_rules import UNKNOWN
+from tactile_rt.models.implausible import IMPLAUSIBLE, implausible
 from tactile_rt.models.onsets import Onsets, find_onsets
 from tactile_rt.stream import ConfigError
-from tactile_rt.sweep_set import SweepManifest, Sweeps, read_sweeps
+from tactile_rt.sweep_set import SweepManifest, Sweeps, join_manifests, read_sweeps
 from tactile_rt.timing import MOUSE, Timing
 
 __all__ = [
@@ -25,11 +27,13 @@ __all__ = [
     "TrainingBatches",
     "find_onsets",
     "frame_of",
+    "joined",
+    "relabelled",
     "windows",
 ]
 
-NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0)  # of the rated noise, at which training finds onsets
-CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others are in between
+NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the rated noise, at which training finds onsets
+CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others are drawn evenly
 JITTER = 5  # samples either side of the onset
 
 
@@ -65,14 +69,29 @@ class SweepSet:
         """How its windows are cut."""
         return Timing.of(self.manifest.period_ns)
 
+    @property
+    def _levels(self) -> tuple[float, ...]:
+        largest = max(self.manifest.faults.noise, 1.0)
+        return tuple(level for level in NOISE_LEVELS if level <= largest)
+
+    @property
+    def refusals(self) -> tuple[str, ...]:
+        """What a network that learns from these sweeps may decide without naming a category."""
+        unknown = (UNKNOWN,) if (self.sweeps.labels < 0).any() else ()
+        named = implausible(self.manifest.spec) if self.manifest.faults.implausible else ()
+        return (*unknown, *named)
+
     @cached_property
     def noisy_starts(self) -> NDArray[np.int64]:
-        """(level, sweep) onsets with noise of each of `NOISE_LEVELS`; -1 where none was found."""
+        """(level, sweep) onsets with noise of each of `NOISE_LEVELS`; -1 where none was found.
+
+        Of levels that training never draws there are none.
+        """
         rng = np.random.default_rng(0)
         starts = []
         for values in np.array_split(self.sweeps.values, max(len(self.sweeps) // 256, 1)):
-            noise = rng.normal(size=values.shape).astype(np.float32) * self.noise
-            noisy = (values + np.float32(level) * noise for level in NOISE_LEVELS)
+            noise = rng.standard_normal(values.shape, dtype=np.float32) * self.noise
+            noisy = (values + np.float32(level) * noise for level in self._levels)
             starts.append(np.stack([find_onsets(v, self.floor).start for v in noisy]))
         return np.concatenate(starts, axis=1)
 
@@ -93,19 +112,51 @@ def windows(
     return shaped
 
 
-def _noise_levels(n: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """(n,) noise in units of the rated: exactly none, exactly the rated, or uniform between."""
-    between = (rng.random(n) - CLEAN_SHARE) / (1 - CLEAN_SHARE - RATED_SHARE)
-    levels: NDArray[np.float32] = np.clip(between, 0.0, 1.0).astype(np.float32)
-    return levels
+def joined(sets: Sequence[SweepSet]) -> SweepSet:
+    """Sets of one array as one, with the categories of all; faults are those of the first.
+
+    Raises:
+        ConfigError: as `join_manifests`; or their sweeps are not of one length.
+    """
+    if len(sets) == 1:
+        return sets[0]
+    manifest = join_manifests([one.manifest for one in sets])
+    lengths = {one.sweeps.values.shape[1] for one in sets}
+    if len(lengths) > 1:
+        raise ConfigError(f"sweeps of {min(lengths)} and {max(lengths)} samples cannot be joined")
+    whole = Sweeps(
+        np.concatenate([one.sweeps.values for one in sets]),
+        np.concatenate([relabelled(one, manifest.categories).sweeps.labels for one in sets]),
+        np.concatenate([one.sweeps.objects for one in sets]),
+    )
+    return replace(sets[0], manifest=manifest, sweeps=whole)
+
+
+def relabelled(data: SweepSet, categories: Sequence[str]) -> SweepSet:
+    """The set with labels among these categories, which have all of its own."""
+    place = np.array([*(categories.index(c) for c in data.manifest.categories), -1])
+    return replace(
+        data,
+        manifest=replace(data.manifest, categories=tuple(categories)),
+        sweeps=replace(data.sweeps, labels=place[data.sweeps.labels]),
+    )
+
+
+def _noise_levels(n: int, largest: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """(n,) noise in units of the rated: exactly none, exactly the rated, or uniform."""
+    which, levels = rng.random(n), largest * rng.random(n)
+    levels = np.where(which < CLEAN_SHARE + RATED_SHARE, min(largest, 1.0), levels)
+    levels = np.where(which < CLEAN_SHARE, 0.0, levels)
+    drawn: NDArray[np.float32] = levels.astype(np.float32)
+    return drawn
 
 
 class TrainingBatches:
     """Epochs of augmented training windows, each drawn afresh from (seed, epoch).
 
-    A third of the windows are clean, a third carry the rated sensor noise, and a third a level
-    drawn between; what else is wrong with the sensor is drawn as the set's recipe says, or else as
-    `SensorFaults` does.
+    A third of the windows are clean, a third carry the rated sensor noise, and a third any level;
+    what else is wrong with the sensor is drawn as the set's recipe says, or else as `SensorFaults`
+    does. Labels beyond the categories are those of the set's `refusals`, in their order.
 
     Raises:
         ConfigError: not even one batch of sweeps with a touch.
@@ -113,7 +164,7 @@ class TrainingBatches:
 
     def __init__(self, data: SweepSet, batch: int, seed: int) -> None:
         self._data, self._batch, self._seed = data, batch, seed
-        self._faults = data.manifest.faults
+        self._faults, self._refusals = data.manifest.faults, data.refusals
         starts = data.noisy_starts
         # Too faint to be found at its noise level: learn it from where it is found without.
         self._starts = np.where(starts < 0, starts[0], starts)  # (level, sweep)
@@ -145,37 +196,56 @@ class TrainingBatches:
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         data, n = self._data, len(at)
         elements, channels = data.manifest.spec.shape
-        level = _noise_levels(n, rng)
-        nearest = np.abs(level[:, None] - np.array(NOISE_LEVELS)).argmin(axis=1)
+        faults = self._faults
+        level = _noise_levels(n, faults.noise, rng)
+        found_at = np.array(NOISE_LEVELS[: len(self._starts)])
+        nearest = np.abs(level[:, None] - found_at).argmin(axis=1)
         start = self._starts[nearest, at] + rng.integers(-JITTER, JITTER + 1, n)
         values = data.sweeps.values[at]
         # Relative to rest, where a magnetometer reads its magnet's field, and a load cell nothing.
         rest = values[:, : data.manifest.lead].mean(axis=1) if data.manifest.lead else 0.0
         samples = windows(values, start, data.timing)
         samples -= np.asarray(rest, dtype=np.float32)[..., None, None, :, :]
-        faults = self._faults
-        gain = 1 + faults.gain * rng.normal(size=(n, 1, 1, elements, 1)).astype(np.float32)
-        alive = rng.random((n, 1, 1, elements, 1)) >= faults.dead
+        shape = (n, 1, 1, elements, 1)
+        gain = 1 + np.float32(faults.gain) * rng.standard_normal(shape, dtype=np.float32)
+        alive = rng.random(shape) >= faults.dead
         if faults.dead_row:
             rows = np.array(data.manifest.spec.grid)[:, 0]
             alive &= (rng.random((n, rows.max() + 1)) >= faults.dead_row)[:, None, None, rows, None]
-        samples = samples * (gain * alive)
+        samples *= gain * alive
+        labels = self._spoilt(samples, data.sweeps.labels[at], rng)
         if faults.offset or faults.drift:
             samples += self._wandered(n, rng)
         noise = data.noise * level[:, None, None]  # (batch, 1, channel)
-        samples += noise[:, None, None] * rng.normal(size=samples.shape).astype(np.float32)
+        samples += noise[:, None, None] * rng.standard_normal(samples.shape, dtype=np.float32)
         # The tare: a mean and a spread over the quiet samples that happened to come before.
         quiet = rng.integers(20, 60, (n, 1, 1))
-        shape = (n, elements, channels)
-        offset = noise * rng.normal(size=shape) / np.sqrt(quiet)
-        spread = 1 + rng.normal(size=shape) / np.sqrt(2 * (quiet - 1))
+        per_channel = (n, elements, channels)
+        offset = noise * rng.normal(size=per_channel) / np.sqrt(quiet)
+        spread = 1 + rng.normal(size=per_channel) / np.sqrt(2 * (quiet - 1))
         sigma = np.maximum(noise * np.abs(spread), data.floor)
         return (
             torch.from_numpy(samples.astype(np.float32)),
             torch.from_numpy(offset.astype(np.float32)),
             torch.from_numpy(sigma.astype(np.float32)),
-            torch.from_numpy(data.sweeps.labels[at]),
+            torch.from_numpy(labels),
         )
+
+    def _spoilt(
+        self, samples: NDArray[np.float32], labels: NDArray[np.int64], rng: np.random.Generator
+    ) -> NDArray[np.int64]:
+        """Make some of the samples implausible, in place; (n,) the labels that all then have."""
+        spec, first = self._data.manifest.spec, len(self._data.manifest.categories)
+        labels = np.where(labels < 0, first, labels)  # unknown is the first refusal
+        names = [name for name in self._refusals if name in IMPLAUSIBLE]
+        if names:
+            bad = rng.random(len(samples)) < self._faults.implausible
+            which = rng.integers(0, len(names), len(samples))
+            for number, name in enumerate(names):
+                at = np.flatnonzero(bad & (which == number))
+                samples[at] = IMPLAUSIBLE[name](samples[at], spec, rng)
+                labels[at] = first + self._refusals.index(name)
+        return labels
 
     def _wandered(self, n: int, rng: np.random.Generator) -> NDArray[np.float32]:
         """(n, step, sub-step, element, channel) what has come to the readings since their tare."""
@@ -186,6 +256,7 @@ class TrainingBatches:
             (self._faults.offset, np.ones_like(course)),
             (self._faults.drift, course),
         ):
-            size = most * rng.random((n, 1, 1)) * data.noise
+            # half of the sweeps have none
+            size = most * np.maximum(rng.uniform(-1, 1, (n, 1, 1)), 0) * data.noise
             there += (size * rng.normal(size=(n, *there.shape[2:])))[:, None] * over[:, None, None]
         return there.reshape(n, timing.steps, timing.substeps, *there.shape[2:])

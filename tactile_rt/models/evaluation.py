@@ -24,6 +24,7 @@ __all__ = [
     "Step",
     "accuracy",
     "accuracy_over_time",
+    "among",
     "at_temperature",
     "auroc",
     "bootstrap",
@@ -113,6 +114,13 @@ def at_temperature(posteriors: NDArray[np.float32], temperature: float) -> NDArr
         logits = np.log(posteriors) / np.float32(temperature)
     scaled = np.exp(logits - logits.max(axis=-1, keepdims=True))
     out: NDArray[np.float32] = scaled / scaled.sum(axis=-1, keepdims=True)
+    return out
+
+
+def among(posteriors: NDArray[np.float32], classes: int) -> NDArray[np.float32]:
+    """(..., class) posteriors of the first so many labels alone, had it to be one of them."""
+    own = posteriors[..., :classes]
+    out: NDArray[np.float32] = own / np.maximum(own.sum(axis=-1, keepdims=True), 1e-30)
     return out
 
 

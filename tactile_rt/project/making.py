@@ -140,7 +140,7 @@ def _train(
     torch.set_num_threads(1)
     tell(MakeProgress("finding onsets", 0, 1, end - time.monotonic()))
     config = read_recipe(RECIPE, str(sweeps.resolve()))
-    splits = read_splits(sweeps, config)
+    splits = read_splits(config)
     batch = max(2, min(config.batch, len(splits[0].sweeps) // 8))
     config = replace(config, batch=batch)
     if not budget.updates:

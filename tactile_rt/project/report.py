@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_file import load_model
+from tactile_rt.evidence.model_windows import stepped
 from tactile_rt.evidence.pictures import draw_confusion
 from tactile_rt.evidence.records import Record
-from tactile_rt.export.release import run_file
 from tactile_rt.files import write_whole
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
@@ -46,9 +46,9 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
     Returns:
         The page.
     """
-    _, card = load_model(project.model)
+    session, card = load_model(project.model)
     test = SweepSet.read(sweeps, "test")
-    run = run_file(project.model)
+    run = stepped(session, card)
     labels, objects = test.sweeps.labels, test.sweeps.objects
     curves = {
         "no sensor noise": evaluation.predict(test, run),
@@ -56,8 +56,8 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
     }
     step_ms = card.period_ns * card.substeps * 1e-6
     draw_over_time(curves, labels, objects, step_ms, project.report / "over_time.png")
-    table = evaluation.confusion(curves["rated noise"][:, -1], labels, len(card.labels))
-    draw_confusion(table, card.labels, project.report / "confusion.png")
+    table = evaluation.confusion(curves["rated noise"][:, -1], labels, len(card.classes))
+    draw_confusion(table, card.classes, project.report / "confusion.png")
     found = {r.name.removeprefix("models."): r for r in records}
     robust = [r for name, r in found.items() if name.startswith("top-1, ")]
     page = resources.files("tactile_rt.project") / "templates" / "report.html.txt"
@@ -70,10 +70,10 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
         ),
         step=f"{step_ms:.3g}",
         sample=f"{len(set(objects.tolist()))} objects, {len(labels)} sweeps",
-        kinds=escape(", ".join(card.labels)),
+        kinds=escape(", ".join(card.classes)),
         headlines=_rows([(found[n], words) for n, words in HEADLINES.items() if n in found]),
         robust=_rows([(r, r.name.removeprefix("models.top-1, ")) for r in robust]),
-        confused=_confusions(confused(table, card.labels)),
+        confused=_confusions(confused(table, card.classes)),
         device=device_section(project),
         over_time=_picture(project.report / "over_time.png"),
         confusion=_picture(project.report / "confusion.png"),

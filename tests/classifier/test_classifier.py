@@ -2,6 +2,7 @@ import itertools
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,6 +11,14 @@ from hypothesis import strategies as st
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classification, Classifier, fuse
+from tactile_rt.classifier.decision_rules import (
+    MASS_ABOVE,
+    POSTERIOR,
+    UNKNOWN,
+    CandidateRule,
+    UnknownRule,
+)
+from tactile_rt.classifier.model_card import decided, rated_noise
 from tactile_rt.stream import NS_PER_S, Chunk, ModelError, SpecMismatch, concatenate
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.tiny_model import (
@@ -350,3 +359,63 @@ def test_fusing_never_divides_by_zero() -> None:
     assert np.isfinite(fuse(certain * 300)).all()
     with pytest.raises(ValueError):
         fuse([])
+
+
+# what it does not know
+
+NAMES = ("cup", "mug", "jar", UNKNOWN, "wrong gain")
+REFUSALS = (UNKNOWN, "wrong gain")
+
+
+def refusing(tmp_path: Path, **changes: object) -> Classifier:
+    """The tiny model with other names: `unknown` is most probable of a touch of 0.1."""
+    path = write_model(tmp_path / "m.onnx", labels=NAMES, refusals=REFUSALS, **changes)
+    return Classifier(path, SAME_RATE)
+
+
+def test_what_no_class_fits_is_unknown_and_a_refusal_is_a_decision_like_any_other(
+    tmp_path: Path,
+) -> None:
+    # the posteriors of the last step are known from the logits: 0, 4, the sum, 0.1, the noise
+    values = stream(signal([(QUIET, 400, 0.1)], 400))
+    probable = push_all(refusing(tmp_path), values)[-1]
+    assert (probable.label, probable.probability) == ("mug", max(probable.probabilities))
+    unknown = float(probable.probabilities[NAMES.index(UNKNOWN)])
+    for threshold, label in ((unknown + 1e-3, "mug"), (unknown - 1e-3, UNKNOWN)):
+        rule = UnknownRule(POSTERIOR, "logits", (1.0, 1.0, 1.0, threshold))
+        decisions = push_all(refusing(tmp_path, unknown=rule), values)
+        assert [d.label for d in decisions] == ["mug", "mug", "mug", label]
+        assert decisions[-1].labels == NAMES
+        assert np.array_equal(decisions[-1].probabilities, probable.probabilities)
+    assert decisions[-1].probability == pytest.approx(unknown)
+
+
+def test_below_its_threshold_unknown_is_not_decided_however_probable(tmp_path: Path) -> None:
+    names = ("cup", UNKNOWN)
+    card = {"unknown": UnknownRule(POSTERIOR, "logits", (0.9,))}
+    card = msgspec.structs.replace(CARD, labels=names, refusals=(UNKNOWN,), **card)
+    assert decided(card, np.array([0.2, 0.8], dtype=np.float32), 1) == 0
+    assert decided(card, np.array([0.05, 0.95], dtype=np.float32), 1) == 1
+    # a score that this release does not know cannot be applied
+    other = msgspec.structs.replace(card, unknown=UnknownRule("entropy", "logits", (0.1,)))
+    assert decided(other, np.array([0.8, 0.2], dtype=np.float32), 1) == 0
+
+
+def test_candidates_are_the_classes_that_the_promise_leaves_at_the_noise_that_is_measured(
+    tmp_path: Path,
+) -> None:
+    values = stream(signal([(QUIET, 400, 0.1)], 400))
+    assert push_all(refusing(tmp_path), values)[-1].candidates == ()
+    rated = float(np.median(SIGMA / rated_noise(CARD)))
+    quiet = CandidateRule(MASS_ABOVE, 0.9, (0.5, 0.6, 0.7, 0.99), 80, noise=0.5 * rated)
+    noisy = CandidateRule(MASS_ABOVE, 0.8, (0.0, 1.0, 0.9, 0.5), 80, noise=4 * rated)
+    decisions = push_all(refusing(tmp_path, candidates=(noisy, quiet)), values)
+    for d, quantile in zip(decisions, noisy.quantiles, strict=True):
+        own = d.probabilities[:3] / d.probabilities[:3].sum()
+        order = np.argsort(-own)
+        above = np.cumsum(own[order]) - own[order]
+        assert d.candidates == tuple(NAMES[k] for k in order[above <= quantile])
+        assert d.coverage == 0.8
+    assert len({len(d.candidates) for d in decisions}) > 1
+    none = push_all(refusing(tmp_path, candidates=(quiet,)), values)[-1]
+    assert (none.candidates, none.coverage) == ((), None), "too noisy for what was promised"

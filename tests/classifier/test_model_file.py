@@ -274,6 +274,8 @@ def test_outputs_that_the_card_promises_must_be_there(
         ({"embedding": -2}, "an embedding of -2 units in version 3"),
         ({"version": 2}, "an embedding of 2 units in version 2"),
         ({"sensor": "quiet"}, r"Expected `object`, got `str` - at `\$.sensor`"),
+        ({"refusals": ("steps",)}, "refusals are not the last of the labels"),
+        ({"refusals": LABELS}, "there are no labels but refusals"),
         ({"unknown": replaced(UNKNOWN, score="")}, "unknown.score must be 1 to 200 printable"),
         ({"unknown": replaced(UNKNOWN, output="state")}, r"Invalid enum .*\$.unknown.output"),
         ({"unknown": replaced(UNKNOWN, thresholds=())}, "unknown.thresholds: 0 values, neither 1"),

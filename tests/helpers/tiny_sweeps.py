@@ -55,15 +55,25 @@ def write_tiny_set(
     spec: ArraySpec | None = None,
     period_ns: int = 9_000_000,
     contacts: bool = False,
+    categories: tuple[str, ...] = CATEGORIES,
+    outliers: int = 0,
+    faults: dict[str, float] | None = None,
 ) -> SweepManifest:
-    """Objects of three categories, every sweep a touch that noise and a category's mean make."""
+    """Objects of some categories, every sweep a touch that noise and a category's mean make."""
     spec, rng = spec or tiny_array(), np.random.default_rng(1)
-    split = split_by_object(CATEGORIES, objects, 1, 1)
+    split = split_by_object(categories, objects, 1, 1)
     recipe = {"contacts": True} if contacts else {}
-    manifest = SweepManifest(spec, period_ns, LEAD, CATEGORIES, split, recipe=recipe)
+    recipe |= {"faults": faults} if faults else {}
+    withheld = ("thing",) if outliers else ()
+    if outliers:
+        split["outliers"] = tuple(f"thing-{k}" for k in range(outliers))
+    manifest = SweepManifest(
+        spec, period_ns, LEAD, categories, split, recipe=recipe, withheld=withheld
+    )
     manifest.write(folder)
     unit = np.array([{"N": 1e-4, "N m": 1e-6}[u] for u in spec.units])
-    means = np.random.default_rng(2).normal(size=(len(CATEGORIES), *spec.shape)) * unit
+    # the last is that of things of no category
+    means = np.random.default_rng(2).normal(size=(len(categories) + 1, *spec.shape)) * unit
     for name in manifest.names():
         values = (
             means[manifest.label(name)] + rng.normal(size=(sweeps, SAMPLES, *spec.shape)) * unit

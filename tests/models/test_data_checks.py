@@ -123,7 +123,7 @@ def test_good_data_is_trained_on_and_exported_wherever_it_lies_then(folder, tmp_
     folder.rename(moved)
     code, _, said = call("export", run / "best.pt", model)
     assert code == 2
-    assert f"{folder}, the sweep set that {run}/best.pt was trained on, is not here" in said
+    assert f"{folder}, a sweep set that {run}/best.pt was trained on, is not here" in said
 
     # As many categories, in another order: every name that it told would be wrong.
     manifest = SweepManifest.read(moved)
@@ -131,7 +131,7 @@ def test_good_data_is_trained_on_and_exported_wherever_it_lies_then(folder, tmp_
     code, _, said = call("export", run / "best.pt", model, "--data", moved)
     assert (code, model.exists()) == (2, False)
     assert "best.pt tells other categories apart than" in said
-    assert "(the same in another order): name the set that it was trained on by --data" in said
+    assert "(the same in another order): name what it was trained on by --data" in said
 
     resplit(moved, categories=manifest.categories)
     code, _, said = call("export", run / "best.pt", model, "--data", moved)

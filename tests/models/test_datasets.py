@@ -12,6 +12,7 @@ from tactile_rt.models.datasets import (
     SweepSet,
     TrainingBatches,
     find_onsets,
+    joined,
     windows,
 )
 from tactile_rt.stream import ArraySpec, ConfigError
@@ -188,8 +189,59 @@ def test_what_has_come_since_the_tare_is_constant_or_grows_and_is_not_tared_away
         true = 100.0 * RATED * (1 + labels[clean, None, None])  # of `touches`
         late = samples[clean].reshape(clean.sum(), -1, ELEMENTS, CHANNELS)[:, 60:100]
         error = (late - true[:, None]) / RATED
-        # evenly drawn from nothing to 3 of the rated noise: 3 over the root of three
-        size = 3 / np.sqrt(3) * (1.0 if samples is still[0] else 80 / 110)
+        # half have none, the others evenly from nothing to 3 of the rated noise
+        size = 3 / np.sqrt(6) * (1.0 if samples is still[0] else 80 / 110)
         assert error.std() == pytest.approx(size, rel=0.2)
         slope = np.ptp(error, axis=1).mean()
         assert slope < 1e-2 if samples is still[0] else slope > 0.2
+
+
+def test_a_set_may_ask_for_more_than_the_rated_noise() -> None:
+    samples = drawn(TrainingBatches(with_faults(touches(60), noise=3.0), 20, seed=0), epochs=20)[0]
+    level = noise_level(samples)
+    assert np.mean(level < 1e-9) == pytest.approx(1 / 3, abs=0.05)
+    assert np.mean(abs(level - 1) < 0.06) == pytest.approx(1 / 3 + 0.12 / 9, abs=0.05)
+    assert level.max() == pytest.approx(3, abs=0.1)
+    assert np.mean(level > 1.06) == pytest.approx(1.94 / 9, abs=0.04)
+
+
+def test_things_of_no_category_and_loads_that_no_touch_makes_have_labels_of_their_own() -> None:
+    data = with_faults(touches(60), implausible=0.4)
+    labels = np.zeros(60, dtype=np.int64)
+    labels[40:] = -1
+    data = replace(data, sweeps=replace(data.sweeps, labels=labels))
+    assert data.refusals == (
+        "unknown", "swapped channels", "turned channels", "wrong gain", "missing elements",
+    )  # fmt: skip
+    samples, _, _, given = drawn(TrainingBatches(data, 20, seed=0), epochs=20)
+    share = np.bincount(given, minlength=6) / len(given)
+    assert share[0] == pytest.approx(0.6 * 2 / 3, abs=0.05)
+    assert share[1] == pytest.approx(0.6 / 3, abs=0.05)
+    assert share[2:] == pytest.approx(0.1, abs=0.03)
+    late = np.median(samples.reshape(len(samples), -1, ELEMENTS, CHANNELS)[:, 40:], axis=1)
+    assert (late[given <= 1] / RATED).min() > 50, "no sound touch is changed"
+    turned = (late / RATED < -50).any(axis=(1, 2))
+    assert np.array_equal(turned, given == 3)
+    gone = (np.abs(late) < 20 * RATED).all(axis=2).sum(axis=1)
+    assert set(gone[given == 5]) == {2, 3} and not gone[given != 5].any()
+
+
+def test_sets_are_joined_by_the_names_of_their_categories() -> None:
+    one, other = sweeps(touches(3)), sweeps(touches(2))
+    manifest = replace(
+        other.manifest, categories=("cup", "mug"), split={"train": ("cup-0", "mug-9")}
+    )
+    there = replace(
+        other,
+        manifest=manifest,
+        sweeps=Sweeps(other.sweeps.values, np.array([0, -1]), np.array(["cup-0", "x-1"])),
+    )
+    one = replace(one, sweeps=replace(one.sweeps, labels=np.zeros(3, dtype=np.int64)))
+    both = joined([one, there])
+    assert both.manifest.categories == ("mug", "cup")
+    assert both.sweeps.labels.tolist() == [0, 0, 0, 1, -1]
+    assert both.manifest.split["train"] == ("mug-0", "mug-1", "mug-2", "cup-0", "mug-9")
+    assert np.array_equal(both.sweeps.values, np.concatenate([touches(3), touches(2)]))
+    fast = replace(there, manifest=replace(manifest, period_ns=1_000_000))
+    with pytest.raises(ConfigError, match="cannot be joined: the period of their samples"):
+        joined([one, fast])

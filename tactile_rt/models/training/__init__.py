@@ -11,6 +11,7 @@ go on) and `best.pt` (the network of the best validation).
 from tactile_rt.models.checkpoints import (
     TactileClassifier,
     load_checkpoint,
+    network_of,
     run_on,
 )
 from tactile_rt.models.training.config import Progress, TrainingConfig
@@ -25,6 +26,7 @@ __all__ = [
     "TrainingConfig",
     "initialise",
     "load_checkpoint",
+    "network_of",
     "probe",
     "read_recipe",
     "run_on",

@@ -31,6 +31,11 @@ class TrainingConfig:
 
     Attributes:
         data: The sweep set's folder.
+        also: The folders of further sweep sets of the same array, which are learnt from together;
+            what is wrong with the sensor is drawn as the first set's recipe says.
+        begin: A checkpoint to begin with, of the same array and network; what it tells apart that
+            is not to be told apart now is forgotten, and what is new learnt from nothing. Empty: a
+            network that knows nothing.
         encoder, attender, decoder, width, readout, dropout, graph: Fields of the network, as in
             `EADConfig`.
         objective: The objective: "supervised", or self-supervised "simclr", "simsiam",
@@ -63,6 +68,8 @@ class TrainingConfig:
     """
 
     data: str
+    also: tuple[str, ...] = ()
+    begin: str = ""
     encoder: str = "zhuang-intersection-ln"
     attender: str = "none"
     decoder: str = "mlp"

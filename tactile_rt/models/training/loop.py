@@ -24,9 +24,9 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from tactile_rt.files import write_whole
 from tactile_rt.models.augmentation import build
-from tactile_rt.models.checkpoints import TactileClassifier, reason, save_whole
+from tactile_rt.models.checkpoints import TactileClassifier, begin_from, reason, save_whole
 from tactile_rt.models.data_checks import check_sets, check_split
-from tactile_rt.models.datasets import SweepSet, TrainingBatches, frame_of
+from tactile_rt.models.datasets import SweepSet, TrainingBatches, frame_of, joined, relabelled
 from tactile_rt.models.objectives import Autoencoder, Objective, SimCLR, SimSiam, Supervised
 from tactile_rt.models.training.config import Progress, TrainingConfig
 from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
@@ -34,12 +34,12 @@ from tactile_rt.models.training.logs import Board, log_epoch
 from tactile_rt.models.training.optimizers import build_optimizer, build_schedule
 from tactile_rt.models.training.validation import Validation
 from tactile_rt.stream import ConfigError, ModelError
-from tactile_rt.sweep_set import SweepManifest
+from tactile_rt.sweep_set import OUTLIERS, SweepManifest, join_manifests
 
 if TYPE_CHECKING:
     from lightning.fabric import Fabric
 
-__all__ = ["build_objective", "initialise", "read_splits", "train"]
+__all__ = ["build_objective", "initialise", "labels_of", "read_splits", "train"]
 
 Report = Callable[[Progress], None]
 Splits = tuple[SweepSet, SweepSet]  # to train and to validate on
@@ -73,8 +73,10 @@ def train(
     """
     fabric = _launched(config, device)
     torch.manual_seed(config.seed)
-    training, validating = splits or read_splits(Path(config.data), config)
-    objective = build_objective(config, training.manifest)
+    training, validating = splits or read_splits(config)
+    objective = build_objective(config, training)
+    if config.begin:
+        begin_from(objective.model, Path(config.begin), labels_of(training))
     board = Board(folder, tensorboard and fabric.is_global_zero)
     if fabric.is_global_zero:
         _begin_run(config, folder)
@@ -159,37 +161,55 @@ def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = Non
         ConfigError, RecordingError: as `train`.
     """
     torch.manual_seed(config.seed)
-    training, _ = splits or read_splits(Path(config.data), config)
-    objective = build_objective(config, training.manifest)
+    training, _ = splits or read_splits(config)
+    objective = build_objective(config, training)
     folder.mkdir(parents=True, exist_ok=True)
     save_whole(folder / "best.pt", _card(config, objective, training, {"epoch": 0}))
     return folder / "best.pt"
 
 
-def read_splits(folder: Path, config: TrainingConfig) -> tuple[SweepSet, SweepSet]:
-    """The splits to train and to validate on, held against `data_checks`.
+def read_splits(config: TrainingConfig) -> tuple[SweepSet, SweepSet]:
+    """What a configuration trains and validates on, held against `data_checks`.
+
+    What it trains on has the outliers of the sets, too.
 
     Raises:
-        ConfigError: the configuration names no network.
-        RecordingError: the set is missing, unfinished, damaged or unfit.
+        ConfigError: the configuration names no network, or its sets cannot be joined.
+        RecordingError: a set is missing, unfinished, damaged or unfit.
     """
-    manifest = SweepManifest.read(folder)
-    config.network(
-        len(manifest.categories), frame_of(manifest)
-    )  # a slip of the pen is told before a set is read
-    check_split(folder, manifest)
-    splits = SweepSet.read(folder, "train"), SweepSet.read(folder, "validation")
-    check_sets(folder, splits)
-    return splits
+    folders = [Path(folder) for folder in (config.data, *config.also)]
+    manifests = [SweepManifest.read(folder) for folder in folders]
+    whole = join_manifests(manifests)
+    # a slip of the pen is told before a set is read
+    config.network(len(whole.categories), frame_of(whole))
+    for folder, manifest in zip(folders, manifests, strict=True):
+        check_split(folder, manifest)
+    check_split(folders[0], whole)
+    training, validating = [], []
+    for folder, manifest in zip(folders, manifests, strict=True):
+        names = ["train", *([OUTLIERS] if manifest.split.get(OUTLIERS) else [])]
+        splits = [joined([SweepSet.read(folder, name) for name in names])]
+        if manifest.split.get("validation") or len(folders) == 1:  # a further set may have none
+            splits.append(SweepSet.read(folder, "validation"))
+        check_sets(folder, splits)
+        training.append(splits[0])
+        validating += splits[1:]
+    return joined(training), relabelled(joined(validating), whole.categories)
 
 
-def build_objective(config: TrainingConfig, manifest: SweepManifest) -> Objective:
+def labels_of(training: SweepSet) -> tuple[str, ...]:
+    """The names of what a network that learns from these sweeps tells apart: last the refusals."""
+    return (*training.manifest.categories, *training.refusals)
+
+
+def build_objective(config: TrainingConfig, training: SweepSet) -> Objective:
     """The network of a configuration and what it is trained for.
 
     Raises:
         ConfigError: there is no such network, or the array cannot be augmented so.
     """
-    network = config.network(len(manifest.categories), frame_of(manifest))
+    manifest = training.manifest
+    network = config.network(len(labels_of(training)), frame_of(manifest))
     model = TactileClassifier(manifest.spec, network, manifest.limits)
     augmentation = build(config.augmentation, manifest.spec, config.masking)
     if config.objective == "supervised":
@@ -283,17 +303,24 @@ def _card(
 ) -> dict[str, Any]:
     return {
         "model": objective.model.state_dict(),
-        "config": asdict(config),
+        "config": _as_json(config),
         "network": msgspec.to_builtins(objective.model.network.config),
         "spec": data.manifest.spec.to_json(),
         "categories": list(data.manifest.categories),
+        "refusals": list(data.refusals),
         "metrics": metrics,
     }
 
 
+def _as_json(config: TrainingConfig) -> dict[str, Any]:
+    """As a file has it, which knows no tuples."""
+    plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(config)))
+    return plain
+
+
 def _begin_run(config: TrainingConfig, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
-    path, mine = folder / "config.json", asdict(config)
+    path, mine = folder / "config.json", _as_json(config)
     # Before its first epoch is finished a run has nothing to lose: correct its options and go on.
     if not (folder / "last.pt").exists() or not path.exists():
         text = msgspec.json.format(msgspec.json.encode(mine), indent=1)
@@ -303,7 +330,8 @@ def _begin_run(config: TrainingConfig, folder: Path) -> None:
         theirs = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is damaged ({error}): choose another folder") from None
-    defaults = asdict(TrainingConfig(config.data))  # a run of before a key was thought of
+    # a run of before a key was thought of
+    defaults = _as_json(TrainingConfig(config.data))
     differing = [
         key for key in {**mine, **theirs} if theirs.get(key, defaults.get(key)) != mine.get(key)
     ]

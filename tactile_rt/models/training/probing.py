@@ -86,7 +86,7 @@ def probe(
     """
     config = config or ProbeConfig()
     trained, saved = load_checkpoint(checkpoint)
-    path = Path(config.data or saved["config"]["data"])
+    path = Path(config.data or saved["config"]["data"])  # of several sets the first
     manifest = SweepManifest.read(path)
     check_array(checkpoint, saved, manifest)
     if splits is None:

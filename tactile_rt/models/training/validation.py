@@ -8,7 +8,7 @@ import torch
 from tactile_rt.models.augmentation import Augmentation
 from tactile_rt.models.checkpoints import run_on
 from tactile_rt.models.datasets import SweepSet, find_onsets, windows
-from tactile_rt.models.evaluation import hits, predict
+from tactile_rt.models.evaluation import among, hits, predict
 from tactile_rt.models.objectives import Objective
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.feeding import Share, generator_of
@@ -58,9 +58,10 @@ class Validation:
 
     def _top1(self, objective: Objective) -> Score:
         data, run = self._data, run_on(objective.model)
-        labels = data.sweeps.labels
-        clean = hits(predict(data, run)[:, -1], labels).mean()
-        noisy = hits(predict(data, run, 1.0)[:, -1], labels).mean()
+        labels, classes = data.sweeps.labels, len(data.manifest.categories)
+        # Whether a model may refuse to decide is another question.
+        clean = hits(among(predict(data, run)[:, -1], classes), labels).mean()
+        noisy = hits(among(predict(data, run, 1.0)[:, -1], classes), labels).mean()
         metrics = {"validation_top1": float(clean), "validation_top1_noisy": float(noisy)}
         return metrics, float(clean + noisy) / 2
 

@@ -74,6 +74,7 @@ class _Range(msgspec.Struct):
     each: tuple[float, ...] | None = None
     once: bool = False
     plus: tuple[float, ...] = ()
+    peak: float = 1.0
 
 
 class _Sweeps(msgspec.Struct):
@@ -274,8 +275,9 @@ def _choice(nodes: SettingNode, name: str, sweeps: _Sweeps, usual: Choice) -> Ch
     if len(written.between or ()) == 2 and written.each is None:
         assert written.between is not None
         low, high = written.between
-        return Between(low, high, written.once, written.plus)
-    if written.each and written.between is None and not (written.once or written.plus):
+        return Between(low, high, written.once, written.plus, written.peak)
+    alone = written.between is None and not (written.once or written.plus) and written.peak == 1
+    if written.each and alone:
         return Each(written.each)
     found = nodes.at(["sweeps", name]).plain()
     wanted = (

@@ -45,7 +45,7 @@ class ShapeObjects:
     def withheld(self) -> tuple[str, ...]:
         """Names of the categories that training never sees."""
         unknown = (*self.choice.withheld, *self.choice.outliers)
-        _check(unknown, (*shapes.CATEGORIES, *shapes.WITHHELD))
+        _check(unknown, (*shapes.CATEGORIES, *shapes.WITHHELD, *shapes.OUTLIERS))
         return self.choice.withheld or (shapes.WITHHELD if self.choice.per_withheld else ())
 
     @cached_property

@@ -18,6 +18,7 @@
     speed_mm_s = { between = [28, 40] }
     yaw_deg = { between = [0, 89], plus = [0, 90] }    # two sweeps: a quarter turn further
     size_mm = { between = [20, 60], once = true }      # the same for all combinations of a draw
+    roll_deg = { between = [-180, 180], peak = 3 }     # mostly near the middle
 
 Every sweep is drawn from (seed, object, sweep index) alone, so that any one of them can be made
 again by itself, and a set at another profile holds the very same sweeps (but for the few that
@@ -60,14 +61,17 @@ LARGEST = 1e4  # of any of the sweep's parameters: beyond it is a slip of the pe
 POSITIVE = ("size_mm", "speed_mm_s")  # of the sweep's parameters; a gap may also be 0
 LATER = ("surface_friction", "shake_g", "shake_hz")  # parameters that older sets do not name
 LONGEST_MS = 600_000.0
+STEEPEST = 10.0  # peak of an interval: beyond it all is in the middle
 
 
 @dataclass(frozen=True)
 class Between:
-    """Drawn evenly from an interval.
+    """Drawn from an interval.
 
     Attributes:
         low, high: The ends of the interval.
+        peak: The power to which the distance from the middle, drawn evenly in half intervals, is
+            raised: 1 draws evenly, and at 3 half of what is drawn is in the middle eighth.
         once: Whether all combinations of a draw share one value; else every sweep has its own.
         plus: Every one of these values is added, with every one of the other parameters'.
     """
@@ -76,6 +80,15 @@ class Between:
     high: float
     once: bool = False
     plus: tuple[float, ...] = ()
+    peak: float = 1.0
+
+    def draw(self, rng: np.random.Generator) -> float:
+        """A value."""
+        if self.peak == 1:
+            return float(rng.uniform(self.low, self.high))
+        away = float(rng.uniform(-1, 1))
+        half = (self.high - self.low) / 2
+        return self.low + half + half * float(np.copysign(abs(away) ** self.peak, away))
 
 
 @dataclass(frozen=True)
@@ -196,6 +209,10 @@ class SweepChoice:
                     f"sweeps.{name}: between has its lower end first, not {choice.low:g}, "
                     f"{choice.high:g}"
                 )
+            if isinstance(choice, Between) and not 1 <= choice.peak <= STEEPEST:
+                raise ConfigError(
+                    f"sweeps.{name}: peak must be from 1 to {STEEPEST:g}, not {choice.peak:g}"
+                )
             ends = _ends(choice)
             least = min(ends)
             if (name in POSITIVE and least <= 0) or (name == "gap_mm" and least < 0):
@@ -238,8 +255,7 @@ class SweepChoice:
         for name in PARAMETERS:
             choice = getattr(self, name)
             if isinstance(choice, Between):
-                source = shared if choice.once else rng
-                drawn = float(source.uniform(choice.low, choice.high))
+                drawn = choice.draw(shared if choice.once else rng)
                 values[name] = drawn + (values[name] if choice.plus else 0.0)
             elif not isinstance(choice, Each):
                 values[name] = float(choice)
@@ -388,6 +404,7 @@ def _written(choice: Choice) -> Any:
     if isinstance(choice, Between):
         written: dict[str, Any] = {"between": [choice.low, choice.high]}
         written |= {"once": True} if choice.once else {}
+        written |= {"peak": choice.peak} if choice.peak != 1 else {}
         return written | ({"plus": list(choice.plus)} if choice.plus else {})
     return {"each": list(choice.values)} if isinstance(choice, Each) else choice
 

@@ -17,13 +17,21 @@ import trimesh
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh
-from tactile_rt.sim_backend.objects.shapes import furniture, outdoors, tools, vehicles, vessels
+from tactile_rt.sim_backend.objects.shapes import (
+    furniture,
+    mixtures,
+    outdoors,
+    tools,
+    vehicles,
+    vessels,
+)
 from tactile_rt.sim_backend.objects.shapes import varied as varied_shapes
 from tactile_rt.sim_backend.objects.solids import TactileObject, normalised, stretched
 from tactile_rt.stream import ConfigError
 
 __all__ = [
     "CATEGORIES",
+    "OUTLIERS",
     "VARIED",
     "WITHHELD",
     "TactileObject",
@@ -69,7 +77,13 @@ _UNKNOWN: dict[str, _Builder] = {
     "truck": vehicles.truck,
 }
 
-_BUILDERS = _KNOWN | _UNKNOWN
+# of no kind at all: what a model may learn to refuse
+_OUTLIERS: dict[str, _Builder] = {
+    "assembly": mixtures.assembly,
+    "medley": partial(mixtures.medley, builders=tuple(_KNOWN.values())),
+}
+
+_BUILDERS = _KNOWN | _UNKNOWN | _OUTLIERS
 
 VARIED = "varied-"  # before the name of a kind
 PLAIN_SHARE = 0.25  # of the varied ones are of the one plan, stretched
@@ -77,6 +91,7 @@ STRETCH = 1.25  # at most, across against along and up
 
 CATEGORIES: tuple[str, ...] = tuple(sorted(_KNOWN))  # for training
 WITHHELD: tuple[str, ...] = tuple(sorted(_UNKNOWN))  # never trained: what is new to a classifier
+OUTLIERS: tuple[str, ...] = tuple(_OUTLIERS)  # of no kind: what a model may learn to refuse
 
 
 def make_object(category: str, index: int) -> TactileObject:
@@ -130,7 +145,8 @@ def _check(category: str, index: int) -> str:
         hint = f" (did you mean {prefix + near[0]!r}?)" if near else ""
         raise ConfigError(
             f"no object called {category!r}{hint}; there are {', '.join(CATEGORIES)}; "
-            f"{', '.join(WITHHELD)} (withheld from training); each also with {VARIED!r} before it; "
+            f"{', '.join(WITHHELD)} (withheld from training); {', '.join(OUTLIERS)} (of no kind); "
+            f"each also with {VARIED!r} before it; "
             f"and mesh files ending in {', '.join(MESH_SUFFIXES)}"
         )
     if index < 0:

@@ -14,10 +14,10 @@ pytest.importorskip("sklearn")
 from bench.perception.area import OBJECTS, BenchmarkResults
 from bench.perception.data import FILE, SOURCE, SPLITS, Data, Portion, load, pack
 from bench.perception.generator import _without, measured
-from bench.perception.methods import Method, joined, of_kinds
+from bench.perception.methods import Method, of_kinds
 from bench.perception.page import write_page
 from bench.perception.scores import accuracy_by_source, score
-from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sweep_set import OUTLIERS, WITHHELD, write_object
@@ -137,7 +137,7 @@ def oracle(data: Data, wrong: set[str] = frozenset()) -> Method:  # type: ignore
 def strange(data: Data) -> tuple[np.ndarray, np.ndarray]:
     """What the oracle makes of things of unknown kinds."""
     unknown = data.sets[WITHHELD]
-    return oracle(data).posteriors(unknown, CLEAN), unknown.sweeps.objects
+    return oracle(data).familiarity(unknown), unknown.sweeps.objects
 
 
 def test_an_oracle_is_right_and_one_that_errs_on_a_source_is_found_out(data: Data) -> None:
@@ -164,7 +164,7 @@ def test_sets_are_joined_by_the_names_of_their_kinds(data: Data) -> None:
     some = of_kinds(test, ("zebra", data.kinds[3]))
     assert set(some.sweeps.labels) == {1}
     assert len(some.sweeps) == (test.sweeps.labels == 3).sum()
-    both = joined([test, turned], data.kinds)
+    both = joined([of_kinds(one, data.kinds) for one in (test, turned)])
     assert np.array_equal(both.sweeps.labels, np.tile(test.sweeps.labels, 2))
 
 

@@ -211,9 +211,28 @@ def test_what_is_drawn_once_is_shared_by_a_draw_s_combinations(tmp_path: Path) -
     assert len({s.yaw_deg for s in drawn}) == 6
     assert sum(100 <= s.yaw_deg <= 101 for s in drawn) == 3
     assert [drawn_of(recipe, i) for i in range(6)] == drawn, "any of them can be made again"
-    refused = write(tmp_path / "no.toml", "[sweeps]\nsize_mm = { each = [1, 2], once = true }\n")
-    with pytest.raises(ConfigError, match=r"no\.toml:2: .*once = true"):
-        read_recipe(refused)
+    for text in ("each = [1, 2], once = true", "each = [1, 2], peak = 2"):
+        refused = write(tmp_path / "no.toml", f"[sweeps]\nsize_mm = {{ {text} }}\n")
+        with pytest.raises(ConfigError, match=r"no\.toml:2: .*once = true"):
+            read_recipe(refused)
+
+
+def test_a_middle_may_be_drawn_oftener_than_the_ends(tmp_path: Path) -> None:
+    text = "[sweeps]\ndraws = 4000\nroll_deg = { between = [-100, 300], peak = 3 }\n"
+    recipe = read_recipe(write(tmp_path / "peak.toml", text))
+    assert recipe_from_dict(recipe.to_dict()) == recipe
+    rng = np.random.default_rng(0)
+    away = np.abs([recipe.sweeps.draw(rng, i, rng).roll_deg - 100 for i in range(4000)]) / 200
+    # the third root of what is drawn is even
+    assert away.max() <= 1
+    for share in (0.1, 0.5, 0.9):
+        assert np.quantile(away, share) == pytest.approx(share**3, abs=0.04)
+    for peak in ("0.5", "11"):
+        refused = write(
+            tmp_path / "no.toml", f"[sweeps]\nroll_deg = {{ between = [0, 1], peak = {peak} }}\n"
+        )
+        with pytest.raises(ConfigError, match="peak must be from 1 to 10"):
+            read_recipe(refused)
 
 
 def test_a_recipe_of_ones_own(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ pytest.importorskip("trimesh")
 
 from tactile_rt.sim_backend.objects.catalogue import (
     CATEGORIES,
+    OUTLIERS,
     VARIED,
     WITHHELD,
     TactileObject,
@@ -108,6 +109,19 @@ def test_two_dozen_categories_and_four_withheld_each_in_order() -> None:
 def test_a_name_stands_for_the_same_corners_for_good() -> None:
     # recordings and models go by these names
     assert {c: digest(drawn(c, 17)) for c in GOLDEN} == GOLDEN
+
+
+@pytest.mark.parametrize("category", OUTLIERS)
+def test_things_of_no_kind_are_solid_and_all_others(category: str) -> None:
+    things = [drawn(category, index) for index in range(40)]
+    for thing in things:
+        assert thing.category == category and 2 <= len(thing.pieces) <= 60
+        assert all(p.is_convex and p.is_watertight and p.volume > 0 for p in thing.pieces)
+        if category == "assembly":
+            assert hanging_together(thing) == len(thing.pieces), thing.name
+        assert np.ptp(np.vstack([p.bounds for p in thing.pieces]), axis=0).max() == pytest.approx(1)
+    assert len({digest(thing) for thing in things}) == len(things)
+    assert digest(make_object(category, 3)) == digest(things[3])
 
 
 @pytest.mark.parametrize("category", KINDS)

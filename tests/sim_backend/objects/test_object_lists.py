@@ -184,7 +184,7 @@ def test_what_is_not_there_is_said(shapes, tmp_path: Path) -> None:
 
 
 def test_the_list_that_ships_has_enough_of_enough_kinds() -> None:
-    assert shipped_lists() == ("real",)
+    assert shipped_lists() == ("everyday", "real")
     shapes: dict[str, set[str]] = {}
     for thing in read_list("real"):
         first = thing.files[0]
@@ -192,6 +192,13 @@ def test_the_list_that_ships_has_enough_of_enough_kinds() -> None:
         assert first.licence in ("CC0-1.0", "MIT")
     assert len(shapes) >= 30
     assert sum(len(some) >= 8 for some in shapes.values()) >= 20
+
+
+def test_the_list_of_everyday_things_has_hundreds_that_are_alone_of_their_kind() -> None:
+    things = read_list("everyday")
+    assert {thing.files[0].licence for thing in things} == {"CC0-1.0"}
+    assert len({thing.name for thing in things}) == len(things) > 800
+    assert sum(thing.files[0].category == "thing" for thing in things) > 400
 
 
 def test_variants_stay_on_one_side_and_a_source_can_be_left_out(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ import { classColour, drawMap, drawProbabilities, drawTraces, layout, readColour
   from "./draw.js";
 import { Stream } from "./stream.js";
 
-const WINDOW_S = 10, STACKED = 6, EVENTS = 60, STEP_MS = 60;
+const WINDOW_S = 10, STACKED = 6, CANDIDATES = 8, EVENTS = 60, STEP_MS = 60;
 const HALF_LIFE_MS = 20000; // of the map's scale after a strong touch
 const $ = (id) => document.getElementById(id);
 
@@ -77,7 +77,7 @@ const take = {
     const last = decisions.findLast((d) => d.model === m.model);
     const from = last && last.onset === onset ? last.t : Math.max(onset, t - STEP_MS);
     decisions.push({ t, from, onset, model: m.model, step: m.step, final: m.final, label: m.label,
-      p: m.probabilities });
+      p: m.probabilities, candidates: m.candidates || [], coverage: m.coverage });
     if (decisions.length > 2000) decisions.splice(0, 1000);
     dirty = true;
   },
@@ -400,6 +400,12 @@ function draw() {
   decide(newest ? newest.t : (decisions.at(-1) || { t: 0 }).t);
 }
 
+function possible(decision) {
+  const names = decision.candidates, shown = names.slice(0, CANDIDATES);
+  const more = names.length > shown.length ? ` and ${names.length - shown.length} more` : "";
+  return `if it is of a known kind, one of: ${shown.join(", ")}${more} (${Math.round(100 * decision.coverage)} % of touches keep to this)`;
+}
+
 function decide(now) {
   const about = snapshot && snapshot.models.find((m) => m.part.name === "model." + model);
   const mine = decisions.filter((d) => d.model === model);
@@ -427,6 +433,7 @@ function decide(now) {
   $("episode").textContent = !about ? "" : touching
     ? `in contact${last ? `, step ${last.step}${last.final ? " (last)" : ""}` : ""}`
     : last ? `no contact; decided ${Math.max(0, (now - last.t) / 1000).toFixed(0)} s ago` : "no contact yet";
+  $("candidates").textContent = last && last.candidates.length ? possible(last) : "";
   const top = last ? Object.entries(last.p).sort((a, b) => b[1] - a[1]).slice(0, 5) : [];
   const list = $("top");
   while (list.children.length < 5) {

@@ -1,0 +1,109 @@
+"""What a model file says of its own decisions, held against what it does: refusals, candidates."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.perception.methods import of_kinds
+from tactile_rt.classifier.decision_rules import UNKNOWN, fitting
+from tactile_rt.classifier.model_card import ModelCard, decided
+from tactile_rt.classifier.model_file import load_model
+from tactile_rt.evidence.model_windows import stepped
+from tactile_rt.models import evaluation
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.disturbances import CLEAN, Disturbance
+from tactile_rt.models.evaluation import Interval
+from tactile_rt.models.implausible import IMPLAUSIBLE
+
+__all__ = ["Promises", "named_faults", "promises"]
+
+NOTHING = Interval(float("nan"), float("nan"), float("nan"))
+
+
+@dataclass(frozen=True)
+class Promises:
+    """What became of a model's promises on a test.
+
+    Attributes:
+        coverage: What it promises, 0 to 1; NaN: nothing.
+        kept: The share of the sweeps of kinds that it knows of which the true kind was a candidate
+            at every step.
+        size: The mean number of candidates at the last step.
+        unknown: The share of the sweeps that it calls unknown.
+        faulty: The share that it refuses for what is wrong with the loads.
+    """
+
+    coverage: float
+    kept: Interval
+    size: Interval
+    unknown: Interval
+    faulty: Interval
+
+
+def promises(path: Path, test: SweepSet, disturbance: Disturbance = CLEAN) -> Promises | None:
+    """What becomes of them on a test; None if the model makes none.
+
+    Args:
+        path: of the model file.
+        test: the sweeps; those of a kind that the model does not know are only refused or not.
+        disturbance: what is wrong with the sensor.
+    """
+    _, card = load_model(path)
+    if not card.refusals and not card.candidates:
+        return None
+    known = of_kinds(test, card.classes)
+    known = known if len(known.sweeps) else test
+    posteriors = _posteriors(path, known, disturbance)
+    labels, objects = known.sweeps.labels, known.sweeps.objects
+    said = _decisions(card, posteriors[:, -1])
+    faults = [name for name in card.refusals if name in IMPLAUSIBLE]
+    unknown = evaluation.accuracy(said == UNKNOWN, objects)
+    faulty = evaluation.accuracy(np.isin(said, faults), objects)
+    rule = fitting(card.candidates, disturbance.noise)
+    if rule is None or known is test:
+        return Promises(float("nan"), NOTHING, NOTHING, unknown, faulty)
+    found = ~np.isnan(posteriors[:, 0, 0])
+    inside = np.zeros(len(labels), dtype=np.bool_)
+    sizes = np.full(len(labels), float(len(card.classes)))
+    for k in np.flatnonzero(found):
+        own = posteriors[k][:, : len(card.classes)]
+        left = [rule.candidates(p, step) for step, p in enumerate(own, start=1)]
+        inside[k] = all(labels[k] in names for names in left)
+        sizes[k] = len(left[-1])
+    return Promises(
+        rule.coverage,
+        evaluation.accuracy(inside, objects),
+        evaluation.bootstrap(lambda at: float(sizes[at].mean()), objects),
+        unknown,
+        faulty,
+    )
+
+
+def named_faults(path: Path, test: SweepSet) -> Iterator[tuple[str, Interval]]:
+    """Of each kind of loads that no touch makes: the share that a model refuses for its loads."""
+    _, card = load_model(path)
+    faults = [name for name in card.refusals if name in IMPLAUSIBLE]
+    rng = np.random.default_rng(0)
+    for name, spoil in IMPLAUSIBLE.items():
+        values = spoil(test.sweeps.values, test.manifest.spec, rng)
+        spoilt = replace(test, sweeps=replace(test.sweeps, values=values))
+        said = _decisions(card, _posteriors(path, spoilt, CLEAN)[:, -1])
+        yield name, evaluation.accuracy(np.isin(said, faults), test.sweeps.objects)
+
+
+def _posteriors(path: Path, test: SweepSet, disturbance: Disturbance) -> NDArray[np.float32]:
+    """(sweep, step, label) of all labels, refusals last."""
+    session, card = load_model(path)
+    run = stepped(session, card, refusals=True)
+    return evaluation.predict(test, run, disturbance=disturbance)
+
+
+def _decisions(card: ModelCard, posteriors: NDArray[np.float32]) -> NDArray[np.str_]:
+    """(sweep,) What is decided at the last step; "" where no contact was found."""
+    labels = [
+        "" if np.isnan(p).any() else card.labels[decided(card, p, card.steps)] for p in posteriors
+    ]
+    return np.array(labels)

@@ -1,0 +1,96 @@
+"""Loads that no touch makes: a sensor wired the wrong way, or half of it gone.
+
+Faults that a network is to see through are `sensor_faults`; these it is to name, since no answer
+about the object can be had from such loads. Training makes them out of sound sweeps.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.stream import ArraySpec
+
+__all__ = ["IMPLAUSIBLE", "implausible"]
+
+Samples = NDArray[np.float32]  # (sweep, ..., element, channel), SI
+
+AXES = "xyz"
+GAINS = (2.5, 5.0)  # too large, or too small, by a factor between these
+MISSING = (0.45, 0.7)  # of the elements
+FEWEST = 4  # elements of which a half can be missed
+
+
+def _swapped(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
+    """Two axes are mistaken for one another, of all vectors or of one."""
+    vectors = _vectors(spec)
+    out = samples.copy()
+    for k in range(len(out)):
+        first, second = rng.choice(3, 2, replace=False)
+        for axes in _some(vectors, rng):
+            out[k][..., [axes[first], axes[second]]] = samples[k][..., [axes[second], axes[first]]]
+    return out
+
+
+def _turned(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
+    """Channels have the wrong sign: one axis or more, of all vectors or of one."""
+    vectors = _vectors(spec) or [tuple(range(len(spec.channels)))]
+    out = samples.copy()
+    for k in range(len(out)):
+        turned = rng.permutation(len(vectors[0]))[: rng.integers(1, len(vectors[0]) + 1)]
+        for axes in _some(vectors, rng):
+            out[k][..., [axes[i] for i in turned]] *= -1
+    return out
+
+
+def _amplified(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
+    """All is several times too large, or too small."""
+    n, (least, most) = len(samples), np.log(GAINS)
+    factor = np.exp(rng.uniform(least, most, n) * rng.choice([-1, 1], n))
+    return _over(samples, factor)
+
+
+def _missing(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
+    """Half of the elements read nothing: any, or those of one side."""
+    elements = len(spec.elements)
+    grid = np.array(spec.grid, dtype=np.float64)
+    alive = np.ones((len(samples), elements))
+    for k in range(len(samples)):
+        along = rng.normal(size=2) @ grid.T if rng.random() < 0.5 else rng.random(elements)
+        alive[k, np.argsort(along)[: round(rng.uniform(*MISSING) * elements)]] = 0
+    shape = (len(samples), *(1,) * (samples.ndim - 3), elements, 1)
+    return (samples * alive.reshape(shape)).astype(np.float32)
+
+
+IMPLAUSIBLE: dict[str, Callable[[Samples, ArraySpec, np.random.Generator], Samples]] = {
+    "swapped channels": _swapped,
+    "turned channels": _turned,
+    "wrong gain": _amplified,
+    "missing elements": _missing,
+}
+
+
+def implausible(spec: ArraySpec) -> tuple[str, ...]:
+    """The names of those that an array can have."""
+    possible = {
+        "swapped channels": bool(_vectors(spec)),
+        "missing elements": len(spec.elements) >= FEWEST,
+    }
+    return tuple(name for name in IMPLAUSIBLE if possible.get(name, True))
+
+
+def _vectors(spec: ArraySpec) -> list[tuple[int, ...]]:
+    """Where the x, y and z of each vector are among the channels: force and moment."""
+    names = list(spec.channels)
+    stems = dict.fromkeys(name[:-1] for name in names if name[-1] in AXES)
+    whole = [stem for stem in stems if all(stem + axis in names for axis in AXES)]
+    return [tuple(names.index(stem + axis) for axis in AXES) for stem in whole]
+
+
+def _some(vectors: list[tuple[int, ...]], rng: np.random.Generator) -> list[tuple[int, ...]]:
+    """All of them, or one."""
+    return vectors if rng.random() < 0.5 else [vectors[rng.integers(len(vectors))]]
+
+
+def _over(samples: Samples, factor: NDArray[np.float64]) -> Samples:
+    return (samples * factor.reshape(-1, *(1,) * (samples.ndim - 1))).astype(np.float32)

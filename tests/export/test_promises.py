@@ -1,0 +1,83 @@
+"""What a model promises holds on draws that it was not fitted on."""
+
+import numpy as np
+import pytest
+
+from tactile_rt.classifier.decision_rules import UNKNOWN, mass_above
+from tactile_rt.export.promises import fit_candidates, fit_unknown
+
+STEPS, CLASSES = 6, 10
+
+
+def objects(
+    rng: np.random.Generator, n: int, sweeps: int = 4
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Posteriors (sweep, step, class), labels and names: hard objects are hard in all sweeps."""
+    labels = rng.integers(0, CLASSES, n).repeat(sweeps)
+    skill = rng.normal(1.0, 1.5, n).repeat(sweeps)
+    logits = rng.normal(size=(n * sweeps, STEPS, CLASSES))
+    logits[np.arange(n * sweeps), :, labels] += skill[:, None] * np.linspace(0.3, 2, STEPS)
+    raised = np.exp(2 * logits)
+    names = np.array([f"o-{k}" for k in range(n)]).repeat(sweeps)
+    return (raised / raised.sum(axis=-1, keepdims=True)).astype(np.float32), labels, names
+
+
+def kept(rule, posteriors: np.ndarray, labels: np.ndarray) -> float:
+    inside = [
+        all(labels[k] in rule.candidates(p, step) for step, p in enumerate(steps, start=1))
+        for k, steps in enumerate(posteriors)
+    ]
+    return float(np.mean(inside))
+
+
+@pytest.mark.parametrize("coverage", [0.8, 0.95])
+def test_the_truth_is_among_the_candidates_at_every_step_as_often_as_promised(
+    coverage: float,
+) -> None:
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in range(40):
+        rule = fit_candidates([objects(rng, 60)], noise=1.0, coverage=coverage)
+        found.append(kept(rule, *objects(rng, 40)[:2]))
+    # one figure strays by the 60 objects that its rule was fitted on, the mean by a sixth of it
+    assert coverage - 0.015 < np.mean(found) < coverage + 0.03
+    assert rule.objects == 60 and rule.noise == 1.0
+
+
+def test_the_promise_is_kept_to_the_harder_group() -> None:
+    rng = np.random.default_rng(1)
+    hard = objects(rng, 200)
+    easy = objects(rng, 200)
+    easy[0][:] = 0.001
+    easy[0][np.arange(800), :, easy[1]] = 0.991
+    alone = fit_candidates([hard], 1.0)
+    both = fit_candidates([easy, hard], 1.0)
+    assert both.quantiles == pytest.approx(alone.quantiles) and both.objects == 400
+
+
+def test_too_few_objects_make_no_promise() -> None:
+    assert fit_candidates([objects(np.random.default_rng(0), 49)], 1.0) is None
+
+
+def test_sweeps_without_contact_do_not_count() -> None:
+    posteriors, labels, names = objects(np.random.default_rng(0), 80)
+    with_gaps = posteriors.copy()
+    with_gaps[::4] = np.nan
+    kept_of = np.arange(len(labels)) % 4 > 0
+    same = fit_candidates([(posteriors[kept_of], labels[kept_of], names[kept_of])], 1.0)
+    assert fit_candidates([(with_gaps, labels, names)], 1.0) == same
+
+
+def test_known_kinds_are_refused_no_more_than_said() -> None:
+    rng = np.random.default_rng(0)
+    groups = [rng.beta(1, 9, (500, STEPS)), rng.beta(1, 3, (500, STEPS))]
+    rule = fit_unknown(groups, refused=0.1)
+    for group in groups:
+        share = (group > np.array(rule.thresholds)).mean(axis=0)
+        assert (share <= 0.1 + 1e-9).all()
+    assert rule.score == f"posterior of {UNKNOWN}"
+
+
+def test_the_mass_above_a_class_is_that_of_the_more_probable_ones() -> None:
+    p = np.array([[0.2, 0.5, 0.3], [1 / 3, 1 / 3, 1 / 3]], dtype=np.float32)
+    assert mass_above(p) == pytest.approx(np.array([[0.8, 0, 0.5], [0, 1 / 3, 2 / 3]]))

@@ -1,0 +1,128 @@
+"""Sets that are learnt from together, things of no category, networks that begin with another."""
+
+import numpy as np
+import pytest
+import torch
+
+from tactile_rt.classifier.decision_rules import UNKNOWN
+from tactile_rt.classifier.model_file import load_model
+from tactile_rt.models.implausible import IMPLAUSIBLE
+from tactile_rt.models.training import load_checkpoint, read_recipe, train
+from tests.helpers.tiny_sweeps import plate, write_tiny_set
+
+SMALL = ("--encoder", "gru", "--attender", "none", "--decoder", "linear", "--width", 1 / 32)
+QUICK = ("--batch", 6, "--updates", 3)
+FAULTS = {"implausible": 0.2}
+
+
+@pytest.fixture(scope="module")
+def sets(tmp_path_factory):
+    """One set with things of no category, and one of other categories that has none to validate."""
+    folder = tmp_path_factory.mktemp("sets")
+    write_tiny_set(folder / "one", outliers=4, faults=FAULTS, sweeps=2)
+    write_tiny_set(folder / "other", categories=("cone", "star"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(sets, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "both"
+    options = {"encoder": "gru", "attender": "none", "decoder": "linear", "width": 1 / 32}
+    config = read_recipe(
+        "default", str(sets / "one"), also=(str(sets / "other"),), batch=6, updates=3, **options
+    )
+    train(config, folder)
+    return folder
+
+
+def test_what_is_told_apart_is_all_categories_and_then_the_refusals(run):
+    model, saved = load_checkpoint(run / "best.pt")
+    assert saved["categories"] == ["ball", "cube", "cone", "star"]
+    assert saved["refusals"] == [UNKNOWN, *IMPLAUSIBLE]
+    assert model.network.config.classes == 9
+    assert 0 <= saved["metrics"]["validation_top1"] <= 1
+
+
+def test_the_exported_file_refuses_and_promises(run, tmp_path, call):
+    code, _, said = call("export", run / "best.pt", tmp_path / "m.onnx")
+    assert not code, said
+    _, card = load_model(tmp_path / "m.onnx")
+    assert card.classes == ("ball", "cube", "cone", "star")
+    assert card.refusals == (UNKNOWN, *IMPLAUSIBLE)
+    assert len(card.unknown.thresholds) == 22
+    assert card.candidates == (), "five objects are too few to promise anything"
+    assert len(card.provenance["also"]) == 1
+    code, shown, _ = call("model", "show", tmp_path / "m.onnx")
+    assert "4: ball, cube, cone, star" in shown and "swapped channels" in shown
+
+
+def test_a_run_goes_on_with_the_same_sets_only(sets, run, call):
+    again = ("train", sets / "one", run, *SMALL, *QUICK)
+    code, _, said = call(*again)
+    assert code == 2 and "another configuration (other also)" in said
+    code, _, said = call(*again, "--also", sets / "other")
+    assert not code, said
+
+
+def test_sets_of_two_arrays_are_refused(sets, tmp_path, call):
+    write_tiny_set(tmp_path / "robot", spec=plate(1, 4))
+    code, _, said = call(
+        "train", sets / "one", tmp_path / "run", "--also", tmp_path / "robot", *SMALL, *QUICK
+    )
+    assert code == 2 and "cannot be joined" in said and not (tmp_path / "run").exists()
+
+
+def test_a_network_begins_with_what_another_knew_by_the_same_name(sets, run, tmp_path, call):
+    knew, before = load_checkpoint(run / "best.pt")
+    # no rate to speak of: the weights stay what they began as
+    begun = ("--from", run / "best.pt", "--batch", 6, "--updates", 1, "--learning-rate", 1e-12)
+    code, _, said = call("train", sets / "other", tmp_path / "next", *begun)
+    assert not code, said
+    model, after = load_checkpoint(tmp_path / "next" / "best.pt")
+    assert after["categories"] == ["cone", "star"] and after["refusals"] == []
+    old, new = knew.state_dict(), model.state_dict()
+    rows = [before["categories"].index(name) for name in ("cone", "star")]
+    for name, weight in new.items():
+        expected = old[name]
+        if name.startswith("network.decoder."):
+            expected = expected[rows]
+        assert torch.allclose(weight, expected, atol=1e-6), name
+    assert after["network"]["width"] == before["network"]["width"], "the network is the other's"
+
+
+def test_what_cannot_be_begun_with_is_said(sets, run, tmp_path, call):
+    code, _, said = call("train", sets / "other", tmp_path / "a", "--from", tmp_path / "no.pt")
+    assert code == 2 and "no checkpoint" in said
+    code, _, said = call(
+        "train",
+        sets / "other",
+        tmp_path / "b",
+        "--from",
+        run / "best.pt",
+        "--width",
+        1 / 16,
+        *QUICK,
+    )
+    assert code == 2 and "cannot be begun with: it is of another width" in said
+    write_tiny_set(tmp_path / "robot", spec=plate(1, 4))
+    code, _, said = call("train", tmp_path / "robot", tmp_path / "c", "--from", run / "best.pt")
+    assert code == 2 and "cannot be begun with: it is of another" in said
+
+
+def test_things_of_no_category_are_what_unknown_is_learnt_from(sets, tmp_path, call):
+    """After some updates things of none are less likely to be taken for known ones."""
+    code, _, said = call("train", sets / "one", tmp_path / "r", *SMALL, "--batch", 6,
+                         "--updates", 150, "--learning-rate", 0.01)  # fmt: skip
+    assert not code, said
+    model, saved = load_checkpoint(tmp_path / "r" / "best.pt")
+    at = [*saved["categories"], *saved["refusals"]].index(UNKNOWN)
+
+    def unknown(name):
+        with np.load(sets / "one" / f"{name}.npz") as arrays:
+            values = torch.from_numpy(arrays["values"][:, 24:134])
+        window = values.unflatten(1, (22, 5))
+        silent = torch.full((len(values), 30, 6), 1e-9)
+        with torch.inference_mode():
+            return model(window, 0 * silent, silent)[:, -1].softmax(-1)[:, at].mean()
+
+    assert unknown("thing-0") > 0.5 > unknown("ball-5")
