@@ -10,7 +10,7 @@ from math import isnan
 from pathlib import Path
 
 from bench.perception.data import NAME, SOURCE, Data, load
-from bench.perception.generator import UPRIGHT, Condition, measured, rows
+from bench.perception.generator import UPRIGHT, Condition, false_touches, measured, rows
 from bench.perception.methods import (
     GENERATED,
     Method,
@@ -19,9 +19,9 @@ from bench.perception.methods import (
     of_kinds,
     onnx_model,
 )
-from bench.perception.promises import Promises, named_faults, promises
 from bench.perception.scores import Figures, accuracy_by_source, robustness, score
-from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.classifier.model_file import load_model, shipped_model
+from tactile_rt.evidence.promises import Promises, named_faults, promises
 from tactile_rt.evidence.records import Record
 from tactile_rt.evidence.robustness import conditions
 from tactile_rt.models.datasets import SweepSet, joined
@@ -51,7 +51,7 @@ SHARED, SHARED_WIDE = "kinds that are also generated", "these kinds, in the wide
 ALL = "all real objects of these kinds"
 
 
-@dataclass(frozen=True)
+@dataclass
 class BenchmarkResults:
     """All that was measured.
 
@@ -63,6 +63,8 @@ class BenchmarkResults:
         generator: Top-1 on generated objects by what is changed, of those that know them.
         promises: What became of the promises of each model file, by its name and test.
         faults: The share of loads that no touch makes that each model file refuses, by their name.
+        false_touches: Touches a minute found while the head is shaken and nothing is near, without
+            and with the rated noise; None: not measured.
         digest: SHA-256 over the sweeps of generated objects, empty if they were not used.
     """
 
@@ -73,6 +75,7 @@ class BenchmarkResults:
     generator: dict[Method, dict[str, Interval]]
     promises: dict[str, dict[str, Promises]] = field(default_factory=dict)
     faults: dict[str, dict[str, Interval]] = field(default_factory=dict)
+    false_touches: tuple[float, float] | None = None
     digest: str = ""
 
 
@@ -139,6 +142,8 @@ def measure(
         results.by_source[method] = accuracy_by_source(
             method, held_out if of[0] == OBJECTS else tests[SHARED], data
         )
+    if not quick:
+        results.false_touches = false_touches(folder, 0.0), false_touches(folder, 1.0)
     for path in (shipped, *models):
         progress(f"{path.stem}: what it promises")
         _hold(results, path, tests, data, changed)
@@ -164,7 +169,11 @@ def _hold(
         for noise, name in ((0, "generated"), (1, "rated noise"), (2, "twice that")):
             said = name if not noise else f"generated, {name}"
             on[said] = plain, Disturbance(noise=noise)
-    found = {name: promises(path, *one) for name, one in on.items()}
+    kinds = load_model(path)[1].classes
+    found = {}
+    for name, (test, disturbance) in on.items():
+        known = of_kinds(test, kinds)  # there are none among the unknown
+        found[name] = promises(path, known if len(known.sweeps) else test, disturbance)
     kept = {name: one for name, one in found.items() if one is not None}
     if kept:
         results.promises[path.stem] = kept

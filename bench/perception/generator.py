@@ -15,15 +15,18 @@ from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import Interval
+from tactile_rt.models.onsets import find_onsets
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
-from tactile_rt.sim_backend.datasets.recipes import Between, Choice
+from tactile_rt.sim_backend.datasets.recipes import Between, Choice, Each
 from tactile_rt.sweep_set import Sweeps
 
-__all__ = ["UPRIGHT", "Condition", "measured", "rows"]
+__all__ = ["UPRIGHT", "Condition", "false_touches", "measured", "rows"]
 
 RECIPE, FIRST, OBJECTS, DRAWS = "default24", 48, 4, 3
 UPRIGHT = "as taught to mouse24"
+SHAKEN = "head shaken with 0.5 g, 10 to 100 Hz"
+FAR_MM = 80.0  # where no whisker reaches
 LEAN = 14.1  # degrees about either axis: 20 in all
 WORLDS: dict[str, dict[str, Choice]] = {
     UPRIGHT: {},
@@ -37,7 +40,7 @@ WORLDS: dict[str, dict[str, Choice]] = {
     "8 to 10 mm away": {"distance_mm": Between(8, 10)},
     "a tenth of the friction": {"surface_friction": 0.1},
     "2.5 times the friction": {"surface_friction": 2.5},
-    "head shaken with 0.5 g, 10 to 100 Hz": {"shake_g": 0.5, "shake_hz": Between(10, 100)},
+    SHAKEN: {"shake_g": 0.5, "shake_hz": Between(10, 100)},
 }
 # on the sweeps as taught; an amount of 1 is 20 uN and 0.1 uN m, 10 uN being the rated noise
 SENSORS = {
@@ -84,6 +87,28 @@ def rows(
     of_row = np.array(plain.manifest.spec.grid)[:, 0]
     found[WORST] = [(_without(plain, of_row == row), CLEAN) for row in np.unique(of_row)]
     return found
+
+
+def false_touches(folder: Path, noise: float) -> float:
+    """Touches a minute that are found while the head is shaken with 0.5 g and nothing is near.
+
+    Args:
+        folder: where the sweeps are, and are made if they are not.
+        noise: of the sensor, in units of the rated.
+    """
+    recipe = read_recipe(RECIPE)
+    objects = replace(recipe.objects, per_category=3, validation=1, test=1, withheld=(),
+                      per_withheld=0)  # fmt: skip
+    sweeps = replace(recipe.sweeps, draws=DRAWS, distance_mm=Each((FAR_MM,)), **WORLDS[SHAKEN])
+    recipe = replace(recipe, name="generator: shaken in the air", objects=objects, sweeps=sweeps)
+    there = folder / "generator" / "shaken-in-the-air"
+    for _ in make_sweeps(recipe, there, splits=("test",)):
+        pass
+    data = SweepSet.read(there, "test")
+    values = Disturbance(noise=noise).of_samples(data.sweeps.values, data, np.random.default_rng(0))
+    found = find_onsets(values, data.floor).start >= 0
+    moving_s = (values.shape[1] - data.manifest.lead) * data.manifest.period_ns / 1e9
+    return float(found.sum() / (len(found) * moving_s / 60))
 
 
 def measured(method: Method, wanted: dict[str, list[Condition]]) -> dict[str, Interval]:

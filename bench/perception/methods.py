@@ -7,6 +7,7 @@ split of what it learns from, each for itself.
 import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.perception.data import Data
-from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.evidence.model_windows import stepped
+from tactile_rt.evidence.promises import familiarity
 from tactile_rt.export.release import fit_temperature
 from tactile_rt.models import evaluation
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
@@ -115,12 +116,7 @@ def onnx_model(path: Path) -> Method:
     def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
         return evaluation.predict(sweeps, run, disturbance=disturbance)[:, -1]
 
-    def familiar(sweeps: SweepSet) -> Floats:
-        there = evaluation.predict(sweeps, stepped(session, card, refusals=True))[:, -1]
-        return np.nan_to_num(1 - there[:, card.labels.index(UNKNOWN)], nan=0.0)
-
-    refuses = familiar if UNKNOWN in card.refusals else None
-    return Method(path.stem, learnt, card.classes, posteriors, refuses)
+    return Method(path.stem, learnt, card.classes, posteriors, partial(familiarity, path))
 
 
 def of_kinds(data: SweepSet, kinds: tuple[str, ...]) -> SweepSet:

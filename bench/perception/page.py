@@ -114,6 +114,7 @@ def write_page(results: BenchmarkResults, path: Path) -> None:
             "",
             *_table(results.generator, list(next(iter(results.generator.values()))), str),
             "",
+            *_false_touches(results),
             f"Those that have learnt from generated objects have learnt from the recipe "
             f"`{DEFAULT_RECIPE}`, whose loads have the SHA-256 `{results.digest}`.",
             "",
@@ -121,6 +122,17 @@ def write_page(results: BenchmarkResults, path: Path) -> None:
     if results.promises:
         lines += [*_promises(results), ""]
     path.write_text("\n".join(lines), encoding="utf-8")
+
+
+def _false_touches(results: BenchmarkResults) -> list[str]:
+    if results.false_touches is None:
+        return []
+    silent, noisy = results.false_touches
+    return [
+        f"While the head is shaken with 0.5 g and nothing is near, {silent:.1f} touches a minute "
+        f"are found, and {noisy:.1f} with the rated noise.",
+        "",
+    ]
 
 
 def _promises(results: BenchmarkResults) -> list[str]:

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.evidence.model_windows import stepped
+from tactile_rt.evidence.promises import familiarity, named_faults, promises
 from tactile_rt.evidence.records import Record
 from tactile_rt.evidence.robustness import measure_robustness, rated_amount, robustness_records
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.stream import ConfigError, SpecMismatch
 from tactile_rt.sweep_set import WITHHELD, Sweeps
 
@@ -140,11 +142,13 @@ def evaluate_model(
     records += _calibration(clean[:, -1], noisy[:, -1], labels, objects, card.temperature, sample)
     undetected = 100 * float(np.isnan(clean[:, 0, 0]).mean())
     records.append(Record("models.undetected sweeps", undetected, "%", "", "", sample))
+    unknown = None
     if test.manifest.split.get(WITHHELD):
         unknown = SweepSet.read(data, WITHHELD)
         if quick:
             unknown = _first_of_each(unknown, QUICK_SWEEPS)
-        records.append(_open_set(run, unknown, clean[:, -1], objects))
+        records.append(_open_set(model, unknown, test))
+    records += _refusals_and_candidates(model, test, unknown, sample)
     if other:
         records += _compare_profiles(run, other, test, clean)
     if svm:
@@ -240,18 +244,43 @@ def _calibration(
     return records
 
 
-def _open_set(
-    run: evaluation.Step, unknown: SweepSet, known: NDArray[np.float32], objects: NDArray[np.str_]
-) -> Record:
-    """How well the largest posterior tells categories that training never saw from those it did."""
-    there = evaluation.predict(unknown, run)[:, -1].max(axis=1)
-    scores = np.concatenate([known.max(axis=1), there])
+def _refusals_and_candidates(
+    model: Path, test: SweepSet, unknown: SweepSet | None, sample: str
+) -> list[Record]:
+    """What becomes of a model's promises; nothing of one that makes none."""
+    records = []
+    for noise, when in ((0.0, ""), (1.0, " at rated noise")):
+        found = promises(model, test, Disturbance(noise=noise))
+        if found is None:
+            return []
+        if found.coverage == found.coverage:
+            how = f"promised: {100 * found.coverage:g} %; {sample}"
+            records.append(_record(f"truth always among the candidates{when}", found.kept, "", how))
+            size = found.size
+            interval = f"95 % interval {size.low:.1f} to {size.high:.1f}, by object"
+            name = f"models.candidates at the last step{when}"
+            records.append(Record(name, size.value, "", "", interval, sample))
+        records.append(_record(f"known things called unknown{when}", found.unknown, "", sample))
+        records.append(_record(f"sound loads called faulty{when}", found.faulty, "", sample))
+    if unknown is not None and (found := promises(model, unknown)):
+        how = f"{len(unknown.sweeps)} sweeps of withheld kinds"
+        records.append(_record("unknown things called unknown", found.unknown, "", how))
+    for name, share in named_faults(model, test):
+        records.append(_record(f"{name}, named as a fault", share, "", sample))
+    return records
+
+
+def _open_set(model: Path, unknown: SweepSet, known: SweepSet) -> Record:
+    """How well a model tells categories that training never saw from those it did."""
+    there, here = familiarity(model, unknown), familiarity(model, known)
+    scores = np.concatenate([here, there])
 
     def area(at: NDArray[np.int64]) -> float:
-        mine = at < len(known)
+        mine = at < len(here)
         return evaluation.auroc(scores[at[mine]], scores[at[~mine]])
 
-    estimate = evaluation.bootstrap(area, np.concatenate([objects, unknown.sweeps.objects]))
+    names = np.concatenate([known.sweeps.objects, unknown.sweeps.objects])
+    estimate = evaluation.bootstrap(area, names)
     return Record(
         "models.known against withheld categories",
         100 * estimate.value,
@@ -259,7 +288,7 @@ def _open_set(
         "",
         f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object; "
         "50: chance",
-        f"largest posterior, {len(known)} sweeps of known and {len(there)} of withheld kinds",
+        f"{len(here)} sweeps of known and {len(there)} of withheld kinds",
     )
 
 

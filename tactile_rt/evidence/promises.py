@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.perception.methods import of_kinds
 from tactile_rt.classifier.decision_rules import UNKNOWN, fitting
 from tactile_rt.classifier.model_card import ModelCard, decided
 from tactile_rt.classifier.model_file import load_model
@@ -16,9 +15,9 @@ from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import Interval
-from tactile_rt.models.implausible import IMPLAUSIBLE
+from tactile_rt.models.implausible import IMPLAUSIBLE, implausible
 
-__all__ = ["Promises", "named_faults", "promises"]
+__all__ = ["Promises", "familiarity", "named_faults", "promises"]
 
 NOTHING = Interval(float("nan"), float("nan"), float("nan"))
 
@@ -28,7 +27,7 @@ class Promises:
     """What became of a model's promises on a test.
 
     Attributes:
-        coverage: What it promises, 0 to 1; NaN: nothing.
+        coverage: The share of touches that is promised, 0 to 1; NaN without a promise.
         kept: The share of the sweeps of kinds that it knows of which the true kind was a candidate
             at every step.
         size: The mean number of candidates at the last step.
@@ -48,22 +47,21 @@ def promises(path: Path, test: SweepSet, disturbance: Disturbance = CLEAN) -> Pr
 
     Args:
         path: of the model file.
-        test: the sweeps; those of a kind that the model does not know are only refused or not.
+        test: the sweeps, labelled by the model's classes; those of none (-1) are only refused or
+            not.
         disturbance: what is wrong with the sensor.
     """
     _, card = load_model(path)
     if not card.refusals and not card.candidates:
         return None
-    known = of_kinds(test, card.classes)
-    known = known if len(known.sweeps) else test
-    posteriors = _posteriors(path, known, disturbance)
-    labels, objects = known.sweeps.labels, known.sweeps.objects
+    posteriors = _posteriors(path, test, disturbance)
+    labels, objects = test.sweeps.labels, test.sweeps.objects
     said = _decisions(card, posteriors[:, -1])
     faults = [name for name in card.refusals if name in IMPLAUSIBLE]
     unknown = evaluation.accuracy(said == UNKNOWN, objects)
     faulty = evaluation.accuracy(np.isin(said, faults), objects)
     rule = fitting(card.candidates, disturbance.noise)
-    if rule is None or known is test:
+    if rule is None or (labels < 0).any():
         return Promises(float("nan"), NOTHING, NOTHING, unknown, faulty)
     found = ~np.isnan(posteriors[:, 0, 0])
     inside = np.zeros(len(labels), dtype=np.bool_)
@@ -82,13 +80,29 @@ def promises(path: Path, test: SweepSet, disturbance: Disturbance = CLEAN) -> Pr
     )
 
 
+def familiarity(path: Path, test: SweepSet) -> NDArray[np.float32]:
+    """How sure (sweep,) a model is that things are of kinds that it knows.
+
+    That is the posterior of all labels but `unknown`; of a model that has no such label, that of
+    the most probable class. 0 where no contact was found.
+    """
+    _, card = load_model(path)
+    last = _posteriors(path, test, CLEAN)[:, -1]
+    if UNKNOWN in card.refusals:
+        sure = 1 - last[:, card.labels.index(UNKNOWN)]
+    else:
+        sure = last.max(axis=1)
+    found: NDArray[np.float32] = np.nan_to_num(sure, nan=0.0)
+    return found
+
+
 def named_faults(path: Path, test: SweepSet) -> Iterator[tuple[str, Interval]]:
     """Of each kind of loads that no touch makes: the share that a model refuses for its loads."""
     _, card = load_model(path)
     faults = [name for name in card.refusals if name in IMPLAUSIBLE]
     rng = np.random.default_rng(0)
-    for name, spoil in IMPLAUSIBLE.items():
-        values = spoil(test.sweeps.values, test.manifest.spec, rng)
+    for name in implausible(test.manifest.spec):
+        values = IMPLAUSIBLE[name](test.sweeps.values, test.manifest.spec, rng)
         spoilt = replace(test, sweeps=replace(test.sweeps, values=values))
         said = _decisions(card, _posteriors(path, spoilt, CLEAN)[:, -1])
         yield name, evaluation.accuracy(np.isin(said, faults), test.sweeps.objects)
