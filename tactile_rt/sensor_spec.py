@@ -42,7 +42,7 @@ Point = tuple[float, float, float]
 # detector takes for noise, for sources without any. All SI.
 RATED_NOISE = {"N": 10e-6, "N m": 5e-8}
 CLIP = {"N": 5e-3, "N m": 5e-6}
-SCALE = {"N": 1e-5, "N m": 1e-7}
+SCALE = {"N": 3e-5, "N m": 1.5e-7}
 CHANNEL_FLOOR = {"N": 2e-6, "N m": 1e-8}
 SILENT = 0.2  # that least, of the noise of a sensor that is described
 # Of the drift: an offset that has wandered for ten seconds since the tare (by 0.6 of its spread, if

@@ -29,7 +29,7 @@ from tactile_rt.sweep_set import OUTLIERS
 RECIPES = Path(__file__).parent / "recipes"
 LISTS = ("real", "everyday")
 SPLITS = ("train", "validation", OUTLIERS)
-STANDING = 12  # sweeps of every real object as the benchmark sweeps its own, but for their draws
+STANDING = 12  # further sweeps of every real object that stands
 
 
 def main() -> int:
@@ -63,24 +63,28 @@ def main() -> int:
 
 
 def recipes(objects: Path) -> list[SweepRecipe]:
-    """What the model learns from; what is wrong with the sensor is drawn as the first says."""
-    standing = read_recipe(str(OF_THE_BENCHMARK / "real27.toml"))
-    standing = replace(
-        standing, name="standing27", seed=1, sweeps=replace(standing.sweeps, draws=STANDING)
-    )
-    fallen = read_recipe(str(RECIPES / "poses27.toml"))
-    everyday = read_recipe(str(RECIPES / "everyday.toml"))
+    """What the model learns from; what is wrong with the sensor is drawn as the first says.
 
-    def of(recipe: SweepRecipe, name: str) -> SweepRecipe:
-        return replace(recipe, objects=replace(recipe.objects, source=str(objects / name)))
-
+    Real things are those that the benchmark gives to learn from, swept as it sweeps its own, then
+    oftener, then in the wide world.
+    """
+    wide = read_recipe("wide24")
+    real = _of(read_recipe(str(OF_THE_BENCHMARK / "real27.toml")), objects / "real")
+    everyday = _of(read_recipe(str(RECIPES / "everyday.toml")), objects / "everyday")
+    again = replace(real.sweeps, draws=STANDING)
+    fallen = replace(wide.sweeps, draws=real.sweeps.draws)
     return [
         read_recipe("poses24"),
-        of(standing, "real"),
-        of(fallen, "real"),
-        of(everyday, "everyday"),
-        read_recipe("wide24"),
+        everyday,
+        real,
+        replace(real, name="standing27", seed=1, sweeps=again),
+        replace(real, name="wide27", sweeps=fallen),
+        wide,
     ]
+
+
+def _of(recipe: SweepRecipe, objects: Path) -> SweepRecipe:
+    return replace(recipe, objects=replace(recipe.objects, source=str(objects)))
 
 
 def _trained(folder: Path, sets: list[Path], seed: int) -> Path:

@@ -175,6 +175,9 @@ def _guess(demo: Demonstration) -> Text:
         text.append(f"{label[:9]:<10}", f"bold {style}" if label == truth else "")
         text.append(f"{'█' * round(BAR * probability):<{BAR}}", style)
         text.append(f" {100 * probability:3.0f} %\n")
+    if decision.candidates:
+        kinds = len(demo.classifier.card.classes)
+        text.append(f"still possible: {len(decision.candidates)} of {kinds} kinds", GREY)
     text.append("\n" * (6 - len(top)))
     right = decision.label == truth
     if decision.final:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
+from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.stream import NS_PER_S
 
 if TYPE_CHECKING:
@@ -51,7 +52,8 @@ class SweepOutcome:
             return f"{self.name:<12} no decision                   WRONG"
         verdict = "right" if self.right else "WRONG"
         sure = f"{100 * self.probability:3.0f} %"
-        return f"{self.name:<12} feels like a {self.said:<12}{sure}  {verdict}"
+        feels = f"feels like a {self.said}" if self.said != UNKNOWN else "feels like nothing known"
+        return f"{self.name:<12} {feels:<25}{sure}  {verdict}"
 
 
 @dataclass(frozen=True)

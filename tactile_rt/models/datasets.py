@@ -158,12 +158,17 @@ class TrainingBatches:
     what else is wrong with the sensor is drawn as the set's recipe says, or else as `SensorFaults`
     does. Labels beyond the categories are those of the set's `refusals`, in their order.
 
+    Attributes:
+        easy_epochs: The number of epochs in which noise, offset and drift rise to what is said: a
+            network that meets them at once takes far longer to learn.
+
     Raises:
         ConfigError: not even one batch of sweeps with a touch.
     """
 
     def __init__(self, data: SweepSet, batch: int, seed: int) -> None:
         self._data, self._batch, self._seed = data, batch, seed
+        self.easy_epochs = 0
         self._faults, self._refusals = data.manifest.faults, data.refusals
         starts = data.noisy_starts
         # Too faint to be found at its noise level: learn it from where it is found without.
@@ -188,16 +193,17 @@ class TrainingBatches:
         order = rng.permutation(self._usable)
         if view:
             rng = np.random.default_rng([self._seed, number, view])
+        severity = min(1.0, number / self.easy_epochs) if self.easy_epochs else 1.0
         for i in range(len(self)):
-            yield self._draw(order[i * self._batch : (i + 1) * self._batch], rng)
+            yield self._draw(order[i * self._batch : (i + 1) * self._batch], rng, severity)
 
     def _draw(
-        self, at: NDArray[np.int64], rng: np.random.Generator
+        self, at: NDArray[np.int64], rng: np.random.Generator, severity: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         data, n = self._data, len(at)
         elements, channels = data.manifest.spec.shape
         faults = self._faults
-        level = _noise_levels(n, faults.noise, rng)
+        level = np.float32(severity) * _noise_levels(n, faults.noise, rng)
         found_at = np.array(NOISE_LEVELS[: len(self._starts)])
         nearest = np.abs(level[:, None] - found_at).argmin(axis=1)
         start = self._starts[nearest, at] + rng.integers(-JITTER, JITTER + 1, n)
@@ -215,7 +221,7 @@ class TrainingBatches:
         samples *= gain * alive
         labels = self._spoilt(samples, data.sweeps.labels[at], rng)
         if faults.offset or faults.drift:
-            samples += self._wandered(n, rng)
+            samples += self._wandered(n, rng, severity)
         noise = data.noise * level[:, None, None]  # (batch, 1, channel)
         samples += noise[:, None, None] * rng.standard_normal(samples.shape, dtype=np.float32)
         # The tare: a mean and a spread over the quiet samples that happened to come before.
@@ -247,7 +253,7 @@ class TrainingBatches:
                 labels[at] = first + self._refusals.index(name)
         return labels
 
-    def _wandered(self, n: int, rng: np.random.Generator) -> NDArray[np.float32]:
+    def _wandered(self, n: int, rng: np.random.Generator, severity: float) -> NDArray[np.float32]:
         """(n, step, sub-step, element, channel) what has come to the readings since their tare."""
         data, timing = self._data, self._data.timing
         course = np.arange(1, timing.samples + 1) / timing.samples
@@ -257,6 +263,7 @@ class TrainingBatches:
             (self._faults.drift, course),
         ):
             # half of the sweeps have none
-            size = most * np.maximum(rng.uniform(-1, 1, (n, 1, 1)), 0) * data.noise
+            share = severity * np.maximum(rng.uniform(-1, 1, (n, 1, 1)), 0)
+            size = most * share * data.noise
             there += (size * rng.normal(size=(n, *there.shape[2:])))[:, None] * over[:, None, None]
         return there.reshape(n, timing.steps, timing.substeps, *there.shape[2:])

@@ -212,7 +212,9 @@ class Fed:
         while not self.over.wait(0.03):
             now = time.monotonic_ns()
             (chunk,) = cut(np.random.default_rng(0).normal(size=(9, 3, 2)), 300.0, start_ns=now)
-            made = Classification(now - 10**8, now, 2, False, EVIL, (EVIL, "y"), p, 0.001)
+            made = Classification(
+                now - 10**8, now, 2, False, EVIL, (EVIL, "y"), p, 0.001, (EVIL, "y"), 0.9
+            )
             self.page.handle(
                 [
                     SourceChunk("a", spec, chunk, now, 0),
@@ -230,6 +232,7 @@ def test_names_that_are_markup_stay_text(tab, port):
         one.has("document.getElementById('label').textContent.startsWith('<img')")
         one.has("document.getElementById('events').textContent.includes('onerror')")
         assert one.page.locator("img").count() == 0
+        assert "one of: <img" in one.text("#candidates") and "90 % of" in one.text("#candidates")
         assert "<img" in one.text("#degraded") and "<img" in one.text("#parts")
         assert one.page.title() == f"{EVIL} · tactile_rt"
         assert {url.rpartition("/")[2].partition("?")[0] for url in one.asked} <= {

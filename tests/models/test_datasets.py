@@ -245,3 +245,15 @@ def test_sets_are_joined_by_the_names_of_their_categories() -> None:
     fast = replace(there, manifest=replace(manifest, period_ns=1_000_000))
     with pytest.raises(ConfigError, match="cannot be joined: the period of their samples"):
         joined([one, fast])
+
+
+def test_faults_rise_to_what_is_said_in_the_easy_epochs() -> None:
+    batches = TrainingBatches(with_faults(touches(300), noise=2.0), 20, seed=0)
+    batches.easy_epochs = 4
+    largest = []
+    for epoch in range(6):
+        samples = np.concatenate([batch[0].numpy() for batch in batches.epoch(epoch)])
+        largest.append(noise_level(samples).max())
+    assert largest[0] < 1e-9
+    assert largest[1:4] == pytest.approx([0.5, 1.0, 1.5], abs=0.15)
+    assert largest[4:] == pytest.approx([2.0, 2.0], abs=0.2)

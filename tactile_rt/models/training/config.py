@@ -53,6 +53,8 @@ class TrainingConfig:
             0.1.
         drop_every: The share of all updates between tenfold drops of the schedule "step";
             StepLR(30) of 100 epochs is 0.3.
+        easy: The share of all epochs in which noise, offset and drift rise from nothing to what the
+            set's recipe says.
         epochs: The number of passes over the training split.
         updates: The number of updates to stop after, whatever `epochs` says; 0 leaves it to
             `epochs`.
@@ -87,6 +89,7 @@ class TrainingConfig:
     weight_decay: float = 1e-4
     warmup: float = 0.05
     drop_every: float = 0.3
+    easy: float = 0.0
     epochs: int = 14
     updates: int = 0
     batch: int = 32
@@ -112,7 +115,7 @@ class TrainingConfig:
         for name in ("updates", "clip_norm", "weight_decay"):
             if not (getattr(self, name) >= 0 and isfinite(getattr(self, name))):
                 raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
-        for name in ("masking", "warmup", "label_smoothing"):
+        for name in ("masking", "warmup", "label_smoothing", "easy"):
             if not 0 <= getattr(self, name) < 1:
                 raise ConfigError(f"{name} must be in [0, 1), not {getattr(self, name)}")
         if self.objective in ("simclr", "simsiam") and self.batch < 2:

@@ -83,6 +83,9 @@ def train(
 
     share = Share(fabric.global_rank, fabric.world_size)
     batches = TrainingBatches(training, config.batch, config.seed)
+    if config.easy:
+        updates = config.updates or config.epochs * len(batches)
+        batches.easy_epochs = round(config.easy * updates / len(batches))
     augmentation = objective.augmentation
     feed = BatchFeed(batches, augmentation, objective.views, config.seed, share, fabric.device)
     validate = Validation(config, validating, augmentation, share, fabric.device)
