@@ -43,6 +43,8 @@ def test_run_prints_every_step_of_an_episode(call):
             "final",
             "label",
             "probabilities",
+            "candidates",
+            "coverage",
             "latency_ms",
         ]
         assert line["type"] == "classification"
