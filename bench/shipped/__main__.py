@@ -3,8 +3,8 @@
 python -m bench.shipped FOLDER [--from CLONES] [--name NAME] [--seeds 0 1 2]
 
 It goes on with what is missing of FOLDER. The objects come from GitHub or from clones, every file
-checked by its hash. Of the networks the one that is best on validation sweeps is exported to
-FOLDER/NAME.onnx, and its weights go to FOLDER/NAME.pt, in half precision.
+checked by its hash. Of the networks the one that is best on validation sweeps goes to
+FOLDER/NAME.pt, in half precision, and from there to FOLDER/NAME.onnx.
 """
 
 import argparse
@@ -57,8 +57,9 @@ def main() -> int:
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         runs = list(pool.map(lambda seed: _trained(given.folder, sets, seed), given.seeds))
     best = max(runs, key=_validated)
-    release(best, given.folder / f"{given.name}.onnx", given.name)
-    _write_weights(best, given.folder / f"{given.name}.pt")
+    weights = given.folder / f"{given.name}.pt"
+    _write_weights(best, weights)
+    release(weights, weights.with_suffix(".onnx"), given.name, "fp16")
     return 0
 
 
@@ -66,7 +67,8 @@ def recipes(objects: Path) -> list[SweepRecipe]:
     """What the model learns from; what is wrong with the sensor is drawn as the first says.
 
     Real things are those that the benchmark gives to learn from, swept as it sweeps its own, then
-    oftener, then in the wide world.
+    oftener, then in the wide world. Generated ones come in any pose, then of any plan in the wide
+    world, then upright, as most things stand.
     """
     wide = read_recipe("wide24")
     real = _of(read_recipe(str(OF_THE_BENCHMARK / "real27.toml")), objects / "real")
@@ -80,6 +82,7 @@ def recipes(objects: Path) -> list[SweepRecipe]:
         replace(real, name="standing27", seed=1, sweeps=again),
         replace(real, name="wide27", sweeps=fallen),
         wide,
+        read_recipe("default24"),
     ]
 
 
@@ -94,7 +97,7 @@ def _trained(folder: Path, sets: list[Path], seed: int) -> Path:
     also = [part for other in others for part in ("--also", other)]
     program = (sys.executable, "-c", "from tactile_rt.cli import main; main()")
     command = [*program, "train", first, str(run), *also]
-    subprocess.run([*command, "--seed", str(seed)], check=True)
+    subprocess.run([*command, "--recipe", "mouse44", "--seed", str(seed)], check=True)
     return run / "best.pt"
 
 

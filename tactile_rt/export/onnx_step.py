@@ -135,7 +135,7 @@ def export_checkpoint(
             "network": msgspec.json.decode(msgspec.json.encode(saved["network"])),
             "sweep_set": manifest.recipe,
             **({"also": [other.recipe for other in manifests[1:]]} if manifests[1:] else {}),
-            "unseen_objects": list(manifest.split["test"]),
+            "unseen_objects": list(manifests[0].split["test"]),
             "commands": list(commands),
             "tactile_rt": VERSION,
             "torch": str(torch.__version__),  # not a plain str, which msgspec insists on

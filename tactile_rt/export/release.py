@@ -18,7 +18,13 @@ from tactile_rt.export.promises import fitted_rules
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet, joined, relabelled
 from tactile_rt.models.evaluation import Step, among, hits, predict
-from tactile_rt.models.training import load_checkpoint, run_on
+from tactile_rt.models.training import (
+    TrainingConfig,
+    load_checkpoint,
+    read_recipe,
+    run_on,
+    shipped_recipes,
+)
 from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["fit_temperature", "quantisation_figures", "release", "run_file"]
@@ -61,11 +67,6 @@ def release(
     temperature = fit_temperature(posteriors[:, -1], labels)
     told = (*known, *saved.get("refusals", ()))
     unknown, candidates = fitted_rules(sets, run_on(model), temperature, told, len(known))
-    recipe = validation.manifest.recipe
-    fields = ("encoder", "attender", "decoder", "width", "epochs", "batch", "learning_rate", "seed")
-    chosen_so = [f"--{key.replace('_', '-')} {config[key]}" for key in fields]
-    chosen_so += [f"--also {folder}" for folder in config.get("also", ())]
-    options = " ".join(chosen_so)
     chosen = "" if precision == "fp32" else f" --precision {precision}"
     chosen += "" if kind == "step" else f" --kind {kind}"
     card = export_checkpoint(
@@ -76,8 +77,11 @@ def release(
         rules=(unknown, candidates),
         figures={k: v for k, v in saved["metrics"].items() if k.startswith("validation")},
         commands=(
-            f"tactile-rt sweep {config['data']} {_sweep_options(recipe)}",
-            f"tactile-rt train {config['data']} {checkpoint.parent} {options}",
+            *(
+                f"tactile-rt sweep {folder} {_sweep_options(SweepManifest.read(folder).recipe)}"
+                for folder in folders
+            ),
+            f"tactile-rt train {config['data']} {checkpoint.parent} {_training_options(config)}",
             f"tactile-rt export {checkpoint} {path.name} --name {name}{chosen}",
         ),
         precision=precision,
@@ -143,6 +147,20 @@ def _described(path: Path, card: ModelCard, figures: dict[str, float]) -> ModelC
     onnx.save(proto, partial)
     partial.replace(path)
     return card
+
+
+def _training_options(config: dict[str, Any]) -> str:
+    """The options of `tactile-rt train` that train so again; a recipe that ships says it all."""
+    also, begin = tuple(config.get("also", ())), config.get("begin", "")
+    here = {"data": config["data"], "also": also, "begin": begin, "seed": config["seed"]}
+    asked = TrainingConfig(**{**config, "also": also})
+    recipe = [name for name in shipped_recipes() if read_recipe(name, **here) == asked]
+    fields = ("encoder", "attender", "decoder", "width", "epochs", "batch", "learning_rate")
+    told = {"recipe": recipe[0]} if recipe else {field: config[field] for field in fields}
+    options = [f"--{key.replace('_', '-')} {value}" for key, value in told.items()]
+    options += [f"--also {folder}" for folder in also]
+    options += [f"--from {begin}"] if begin else []
+    return " ".join([*options, f"--seed {config['seed']}"])
 
 
 def _sweep_options(recipe: dict[str, Any]) -> str:

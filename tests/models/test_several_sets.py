@@ -52,6 +52,10 @@ def test_the_exported_file_refuses_and_promises(run, tmp_path, call):
     assert len(card.unknown.thresholds) == 22
     assert card.candidates == (), "five objects are too few to promise anything"
     assert len(card.provenance["also"]) == 1
+    unseen = card.provenance["unseen_objects"]  # of the first set
+    assert unseen and not any(name.startswith("star") for name in unseen)
+    *sweeps, training, _ = card.provenance["commands"]
+    assert len(sweeps) == 2 and "--encoder gru" in training and "other --seed 0" in training
     code, shown, _ = call("model", "show", tmp_path / "m.onnx")
     assert "4: ball, cube, cone, star" in shown and "swapped channels" in shown
 
