@@ -120,7 +120,7 @@ def measure(
             _together([data.sets[split] for split in (*SPLITS, SOURCE)]), generated_kinds
         ),
     }
-    methods = [*baselines(data, shipped, generated, None if quick else folder / "runs"), *files]
+    methods = [*baselines(data, generated, None if quick else folder / "runs"), *files]
     changed = {} if quick else rows(folder, progress)
     results = BenchmarkResults(data, {test: {} for test in tests}, {}, {}, {}, digest=digest)
     for method in methods:

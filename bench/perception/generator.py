@@ -1,6 +1,6 @@
 """What a method makes of generated objects when the world or the sensor is not as it was taught.
 
-The objects are the plain shapes, 4 of each of their 24 kinds that mouse24 has not seen, 3 sweeps
+The objects are the plain shapes, 4 of each of their 24 kinds that no method has seen, 3 sweeps
 each. Every row changes one thing.
 """
 
@@ -24,7 +24,7 @@ from tactile_rt.sweep_set import Sweeps
 __all__ = ["UPRIGHT", "Condition", "false_touches", "measured", "rows"]
 
 RECIPE, FIRST, OBJECTS, DRAWS = "default24", 48, 4, 3
-UPRIGHT = "as taught to mouse24"
+UPRIGHT = "upright, 40 mm large, 28 to 40 mm/s"
 SHAKEN = "head shaken with 0.5 g, 10 to 100 Hz"
 FAR_MM = 80.0  # where no whisker reaches
 LEAN = 14.1  # degrees about either axis: 20 in all
@@ -42,7 +42,7 @@ WORLDS: dict[str, dict[str, Choice]] = {
     "2.5 times the friction": {"surface_friction": 2.5},
     SHAKEN: {"shake_g": 0.5, "shake_hz": Between(10, 100)},
 }
-# on the sweeps as taught; an amount of 1 is 20 uN and 0.1 uN m, 10 uN being the rated noise
+# on upright sweeps; an amount of 1 is 20 uN and 0.1 uN m, 10 uN being the rated noise
 SENSORS = {
     "rated noise": Disturbance(noise=1),
     "twice the rated noise": Disturbance(noise=2),

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.perception.data import Data
+from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.evidence.model_windows import stepped
 from tactile_rt.evidence.promises import familiarity
@@ -44,8 +45,6 @@ REAL, GENERATED, BOTH = "real", "generated", "generated + real"
 RATES = (1e-3, 2e-3, 5e-3)  # of the GRU, of which validation chooses
 UPDATES = 3000  # of the GRU
 REPEATS = 3  # of the real sweeps beside the generated ones, which are more
-STRENGTHS = (0.003, 0.01, 0.03, 0.1, 0.3)  # inverse, of the head's regularisation
-QUARTERS = ((3, 22), (3, 9), (9, 15), (15, 22))  # steps whose means the linear head takes
 
 
 @dataclass(frozen=True)
@@ -76,13 +75,12 @@ class Method:
 
 
 def baselines(
-    data: Data, shipped: Path, generated: tuple[SweepSet, SweepSet] | None, runs: Path | None
+    data: Data, generated: tuple[SweepSet, SweepSet] | None, runs: Path | None
 ) -> Iterator[Method]:
     """The methods that every model is compared with.
 
     Args:
         data: of the benchmark.
-        shipped: the model whose encoder gets a new head.
         generated: training and validation sweeps of generated objects; None leaves out what needs
             them.
         runs: where networks are trained, and found trained; None leaves them out.
@@ -102,21 +100,25 @@ def baselines(
         kinds = tuple(dict.fromkeys((*data.kinds, *generated[0].manifest.categories)))
         both = joined([of_kinds(one, kinds) for one in (generated[0], *[real[0]] * REPEATS)])
         yield _gru(BOTH, both, of_kinds(real[1], kinds), runs)
-    yield _headed(shipped, *real)
 
 
 def onnx_model(path: Path) -> Method:
     """A model file, as it is."""
     session, card = load_model(path)
     run = stepped(session, card)
-    taught = card.provenance.get("sweep_set", {})
-    source = taught.get("objects", {}).get("from", "?") if isinstance(taught, dict) else "?"
-    learnt = GENERATED if source in recipes.GENERATED else source
-
     def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
         return evaluation.predict(sweeps, run, disturbance=disturbance)[:, -1]
 
-    return Method(path.stem, learnt, card.classes, posteriors, partial(familiarity, path))
+    taught, familiar = _learnt_from(card), partial(familiarity, path)
+    return Method(path.stem, taught, card.classes, posteriors, familiar)
+
+
+def _learnt_from(card: ModelCard) -> str:
+    """Where the objects come from, set by set."""
+    told = (card.provenance.get("sweep_set"), *card.provenance.get("also", ()))
+    sources = [one.get("objects", {}).get("from", "?") for one in told if isinstance(one, dict)]
+    named = (GENERATED if s in recipes.GENERATED else Path(s).name for s in sources)
+    return " + ".join(dict.fromkeys(named)) or "?"
 
 
 def of_kinds(data: SweepSet, kinds: tuple[str, ...]) -> SweepSet:
@@ -222,33 +224,3 @@ def _gru(taught: str, training: SweepSet, validation: SweepSet, runs: Path) -> M
 
     best = _best([candidate(rate) for rate in RATES], validation)
     return _calibrated("GRU", taught, validation, best)
-
-
-def _headed(shipped: Path, training: SweepSet, validation: SweepSet) -> Method:
-    from sklearn.linear_model import LogisticRegression
-    from sklearn.preprocessing import StandardScaler
-
-    session, card = load_model(shipped)
-    run = stepped(session, card, "embedding")
-
-    def features(sweeps: SweepSet, disturbance: Disturbance) -> tuple[Floats, NDArray[np.bool_]]:
-        steps, found = evaluation.run_windows(sweeps, run, disturbance=disturbance)
-        return np.concatenate([steps[:, a:b].mean(axis=1) for a, b in QUARTERS], axis=1), found
-
-    x, usable = features(training, CLEAN)
-    scaler, classes = StandardScaler().fit(x[usable]), len(training.manifest.categories)
-
-    def candidate(strength: float) -> Callable[..., Floats]:
-        head = LogisticRegression(C=strength, max_iter=500)
-        head.fit(scaler.transform(x[usable]), training.sweeps.labels[usable])
-
-        def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
-            there, found = features(sweeps, disturbance)
-            margins = np.full((len(there), classes), -np.inf)
-            margins[:, head.classes_] = head.decision_function(scaler.transform(there))
-            return _softmax(margins, found)
-
-        return posteriors
-
-    best = _best([candidate(strength) for strength in STRENGTHS], validation)
-    return _calibrated(f"{shipped.stem} + linear head", f"generated, then {REAL}", validation, best)

@@ -53,7 +53,7 @@ In percent, with 95 % intervals of a bootstrap over objects. *Two* and *four*: p
 sweeps of an object, fused. *ECE*: expected calibration error, 15 bins; less is better. *AUROC*: how
 well the largest posterior tells known kinds from the withheld ones; 50 is chance. Every method has
 chosen its own settings on the validation split of what it learnt from: the SVM its penalty, the GRU
-its rate of learning, the head its regularisation, and all that learn here their temperature.
+its rate of learning, and all that learn here their temperature.
 """
 RUN_IT = """\
 ## Run it
@@ -105,12 +105,12 @@ def write_page(results: BenchmarkResults, path: Path) -> None:
     ]
     if results.generator:
         lines += [
-            "### Generated objects when one thing is not as taught",
+            "### Generated objects when one thing is not as in the first row",
             "",
             "Top-1 on 96 plain generated objects of 24 kinds that no method has seen, 3 sweeps "
             "each (`bench/perception/generator.py`), of those methods that know these kinds. "
-            "mouse24 has learnt from such objects, the others from those of any plan in the "
-            "wide world.",
+            "What ships has learnt from such objects, too, the others from those of any plan in "
+            "the wide world.",
             "",
             *_table(results.generator, list(next(iter(results.generator.values()))), str),
             "",
