@@ -37,9 +37,9 @@ FIELD = ("x", "y", "z")
 Point = tuple[float, float, float]
 
 # Of arrays that say nothing of their sensor, as a mouse's: noise per sample of the network, one
-# standard deviation; the largest load that is believed; the smallest scale of the logarithm, a
-# third of the median load of a touching whisker in passive sweeps; and the least that the contact
-# detector takes for noise, for sources without any. All SI.
+# standard deviation; the largest load that is believed; the smallest scale of the logarithm, three
+# times that noise; and the least that the contact detector takes for noise, for sources without
+# any. All SI.
 RATED_NOISE = {"N": 10e-6, "N m": 5e-8}
 CLIP = {"N": 5e-3, "N m": 5e-6}
 SCALE = {"N": 3e-5, "N m": 1.5e-7}

@@ -101,6 +101,12 @@ class SweepManifest:
             raise RecordingError(f"{MANIFEST} is damaged: {error}") from None
 
     @property
+    def source(self) -> str:
+        """Where the objects come from, as its recipe says it; "" if it does not."""
+        objects = self.recipe.get("objects")
+        return str(objects.get("from", "")) if isinstance(objects, dict) else ""
+
+    @property
     def limits(self) -> ChannelLimits:
         """What a network may believe of the channels.
 
@@ -202,13 +208,15 @@ def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
     """Sets of one array as one, which is the first with the categories and objects of the others.
 
     Raises:
-        ConfigError: sets of another array, or of another period or lead.
+        ConfigError: sets of another array or sensor, or of another period or lead.
     """
     first = manifests[0]
     for other in manifests[1:]:
         differing = first.spec.differences(other.spec, ("name", "rate_hz"))
         if (first.period_ns, first.lead) != (other.period_ns, other.lead):
             differing = [*differing, "the period of their samples, or how long they rest first"]
+        if first.sensor != other.sensor:
+            differing = [*differing, "the sensor: its noise, range or rate"]
         if differing:
             names = " and ".join(str(m.recipe.get("name", "?")) for m in (first, other))
             raise ConfigError(f"the sweep sets {names} cannot be joined: {differing[0]}")

@@ -36,4 +36,10 @@ for step in range(card["steps"]):
     posterior = np.exp(evidence - evidence.max())
     posterior /= posterior.sum()
     best = int(posterior.argmax())
+    faults = {*card.get("refusals", ())} - {"unknown"}
+    if card.get("unknown") and card["labels"][best] not in faults:
+        limits, unknown = card["unknown"]["thresholds"], card["labels"].index("unknown")
+        doubt, posterior[unknown] = float(posterior[unknown]), -1  # it has a threshold of its own
+        best = unknown if doubt > limits[min(step, len(limits) - 1)] else int(posterior.argmax())
+        posterior[unknown] = doubt
     print(f"step {step + 1:2d}: {card['labels'][best]} {posterior[best]:.2f}")  # noqa: T201

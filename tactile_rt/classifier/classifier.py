@@ -58,7 +58,8 @@ class Classification:
         probabilities: (class,) The posterior probability of each of them, float32.
         latency_s: The time that the model's step took, s.
         candidates: The classes that are still possible, the most probable first, by the model's
-            promise for the noise that was measured; empty if it makes none.
+            promise for the noise that was measured; empty if it makes none, as of windows of
+            ``sliding`` that begin within a contact.
         coverage: The promise: in this share of touches of known kinds the true class is among the
             candidates at every step; None: there is none.
         late: Whether more work had gathered than the deadline allows.
@@ -275,6 +276,8 @@ class Classifier:
             return None
         best = decided(self.card, probabilities, step)
         final = step == self.card.steps or self._exit.reached(best, float(probabilities[best]))
+        # it was fitted on windows that begin where the contact does
+        promise = None if self._decided else self._promise
         self._decided = self._decided or final
         if late and self._deadline.policy == "skip":
             self.stats.withheld += 1
@@ -288,17 +291,19 @@ class Classifier:
             labels=self.card.labels,
             probabilities=probabilities,
             latency_s=latency,
-            candidates=self._candidates(probabilities, step),
-            coverage=self._promise.coverage if self._promise else None,
+            candidates=self._candidates(promise, probabilities, step),
+            coverage=promise.coverage if promise else None,
             late=late,
             embedding=self._stepper.embedding[lane].copy() if self._embeds else None,
         )
 
-    def _candidates(self, probabilities: NDArray[np.float32], step: int) -> tuple[str, ...]:
-        if self._promise is None:
+    def _candidates(
+        self, promise: CandidateRule | None, probabilities: NDArray[np.float32], step: int
+    ) -> tuple[str, ...]:
+        if promise is None:
             return ()
         classes = self.card.classes
-        left = self._promise.candidates(probabilities[: len(classes)], step)
+        left = promise.candidates(probabilities[: len(classes)], step)
         return tuple(classes[k] for k in left)
 
     def _posterior(self, logits: NDArray[np.float32]) -> NDArray[np.float32] | None:

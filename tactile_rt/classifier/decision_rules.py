@@ -115,9 +115,11 @@ def fitting(rules: Sequence[CandidateRule], noise: float) -> CandidateRule | Non
 def mass_above(probabilities: NDArray[np.float32]) -> NDArray[np.float64]:
     """(..., class) The share of the posterior that the classes have which are more probable.
 
-    It is 0 for the most probable class, and next to 1 for the least.
+    It is 0 for the most probable class, and next to 1 for the least. Where the posterior leaves
+    nothing to any class (all of it is a refusal's), all are alike.
     """
     p = probabilities.astype(np.float64)
+    p = np.where(p.sum(axis=-1, keepdims=True) > 0, p, 1.0)
     p = p / p.sum(axis=-1, keepdims=True)
     order = np.argsort(-p, axis=-1, kind="stable")
     ranked = np.take_along_axis(p, order, axis=-1)

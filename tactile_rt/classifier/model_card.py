@@ -293,7 +293,9 @@ def decided(card: ModelCard, probabilities: NDArray[np.float32], step: int) -> i
     rule = card.unknown
     if rule is None or rule.score != POSTERIOR or UNKNOWN not in card.refusals:
         return int(probabilities.argmax())
-    unknown = card.labels.index(UNKNOWN)
+    best, unknown = int(probabilities.argmax()), card.labels.index(UNKNOWN)
+    if best != unknown and best >= len(card.classes):
+        return best  # what is wrong with the loads says nothing of the object
     if probabilities[unknown] > rule.threshold(step):
         return unknown
     others = probabilities.copy()

@@ -40,6 +40,7 @@ class SweepOutcome:
     category: str
     said: str | None  # None: it passed without a decision
     probability: float
+    faulty: bool = False  # what was said is that something is wrong with the loads
 
     @property
     def right(self) -> bool:
@@ -52,7 +53,8 @@ class SweepOutcome:
             return f"{self.name:<12} no decision                   WRONG"
         verdict = "right" if self.right else "WRONG"
         sure = f"{100 * self.probability:3.0f} %"
-        feels = f"feels like a {self.said}" if self.said != UNKNOWN else "feels like nothing known"
+        what = {UNKNOWN: "like nothing known"}.get(self.said, f"like a {self.said}")
+        feels = f"feels {f'wrong: {self.said}' if self.faulty else what}"
         return f"{self.name:<12} {feels:<25}{sure}  {verdict}"
 
 
@@ -224,6 +226,7 @@ class Demonstration:
                     self.target.category,
                     decision.label,
                     decision.probability,
+                    decision.label in set(self.classifier.card.refusals) - {UNKNOWN},
                 )
             )
 

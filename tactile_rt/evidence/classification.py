@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.evidence.model_windows import stepped
@@ -73,8 +74,7 @@ def evaluate_model(
     if quick:
         test = _first_of_each(test, QUICK_SWEEPS)
     labels, objects = test.sweeps.labels, test.sweeps.objects
-    unseen = card.provenance.get("unseen_objects")
-    if not _from_elsewhere(test, card) and unseen and not set(objects.tolist()) <= set(unseen):
+    if _met(card, test):
         raise ConfigError(f"{model} may have been trained on objects that {data} tests on")
     # What may fail comes first, lest it fail after minutes.
     other = None
@@ -189,6 +189,16 @@ def _labelled(test: SweepSet, known: tuple[str, ...], model: Path, data: Path) -
     return replace(test, sweeps=replace(test.sweeps, labels=number[test.sweeps.labels]))
 
 
+def _met(card: ModelCard, test: SweepSet) -> bool:
+    """Whether the model was, or may have been, trained on objects of the test."""
+    names = set(test.sweeps.objects.tolist())
+    trained = card.provenance.get("trained_objects")
+    if isinstance(trained, dict):
+        return not names.isdisjoint(trained.get(test.manifest.source, ()))
+    unseen = set(card.provenance.get("unseen_objects", ()))
+    return not _from_elsewhere(test, card) and bool(unseen) and not names <= unseen
+
+
 def _from_elsewhere(test: SweepSet, card: ModelCard) -> bool:
     """Whether the objects are not of the source that the model was trained on."""
     trained: Any = card.provenance.get("sweep_set", {})
@@ -248,7 +258,7 @@ def _refusals_and_candidates(
     model: Path, test: SweepSet, unknown: SweepSet | None, sample: str
 ) -> list[Record]:
     """What becomes of a model's promises; nothing of one that makes none."""
-    records = []
+    records, refusals = [], set(load_model(model)[1].refusals)
     for noise, when in ((0.0, ""), (1.0, " at rated noise")):
         found = promises(model, test, Disturbance(noise=noise))
         if found is None:
@@ -260,8 +270,10 @@ def _refusals_and_candidates(
             interval = f"95 % interval {size.low:.1f} to {size.high:.1f}, by object"
             name = f"models.candidates at the last step{when}"
             records.append(Record(name, size.value, "", "", interval, sample))
-        records.append(_record(f"known things called unknown{when}", found.unknown, "", sample))
-        records.append(_record(f"sound loads called faulty{when}", found.faulty, "", sample))
+        if UNKNOWN in refusals:
+            records.append(_record(f"known things called unknown{when}", found.unknown, "", sample))
+        if refusals - {UNKNOWN}:
+            records.append(_record(f"sound loads called faulty{when}", found.faulty, "", sample))
     if unknown is not None and (found := promises(model, unknown)):
         how = f"{len(unknown.sweeps)} sweeps of withheld kinds"
         records.append(_record("unknown things called unknown", found.unknown, "", how))

@@ -15,7 +15,7 @@ from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import Interval
-from tactile_rt.models.implausible import IMPLAUSIBLE, implausible
+from tactile_rt.models.implausible import IMPLAUSIBLE
 
 __all__ = ["Promises", "familiarity", "named_faults", "promises"]
 
@@ -28,9 +28,9 @@ class Promises:
 
     Attributes:
         coverage: The share of touches that is promised, 0 to 1; NaN without a promise.
-        kept: The share of the sweeps of kinds that it knows of which the true kind was a candidate
-            at every step.
-        size: The mean number of candidates at the last step.
+        kept: The share of the sweeps of kinds that it knows, and in which it found a contact, of
+            which the true kind was a candidate at every step.
+        size: The mean number of candidates at the last step of these.
         unknown: The share of the sweeps that it calls unknown.
         faulty: The share that it refuses for what is wrong with the loads.
     """
@@ -63,11 +63,11 @@ def promises(path: Path, test: SweepSet, disturbance: Disturbance = CLEAN) -> Pr
     rule = fitting(card.candidates, disturbance.noise)
     if rule is None or (labels < 0).any():
         return Promises(float("nan"), NOTHING, NOTHING, unknown, faulty)
-    found = ~np.isnan(posteriors[:, 0, 0])
-    inside = np.zeros(len(labels), dtype=np.bool_)
-    sizes = np.full(len(labels), float(len(card.classes)))
-    for k in np.flatnonzero(found):
-        own = posteriors[k][:, : len(card.classes)]
+    found = np.flatnonzero(~np.isnan(posteriors[:, 0, 0]))
+    labels, objects = labels[found], objects[found]
+    inside, sizes = np.zeros(len(labels), dtype=np.bool_), np.zeros(len(labels))
+    for k, at in enumerate(found):
+        own = posteriors[at][:, : len(card.classes)]
         left = [rule.candidates(p, step) for step, p in enumerate(own, start=1)]
         inside[k] = all(labels[k] in names for names in left)
         sizes[k] = len(left[-1])
@@ -91,17 +91,20 @@ def familiarity(path: Path, test: SweepSet) -> NDArray[np.float32]:
     if UNKNOWN in card.refusals:
         sure = 1 - last[:, card.labels.index(UNKNOWN)]
     else:
-        sure = last.max(axis=1)
+        sure = last[:, : len(card.classes)].max(axis=1)
     found: NDArray[np.float32] = np.nan_to_num(sure, nan=0.0)
     return found
 
 
 def named_faults(path: Path, test: SweepSet) -> Iterator[tuple[str, Interval]]:
-    """Of each kind of loads that no touch makes: the share that a model refuses for its loads."""
+    """Of each kind of loads that no touch makes: the share that a model refuses for its loads.
+
+    Only of those that it has a label for.
+    """
     _, card = load_model(path)
     faults = [name for name in card.refusals if name in IMPLAUSIBLE]
     rng = np.random.default_rng(0)
-    for name in implausible(test.manifest.spec):
+    for name in faults:
         values = IMPLAUSIBLE[name](test.sweeps.values, test.manifest.spec, rng)
         spoilt = replace(test, sweeps=replace(test.sweeps, values=values))
         said = _decisions(card, _posteriors(path, spoilt, CLEAN)[:, -1])

@@ -33,7 +33,7 @@ from tactile_rt.export.windows import window_graph
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.training import TactileClassifier, load_checkpoint
 from tactile_rt.stream import ModelError
-from tactile_rt.sweep_set import SweepManifest, join_manifests
+from tactile_rt.sweep_set import OUTLIERS, SweepManifest, join_manifests
 from tactile_rt.version import VERSION
 
 __all__ = [
@@ -136,6 +136,7 @@ def export_checkpoint(
             "sweep_set": manifest.recipe,
             **({"also": [other.recipe for other in manifests[1:]]} if manifests[1:] else {}),
             "unseen_objects": list(manifests[0].split["test"]),
+            "trained_objects": _trained_objects(manifests),
             "commands": list(commands),
             "tactile_rt": VERSION,
             "torch": str(torch.__version__),  # not a plain str, which msgspec insists on
@@ -146,6 +147,15 @@ def export_checkpoint(
         figures=dict(figures or {}),
     )
     return export_step(model, card, path, precision, kind)
+
+
+def _trained_objects(manifests: Sequence[SweepManifest]) -> dict[str, list[str]]:
+    """By where the objects come from, the names of those that were trained on."""
+    found: dict[str, dict[str, None]] = {}
+    for one in manifests:
+        names = (*one.split["train"], *one.split.get(OUTLIERS, ()))
+        found.setdefault(one.source, {}).update(dict.fromkeys(names))
+    return {source: list(names) for source, names in found.items()}
 
 
 def export_step(
@@ -301,8 +311,9 @@ def parity(
 ) -> dict[str, float]:
     """Largest difference of each output, over every step, between a file and the torch window.
 
-    In units of the output's spread where that is more than 1: training makes logits larger, and
-    single precision rounds what is larger more coarsely. NaN if either computes one.
+    In units of the output's spread, or of the number itself, where that is more than 1: training
+    makes numbers larger, and single precision rounds what is larger more coarsely. NaN if either
+    computes one.
     """
     session, card = load_model(path, kind=None)
     elements, channels = card.array.shape
@@ -319,6 +330,8 @@ def parity(
             expected["embedding"] = model.network.embed(model.inputs(*arrays)).numpy()
     found = file_outputs(session, card, samples, offset, sigma)
     return {
-        name: float(np.abs(found[name] - values).max()) / max(1.0, float(values.std()))
-        for name, values in expected.items()
+        name: float(
+            (np.abs(found[name] - v) / np.maximum(max(1.0, float(v.std())), np.abs(v))).max()
+        )
+        for name, v in expected.items()
     }

@@ -5,10 +5,13 @@ as was promised, whatever the network makes of them, as long as these are drawn 
 the rule was fitted on (Vovk, Gammerman & Shafer 2005). Sweeps of one object are alike, so that an
 object counts once, however often it was swept (Lee, Barber & Willett 2023, hierarchical conformal
 prediction). A robot may stop at any step, so that the promise is about all of them at once: a
-sweep's score is that of its worst step, steps being compared by how rare their scores are.
+sweep's score is that of its worst step. What is usual at a step, which steps are compared by, is
+told by half of the objects; the other half, for which that is given, tells how far a sweep may be
+from it.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,14 +26,19 @@ from tactile_rt.classifier.decision_rules import (
 )
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import Step, at_temperature, predict
+from tactile_rt.stream import RecordingError
 
 __all__ = ["COVERAGE", "fit_candidates", "fit_unknown", "fitted_rules"]
 
 COVERAGE = 0.96
-REFUSED = 0.08  # of the sweeps of known kinds, at most, at the threshold
+REFUSED = 0.08  # of the sweeps of known kinds, at most, at each step
+LEAST = 0.05  # a smaller posterior of `unknown` refuses nothing
 FEWEST = 50  # objects below which no promise is made: it would leave nearly all classes possible
-# A rule holds up to a noise, and is fitted at these, in units of the rated.
-NOISE = {0.3: (0.0, 0.25), 1.2: (1.0,), 2.2: (2.0,)}
+USUAL = 0.9  # the share of sweeps that are no worse than what is usual at a step
+SMALLEST = 0.05  # what is usual, at least: where nearly all sweeps are right, it would be nothing
+# A rule holds up to a noise, in units of the rated, and is fitted at the ends of its range.
+NOISE = {0.3: (0.0, 0.3), 1.2: (1.2,), 2.2: (2.2,)}
+REFUSED_AT = (0.0, 1.0)  # the noise at which so few are refused, each
 
 Floats = NDArray[np.float64]
 
@@ -48,25 +56,28 @@ def fitted_rules(
         labels: what it tells apart.
         classes: how many of the labels are classes; the others are refusals.
     """
+    levels = {*REFUSED_AT, *(level for ends in NOISE.values() for level in ends)}
     posteriors = {
         level: [at_temperature(predict(one, run, level), temperature) for one in sets]
-        for level in sorted({level for levels in NOISE.values() for level in levels})
+        for level in sorted(levels)
     }
+    names = [one.sweeps.objects for one in sets]
     unknown = None
     if UNKNOWN in labels[classes:]:
         at = list(labels).index(UNKNOWN)
         groups = [
-            np.concatenate([posteriors[level][k][..., at] for level in (0.0, 1.0)])
+            (posteriors[level][k][..., at], names[k])
+            for level in REFUSED_AT
             for k in range(len(sets))
         ]
         unknown = fit_unknown(groups)
     rules = []
-    for bound, levels in NOISE.items():
+    for bound, ends in NOISE.items():
         drawn = [
             (
-                np.concatenate([posteriors[level][k][..., :classes] for level in levels]),
-                np.tile(one.sweeps.labels, len(levels)),
-                np.tile(one.sweeps.objects, len(levels)),
+                np.concatenate([posteriors[level][k][..., :classes] for level in ends]),
+                np.tile(one.sweeps.labels, len(ends)),
+                np.tile(names[k], len(ends)),
             )
             for k, one in enumerate(sets)
         ]
@@ -75,17 +86,28 @@ def fitted_rules(
     return unknown, tuple(rules)
 
 
-def fit_unknown(groups: Sequence[NDArray[np.float32]], refused: float = REFUSED) -> UnknownRule:
-    """The threshold of each step by which at most so many sweeps of known kinds are refused.
+def fit_unknown(
+    groups: Sequence[tuple[NDArray[np.float32], NDArray[np.str_]]], refused: float = REFUSED
+) -> UnknownRule:
+    """The thresholds by which at each step at most so many sweeps of known kinds are refused.
 
     Args:
-        groups: posteriors (sweep, step) of the label `unknown`, NaN where no contact was found;
-            each of the groups is refused no more.
-        refused: the share.
+        groups: posteriors (sweep, step) of the label `unknown`, NaN where no contact was found, and
+            objects (sweep,); each of the groups is refused no more.
+        refused: the share of sweeps of new objects.
+
+    Raises:
+        RecordingError: no contact in any sweep.
     """
-    each = [np.nanquantile(group, 1 - refused, axis=0) for group in groups]
-    thresholds = np.max(each, axis=0)
-    return UnknownRule(POSTERIOR, "logits", tuple(float(round(t, 6)) for t in thresholds))
+    each = []
+    for posteriors, names in _touched(groups):
+        order = np.argsort(posteriors, axis=0)
+        share = np.cumsum(_weights(names)[order], axis=0)
+        rank = (share < 1 - refused - 1e-12).sum(axis=0)  # (step,) of the threshold
+        ranked = np.vstack([np.take_along_axis(posteriors, order, axis=0), np.ones(rank.shape)])
+        each.append(ranked[rank, np.arange(len(rank))])
+    thresholds = np.maximum(np.max(each, axis=0), LEAST)
+    return UnknownRule(POSTERIOR, "logits", tuple(float(t) for t in thresholds))
 
 
 def fit_candidates(
@@ -93,27 +115,55 @@ def fit_candidates(
     noise: float,
     coverage: float = COVERAGE,
 ) -> CandidateRule | None:
-    """The quantiles that keep the promise to each of the groups; None of too few objects.
+    """The quantiles that keep the promise to each of the groups; None if one has too few objects.
 
     Args:
         groups: posteriors (sweep, step, class), NaN where no contact was found, labels (sweep,)
             and objects (sweep,).
         noise: the largest in units of the rated at which they hold.
         coverage: the promise.
+
+    Raises:
+        RecordingError: no contact in any sweep.
     """
-    fitted, objects = [], 0
-    for posteriors, labels, names in groups:
-        found = ~np.isnan(posteriors[:, 0, 0])
-        names = names[found]
-        scores = mass_above(posteriors[found])[np.arange(int(found.sum())), :, labels[found]]
-        objects += len(set(names.tolist()))
-        fitted.append(_envelope(scores, _weights(names), coverage))
-    if objects < FEWEST:
-        return None
+    fitted, objects = [], set()
+    for posteriors, labels, names in _touched(groups):
+        own = sorted(set(names.tolist()))
+        if len(own) < FEWEST:
+            return None
+        objects |= set(own)
+        scores = mass_above(posteriors)[np.arange(len(labels)), :, labels]
+        usual = np.isin(names, own[::2])
+        fitted.append(
+            _envelope(
+                scores[~usual],
+                _weights(names[~usual]),
+                _usual(scores[usual], _weights(names[usual])),
+                coverage,
+            )
+        )
     quantiles = np.max(fitted, axis=0)
     return CandidateRule(
-        MASS_ABOVE, coverage, tuple(float(q) for q in quantiles), objects, noise=noise
+        MASS_ABOVE, coverage, tuple(float(q) for q in quantiles), len(objects), noise=noise
     )
+
+
+def _touched(groups: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+    """Of each group the sweeps in which a contact was found, posteriors first; of none: left out.
+
+    Raises:
+        RecordingError: there is none in any.
+    """
+    found = [
+        (group, ~np.isnan(group[0]).reshape(len(group[0]), -1).any(axis=1)) for group in groups
+    ]
+    kept = [tuple(part[there] for part in group) for group, there in found if there.any()]
+    if not kept:
+        raise RecordingError(
+            "in no validation sweep a contact was found, so that nothing can be promised: are "
+            "the loads of the sweep set in SI units?"
+        )
+    return kept
 
 
 def _weights(names: NDArray[np.str_]) -> Floats:
@@ -123,28 +173,30 @@ def _weights(names: NDArray[np.str_]) -> Floats:
     return weights
 
 
-def _envelope(scores: Floats, weights: Floats, coverage: float) -> Floats:
+def _usual(scores: Floats, weights: Floats) -> Floats:
+    """(step,) What few sweeps (sweep, step) of scores in [0, 1) exceed at a step."""
+    order = np.argsort(scores, axis=0)
+    share = np.cumsum(weights[order], axis=0) / weights.sum()
+    rank = np.minimum((share < USUAL).sum(axis=0), len(scores) - 1)
+    usual = np.take_along_axis(scores, order, axis=0)[rank, np.arange(len(rank))]
+    clipped: Floats = np.clip(usual, SMALLEST, 1 - SMALLEST * 1e-4)
+    return clipped
+
+
+def _envelope(scores: Floats, weights: Floats, usual: Floats, coverage: float) -> Floats:
     """(step,) The scores that no step of so large a share of the sweeps exceeds.
 
     Args:
         scores: (sweep, step), in [0, 1).
         weights: (sweep,), of which the sum is less than 1.
+        usual: (step,), in (0, 1); the more, the larger a score is let through.
         coverage: the share.
     """
-    sweeps, steps = scores.shape
-    order = np.argsort(scores, axis=0)
-    ranked = np.take_along_axis(scores, order, axis=0)
-    share = np.cumsum(weights[order], axis=0)  # (sweep, step) of all that are no larger
-    rarity = np.empty_like(scores)  # (sweep, step) how large a share is no larger
-    for step in range(steps):
-        last = np.searchsorted(ranked[:, step], scores[:, step], side="right") - 1
-        rarity[:, step] = share[last, step]
-    worst = rarity.max(axis=1)
-    at = np.argsort(worst)
-    enough = np.searchsorted(np.cumsum(weights[at]), coverage)
-    if enough == sweeps:
-        return np.ones(steps)  # too few objects for any set but that of all classes
-    level = worst[at[enough]]
-    which = [np.searchsorted(share[:, step], level - 1e-12) for step in range(steps)]
-    found: Floats = ranked[np.minimum(which, sweeps - 1), np.arange(steps)]
+    # what is left of the posterior at and below a class, as a power of what usually is
+    worst = (np.log1p(-np.minimum(scores, 1 - 1e-12)) / np.log1p(-usual)).max(axis=1)
+    order = np.argsort(worst)
+    enough = np.searchsorted(np.cumsum(weights[order]), coverage - 1e-12)
+    if enough == len(worst):
+        return np.ones(len(usual))  # too few objects for any set but that of all classes
+    found: Floats = 1 - (1 - usual) ** (worst[order[enough]] * (1 + 1e-9))
     return found

@@ -1,6 +1,7 @@
 """A checkpoint made ready for robots: calibrated on validation sweeps, exported, described."""
 
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from tactile_rt.models.training import (
     run_on,
     shipped_recipes,
 )
-from tactile_rt.sweep_set import SweepManifest
+from tactile_rt.sweep_set import SweepManifest, join_manifests
 
 __all__ = ["fit_temperature", "quantisation_figures", "release", "run_file"]
 
@@ -54,7 +55,7 @@ def release(
     model, saved = load_checkpoint(checkpoint)
     config = saved["config"]
     folders = trained_on(checkpoint, saved, data)
-    known = tuple(saved["categories"])
+    known = join_manifests([SweepManifest.read(folder) for folder in folders]).categories
     sets = [
         relabelled(SweepSet.read(folder, "validation"), known)
         for folder in folders
@@ -64,7 +65,7 @@ def release(
     # Half clean, half at rated noise: what the checkpoint was chosen by, too.
     posteriors = np.concatenate([predict(validation, run_on(model), level) for level in (0.0, 1.0)])
     labels = np.tile(validation.sweeps.labels, 2)
-    temperature = fit_temperature(posteriors[:, -1], labels)
+    temperature = fit_temperature(among(posteriors[:, -1], len(known)), labels)
     told = (*known, *saved.get("refusals", ()))
     unknown, candidates = fitted_rules(sets, run_on(model), temperature, told, len(known))
     chosen = "" if precision == "fp32" else f" --precision {precision}"
@@ -153,10 +154,11 @@ def _training_options(config: dict[str, Any]) -> str:
     """The options of `tactile-rt train` that train so again; a recipe that ships says it all."""
     also, begin = tuple(config.get("also", ())), config.get("begin", "")
     here = {"data": config["data"], "also": also, "begin": begin, "seed": config["seed"]}
-    asked = TrainingConfig(**{**config, "also": also})
+    told = {f.name: config[f.name] for f in fields(TrainingConfig) if f.name in config}
+    asked = TrainingConfig(**{**told, "also": also})
     recipe = [name for name in shipped_recipes() if read_recipe(name, **here) == asked]
-    fields = ("encoder", "attender", "decoder", "width", "epochs", "batch", "learning_rate")
-    told = {"recipe": recipe[0]} if recipe else {field: config[field] for field in fields}
+    network = ("encoder", "attender", "decoder", "width", "epochs", "batch", "learning_rate")
+    told = {"recipe": recipe[0]} if recipe else {name: config[name] for name in network}
     options = [f"--{key.replace('_', '-')} {value}" for key, value in told.items()]
     options += [f"--also {folder}" for folder in also]
     options += [f"--from {begin}"] if begin else []

@@ -128,8 +128,11 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
 
 
 def labels_of_checkpoint(saved: dict[str, Any]) -> tuple[str, ...]:
-    """The names of what a checkpoint's network tells apart: categories, then refusals."""
-    return (*saved["categories"], *saved.get("refusals", ()))
+    """The names of what a checkpoint's network tells apart: categories, then refusals.
+
+    An early checkpoint has only how many they are: of that, none.
+    """
+    return (*saved.get("categories", ()), *saved.get("refusals", ()))
 
 
 def network_of(path: Path) -> dict[str, Any]:
@@ -167,10 +170,10 @@ def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> N
     both = [name for name in labels if name in known]
     to, of = [labels.index(n) for n in both], [known.index(n) for n in both]
     weights, own = trained.state_dict(), model.state_dict()
-    for name, fresh in own.items():
-        if fresh.shape != weights[name].shape:  # of the last layer: a row for every label
-            fresh[to] = weights[name][of]
-            weights[name] = fresh
+    # a row of the last layer is of a label, whose place may be another though as many are known
+    for name in [name for name in own if name.startswith("network.decoder.")][-2:]:
+        own[name][to] = weights[name][of]
+        weights[name] = own[name]
     # what the channels are limited to is the new set's to say
     kept = {name: own[name] if name.startswith("inputs.") else w for name, w in weights.items()}
     model.load_state_dict(kept)

@@ -5,9 +5,10 @@ onset on the noisy signal, and carries the tare that the detector had measured b
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,6 +29,7 @@ __all__ = [
     "find_onsets",
     "frame_of",
     "joined",
+    "of_categories",
     "relabelled",
     "windows",
 ]
@@ -130,6 +132,17 @@ def joined(sets: Sequence[SweepSet]) -> SweepSet:
         np.concatenate([one.sweeps.objects for one in sets]),
     )
     return replace(sets[0], manifest=manifest, sweeps=whole)
+
+
+def of_categories(data: SweepSet) -> SweepSet:
+    """The sweeps of its categories alone, of which training then spoils none."""
+    known = np.flatnonzero(data.sweeps.labels >= 0)
+    faults = replace(data.manifest.faults, implausible=0.0)
+    recipe = {**data.manifest.recipe, "faults": asdict(faults)}
+    there = {f.name: getattr(data.sweeps, f.name) for f in fields(data.sweeps)}
+    kept: dict[str, Any] = {k: None if v is None else v[known] for k, v in there.items()}
+    sweeps = Sweeps(**kept)
+    return replace(data, manifest=replace(data.manifest, recipe=recipe), sweeps=sweeps)
 
 
 def relabelled(data: SweepSet, categories: Sequence[str]) -> SweepSet:

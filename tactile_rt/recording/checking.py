@@ -25,7 +25,8 @@ __all__ = [
     "recorded_models",
 ]
 
-FACTS = ("onset_ns", "step", "t_ns", "final", "label", "probabilities")
+FACTS = ("onset_ns", "step", "t_ns", "final", "label", "probabilities",
+         "candidates", "coverage")  # fmt: skip
 # A recording ends with its source; what was being decided just then came too late for it.
 END_NS = NS_PER_S
 
@@ -187,6 +188,8 @@ def _of(decision: Fields) -> str:
 
 def _difference(recorded: Fields, replayed: Fields) -> str:
     for name in FACTS:
+        if name not in recorded:  # by an earlier release, that did not tell it
+            continue
         was, now = recorded[name], replayed[name]
         if was == now:
             continue

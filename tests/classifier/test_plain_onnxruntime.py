@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_rt.classifier.model_card import decided
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.stepper import Stepper
 
@@ -41,7 +42,7 @@ def ours() -> list[str]:
         evidence = stepper.run()[0] / card.temperature
         posterior = np.exp(evidence - evidence.max())
         posterior /= posterior.sum()
-        best = int(posterior.argmax())
+        best = decided(card, posterior, step + 1)
         lines.append(f"step {step + 1:2d}: {card.labels[best]} {posterior[best]:.2f}")
     return lines
 

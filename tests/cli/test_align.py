@@ -34,7 +34,7 @@ def test_score_report_and_a_baseline(call, frozen, tmp_path):
         "align", "score", MODEL, "--benchmark", frozen / "6.json", "--json", scores,
         "--page", page, "--performance", "0.91",
     )  # fmt: skip
-    assert code == 0 and "mouse24" in out and "raw sensor" in out
+    assert code == 0 and "mouse44" in out and "raw sensor" in out
     model = json.loads(scores.read_text())["models"][0]
     assert model["performance"] == 0.91 and model["layers"][0] == "encoder.conv1"
     assert page.read_text().startswith("<!doctype html>")

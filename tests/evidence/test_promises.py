@@ -73,10 +73,17 @@ def test_things_of_no_known_kind_are_counted_as_refused_or_not(tmp_path: Path) -
 
 
 def test_a_fault_is_named_where_a_label_that_is_one_is_decided(tmp_path: Path) -> None:
-    found = dict(named_faults(model(tmp_path), touched(0.1, 0.1, labels=(1, 1))))
-    assert found and all(one.value == 0 for one in found.values())
-    # the label that is most probable of every touch is now a refusal
-    other = ("none", "strong", UNKNOWN, "wrong gain", "sigma")
-    path = write_model(tmp_path / "o.onnx", labels=other, refusals=other[2:])
     data = touched(10.0, 10.0, labels=(0, 0))
-    assert {one.value for one in dict(named_faults(path, data)).values()} <= {0.0, 1.0}
+    (found,) = named_faults(model(tmp_path), data)
+    assert (found[0], found[1].value) == ("wrong gain", 0.0), "the strong one is decided"
+    # the label that is most probable of every strong touch is now that of a fault
+    other = ("none", "late", "wrong gain", UNKNOWN, "turned channels")
+    path = write_model(tmp_path / "o.onnx", labels=other, refusals=other[2:])
+    named = {name: one.value for name, one in named_faults(path, data)}
+    assert named == {"wrong gain": 1.0, "turned channels": 0.0}  # turned, they are not strong
+
+
+def test_touches_that_are_not_found_break_no_promise(tmp_path: Path) -> None:
+    all_classes = CandidateRule(MASS_ABOVE, 0.9, (1.0,) * STEPS, 80)
+    found = promises(model(tmp_path, candidates=(all_classes,)), touched(0.1, 0.0, labels=(1, 1)))
+    assert (found.kept.value, found.size.value) == (1.0, 3.0)

@@ -1,5 +1,7 @@
 """Sets that are learnt from together, things of no category, networks that begin with another."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,9 @@ from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_file import load_model
 from tactile_rt.models.implausible import IMPLAUSIBLE
 from tactile_rt.models.training import load_checkpoint, read_recipe, train
+from tactile_rt.sensor_spec import ChannelSpec, SensorSpec
+from tactile_rt.stream import ConfigError
+from tactile_rt.sweep_set import SweepManifest, join_manifests
 from tests.helpers.tiny_sweeps import plate, write_tiny_set
 
 SMALL = ("--encoder", "gru", "--attender", "none", "--decoder", "linear", "--width", 1 / 32)
@@ -130,3 +135,50 @@ def test_things_of_no_category_are_what_unknown_is_learnt_from(sets, tmp_path, c
             return model(window, 0 * silent, silent)[:, -1].softmax(-1)[:, at].mean()
 
     assert unknown("thing-0") > 0.5 > unknown("ball-5")
+
+
+def test_rows_go_by_name_where_as_many_labels_are_known_in_another_order(tmp_path, call):
+    orders = ("ball", "cube", "cone"), ("cone", "cube", "ball")
+    for k, categories in enumerate(orders):
+        write_tiny_set(tmp_path / f"set-{k}", categories=categories)
+    code, _, said = call("train", tmp_path / "set-0", tmp_path / "first", *SMALL, *QUICK)
+    assert not code, said
+    begun = ("--from", tmp_path / "first" / "best.pt", *QUICK, "--learning-rate", 1e-12)
+    assert not call("train", tmp_path / "set-1", tmp_path / "next", *begun)[0]
+    old, new = (
+        load_checkpoint(tmp_path / run / "best.pt")[0].state_dict() for run in ("first", "next")
+    )
+    for name in ("network.decoder.weight", "network.decoder.bias"):
+        assert torch.allclose(new[name], old[name][[2, 1, 0]], atol=1e-6)
+
+
+def test_sets_of_two_sensors_are_refused(sets, tmp_path, call):
+    sensor = SensorSpec(channels=(ChannelSpec(name="fx", unit="N", range=1.0, resolution=1e-3),))
+    manifest = SweepManifest.read(sets / "other")
+    replace(manifest, sensor=sensor).write(tmp_path)
+    with pytest.raises(ConfigError, match="cannot be joined: the sensor"):
+        join_manifests([manifest, SweepManifest.read(tmp_path)])
+
+
+def test_a_layer_over_categories_is_probed_and_exported_without_refusals(run, tmp_path, call):
+    code, _, said = call("probe", run / "best.pt", tmp_path / "probe", "--epochs", 2)
+    assert not code, said
+    code, _, said = call("export", tmp_path / "probe" / "best.pt", tmp_path / "p.onnx")
+    assert not code, said
+    assert load_model(tmp_path / "p.onnx")[1].labels == ("ball", "cube", "cone")
+
+
+def test_no_set_is_tested_on_that_the_model_was_trained_on(sets, run, tmp_path, call):
+    call("export", run / "best.pt", tmp_path / "m.onnx")
+    card = load_model(tmp_path / "m.onnx")[1]
+    assert "star-0" in card.provenance["trained_objects"][""]
+    code, _, said = call("eval", tmp_path / "m.onnx", sets / "other")
+    assert not code, said
+    spoilt = SweepManifest.read(sets / "other")
+    split = {**spoilt.split, "test": spoilt.split["train"], "train": ()}
+    folder = tmp_path / "spoilt"
+    replace(spoilt, split=split).write(folder)
+    for name in split["test"]:
+        (folder / f"{name}.npz").write_bytes((sets / "other" / f"{name}.npz").read_bytes())
+    code, _, said = call("eval", tmp_path / "m.onnx", folder)
+    assert code == 2 and "may have been trained on objects that" in said

@@ -175,12 +175,12 @@ class Workbench:
 
     def _score(self, run: Step) -> dict[str, NDArray[np.bool_]]:
         labels = self.test.sweeps.labels
-        last = {}
+        last, classes = {}, len(self.test.manifest.categories)
         for name, (cut, offset, sigma, found) in self._windows.items():
             parts = [slice(i, i + BATCH) for i in range(0, len(cut), BATCH)]
             logits = np.concatenate([run(cut[p], offset[p], sigma[p])[:, -1] for p in parts])
             logits[~found] = np.nan
-            last[name] = logits
+            last[name] = logits[:, :classes]  # had it to name one
         return {
             "top1": hits(last["clean"], labels),
             "top5": hits(last["clean"], labels, 5),

@@ -15,7 +15,13 @@ from torch.nn import functional as F
 
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
 from tactile_rt.models.data_checks import check_array, check_sets, check_split
-from tactile_rt.models.datasets import SweepSet, TrainingBatches, find_onsets, windows
+from tactile_rt.models.datasets import (
+    SweepSet,
+    TrainingBatches,
+    find_onsets,
+    of_categories,
+    windows,
+)
 from tactile_rt.models.ead import READOUTS
 from tactile_rt.models.evaluation import hits, predict
 from tactile_rt.models.training.config import Progress
@@ -93,7 +99,8 @@ def probe(
         check_split(path, manifest)
         splits = SweepSet.read(path, "train"), SweepSet.read(path, "validation")
         check_sets(path, splits)
-    data, validation = splits
+    # a layer over categories learns nothing of what is refused
+    data, validation = (of_categories(one) for one in splits)
     torch.manual_seed(config.seed)
     batches = TrainingBatches(data, min(WINDOWS, len(data.sweeps)), config.seed)
     begin = trained.network.encoder.lag if config.readout == "mean" else -1
@@ -126,7 +133,13 @@ def probe(
         log_epoch(folder / "history.csv", line)
     card = {
         "model": model.state_dict(),
-        "config": {**saved["config"], "data": str(path), "probe": asdict(config)},
+        "config": {
+            **saved["config"],
+            "data": str(path),
+            "also": (),
+            "begin": "",
+            "probe": asdict(config),
+        },
         "network": msgspec.to_builtins(network),
         "spec": manifest.spec.to_json(),
         "categories": list(manifest.categories),

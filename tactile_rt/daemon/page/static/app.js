@@ -348,7 +348,7 @@ function parts(s) {
     const device = p.device ? `, device ${p.device.state} ${p.device.reason}` : "";
     lines.push([p.part, `${p.url}${device}`, p.device && p.device.state !== "streaming"]);
   }
-  for (const m of s.models) lines.push([m.part, `${base(m.file)} on ${m.source}, ${m.labels.length} classes`]);
+  for (const m of s.models) lines.push([m.part, `${base(m.file)} on ${m.source}, ${m.labels.length} labels`]);
   for (const c of s.consumers) {
     const gone = Object.entries(c.queue.dropped).filter(([, n]) => n).map(([k, n]) => `${n} ${k} dropped`);
     const about = Object.entries(c.details).filter(([, v]) => v !== "").map(([k, v]) => `${k.replaceAll("_", " ")} ${v}`);
