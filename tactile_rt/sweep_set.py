@@ -1,6 +1,6 @@
 """Streams at rest: a sweep set is a folder of arrays for training and evaluation.
 
-    sets/mouse24/
+    sets/default24/
         manifest.json      what the set is: array, period, categories, split by object, recipe
         mug-17.npz         every sweep of one object
         skipped.json       objects that could not be made, and why

@@ -106,6 +106,7 @@ def onnx_model(path: Path) -> Method:
     """A model file, as it is."""
     session, card = load_model(path)
     run = stepped(session, card)
+
     def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
         return evaluation.predict(sweeps, run, disturbance=disturbance)[:, -1]
 

@@ -3,8 +3,10 @@
 python -m bench.shipped FOLDER [--from CLONES] [--name NAME] [--seeds 0 1 2]
 
 It goes on with what is missing of FOLDER. The objects come from GitHub or from clones, every file
-checked by its hash. Of the networks the one that is best on validation sweeps goes to
-FOLDER/NAME.pt, in half precision, and from there to FOLDER/NAME.onnx.
+checked by its hash. A network learns from all sets, with smoothed labels; then it goes on with
+sharp ones, once on the sets as they are and once mostly on real things, and the mean of the two
+networks' weights is taken (Wortsman et al. 2022, model soups). Of the seeds the one that is best on
+validation sweeps goes to FOLDER/NAME.pt, in half precision, and from there to FOLDER/NAME.onnx.
 """
 
 import argparse
@@ -14,6 +16,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -29,7 +32,10 @@ from tactile_rt.sweep_set import OUTLIERS
 RECIPES = Path(__file__).parent / "recipes"
 LISTS = ("real", "everyday")
 SPLITS = ("train", "validation", OUTLIERS)
+WIDE = "wide27"  # real things in the wide world
+OFTEN = "standing27"  # real things as they stand, once more
 STANDING = 12  # further sweeps of every real object that stands
+AGAIN = (3, 1)  # times these are learnt from in the second stage, by network
 
 
 def main() -> int:
@@ -79,8 +85,8 @@ def recipes(objects: Path) -> list[SweepRecipe]:
         read_recipe("poses24"),
         everyday,
         real,
-        replace(real, name="standing27", seed=1, sweeps=again),
-        replace(real, name="wide27", sweeps=fallen),
+        replace(real, name=OFTEN, seed=1, sweeps=again),
+        replace(real, name=WIDE, sweeps=fallen),
         wide,
         read_recipe("default24"),
     ]
@@ -90,33 +96,49 @@ def _of(recipe: SweepRecipe, objects: Path) -> SweepRecipe:
     return replace(recipe, objects=replace(recipe.objects, source=str(objects)))
 
 
-def _trained(folder: Path, sets: list[Path], seed: int) -> Path:
-    """A network's checkpoint; each is trained by a process of its own."""
+def _trained(folder: Path, sets: list[Path], seed: int) -> list[Path]:
+    """The checkpoints of which the mean is taken.
+
+    What a network says of real things in the wide world is little more than a guess. So that its
+    candidates are not judged by these, it goes on without them.
+    """
     run = folder / f"run-{seed}"
+    _train(sets, run, "--recipe", "mouse44", "--seed", str(seed))
+    begun = ("--from", str(run / "best.pt"), "--recipe", "sharpen", "--seed", str(seed))
+    for times in AGAIN:
+        again = [one for one in sets for _ in range(times if one.name == OFTEN else 1)]
+        _train([s for s in again if s.name != WIDE], folder / f"sharp-{seed}-{times}", *begun)
+    return [folder / f"sharp-{seed}-{times}" / "best.pt" for times in AGAIN]
+
+
+def _train(sets: list[Path], run: Path, *options: str) -> None:
     first, *others = map(str, sets)
     also = [part for other in others for part in ("--also", other)]
     program = (sys.executable, "-c", "from tactile_rt.cli import main; main()")
-    command = [*program, "train", first, str(run), *also]
-    subprocess.run([*command, "--recipe", "mouse44", "--seed", str(seed)], check=True)
-    return run / "best.pt"
+    subprocess.run([*program, "train", first, str(run), *also, *options], check=True)
 
 
-def _validated(checkpoint: Path) -> float:
-    """By what the epoch was chosen, too."""
-    metrics = torch.load(checkpoint, map_location="cpu", weights_only=True)["metrics"]
-    return float(metrics["validation_top1"] + metrics["validation_top1_noisy"])
+def _validated(checkpoints: list[Path]) -> float:
+    """By what their epochs were chosen, too."""
+    metrics = [_read(checkpoint)["metrics"] for checkpoint in checkpoints]
+    return sum(m["validation_top1"] + m["validation_top1_noisy"] for m in metrics)
 
 
-def _write_weights(checkpoint: Path, path: Path) -> None:
-    """The checkpoint with its numbers in half precision."""
-    saved = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    saved["model"] = {
-        name: value.half()
-        if value.is_floating_point() and not name.startswith("inputs.")
-        else value
-        for name, value in saved["model"].items()
-    }
-    save_whole(path, saved)
+def _write_weights(checkpoints: list[Path], path: Path) -> None:
+    """The last checkpoint with the mean of all numbers, in half precision."""
+    saved = [_read(checkpoint) for checkpoint in checkpoints]
+    weights = {}
+    for name, value in saved[-1]["model"].items():
+        if value.is_floating_point() and not name.startswith("inputs."):
+            weights[name] = torch.stack([s["model"][name].double() for s in saved]).mean(0).half()
+        else:
+            weights[name] = value
+    save_whole(path, {**saved[-1], "model": weights, "made_by": "python -m bench.shipped FOLDER"})
+
+
+def _read(checkpoint: Path) -> dict[str, Any]:
+    saved: dict[str, Any] = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    return saved
 
 
 if __name__ == "__main__":

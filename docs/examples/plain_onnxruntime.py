@@ -6,9 +6,7 @@ import sys
 import numpy as np
 import onnxruntime as ort
 
-options = ort.SessionOptions()
-options.intra_op_num_threads = 1  # a step is too short for more
-session = ort.InferenceSession(sys.argv[1], options, providers=["CPUExecutionProvider"])
+session = ort.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
 card = json.loads(session.get_modelmeta().custom_metadata_map["tactile_rt"])
 elements, channels = len((spec := json.loads(card["spec"]))["elements"]), len(spec["channels"])
 names = [output.name for output in session.get_outputs()]
@@ -20,26 +18,23 @@ quiet = rng.normal(size=(50, elements, channels)).astype(np.float32) * floor
 offset, sigma = quiet.mean(axis=0)[None], np.maximum(quiet.std(axis=0), floor)[None]
 
 # An episode begins at contact, with a state of zeros.
-feed = {"offset": offset, "sigma": sigma}
-for state in card["state"]:
-    feed[state["name"]] = np.zeros((1, *state["shape"]), dtype=state["dtype"])
+state = {s["name"]: np.zeros((1, *s["shape"]), dtype=s["dtype"]) for s in card["state"]}
 
 for step in range(card["steps"]):
     # Here your array's samples, one every card["period_ns"], with its elements in the order of
     # spec["elements"]; made up: a touch ten times stronger than noise.
     samples = rng.normal(size=(1, card["substeps"], elements, channels)).astype(np.float32)
     samples *= 10 * floor
-    out = dict(zip(names, session.run(names, {"samples": samples, **feed}), strict=True))
-    for state in card["state"]:
-        feed[state["name"]] = out[state["name"] + "_next"]
+    feed = {"samples": samples, "offset": offset, "sigma": sigma, **state}
+    out = dict(zip(names, session.run(names, feed), strict=True))
+    state = {name: out[name + "_next"] for name in state}
     evidence = out["logits"][0] / card["temperature"]
     posterior = np.exp(evidence - evidence.max())
     posterior /= posterior.sum()
     best = int(posterior.argmax())
-    faults = {*card.get("refusals", ())} - {"unknown"}
-    if card.get("unknown") and card["labels"][best] not in faults:
+    if card.get("unknown") and card["labels"][best] not in {*card["refusals"]} - {"unknown"}:
         limits, unknown = card["unknown"]["thresholds"], card["labels"].index("unknown")
-        doubt, posterior[unknown] = float(posterior[unknown]), -1  # it has a threshold of its own
-        best = unknown if doubt > limits[min(step, len(limits) - 1)] else int(posterior.argmax())
-        posterior[unknown] = doubt
+        others = np.where(np.arange(len(posterior)) == unknown, -1, posterior)
+        doubtful = posterior[unknown] > limits[min(step, len(limits) - 1)]
+        best = unknown if doubtful else int(others.argmax())
     print(f"step {step + 1:2d}: {card['labels'][best]} {posterior[best]:.2f}")  # noqa: T201

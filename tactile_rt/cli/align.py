@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 from typer.core import TyperCommand
 
 from tactile_rt.cli.app import app, check_output, needs, progress_bar
@@ -319,10 +319,12 @@ def _show_scores(results: Any) -> None:
 
 
 def _show_decoded(rows: list[tuple[str, str, Any]]) -> None:
-    table = Table("layer", "variant", "shape", "chance", "p", "distance", "chance", "p")
+    layer = Column("layer", overflow="fold")
+    table = Table(layer, "shape", "chance", "p", "distance", "chance", "p")
     for name, variant, d in rows:
         table.add_row(
-            name, variant, *(_said(v) for v in (d.shape, d.shape_chance)), _said(d.shape_p, 3),
+            f"{name} ({variant})" if variant else name,
+            *(_said(v) for v in (d.shape, d.shape_chance)), _said(d.shape_p, 3),
             *(_said(v) for v in (d.distance, d.distance_chance)), _said(d.distance_p, 3),
         )  # fmt: skip
     Console().print(table)

@@ -16,6 +16,7 @@ from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.export.precision import Precision
 from tactile_rt.export.promises import fitted_rules
+from tactile_rt.models.checkpoints import NETWORK
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet, joined, relabelled
 from tactile_rt.models.evaluation import Step, among, hits, predict
@@ -65,7 +66,9 @@ def release(
     # Half clean, half at rated noise: what the checkpoint was chosen by, too.
     posteriors = np.concatenate([predict(validation, run_on(model), level) for level in (0.0, 1.0)])
     labels = np.tile(validation.sweeps.labels, 2)
-    temperature = fit_temperature(among(posteriors[:, -1], len(known)), labels)
+    last = among(posteriors[:, -1], len(known))
+    right = hits(last, labels).reshape(2, -1).mean(axis=1).tolist()
+    temperature = fit_temperature(last, labels)
     told = (*known, *saved.get("refusals", ()))
     unknown, candidates = fitted_rules(sets, run_on(model), temperature, told, len(known))
     chosen = "" if precision == "fp32" else f" --precision {precision}"
@@ -76,13 +79,14 @@ def release(
         name,
         temperature=temperature,
         rules=(unknown, candidates),
-        figures={k: v for k, v in saved["metrics"].items() if k.startswith("validation")},
+        figures={"validation_top1": right[0], "validation_top1_noisy": right[1]},
         commands=(
             *(
                 f"tactile-rt sweep {folder} {_sweep_options(SweepManifest.read(folder).recipe)}"
                 for folder in folders
             ),
-            f"tactile-rt train {config['data']} {checkpoint.parent} {_training_options(config)}",
+            saved.get("made_by")
+            or f"tactile-rt train {config['data']} {checkpoint.parent} {_training_options(config)}",
             f"tactile-rt export {checkpoint} {path.name} --name {name}{chosen}",
         ),
         precision=precision,
@@ -154,6 +158,8 @@ def _training_options(config: dict[str, Any]) -> str:
     """The options of `tactile-rt train` that train so again; a recipe that ships says it all."""
     also, begin = tuple(config.get("also", ())), config.get("begin", "")
     here = {"data": config["data"], "also": also, "begin": begin, "seed": config["seed"]}
+    if begin:  # whose network it is
+        here |= {name: config[name] for name in NETWORK if name in config}
     told = {f.name: config[f.name] for f in fields(TrainingConfig) if f.name in config}
     asked = TrainingConfig(**{**told, "also": also})
     recipe = [name for name in shipped_recipes() if read_recipe(name, **here) == asked]

@@ -4,7 +4,7 @@ replay:run.mcap                                   the recorded chunks, as fast a
 replay:run.mcap?speed=10                          ten times as fast; 0: as fast as they are read
 replay:run.mcap?from=wire                         raw packets, decoded again
 replay:run.mcap?from=wire&codec=native            by another codec than the recorded one
-replay:data/mouse24/mug-1.npz?sweep=3&rest_s=1    one object's sweeps out of a sweep set
+replay:data/default24/mug-1.npz?sweep=3&rest_s=1    one object's sweeps out of a sweep set
 """
 
 import math

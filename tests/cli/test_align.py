@@ -36,7 +36,7 @@ def test_score_report_and_a_baseline(call, frozen, tmp_path):
     )  # fmt: skip
     assert code == 0 and "mouse44" in out and "raw sensor" in out
     model = json.loads(scores.read_text())["models"][0]
-    assert model["performance"] == 0.91 and model["layers"][0] == "encoder.conv1"
+    assert model["performance"] == 0.91 and model["layers"][0] == "encoder.layer0"
     assert page.read_text().startswith("<!doctype html>")
     again = tmp_path / "again.html"
     assert call("align", "report", scores, "--out", again)[0] == 0
@@ -53,7 +53,7 @@ def test_score_report_and_a_baseline(call, frozen, tmp_path):
         "validity": "pass", "turing": "fail", "regression": "pass", "fidelity": "pass"
     }  # fmt: skip
     assert code == found["exit_code"] == 1
-    assert {tap["layer"] for tap in found["taps"]} >= {"encoder.conv1", "output"}
+    assert {tap["layer"] for tap in found["taps"]} >= {"encoder.layer0", "output"}
 
 
 def test_the_gate_without_neural_data(call):
@@ -95,7 +95,7 @@ def test_what_the_gate_cannot_read_is_an_input_error(call, frozen, tmp_path):
 def test_decode(call, frozen, tmp_path):
     table = tmp_path / "table.json"
     code, out, _ = call("align", "decode", MODEL, "--benchmark", frozen / "1.json", "--json", table)
-    assert code == 0 and "encoder.fc8" in out
+    assert code == 0 and "encoder.layer1" in out
     rows = json.loads(table.read_text())
     assert rows[0]["name"] == "raw sensor input" and rows[-1]["name"] == "mouse-0"
     assert rows[0]["shape_chance"] == pytest.approx(0.5)

@@ -110,7 +110,7 @@ def test_without_mujoco_a_recording_is_played_over_a_serial_port(call, monkeypat
     code, out, err = call("demo", "--sweeps", "2")
     first, second, summary = out.splitlines()
     assert (code, err) == (0, "")
-    assert first.startswith("bowl-50 ") and second.startswith("dumbbell-53 ")
+    assert first.startswith("birdcage-58 ") and second.startswith("grapes-49 ")
     assert first.endswith("right") and second.endswith("right")
     assert "2 of 2 right (100 %)" in summary
     code, out, err = call("demo", "--fast")

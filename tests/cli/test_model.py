@@ -48,12 +48,12 @@ def test_show_says_what_the_shipped_model_is(call):
     assert (code, err) == (0, "")
     words = " ".join(out.split())
     for said in (
-        f"{len(data) / 1e6:.2f} MB, fp32, metadata version {card.version}",
+        f"{len(data) / 1e6:.2f} MB, fp16, metadata version {card.version}",
         f"{sum(contents.operators.values())} operators, opset 20",
         "mouse-right: 30 elements x fx, fy, fz, mx, my, mz at 1000 Hz",
         "a step is 5 x 9 ms, an episode 22 steps",
-        "24: beehive, birdcage",
-        "embedding 64 units",
+        "44: beehive, birdcage",
+        "embedding 256 units",
     ):
         assert said in words
 

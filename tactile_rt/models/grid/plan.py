@@ -1,6 +1,6 @@
 """What a grid trains: a TOML file of encoder x attender x objective under one budget.
 
-data = "data/mouse24"
+data = "data/default24"
 updates = 600
 [[cell]]
 encoder = "zhuang-gru"

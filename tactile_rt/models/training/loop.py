@@ -3,7 +3,7 @@
 A run that is killed goes on from its last finished epoch and ends with the same numbers as one
 that was not. Under torchrun every process has a share of each batch:
 
-    torchrun --nproc-per-node 2 --no-python tactile-rt train data/mouse24 runs/mouse24
+    torchrun --nproc-per-node 2 --no-python tactile-rt train data/default24 runs/mine
 """
 
 import os

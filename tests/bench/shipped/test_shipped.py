@@ -39,7 +39,7 @@ def test_weights_in_half_precision_are_the_network(tmp_path: Path) -> None:
     config = TrainingConfig(str(tmp_path / "set"), encoder="gru", width=1 / 8)
     whole = initialise(config, tmp_path / "run")
     half = tmp_path / "half.pt"
-    _write_weights(whole, half)
+    _write_weights([whole, whole], half)
     assert half.stat().st_size < 0.6 * whole.stat().st_size
     (one, saved), (other, told) = load_checkpoint(whole), load_checkpoint(half)
     assert told["categories"] == saved["categories"]
@@ -49,3 +49,18 @@ def test_weights_in_half_precision_are_the_network(tmp_path: Path) -> None:
         a, b = one(samples, rest, rest + 1e-6), other(samples, rest, rest + 1e-6)
     assert torch.equal(other.inputs.scale, one.inputs.scale)
     assert torch.allclose(a, b, atol=2e-3) and not torch.equal(a, b)
+
+
+def test_the_weights_are_the_mean_of_the_networks(tmp_path: Path) -> None:
+    write_tiny_set(tmp_path / "set")
+    runs = [
+        initialise(TrainingConfig(str(tmp_path / "set"), "gru", width=1 / 8, seed=seed), folder)
+        for seed, folder in enumerate((tmp_path / "a", tmp_path / "b"))
+    ]
+    _write_weights(runs, tmp_path / "mean.pt")
+    one, other, mean = (
+        torch.load(path, weights_only=True)["model"] for path in (*runs, tmp_path / "mean.pt")
+    )
+    for name, value in mean.items():
+        between = (one[name] + other[name]) / 2 if value.is_floating_point() else one[name]
+        assert torch.allclose(value.float(), between.float(), atol=1e-3), name

@@ -130,7 +130,9 @@ def exported(tmp_path_factory):
     """A small network and its export."""
     torch.manual_seed(2)
     card = load_model(shipped_model())[1]
-    model = TactileClassifier(card.array, EADConfig(24, "gru", "none", "mlp", width=1 / 16)).eval()
+    model = TactileClassifier(
+        card.array, EADConfig(len(card.labels), "gru", "none", "mlp", width=1 / 16)
+    ).eval()
     stir(model)
     path = tmp_path_factory.mktemp("gate") / "step.onnx"
     export_step(model, msgspec.structs.replace(card, provenance={}, figures={}), path)
