@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 __all__ = ["RECORDING", "Demonstration", "SweepOutcome"]
 
 RECORDING = Path(__file__).parents[1] / "assets" / "demo.mcap"  # see bench/write_demo.py
-END_NS = 50_000_000  # before the end of what is played: the last samples may be lost
+END_NS = 50_000_000  # before the end of the recording: the last samples may be lost
 LATENCIES_KEPT = 10_000  # steps that the latency percentiles look back on: a demo may run for days
 
 
@@ -147,9 +147,10 @@ class Demonstration:
         told = [notes[f"pass_{i}"].split() for i in range(len(notes))]
         passes = [RecordedPass(int(start), name, category) for start, name, category in told]
         chunks = list(recording)
-        ends = [p.start_ns for p in passes[1:]] + [int(chunks[-1].t_ns[-1] - chunks[0].t_ns[0])]
+        last = int(chunks[-1].t_ns[-1] - chunks[0].t_ns[0])
+        ends = [p.start_ns for p in passes[1:]] + [last - END_NS]
         count = min(sweeps or len(passes), len(passes))
-        self.passes, self._ends_ns = passes[:count], ends[count - 1] - END_NS
+        self.passes, self._ends_ns = passes[:count], ends[count - 1]
         played = self._device.enter_context(open_source(f"replay:{RECORDING}?speed=0"))
         device = self._device.enter_context(EmulatedSerial(played, "native", log=False))
         return open_source(device.url)

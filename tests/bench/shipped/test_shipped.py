@@ -54,7 +54,9 @@ def test_weights_in_half_precision_are_the_network(tmp_path: Path) -> None:
 def test_the_weights_are_the_mean_of_the_networks(tmp_path: Path) -> None:
     write_tiny_set(tmp_path / "set")
     runs = [
-        initialise(TrainingConfig(str(tmp_path / "set"), "gru", width=1 / 8, seed=seed), folder)
+        initialise(
+            TrainingConfig(str(tmp_path / "set"), encoder="gru", width=1 / 8, seed=seed), folder
+        )
         for seed, folder in enumerate((tmp_path / "a", tmp_path / "b"))
     ]
     _write_weights(runs, tmp_path / "mean.pt")
