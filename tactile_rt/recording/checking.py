@@ -191,6 +191,8 @@ def _difference(recorded: Fields, replayed: Fields) -> str:
         if name not in recorded:  # by an earlier release, that did not tell it
             continue
         was, now = recorded[name], replayed[name]
+        if name == "candidates":
+            was, now = list(was), list(now)  # a message has no tuples
         if was == now:
             continue
         if name != "probabilities":
