@@ -30,7 +30,7 @@ from tactile_rt.stream import RecordingError
 
 __all__ = ["COVERAGE", "fit_candidates", "fit_unknown", "fitted_rules"]
 
-COVERAGE = 0.96
+COVERAGE = 0.95
 REFUSED = 0.08  # of the sweeps of known kinds, at most, at each step
 LEAST = 0.05  # a smaller posterior of `unknown` refuses nothing
 FEWEST = 50  # objects below which no promise is made: it would leave nearly all classes possible
