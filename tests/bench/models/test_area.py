@@ -42,12 +42,8 @@ def test_it_makes_what_it_evaluates(quick, monkeypatch):
 def test_from_nothing_to_every_barred_figure():
     records = {r.name: r for r in area.run(quick=True)}
     assert [name for name, r in records.items() if r.bar] == [
-        "models.top-1",
-        "models.top-5",
-        "models.two sweeps fused",
-        "models.points lost at rated noise",
         "models.calibration error",
         "models.step.parity",
     ]
-    assert records["models.top-1"].value > 50  # a broken model guesses: 4 %
+    assert records["models.top-1"].value > 20  # in any pose; a broken model guesses: 2 %
     assert records["models.step.parity"].met
