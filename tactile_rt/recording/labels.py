@@ -1,0 +1,197 @@
+"""What was touched when: intervals of recordings with a label, in a CSV file beside them.
+
+    recording,start_s,end_s,label,object
+    night.mcap,12.5,31,mug,red mug
+    night.mcap,35,52.25,plate,
+
+Times are seconds since the recording's first sample, file names are relative to the CSV. The column
+``object`` (which of the mugs it was) may be left out, and ``recording`` where there is one alone.
+Whoever labels as a robot touches appends line by line; a line is there whole or not at all.
+"""
+
+import csv
+import io
+import math
+import os
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+
+from tactile_rt.settings import check_columns, convert, nearest, read_csv, refusal
+from tactile_rt.stream import ConfigError
+
+__all__ = ["LABELS", "Interval", "append_label", "check_name", "label_of_file", "read_labels"]
+
+LABELS = "labels.csv"  # beside the recordings
+NEEDED = ("start_s", "end_s", "label")
+COLUMNS = ("recording", *NEEDED, "object")
+LONGEST = 60  # characters of a name, as it becomes part of a file's
+RESERVED = ("unknown", "unlabelled")  # a model's refusal, and a touch that nobody labelled
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interval:
+    """A part of a recording in which one thing is touched.
+
+    Attributes:
+        label: The kind of thing.
+        start_s, end_s: Seconds since the recording's first sample; the end is not in it.
+        object: Which of the things of this kind; empty: it is not told.
+        where: File and line, for messages; empty: not out of a file.
+    """
+
+    label: str
+    start_s: float = 0.0
+    end_s: float = math.inf
+    object: str = ""
+    where: str = ""
+
+    @property
+    def thing(self) -> tuple[str, str]:
+        """What was touched: label and object."""
+        return self.label, self.object
+
+
+class _Row(msgspec.Struct):
+    start_s: float
+    end_s: float
+    label: str
+    recording: str = ""
+    object: str = ""
+
+
+def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Interval]]:
+    """The intervals of a file by recording, also of recordings that are not asked for.
+
+    Args:
+        path: the CSV file.
+        recordings: those asked for; the paths of these are keys as they are given here.
+
+    Raises:
+        ConfigError: it cannot be read, or a line is wrong; names file, line and column, and what to
+            do.
+    """
+    table = read_csv(path)
+    check_columns(table, COLUMNS, NEEDED)
+    if "recording" not in table.columns and len(recordings) > 1:
+        raise ConfigError(
+            f"{table.where}: no column recording, which {len(recordings)} recordings need; add it"
+        )
+    known = {one.resolve(): one for one in recordings}
+    found: dict[Path, list[Interval]] = {one: [] for one in recordings}
+    for node in table.rows:
+        row = convert(node, _Row, lax=True)
+        for column, name in (("label", row.label), ("object", row.object)):
+            if why := check_name(name, empty=column == "object"):
+                raise refusal(node, [column], why)
+        if row.start_s < 0:
+            raise refusal(node, ["start_s"], f"must be 0 or more, not {row.start_s:g}")
+        if row.end_s <= row.start_s:
+            raise refusal(node, ["end_s"], f"must be after start_s, {row.start_s:g} s")
+        file = path.parent / row.recording
+        if not row.recording and len(recordings) > 1:
+            raise refusal(node, ["recording"], "is empty; name one of several recordings")
+        one = known.get(file.resolve()) if row.recording else recordings[0]
+        if one is None and not file.is_file():
+            names = sorted(r.name for r in recordings)
+            why = f"no file {row.recording!r} beside {path.name}; {nearest(row.recording, names)}"
+            raise refusal(node, ["recording"], why)
+        found.setdefault(one or file, []).append(
+            Interval(
+                label=row.label,
+                start_s=row.start_s,
+                end_s=row.end_s,
+                object=row.object,
+                where=node.where,
+            )
+        )
+    return found
+
+
+def append_label(path: Path, recording: str, interval: Interval) -> None:
+    """Add a line to a file, which is made if it is not there; on return it is on the disk.
+
+    A line is written at once. What an interruption has left of an earlier one ends where the next
+    begins, so that it spoils no other.
+
+    Args:
+        path: the CSV file.
+        recording: name of the recording, relative to the file's folder.
+        interval: what to say of it.
+
+    Raises:
+        ConfigError: a name that cannot be, times out of order, or a file with other columns.
+    """
+    for what, name in (("label", interval.label), ("object", interval.object)):
+        if why := check_name(name, empty=what == "object"):
+            raise ConfigError(f"{what} {name!r}: {why}")
+    if not 0 <= interval.start_s < interval.end_s < math.inf:
+        raise ConfigError(f"start_s must be 0 or more and before end_s: {interval}")
+    new = not path.exists() or not path.stat().st_size
+    if not new and (columns := read_columns(path)) != COLUMNS:
+        raise ConfigError(
+            f"{path}:1: columns are {','.join(columns)}, not {','.join(COLUMNS)}: name another file"
+        )
+    times = (f"{t:.6f}".rstrip("0").rstrip(".") for t in (interval.start_s, interval.end_s))
+    text = _line(recording, *times, interval.label, interval.object)
+    with path.open("ab+") as file:
+        if new:
+            text = _line(*COLUMNS) + text
+        else:
+            file.seek(-1, os.SEEK_END)
+            text = text if file.read(1) == b"\n" else "\n" + text
+        file.write(text.encode())  # one write, at the end
+        file.flush()
+        os.fsync(file.fileno())
+    if new:
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)  # the name, too
+        finally:
+            os.close(folder)
+
+
+def read_columns(path: Path) -> tuple[str, ...]:
+    """The names of a file's columns."""
+    with path.open(newline="", encoding="utf-8-sig") as file:
+        return tuple(cell.strip() for cell in next(csv.reader(file), []))
+
+
+def check_name(name: str, empty: bool = False) -> str:
+    """Why a text cannot be a label or an object's name, which become names of files; "": it can.
+
+    Args:
+        name: the text.
+        empty: whether it may be empty.
+    """
+    if not name:
+        return "" if empty else "is empty; name what is touched"
+    if name in RESERVED:
+        return f"{name!r} has a meaning of its own; name it otherwise"
+    if not name.isprintable() or name.startswith(".") or set(name) & set('/\\@:*?"<>|'):
+        return f"{name!r} cannot be part of a file's name; use letters, digits, -, _ and spaces"
+    if len(name) > LONGEST:
+        return f"{name!r} is too long: {len(name)} characters, {LONGEST} at most"
+    return ""
+
+
+def label_of_file(path: Path) -> str:
+    """The label that a recording's name tells: `mug` of ``mug.mcap``, ``mug-3.mcap``, ``mug_3``.
+
+    Raises:
+        ConfigError: it tells none.
+    """
+    stem = re.sub(r"-\d{8}T\d{6}Z$", "", path.stem)  # of a rotated file
+    label = re.sub(r"[-_ ]\d+$", "", stem)
+    if why := check_name(label):
+        raise ConfigError(f"{path}: its name tells no label: {why}")
+    return label
+
+
+def _line(*cells: str) -> str:
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerow(cells)
+    return out.getvalue()
