@@ -31,7 +31,7 @@ from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, ModelError
 
-__all__ = ["Classification", "Classifier", "ClassifierStats", "fuse"]
+__all__ = ["Classification", "Classifier", "ClassifierStats", "fuse", "without_bad_samples"]
 
 Mode = Literal["episode", "sliding"]
 EVERY = 4
@@ -200,7 +200,7 @@ class Classifier:
     def push(self, chunk: Chunk) -> list[Classification]:
         """Take samples as they come from the array, return the decisions that they complete."""
         # What no sensor measures is not taken for a measurement: no number, infinite, or absurd.
-        chunk, bad = _without_bad_samples(chunk)
+        chunk, bad = without_bad_samples(chunk)
         self.stats.bad_samples += bad
         resampled = self._resampler.push(chunk)
         if resampled is None:
@@ -335,7 +335,7 @@ def fuse(posteriors: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
     return normalised
 
 
-def _without_bad_samples(chunk: Chunk) -> tuple[Chunk, int]:
+def without_bad_samples(chunk: Chunk) -> tuple[Chunk, int]:
     """Mark elements invalid that claim a value which is none.
 
     Returns:

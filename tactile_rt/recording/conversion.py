@@ -10,12 +10,12 @@ from tactile_rt.recording.as_arrays import TEXTS, read_npz, write_npz
 from tactile_rt.recording.as_csv import beside, read_csv, write_csv
 from tactile_rt.recording.as_hdf5 import need_h5py, read_hdf5, write_hdf5
 from tactile_rt.recording.description import RECOVERED, Description
-from tactile_rt.recording.layout import SAMPLES, Raw, need_mcap, samples_in
+from tactile_rt.recording.layout import SAMPLES, Raw, decode_samples, need_mcap, samples_in
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.writer import McapFile
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import Chunk, ConfigError
 
-__all__ = ["convert", "outputs_of"]
+__all__ = ["chunks_of", "convert", "outputs_of"]
 
 MCAP, HDF5 = ".mcap", (".h5", ".hdf5")
 READERS = {".npz": read_npz, ".csv": read_csv, **dict.fromkeys(HDF5, read_hdf5)}
@@ -43,14 +43,9 @@ def convert(path: str | Path, output: str | Path) -> int:
     """
     path, output = Path(path), Path(output)
     for file in (path, output):
-        if file.suffix not in (MCAP, *READERS):
-            raise ConfigError(f"{file} is neither .mcap nor {', '.join(READERS)}")
+        _check_kind(file)
     if path.suffix == output.suffix == MCAP:
         raise ConfigError(f"{path} is a recording already: {output} would be no other")
-    if {path.suffix, output.suffix} & set(HDF5):
-        need_h5py()
-    if MCAP in (path.suffix, output.suffix):
-        need_mcap()
     about, raws = _read(path)
     n = 0
 
@@ -61,6 +56,29 @@ def convert(path: str | Path, output: str | Path) -> int:
     with closing(raws):
         write_whole(output, fill)
     return n
+
+
+def chunks_of(path: str | Path) -> tuple[Description, Generator[Chunk, None, None]]:
+    """What a recording of any form is of, and its chunks, as they were recorded.
+
+    Raises:
+        ConfigError: no such file, a file of another kind, or an extra is not installed.
+        RecordingError: it is damaged; the chunks raise it, too.
+    """
+    path = Path(path)
+    _check_kind(path)
+    about, raws = _read(path)
+    return about, (decode_samples(r.data, about.spec.shape) for r in raws if r.topic == SAMPLES)
+
+
+def _check_kind(path: Path) -> None:
+    """Refuse what is no form of a recording, or needs an extra that is not there."""
+    if path.suffix not in (MCAP, *READERS):
+        raise ConfigError(f"{path} is neither .mcap nor {', '.join(READERS)}")
+    if path.suffix in HDF5:
+        need_h5py()
+    if path.suffix == MCAP:
+        need_mcap()
 
 
 def _read(path: Path) -> tuple[Description, Generator[Raw, None, None]]:

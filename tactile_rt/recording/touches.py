@@ -1,0 +1,151 @@
+"""The touches in a stream, cut as a classifier meets them.
+
+    chunks -> Resampler -> ContactDetector -> Touch: rest, then a window from the onset on
+
+Goals: a network that learns from a touch gets the very numbers that a running `Classifier` would
+have fed it: the same resampled samples, the same onset, the same tare.
+
+Plan: the stream goes through the resampler and the detector that a classifier has. An onset begins
+a touch, as long as an episode; while it lasts no other begins. With a touch goes the rest before
+it: the latest samples without contact, as these are what its tare was measured on; enough of them
+that the detector, run on a touch alone, has forgotten how it began when the onset comes, and finds
+it where it found it in the stream. A touch that a classifier would have had no samples for, as the
+stream ended or had a gap, is given with the reason why it is none to learn from.
+"""
+
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.classifier.classifier import without_bad_samples
+from tactile_rt.classifier.contact import (
+    BASELINE_SAMPLES,
+    FIRST_GUARD_SAMPLES,
+    TARE_SAMPLES,
+    ContactDetector,
+)
+from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.stream import ArraySpec, Chunk
+from tactile_rt.timing import Timing
+
+__all__ = ["ENDS", "GAP", "REST", "UNSURE", "Touch", "find_touches"]
+
+REST = 2 * BASELINE_SAMPLES  # samples before the onset: a whole baseline, measured on a whole one
+LEAST_REST = TARE_SAMPLES + FIRST_GUARD_SAMPLES
+SURE = FIRST_GUARD_SAMPLES  # samples by which an onset may be found elsewhere than in the stream
+# why a touch is none to learn from
+ENDS = "before whose window ends the recording ends"
+GAP = "with lost or invalid samples in their window"
+UNSURE = "whose onset is not found again after so short a rest"
+
+
+@dataclass(frozen=True)
+class Touch:
+    """One touch.
+
+    Attributes:
+        onset_ns: The stream time of the onset, ns.
+        end_ns: The stream time of the window's last sample, ns.
+        values: (sample, element, channel) float32: `REST` samples of rest, then the window, SI;
+            where a classifier takes an element for untouched, its tare.
+        flaw: Why it is none to learn from; empty: it is one.
+    """
+
+    onset_ns: int
+    end_ns: int
+    values: NDArray[np.float32]
+    flaw: str = ""
+
+
+def find_touches(
+    spec: ArraySpec, chunks: Iterable[Chunk], period_ns: int, floor: NDArray[np.float32]
+) -> Iterator[Touch]:
+    """The touches of a stream, in their order.
+
+    Args:
+        spec: the array of the stream.
+        chunks: the stream, as it came.
+        period_ns: of the samples of a touch, ns.
+        floor: (channel,) smallest sigma of the detector, SI.
+    """
+    resampler, cutter = Resampler(period_ns, spec.rate_hz), _Cutter(spec, period_ns, floor)
+    for chunk in chunks:
+        resampled = resampler.push(without_bad_samples(chunk)[0])
+        if resampled is not None:
+            yield from cutter.push(resampled)
+    yield from cutter.broken(ENDS)
+
+
+class _Cutter:
+    """Cuts a resampled stream."""
+
+    def __init__(self, spec: ArraySpec, period_ns: int, floor: NDArray[np.float32]) -> None:
+        self._detector = ContactDetector(spec.shape, floor)
+        self._samples = Timing.of(period_ns).samples
+        self._rest: deque[tuple[NDArray[np.float32], NDArray[np.bool_]]] = deque(maxlen=REST)
+        self._touch: _Growing | None = None
+        self._next_seq = 0
+
+    def push(self, chunk: Chunk) -> Iterator[Touch]:
+        for seq, t_ns, values, valid in zip(
+            chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True
+        ):
+            if seq != self._next_seq:
+                yield from self.broken(GAP)
+            self._next_seq = seq + 1
+            detector = self._detector
+            begins = detector.update(values, valid)
+            if begins and self._touch is None:
+                tare = detector.offset, detector.tared
+                self._touch = _Growing(t_ns, list(self._rest), *tare, detector.floor, [], [])
+            if not detector.contact:
+                self._rest.append((values, valid))
+            if self._touch is not None:
+                self._touch.values.append(values)
+                self._touch.valid.append(valid)
+                if len(self._touch.values) == self._samples:
+                    yield self._touch.done(t_ns)
+                    self._touch = None
+
+    def broken(self, why: str) -> Iterator[Touch]:
+        """The touch under way, if there is one, ends before its window does."""
+        if self._touch is not None:
+            nothing = np.empty((0, *self._touch.offset.shape), np.float32)
+            yield Touch(self._touch.onset_ns, self._touch.onset_ns, nothing, why)
+            self._touch = None
+
+
+@dataclass
+class _Growing:
+    """A touch under way: what came before it, its tare, and what has come."""
+
+    onset_ns: int
+    rest: list[tuple[NDArray[np.float32], NDArray[np.bool_]]]
+    offset: NDArray[np.float32]  # (element, channel)
+    tared: NDArray[np.bool_]  # (element,)
+    floor: NDArray[np.float32]  # (channel,)
+    values: list[NDArray[np.float32]]
+    valid: list[NDArray[np.bool_]]
+
+    def done(self, end_ns: int) -> Touch:
+        window, valid = np.stack(self.values), np.stack(self.valid)
+        there = valid.any(axis=0) & self.tared  # elements that measure anything
+        quiet = [values for values, trusted in self.rest if trusted[there].all()]
+        gap = not valid[:, there].all() or len(quiet) < LEAST_REST
+        if gap or not there.any():
+            return Touch(self.onset_ns, end_ns, window[:0], GAP)
+        # Where there was less rest it is there again and again, the latest last.
+        rest = np.stack(quiet)[np.arange(-REST, 0) % len(quiet)]
+        whole = np.concatenate([rest, window])
+        whole[:, ~there] = self.offset[~there]
+        return Touch(self.onset_ns, end_ns, whole, "" if self._found_in(whole) else UNSURE)
+
+    def _found_in(self, whole: NDArray[np.float32]) -> bool:
+        """Whether the onset is found in the touch alone, too."""
+        detector = ContactDetector(self.offset.shape, self.floor)
+        trusted = np.ones(len(self.tared), np.bool_)
+        onsets = (k for k, sample in enumerate(whole) if detector.update(sample, trusted))
+        return abs(next(onsets, -1) - REST) <= SURE
