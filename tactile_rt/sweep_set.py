@@ -13,7 +13,7 @@ file at every reading.
 
 import zipfile
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,10 @@ from tactile_rt.stream import ArraySpec, ConfigError, RecordingError
 
 __all__ = [
     "OUTLIERS",
+    "RECORDED_VERSION",
+    "RECORDINGS",
     "SPLITS",
+    "UNLABELLED",
     "WITHHELD",
     "SweepManifest",
     "Sweeps",
@@ -45,10 +48,14 @@ __all__ = [
 ]
 
 SET_VERSION = 2
-READABLE = (1, 2)  # version 1 knew neither withheld categories nor objects out of files
+RECORDED_VERSION = 3  # of recordings: who does not know them would add their noise again
+# Version 1 knew neither withheld categories nor objects out of files.
+READABLE = (1, SET_VERSION, RECORDED_VERSION)
 MANIFEST, SKIPPED = "manifest.json", "skipped.json"
 CONTACTS = "contacts"  # in an object's file, and in the recipe that asks for them
 FAULTS = "faults"  # in the recipe, see `sensor_faults`
+RECORDINGS = "recordings"  # in the recipe of a set that is made of them
+UNLABELLED = "unlabelled"  # the category of touches of which nobody said what was touched
 SPLITS = ("train", "validation", "test")
 # Further splits, of categories that are labelled -1: training never sees the first, and may learn
 # from the second what to refuse.
@@ -72,7 +79,7 @@ class SweepManifest:
         settings: The settings of the simulation profile.
         sensor: The description of the array's sensor; None: it has none, and the values are base
             loads.
-        version: The version of the set's format.
+        version: The version of the set's format: 2 of simulated sweeps, 3 of recorded ones.
     """
 
     spec: ArraySpec
@@ -105,6 +112,11 @@ class SweepManifest:
         """Where the objects come from, as its recipe says it; "" if it does not."""
         objects = self.recipe.get("objects")
         return str(objects.get("from", "")) if isinstance(objects, dict) else ""
+
+    @property
+    def recorded(self) -> bool:
+        """Whether its sweeps were recorded, with the noise of their sensor, not simulated."""
+        return RECORDINGS in self.recipe
 
     @property
     def limits(self) -> ChannelLimits:
@@ -166,7 +178,7 @@ class SweepManifest:
             # Compared as JSON, which knows no tuples: a recipe may have been written with some.
             here = msgspec.json.decode(text)
             there = msgspec.json.decode(msgspec.json.encode(SweepManifest.read(folder)))
-            if there["version"] != SET_VERSION:
+            if there["version"] != self.version:
                 raise ConfigError(
                     f"{folder} holds a sweep set of version {there['version']}, which can be read "
                     "but not gone on with: choose another folder"
@@ -198,7 +210,8 @@ class SweepManifest:
             return msgspec.convert(raw, cls)
         except OSError:
             raise RecordingError(
-                f"{folder} is not a sweep set: no {MANIFEST} (make one with `tactile-rt sweep`)"
+                f"{folder} is not a sweep set: no {MANIFEST} (make one with `tactile-rt sweep` or "
+                "`tactile-rt label`)"
             ) from None
         except (msgspec.MsgspecError, UnicodeDecodeError, ConfigError) as error:
             raise RecordingError(f"{path} is damaged: {error}") from None
@@ -208,13 +221,14 @@ def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
     """Sets of one array as one, which is the first with the categories and objects of the others.
 
     Raises:
-        ConfigError: sets of another array or sensor, or of another period or lead.
+        ConfigError: sets of another array or sensor, or of another period.
     """
     first = manifests[0]
     for other in manifests[1:]:
         differing = first.spec.differences(other.spec, ("name", "rate_hz"))
-        if (first.period_ns, first.lead) != (other.period_ns, other.lead):
-            differing = [*differing, "the period of their samples, or how long they rest first"]
+        if first.period_ns != other.period_ns:
+            periods = (f"{m.period_ns * 1e-6:g} ms" for m in (first, other))
+            differing = [*differing, f"the period of their samples, {' and '.join(periods)}"]
         if first.sensor != other.sensor:
             differing = [*differing, "the sensor: its noise, range or rate"]
         if differing:
@@ -226,6 +240,7 @@ def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
             split.setdefault(side, {}).update(dict.fromkeys(names_there))
     return replace(
         first,
+        lead=max(one.lead for one in manifests),
         categories=tuple(dict.fromkeys(c for one in manifests for c in one.categories)),
         withheld=tuple(dict.fromkeys(c for one in manifests for c in one.withheld)),
         split={side: tuple(names) for side, names in split.items()},
@@ -255,15 +270,24 @@ class Sweeps:
         objects: The (sweep,) names of the objects; sweeps of one object share the name.
         contacts: The (sweep, sample, element) float32 arc length (m) from the whisker's base to
             where it touches, NaN where it does not; None: the set was made without.
+        recorded: The (sweep,) bool whether it was recorded, so that its sensor's noise is in it;
+            None: all were simulated, without any.
     """
 
     values: NDArray[np.float32]
     labels: NDArray[np.int64]
     objects: NDArray[np.str_]
     contacts: NDArray[np.float32] | None = None
+    recorded: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.labels)
+
+    def __getitem__(self, at: slice | NDArray[Any]) -> "Sweeps":
+        """Some of the sweeps."""
+        there = ((f.name, getattr(self, f.name)) for f in fields(self))
+        taken: dict[str, Any] = {name: v if v is None else v[at] for name, v in there}
+        return Sweeps(**taken)
 
 
 def contacts_of(sweeps: Sweeps) -> NDArray[np.float32]:
@@ -352,7 +376,13 @@ def read_sweeps(folder: Path, split: str) -> Sweeps:
                 raise _damaged(path, ValueError(f"contacts {stored.shape} beside other values"))
             contacts[at : at + count] = stored
         at += count
-    return Sweeps(values, np.repeat(np.array(labels), counts), np.repeat(names, counts), contacts)
+    return Sweeps(
+        values,
+        np.repeat(np.array(labels), counts),
+        np.repeat(names, counts),
+        contacts,
+        np.full(len(values), True) if manifest.recorded else None,
+    )
 
 
 def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str, NDArray[Any]]]:

@@ -22,7 +22,7 @@ from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.stream import ConfigError, SpecMismatch
-from tactile_rt.sweep_set import WITHHELD, Sweeps
+from tactile_rt.sweep_set import WITHHELD
 
 __all__ = ["evaluate_model"]
 
@@ -114,7 +114,9 @@ def evaluate_model(
         )
     noisy = evaluation.predict(test, run, 1.0)
     rated, period_ms = rated_amount(test), card.period_ns * 1e-6
-    how = f"{sample}; white noise {rated} added to every {period_ms:g} ms sample, "
+    recorded = test.manifest.recorded
+    added = f"white noise {rated} added to every {period_ms:g} ms sample"
+    how = f"{sample}; {'none added to that of the recordings' if recorded else added}, "
     how += "undetected sweeps count as "
     records.append(
         _accuracy("top-1 at rated noise", noisy[:, -1], labels, objects, "", how + "wrong")
@@ -130,7 +132,7 @@ def evaluate_model(
             how + "wrong",
         )
     )
-    if test.manifest.sensor is None:
+    if test.manifest.sensor is None and not recorded:
         # The same noise on samples of 1 kHz: the resampler's Hann kernel leaves 0.29.
         raw = evaluation.predict(test, run, float(np.sqrt(1.5 / 18)))
         how = f"{sample}; white noise {rated} on every 1 kHz sample, through the resampler"
@@ -164,7 +166,7 @@ def evaluate_model(
         table = evaluation.confusion(clean[:, -1], labels, len(card.classes))
         draw_confusion(table, card.classes, pictures / "confusion.png")
         curves = {
-            "no sensor noise": over_time,
+            "as recorded" if recorded else "no sensor noise": over_time,
             f"rated noise ({rated} per sample)": evaluation.accuracy_over_time(noisy, labels),
         }
         draw_accuracy_over_time(curves, 1e-3 * step_ms, pictures / "accuracy_over_time.png")
@@ -311,9 +313,7 @@ def _firsts(objects: NDArray[np.str_], sweeps: int) -> NDArray[np.int64]:
 
 
 def _first_of_each(data: SweepSet, sweeps: int) -> SweepSet:
-    at = _firsts(data.sweeps.objects, sweeps)
-    values, labels, objects = data.sweeps.values, data.sweeps.labels, data.sweeps.objects
-    return replace(data, sweeps=Sweeps(values[at], labels[at], objects[at]))
+    return data[_firsts(data.sweeps.objects, sweeps)]
 
 
 def _compare_profiles(

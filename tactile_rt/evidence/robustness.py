@@ -52,6 +52,8 @@ def conditions(data: SweepSet) -> dict[str, Disturbance]:
     channels = data.manifest.spec.channels
     if any(name.endswith("x") and f"{name[:-1]}y" in channels for name in channels):
         found["x and y connected the wrong way round"] = Disturbance(swapped=True)
+    if data.manifest.recorded:  # with a noise that cannot be taken out of them
+        return {name: d for name, d in found.items() if not 0 < d.noise <= 1}
     return found
 
 

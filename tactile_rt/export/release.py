@@ -27,7 +27,7 @@ from tactile_rt.models.training import (
     run_on,
     shipped_recipes,
 )
-from tactile_rt.sweep_set import SweepManifest, join_manifests
+from tactile_rt.sweep_set import RECORDINGS, SweepManifest, join_manifests
 
 __all__ = ["fit_temperature", "quantisation_figures", "release", "run_file"]
 
@@ -81,10 +81,7 @@ def release(
         rules=(unknown, candidates),
         figures={"validation_top1": right[0], "validation_top1_noisy": right[1]},
         commands=(
-            *(
-                f"tactile-rt sweep {folder} {_sweep_options(SweepManifest.read(folder).recipe)}"
-                for folder in folders
-            ),
+            *(_making(folder, SweepManifest.read(folder)) for folder in folders),
             saved.get("made_by")
             or f"tactile-rt train {config['data']} {checkpoint.parent} {_training_options(config)}",
             f"tactile-rt export {checkpoint} {path.name} --name {name}{chosen}",
@@ -171,9 +168,11 @@ def _training_options(config: dict[str, Any]) -> str:
     return " ".join([*options, f"--seed {config['seed']}"])
 
 
-def _sweep_options(recipe: dict[str, Any]) -> str:
-    """The options of `tactile-rt sweep` that make a set of this recipe again."""
-    options = recipe
+def _making(folder: Path, manifest: SweepManifest) -> str:
+    """The command that makes a set again."""
+    options = recipe = manifest.recipe
+    if manifest.recorded:
+        return f"tactile-rt label {' '.join(recipe[RECORDINGS])} {folder} {recipe['options']}"
     if isinstance(recipe.get("objects"), dict):  # since version 2 of the manifest
         objects = recipe["objects"]
         options = {
@@ -183,7 +182,8 @@ def _sweep_options(recipe: dict[str, Any]) -> str:
             "sweeps": recipe["sweeps"]["draws"],
             **{key: recipe[key] for key in ("profile", "seed")},
         }
-    return " ".join(f"--{key} {value}" for key, value in options.items())
+    said = " ".join(f"--{key} {value}" for key, value in options.items())
+    return f"tactile-rt sweep {folder} {said}"
 
 
 def fit_temperature(posteriors: NDArray[np.float32], labels: NDArray[np.int64]) -> float:

@@ -9,16 +9,17 @@ import numpy as np
 
 from tactile_rt.models.datasets import SweepSet, frame_of
 from tactile_rt.models.ead import EADConfig
-from tactile_rt.stream import ArraySpec, RecordingError, SpecMismatch
+from tactile_rt.stream import ArraySpec, ConfigError, RecordingError, SpecMismatch
 from tactile_rt.sweep_set import (
     OUTLIERS,
+    UNLABELLED,
     WITHHELD,
     SweepManifest,
     join_manifests,
     object_path,
 )
 
-__all__ = ["check_array", "check_sets", "check_split", "trained_on"]
+__all__ = ["check_array", "check_labelled", "check_sets", "check_split", "trained_on"]
 
 
 def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManifest) -> None:
@@ -77,6 +78,19 @@ def trained_on(
             "it was trained on by --data"
         )
     return folders
+
+
+def check_labelled(folder: Path, manifest: SweepManifest) -> None:
+    """What is to be learnt from a set's labels must have some.
+
+    Raises:
+        ConfigError: its touches have none.
+    """
+    if UNLABELLED in manifest.categories:
+        raise ConfigError(
+            f"{folder} holds touches without labels: learn from them by --recipe simclr, or say "
+            "what was touched with `tactile-rt label`"
+        )
 
 
 def check_split(folder: Path, manifest: SweepManifest) -> None:

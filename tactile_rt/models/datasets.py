@@ -5,7 +5,7 @@ onset on the noisy signal, and carries the tare that the detector had measured b
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -72,6 +72,17 @@ class SweepSet:
         return Timing.of(self.manifest.period_ns)
 
     @property
+    def recorded(self) -> NDArray[np.bool_]:
+        """(sweep,) whether it was recorded: its sensor's noise, which counts as the rated, is in
+        it already."""
+        none = np.zeros(len(self.sweeps), dtype=np.bool_)
+        return none if self.sweeps.recorded is None else self.sweeps.recorded
+
+    def __getitem__(self, at: slice | NDArray[Any]) -> "SweepSet":
+        """Some of the sweeps."""
+        return replace(self, sweeps=self.sweeps[at])
+
+    @property
     def _levels(self) -> tuple[float, ...]:
         largest = max(self.manifest.faults.noise, 1.0)
         return tuple(level for level in NOISE_LEVELS if level <= largest)
@@ -87,15 +98,31 @@ class SweepSet:
     def noisy_starts(self) -> NDArray[np.int64]:
         """(level, sweep) onsets with noise of each of `NOISE_LEVELS`; -1 where none was found.
 
-        Of levels that training never draws there are none.
+        Of levels that training never draws there are none. Recorded sweeps have their own noise at
+        every level.
         """
         rng = np.random.default_rng(0)
-        starts = []
-        for values in np.array_split(self.sweeps.values, max(len(self.sweeps) // 256, 1)):
+        starts, parts = [], max(len(self.sweeps) // 256, 1)
+        for values, recorded in zip(
+            np.array_split(self.sweeps.values, parts),
+            np.array_split(self.recorded, parts),
+            strict=True,
+        ):
             noise = rng.standard_normal(values.shape, dtype=np.float32) * self.noise
+            noise[recorded] = 0
             noisy = (values + np.float32(level) * noise for level in self._levels)
             starts.append(np.stack([find_onsets(v, self.floor).start for v in noisy]))
         return np.concatenate(starts, axis=1)
+
+    @cached_property
+    def tares(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Offset and sigma (sweep, element, channel), SI, as the detector has measured them by the
+        onset, of recorded sweeps; 0 of others, of which training draws them."""
+        offset, sigma = np.zeros((2, len(self.sweeps), *self.manifest.spec.shape), dtype=np.float32)
+        if self.recorded.any():
+            found = find_onsets(self.sweeps.values[self.recorded], self.floor)
+            offset[self.recorded], sigma[self.recorded] = found.offset, found.sigma
+        return offset, sigma
 
 
 def windows(
@@ -117,21 +144,32 @@ def windows(
 def joined(sets: Sequence[SweepSet]) -> SweepSet:
     """Sets of one array as one, with the categories of all; faults are those of the first.
 
+    Shorter sweeps rest longer before, as they did, and repeat their last sample after.
+
     Raises:
-        ConfigError: as `join_manifests`; or their sweeps are not of one length.
+        ConfigError: as `join_manifests`.
     """
     if len(sets) == 1:
         return sets[0]
     manifest = join_manifests([one.manifest for one in sets])
-    lengths = {one.sweeps.values.shape[1] for one in sets}
-    if len(lengths) > 1:
-        raise ConfigError(f"sweeps of {min(lengths)} and {max(lengths)} samples cannot be joined")
+    after = max(one.sweeps.values.shape[1] - one.manifest.lead for one in sets)
     whole = Sweeps(
-        np.concatenate([one.sweeps.values for one in sets]),
+        np.concatenate([_lengthened(one, manifest.lead, after) for one in sets]),
         np.concatenate([relabelled(one, manifest.categories).sweeps.labels for one in sets]),
         np.concatenate([one.sweeps.objects for one in sets]),
+        recorded=np.concatenate([one.recorded for one in sets]),
     )
     return replace(sets[0], manifest=manifest, sweeps=whole)
+
+
+def _lengthened(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
+    """Its values (sweep, sample, element, channel), so many samples before the touch and after."""
+    own, samples = data.manifest.lead, data.sweeps.values.shape[1]
+    if (own, samples) == (lead, lead + after):
+        return data.sweeps.values
+    rest = np.arange(-lead, 0) % max(own, 1)  # again and again, the latest last
+    touch = np.minimum(own + np.arange(after), samples - 1)
+    return data.sweeps.values[:, np.concatenate([rest, touch])]
 
 
 def of_categories(data: SweepSet) -> SweepSet:
@@ -139,10 +177,7 @@ def of_categories(data: SweepSet) -> SweepSet:
     known = np.flatnonzero(data.sweeps.labels >= 0)
     faults = replace(data.manifest.faults, implausible=0.0)
     recipe = {**data.manifest.recipe, "faults": asdict(faults)}
-    there = {f.name: getattr(data.sweeps, f.name) for f in fields(data.sweeps)}
-    kept: dict[str, Any] = {k: None if v is None else v[known] for k, v in there.items()}
-    sweeps = Sweeps(**kept)
-    return replace(data, manifest=replace(data.manifest, recipe=recipe), sweeps=sweeps)
+    return replace(data[known], manifest=replace(data.manifest, recipe=recipe))
 
 
 def relabelled(data: SweepSet, categories: Sequence[str]) -> SweepSet:
@@ -169,7 +204,9 @@ class TrainingBatches:
 
     A third of the windows are clean, a third carry the rated sensor noise, and a third any level;
     what else is wrong with the sensor is drawn as the set's recipe says, or else as `SensorFaults`
-    does. Labels beyond the categories are those of the set's `refusals`, in their order.
+    does. A recorded sweep has the noise that it was recorded with and no other, and its own tare,
+    as when a classifier meets it. Labels beyond the categories are those of the set's `refusals`,
+    in their order.
 
     Attributes:
         easy_epochs: The number of epochs in which noise, offset and drift rise to what is said: a
@@ -216,15 +253,21 @@ class TrainingBatches:
         data, n = self._data, len(at)
         elements, channels = data.manifest.spec.shape
         faults = self._faults
+        recorded = data.recorded[at]
         level = np.float32(severity) * _noise_levels(n, faults.noise, rng)
+        level[recorded] = 0
         found_at = np.array(NOISE_LEVELS[: len(self._starts)])
         nearest = np.abs(level[:, None] - found_at).argmin(axis=1)
         start = self._starts[nearest, at] + rng.integers(-JITTER, JITTER + 1, n)
         values = data.sweeps.values[at]
         # Relative to rest, where a magnetometer reads its magnet's field, and a load cell nothing.
-        rest = values[:, : data.manifest.lead].mean(axis=1) if data.manifest.lead else 0.0
+        rest = np.zeros((n, elements, channels), dtype=np.float32)
+        if data.manifest.lead:
+            rest = values[:, : data.manifest.lead].mean(axis=1)
+        tare = data.tares[0][at], data.tares[1][at]
+        rest = np.where(recorded[:, None, None], tare[0], rest)
         samples = windows(values, start, data.timing)
-        samples -= np.asarray(rest, dtype=np.float32)[..., None, None, :, :]
+        samples -= rest[:, None, None]
         shape = (n, 1, 1, elements, 1)
         gain = 1 + np.float32(faults.gain) * rng.standard_normal(shape, dtype=np.float32)
         alive = rng.random(shape) >= faults.dead
@@ -243,6 +286,7 @@ class TrainingBatches:
         offset = noise * rng.normal(size=per_channel) / np.sqrt(quiet)
         spread = 1 + rng.normal(size=per_channel) / np.sqrt(2 * (quiet - 1))
         sigma = np.maximum(noise * np.abs(spread), data.floor)
+        sigma = np.where(recorded[:, None, None], tare[1], sigma)
         return (
             torch.from_numpy(samples.astype(np.float32)),
             torch.from_numpy(offset.astype(np.float32)),

@@ -22,7 +22,8 @@ class Disturbance:
     """What is wrong with the sensor; each sweep is a draw of its own.
 
     Attributes:
-        noise: The white noise on every stored sample, in units of the rated noise.
+        noise: The white noise on every stored sample, in units of the rated noise; recorded sweeps
+            have one unit of it already, and only what is lacking is added.
         gain: The standard deviation of every whisker's relative gain error.
         dead: The number of whiskers, drawn at random, that read zero throughout.
         rows: The number of rows of the grid, drawn at random, whose whiskers all do.
@@ -32,7 +33,7 @@ class Disturbance:
             units of `OFFSET`; a sign is drawn as for the offset.
         swapped: Whether the channels of x and of y are connected the wrong way round.
         rest: The number of stored samples of silence before each sweep, for the tare; a robot has
-            them, the sweeps have only a short lead.
+            them, simulated sweeps have only a short lead.
 
     Raises:
         ConfigError: a negative amount.
@@ -55,11 +56,19 @@ class Disturbance:
     def of_samples(
         self, values: NDArray[np.float32], data: SweepSet, rng: np.random.Generator
     ) -> NDArray[np.float32]:
-        """What the detector sees, of (sweep, sample, element, channel) SI."""
+        """What the detector sees.
+
+        Args:
+            values: (sweep, sample, element, channel) of these sweeps, SI.
+            data: the same sweeps.
+            rng: what is drawn is drawn from.
+        """
+        if self == CLEAN:
+            return values
         n, elements = len(values), values.shape[2]
         if data.manifest.lead:  # what is wrong adds to rest, which is not nothing in a field
             values = values - values[:, : data.manifest.lead].mean(axis=1, keepdims=True)
-        if self.rest:
+        if self.rest and not data.recorded.any():
             silence = np.zeros((n, self.rest, *values.shape[2:]), dtype=np.float32)
             values = np.concatenate([silence, values], axis=1)
         if self.gain:
@@ -77,7 +86,9 @@ class Disturbance:
             values = values[..., _x_for_y(data.manifest.spec.channels)]
         if self.noise:
             noise = rng.normal(size=values.shape).astype(np.float32)
-            values = values + noise * data.noise * np.float32(self.noise)
+            lacking = np.sqrt(max(self.noise**2 - 1, 0))
+            level = np.where(data.recorded, lacking, self.noise).astype(np.float32)
+            values = values + noise * data.noise * level[:, None, None, None]
         return values
 
     def of_windows(

@@ -100,7 +100,8 @@ def run_windows(
     rng = np.random.default_rng(seed)
     parts, detected = [], []
     for i in range(0, len(data.sweeps), batch):
-        values = disturbance.of_samples(data.sweeps.values[i : i + batch], data, rng)
+        part = data[i : i + batch]
+        values = disturbance.of_samples(part.sweeps.values, part, rng)
         found = find_onsets(values, data.floor)
         cut = disturbance.of_windows(windows(values, found.start, data.timing), data, rng)
         parts.append(run(cut, found.offset, found.sigma))

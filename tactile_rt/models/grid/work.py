@@ -191,8 +191,8 @@ class Workbench:
         rng = np.random.default_rng(0)
         parts = []
         for i in range(0, len(self.test.sweeps), BATCH):
-            values = self.test.sweeps.values[i : i + BATCH]
-            values = disturbance.of_samples(values, self.test, rng)
+            part = self.test[i : i + BATCH]
+            values = disturbance.of_samples(part.sweeps.values, part, rng)
             at = find_onsets(values, self.test.floor)
             cut = windows(values, at.start, self.test.timing)
             parts.append((cut, at.offset, at.sigma, at.start >= 0))

@@ -25,7 +25,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from tactile_rt.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import TactileClassifier, begin_from, reason, save_whole
-from tactile_rt.models.data_checks import check_sets, check_split
+from tactile_rt.models.data_checks import check_labelled, check_sets, check_split
 from tactile_rt.models.datasets import SweepSet, TrainingBatches, frame_of, joined, relabelled
 from tactile_rt.models.objectives import Autoencoder, Objective, SimCLR, SimSiam, Supervised
 from tactile_rt.models.training.config import Progress, TrainingConfig
@@ -177,7 +177,8 @@ def read_splits(config: TrainingConfig) -> tuple[SweepSet, SweepSet]:
     What it trains on has the outliers of the sets, too.
 
     Raises:
-        ConfigError: the configuration names no network, or its sets cannot be joined.
+        ConfigError: the configuration names no network, its sets cannot be joined, or one has no
+            labels to learn from.
         RecordingError: a set is missing, unfinished, damaged or unfit.
     """
     folders = [Path(folder) for folder in (config.data, *config.also)]
@@ -186,6 +187,8 @@ def read_splits(config: TrainingConfig) -> tuple[SweepSet, SweepSet]:
     # a slip of the pen is told before a set is read
     config.network(len(whole.categories), frame_of(whole))
     for folder, manifest in zip(folders, manifests, strict=True):
+        if config.objective == "supervised":
+            check_labelled(folder, manifest)
         check_split(folder, manifest)
     check_split(folders[0], whole)
     training, validating = [], []

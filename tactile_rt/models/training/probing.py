@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
-from tactile_rt.models.data_checks import check_array, check_sets, check_split
+from tactile_rt.models.data_checks import check_array, check_labelled, check_sets, check_split
 from tactile_rt.models.datasets import (
     SweepSet,
     TrainingBatches,
@@ -95,6 +95,7 @@ def probe(
     path = Path(config.data or saved["config"]["data"])  # of several sets the first
     manifest = SweepManifest.read(path)
     check_array(checkpoint, saved, manifest)
+    check_labelled(path, manifest)
     if splits is None:
         check_split(path, manifest)
         splits = SweepSet.read(path, "train"), SweepSet.read(path, "validation")
