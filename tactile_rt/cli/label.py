@@ -1,0 +1,115 @@
+"""`tactile-rt label`: recordings become a sweep set."""
+
+import shlex
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from tactile_rt.cli.app import app, progress_bar
+from tactile_rt.stream import ConfigError, RecordingError
+
+
+@app.command()
+def label(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings: .mcap, .npz, .csv, .h5.")],
+    folder: Annotated[Path, typer.Argument(help="Where the sweep set goes.", metavar="OUT")],
+    labels: Annotated[
+        Path | None, typer.Option(help="What was touched when; default: labels.csv beside them.")
+    ] = None,
+    by_name: Annotated[
+        bool, typer.Option("--by-name", help="The file's name is the label: mug-3.mcap is of mugs.")
+    ] = False,
+    unlabelled: Annotated[
+        bool, typer.Option("--unlabelled", help="Every touch, to pretrain on by --recipe simclr.")
+    ] = False,
+    like: Annotated[
+        Path | None,
+        typer.Option(help="A sweep set or model of the array: its sensor and sample period."),
+    ] = None,
+    split: Annotated[
+        str, typer.Option(help="Shares of the objects: train,validation,test.")
+    ] = "0.7,0.15,0.15",
+    seed: Annotated[int, typer.Option(min=0, help="Of the split.")] = 0,
+    force: Annotated[bool, typer.Option("--force", help="Replace a set that is there.")] = False,
+) -> None:
+    """Make a sweep set of recordings, to train and evaluate on.
+
+    labels.csv says what was touched when: recording,start_s,end_s,label
+    and, if you like, object; times are seconds since the recording's
+    first sample. What cannot be used is counted on stderr.
+    """
+    from tactile_rt.recording.labelling import (
+        find_labelled,
+        intervals_beside,
+        intervals_by_name,
+        intervals_of_all,
+        write_set,
+    )
+    from tactile_rt.sim_backend.datasets.inventory import write_sums
+    from tactile_rt.sweep_set import SPLITS
+
+    if (labels is not None) + by_name + unlabelled > 1:
+        raise ConfigError("--labels, --by-name and --unlabelled exclude one another: give one")
+    shares = _shares(split)
+    _check_out(folder, force)
+    if twice := [one for one in recordings if recordings.count(one) > 1]:
+        raise ConfigError(f"{twice[0]} is named twice: name it once")
+    if by_name:
+        intervals = intervals_by_name(recordings)
+    elif unlabelled:
+        intervals = intervals_of_all(recordings)
+    else:
+        intervals = intervals_beside(recordings, labels)
+    console = Console(stderr=True, soft_wrap=True, highlight=False)
+    with progress_bar(console, "finding touches") as update:
+        touches = find_labelled(
+            recordings, intervals, like,
+            lambda one, seconds: update(description=f"{one.name} {seconds:.0f} s"),
+        )  # fmt: skip
+    given = {"--labels": labels, "--like": like, "--split": split, "--seed": seed}
+    words = [w for k, v in given.items() if v is not None for w in (k, str(v))]
+    words += [k for k, v in {"--by-name": by_name, "--unlabelled": unlabelled}.items() if v]
+    manifest = write_set(folder, touches, shares, seed, shlex.join(words), write_sums)
+    for line in touches.left_out:
+        console.print(line, markup=False)
+    for name, some in (("validation", "to train"), ("test", "for `tactile-rt eval`")):
+        if not manifest.split[name]:
+            console.print(f"no object is left for {name}, which is needed {some}: label more")
+    sides = ", ".join(f"{name} {len(manifest.split[name])}" for name in SPLITS)
+    counts = {
+        c: sum(used.interval.label == c for used in touches.used) for c in manifest.categories
+    }
+    told = ", ".join(f"{name} {n}" for name, n in counts.items())
+    console.print(
+        f"{folder}: {len(touches.used)} of {touches.found.total()} touches ({told}); "
+        f"objects: {sides}"
+    )
+
+
+def _shares(text: str) -> tuple[float, ...]:
+    try:
+        return tuple(map(float, text.split(",")))
+    except ValueError:
+        raise ConfigError(
+            f"--split is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15, not {text!r}"
+        ) from None
+
+
+def _check_out(folder: Path, force: bool) -> None:
+    """Refuse a folder that is there, unless it is a recorded set that is to be replaced."""
+    from tactile_rt.sweep_set import SweepManifest
+
+    if not folder.absolute().parent.is_dir():
+        raise ConfigError(f"no folder {folder.parent} to make {folder.name} in")
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return
+    if not force:
+        raise ConfigError(f"{folder} is there already: name another folder, or give --force")
+    try:
+        recorded = SweepManifest.read(folder).recorded
+    except RecordingError:
+        recorded = False
+    if not recorded:
+        raise ConfigError(f"{folder} is no set of recordings, and stays: name another folder")
