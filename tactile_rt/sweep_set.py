@@ -205,7 +205,7 @@ class SweepManifest:
             if raw.get("version") not in READABLE:
                 raise RecordingError(
                     f"{path} is of version {raw.get('version')!r}; this release reads "
-                    + " and ".join(map(str, READABLE))
+                    f"{READABLE[0]} to {READABLE[-1]}"
                 )
             return msgspec.convert(raw, cls)
         except OSError:

@@ -203,8 +203,8 @@ def manifest_with(**fields: object) -> bytes:
         (b"{", "is damaged"),
         (b"[]", "is damaged"),
         (b'{"version": "\xff"}', "is damaged"),
-        (b"{}", "is of version None; this release reads 1 and 2"),
-        (manifest_with(version=3), "is of version 3; this release reads 1 and 2"),
+        (b"{}", "is of version None; this release reads 1 to 3"),
+        (manifest_with(version=4), "is of version 4; this release reads 1 to 3"),
         (manifest_with(lead="four"), r"is damaged: .*\$.lead"),
         (manifest_with(spec={}), r"is damaged: .*\$.spec"),
         (

@@ -99,7 +99,8 @@ def _shares(text: str) -> tuple[float, ...]:
 
 def _check_out(folder: Path, force: bool) -> None:
     """Refuse a folder that is there, unless it is a recorded set that is to be replaced."""
-    from tactile_rt.sweep_set import SweepManifest
+    from tactile_rt.sim_backend.datasets.inventory import SUMS
+    from tactile_rt.sweep_set import MANIFEST, SweepManifest, object_path
 
     if not folder.absolute().parent.is_dir():
         raise ConfigError(f"no folder {folder.parent} to make {folder.name} in")
@@ -108,8 +109,11 @@ def _check_out(folder: Path, force: bool) -> None:
     if not force:
         raise ConfigError(f"{folder} is there already: name another folder, or give --force")
     try:
-        recorded = SweepManifest.read(folder).recorded
+        manifest = SweepManifest.read(folder)
     except RecordingError:
-        recorded = False
-    if not recorded:
+        manifest = None
+    if manifest is None or not manifest.recorded:
         raise ConfigError(f"{folder} is no set of recordings, and stays: name another folder")
+    own = {MANIFEST, SUMS, *(object_path(folder, name).name for name in manifest.names())}
+    if others := sorted({path.name for path in folder.iterdir()} - own):
+        raise ConfigError(f"{folder} holds {others[0]!r}, too, and stays: name another folder")

@@ -120,6 +120,8 @@ def _recipe(folder: Path, name: str | None) -> "SweepRecipe":
 
     if name is None and (folder / "manifest.json").exists():
         manifest = SweepManifest.read(folder)
+        if manifest.recorded:
+            raise ConfigError(f"{folder} is made of recordings, by `tactile-rt label`")
         return recipe_of_set(manifest.recipe, manifest.categories)
     return read_recipe(name or DEFAULT_RECIPE)
 

@@ -21,8 +21,8 @@ import numpy as np
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.files import whole_folder
 from tactile_rt.recording.conversion import chunks_of
-from tactile_rt.recording.labels import LABELS, Interval, label_of_file, read_labels
-from tactile_rt.recording.touches import REST, Touch, find_touches
+from tactile_rt.recording.labels import LABELS, LabelledInterval, label_of_file, read_labels
+from tactile_rt.recording.touches import REST, RecordedTouch, find_touches
 from tactile_rt.sensor_spec import SensorSpec, channel_limits
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, SpecMismatch
 from tactile_rt.sweep_set import (
@@ -56,17 +56,17 @@ OUTSIDE = "outside every interval"
 DISPUTED = "in intervals that overlap and name different things"
 MIXED = "that run into the interval of another thing"
 
-Intervals = dict[Path, list[Interval]]
+Intervals = dict[Path, list[LabelledInterval]]
 
 
 @dataclass(frozen=True)
 class _Used:
     """A touch that is used: of which recording, when, and of what."""
 
-    touch: Touch
+    touch: RecordedTouch
     recording: Path
     onset_s: float
-    interval: Interval
+    interval: LabelledInterval
 
 
 @dataclass
@@ -123,12 +123,12 @@ def intervals_by_name(recordings: Sequence[Path]) -> Intervals:
     Raises:
         ConfigError: a name tells none.
     """
-    return {one: [Interval(label=label_of_file(one))] for one in recordings}
+    return {one: [LabelledInterval(label=label_of_file(one))] for one in recordings}
 
 
 def intervals_of_all(recordings: Sequence[Path]) -> Intervals:
     """All of each recording, without a label."""
-    return {one: [Interval(label=UNLABELLED)] for one in recordings}
+    return {one: [LabelledInterval(label=UNLABELLED)] for one in recordings}
 
 
 def like(path: Path) -> tuple[ArraySpec, SensorSpec | None, int]:
@@ -148,7 +148,7 @@ def like(path: Path) -> tuple[ArraySpec, SensorSpec | None, int]:
 
 def find_labelled(
     recordings: Sequence[Path],
-    intervals: Mapping[Path, Sequence[Interval]],
+    intervals: Mapping[Path, Sequence[LabelledInterval]],
     pattern: Path | None = None,
     report: Callable[[Path, float], None] = lambda recording, seconds: None,
 ) -> LabelledTouches:
@@ -321,7 +321,9 @@ class _Reasons:
         return [f"{what} {why}: {n}, first {self._first[why]}" for why, n in self._count.items()]
 
 
-def _runs_into(own: Interval, onset_s: float, end_s: float, intervals: Sequence[Interval]) -> bool:
+def _runs_into(
+    own: LabelledInterval, onset_s: float, end_s: float, intervals: Sequence[LabelledInterval]
+) -> bool:
     """Whether another thing's interval begins before the window ends."""
     return any(onset_s < i.start_s <= end_s and i.thing != own.thing for i in intervals)
 

@@ -23,7 +23,14 @@ import msgspec
 from tactile_rt.settings import check_columns, convert, nearest, read_csv, refusal
 from tactile_rt.stream import ConfigError
 
-__all__ = ["LABELS", "Interval", "append_label", "check_name", "label_of_file", "read_labels"]
+__all__ = [
+    "LABELS",
+    "LabelledInterval",
+    "append_label",
+    "check_name",
+    "label_of_file",
+    "read_labels",
+]
 
 LABELS = "labels.csv"  # beside the recordings
 NEEDED = ("start_s", "end_s", "label")
@@ -33,13 +40,13 @@ RESERVED = ("unknown", "unlabelled")  # a model's refusal, and a touch that nobo
 
 
 @dataclass(frozen=True, kw_only=True)
-class Interval:
+class LabelledInterval:
     """A part of a recording in which one thing is touched.
 
     Attributes:
         label: The kind of thing.
         start_s, end_s: Seconds since the recording's first sample; the end is not in it.
-        object: Which of the things of this kind; empty: it is not told.
+        object: The name of the one thing of this kind; empty: it is not told.
         where: File and line, for messages; empty: not out of a file.
     """
 
@@ -63,7 +70,7 @@ class _Row(msgspec.Struct):
     object: str = ""
 
 
-def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Interval]]:
+def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[LabelledInterval]]:
     """The intervals of a file by recording, also of recordings that are not asked for.
 
     Args:
@@ -81,7 +88,7 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Inter
             f"{table.where}: no column recording, which {len(recordings)} recordings need; add it"
         )
     known = {one.resolve(): one for one in recordings}
-    found: dict[Path, list[Interval]] = {one: [] for one in recordings}
+    found: dict[Path, list[LabelledInterval]] = {one: [] for one in recordings}
     for node in table.rows:
         row = convert(node, _Row, lax=True)
         for column, name in (("label", row.label), ("object", row.object)):
@@ -100,7 +107,7 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Inter
             why = f"no file {row.recording!r} beside {path.name}; {nearest(row.recording, names)}"
             raise refusal(node, ["recording"], why)
         found.setdefault(one or file, []).append(
-            Interval(
+            LabelledInterval(
                 label=row.label,
                 start_s=row.start_s,
                 end_s=row.end_s,
@@ -111,7 +118,7 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Inter
     return found
 
 
-def append_label(path: Path, recording: str, interval: Interval) -> None:
+def append_label(path: Path, recording: str, interval: LabelledInterval) -> None:
     """Add a line to a file, which is made if it is not there; on return it is on the disk.
 
     A line is written at once. What an interruption has left of an earlier one ends where the next
@@ -124,10 +131,13 @@ def append_label(path: Path, recording: str, interval: Interval) -> None:
 
     Raises:
         ConfigError: a name that cannot be, times out of order, or a file with other columns.
+        OSError: the file cannot be written.
     """
     for what, name in (("label", interval.label), ("object", interval.object)):
         if why := check_name(name, empty=what == "object"):
             raise ConfigError(f"{what} {name!r}: {why}")
+    if not recording.isprintable() or recording.startswith("#"):  # which begins a remark
+        raise ConfigError(f"recording {recording!r} cannot stand in {path.name}: rename it")
     if not 0 <= interval.start_s < interval.end_s < math.inf:
         raise ConfigError(f"start_s must be 0 or more and before end_s: {interval}")
     new = not path.exists() or not path.stat().st_size

@@ -1,6 +1,6 @@
 """The touches in a stream, cut as a classifier meets them.
 
-    chunks -> Resampler -> ContactDetector -> Touch: rest, then a window from the onset on
+    chunks -> Resampler -> ContactDetector -> RecordedTouch: rest, then a window from the onset on
 
 Goals: a network that learns from a touch gets the very numbers that a running `Classifier` would
 have fed it: the same resampled samples, the same onset, the same tare.
@@ -31,7 +31,7 @@ from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.stream import ArraySpec, Chunk
 from tactile_rt.timing import Timing
 
-__all__ = ["ENDS", "GAP", "REST", "UNSURE", "Touch", "find_touches"]
+__all__ = ["ENDS", "GAP", "REST", "UNSURE", "RecordedTouch", "find_touches"]
 
 REST = 2 * BASELINE_SAMPLES  # samples before the onset: a whole baseline, measured on a whole one
 LEAST_REST = TARE_SAMPLES + FIRST_GUARD_SAMPLES
@@ -43,7 +43,7 @@ UNSURE = "whose onset is not found again after so short a rest"
 
 
 @dataclass(frozen=True)
-class Touch:
+class RecordedTouch:
     """One touch.
 
     Attributes:
@@ -51,7 +51,7 @@ class Touch:
         end_ns: The stream time of the window's last sample, ns.
         values: (sample, element, channel) float32: `REST` samples of rest, then the window, SI;
             where a classifier takes an element for untouched, its tare.
-        flaw: Why it is none to learn from; empty: it is one.
+        flaw: The reason why nothing can be learnt from the touch; empty: there is none.
     """
 
     onset_ns: int
@@ -62,7 +62,7 @@ class Touch:
 
 def find_touches(
     spec: ArraySpec, chunks: Iterable[Chunk], period_ns: int, floor: NDArray[np.float32]
-) -> Iterator[Touch]:
+) -> Iterator[RecordedTouch]:
     """The touches of a stream, in their order.
 
     Args:
@@ -89,7 +89,7 @@ class _Cutter:
         self._touch: _Growing | None = None
         self._next_seq = 0
 
-    def push(self, chunk: Chunk) -> Iterator[Touch]:
+    def push(self, chunk: Chunk) -> Iterator[RecordedTouch]:
         for seq, t_ns, values, valid in zip(
             chunk.seq.tolist(), chunk.t_ns.tolist(), chunk.values, chunk.valid, strict=True
         ):
@@ -110,11 +110,11 @@ class _Cutter:
                     yield self._touch.done(t_ns)
                     self._touch = None
 
-    def broken(self, why: str) -> Iterator[Touch]:
+    def broken(self, why: str) -> Iterator[RecordedTouch]:
         """The touch under way, if there is one, ends before its window does."""
         if self._touch is not None:
             nothing = np.empty((0, *self._touch.offset.shape), np.float32)
-            yield Touch(self._touch.onset_ns, self._touch.onset_ns, nothing, why)
+            yield RecordedTouch(self._touch.onset_ns, self._touch.onset_ns, nothing, why)
             self._touch = None
 
 
@@ -130,18 +130,18 @@ class _Growing:
     values: list[NDArray[np.float32]]
     valid: list[NDArray[np.bool_]]
 
-    def done(self, end_ns: int) -> Touch:
+    def done(self, end_ns: int) -> RecordedTouch:
         window, valid = np.stack(self.values), np.stack(self.valid)
         there = valid.any(axis=0) & self.tared  # elements that measure anything
         quiet = [values for values, trusted in self.rest if trusted[there].all()]
         gap = not valid[:, there].all() or len(quiet) < LEAST_REST
         if gap or not there.any():
-            return Touch(self.onset_ns, end_ns, window[:0], GAP)
+            return RecordedTouch(self.onset_ns, end_ns, window[:0], GAP)
         # Where there was less rest it is there again and again, the latest last.
         rest = np.stack(quiet)[np.arange(-REST, 0) % len(quiet)]
         whole = np.concatenate([rest, window])
         whole[:, ~there] = self.offset[~there]
-        return Touch(self.onset_ns, end_ns, whole, "" if self._found_in(whole) else UNSURE)
+        return RecordedTouch(self.onset_ns, end_ns, whole, "" if self._found_in(whole) else UNSURE)
 
     def _found_in(self, whole: NDArray[np.float32]) -> bool:
         """Whether the onset is found in the touch alone, too."""

@@ -14,7 +14,7 @@ from tactile_rt.recording.labelling import (
     intervals_of_all,
     write_set,
 )
-from tactile_rt.recording.labels import Interval
+from tactile_rt.recording.labels import LabelledInterval
 from tactile_rt.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.stream import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.sweep_set import SweepManifest, read_object, read_sweeps
@@ -82,7 +82,7 @@ def test_what_cannot_be_used_is_counted(night, tmp_path):
 def test_lost_samples_and_recordings_without_labels_are_told(night, tmp_path):
     chunks = chunks_of_touches(["mug", "mug"])
     path = write(tmp_path / "gaps.mcap", chunks[:10] + chunks[12:130] + chunks[160:], ARRAY)
-    intervals = {path: [Interval(label="mug")], night: []}
+    intervals = {path: [LabelledInterval(label="mug")], night: []}
     said = "; ".join(find_labelled([path, night], intervals).left_out)
     assert "samples missing in gaps.mcap: 160" in said
     assert "touches with lost or invalid samples in their window: 1, first gaps.mcap" in said
@@ -125,7 +125,7 @@ def test_three_recordings_of_a_label_are_its_objects(tmp_path):
 def test_shares_are_of_each_category_and_some_of_each_are_trained(night, tmp_path, objects, sizes):
     found = find_labelled([night], intervals_of_all([night]))
     found.used = [
-        replace(found.used[0], interval=Interval(label=kind, object=str(k)))
+        replace(found.used[0], interval=LabelledInterval(label=kind, object=str(k)))
         for kind in KINDS
         for k in range(objects)
     ]

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from tactile_rt.recording.labels import Interval, append_label, label_of_file, read_labels
+from tactile_rt.recording.labels import LabelledInterval, append_label, label_of_file, read_labels
 from tactile_rt.stream import ConfigError
 
 HEADER = "recording,start_s,end_s,label,object\n"
@@ -27,8 +27,8 @@ def read(night, text, also=()):
 def test_what_was_appended_is_read(night):
     path = night.with_name("labels.csv")
     said = [
-        Interval(label="mug", start_s=0.25, end_s=12, object="red, with a handle"),
-        Interval(label="plate", start_s=12, end_s=1e4),
+        LabelledInterval(label="mug", start_s=0.25, end_s=12, object="red, with a handle"),
+        LabelledInterval(label="plate", start_s=12, end_s=1e4),
     ]
     for one in said:
         append_label(path, "night.mcap", one)
@@ -43,7 +43,7 @@ def test_what_was_appended_is_read(night):
 def test_what_is_left_of_a_line_spoils_no_other(night):
     path = night.with_name("labels.csv")
     path.write_text(HEADER + "night.mcap,1,2,m")  # the power failed
-    append_label(path, "night.mcap", Interval(label="mug", start_s=3, end_s=4))
+    append_label(path, "night.mcap", LabelledInterval(label="mug", start_s=3, end_s=4))
     assert path.read_text().splitlines()[1:] == ["night.mcap,1,2,m", "night.mcap,3,4,mug,"]
     with pytest.raises(ConfigError, match=r"labels.csv:2: 4 values for 5 columns"):
         read_labels(path, [night])
@@ -52,17 +52,20 @@ def test_what_is_left_of_a_line_spoils_no_other(night):
 def test_nothing_is_appended_that_could_not_be_read(night):
     path = night.with_name("labels.csv")
     for bad in (
-        Interval(label="", start_s=0, end_s=1),
-        Interval(label="mug", start_s=0, end_s=1, object="a/b"),
-        Interval(label="mug", start_s=2, end_s=1),
-        Interval(label="mug", start_s=0, end_s=math.inf),
+        LabelledInterval(label="", start_s=0, end_s=1),
+        LabelledInterval(label="mug", start_s=0, end_s=1, object="a/b"),
+        LabelledInterval(label="mug", start_s=2, end_s=1),
+        LabelledInterval(label="mug", start_s=0, end_s=math.inf),
     ):
         with pytest.raises(ConfigError):
             append_label(path, "night.mcap", bad)
+    for bad in ("#1.mcap", "a\nb.mcap"):
+        with pytest.raises(ConfigError, match=r"cannot stand in labels.csv"):
+            append_label(path, bad, LabelledInterval(label="mug", start_s=0, end_s=1))
     assert not path.exists()
     path.write_text("time,what\n")
-    with pytest.raises(ConfigError, match="labels.csv:1: columns are time,what, not recording"):
-        append_label(path, "night.mcap", Interval(label="mug", start_s=0, end_s=1))
+    with pytest.raises(ConfigError, match=r"labels.csv:1: columns are time,what, not recording"):
+        append_label(path, "night.mcap", LabelledInterval(label="mug", start_s=0, end_s=1))
 
 
 def test_one_recording_need_not_be_named(night, tmp_path):

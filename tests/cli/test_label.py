@@ -1,0 +1,259 @@
+"""`tactile-rt label`: from a recording to a model that decides on it, and refusals in one line."""
+
+import json
+import re
+import shlex
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mcap")
+pytest.importorskip("torch")
+pytest.importorskip("onnx")
+
+from tactile_rt.classifier.classifier import Classifier
+from tactile_rt.classifier.model_file import load_model
+from tactile_rt.models import datasets
+from tactile_rt.models.datasets import SweepSet, TrainingBatches, joined
+from tactile_rt.models.disturbances import CLEAN, Disturbance
+from tactile_rt.models.evaluation import run_windows
+from tactile_rt.recording import Recording
+from tactile_rt.sensor_faults import SensorFaults
+from tactile_rt.stream import ConfigError
+from tactile_rt.sweep_set import SweepManifest
+from tests.helpers.labelled import ARRAY, record_touches, touched
+from tests.helpers.source_tree import ROOT
+from tests.helpers.tiny_sweeps import LEAD, SAMPLES, plate, write_tiny_set
+
+PAGE = ROOT / "docs" / "labelling.md"
+SOUND = {"noise": 1.0, "gain": 0.0, "dead": 0.0}
+SMALL = ("--encoder", "gru", "--attender", "none", "--decoder", "linear", "--width", 1 / 32)
+
+
+def blocks(language):
+    return re.findall(rf"```{language}\n(.*?)```", PAGE.read_text("utf-8"), re.S)
+
+
+def place_of(folder):
+    """A folder with the tutorial's recording, its labels, and a simulated set of the array."""
+    record_touches(folder / "night.mcap", ["mug"] * 12 + ["cup"] * 12)
+    (folder / "labels.csv").write_text("".join(blocks("csv")))
+    write_tiny_set(folder / "data" / "robot", spec=ARRAY, categories=("mug", "bowl"))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    return place_of(tmp_path_factory.mktemp("label"))
+
+
+@pytest.fixture(scope="module")
+def night(here):
+    """The tutorial's set, made by hand of what the command is made of."""
+    from tactile_rt.recording.labelling import find_labelled, intervals_beside, write_set
+
+    path = here / "night.mcap"
+    write_set(here / "set", find_labelled([path], intervals_beside([path])))
+    return here / "set"
+
+
+def lines_of(call, *words):
+    code, out, err = call(*words)
+    assert not code, err
+    return out, err
+
+
+@pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
+def test_the_tutorial_does_what_it_says(here, call, monkeypatch):
+    monkeypatch.chdir(here)
+    said = {}
+    for block in blocks("sh"):
+        words = shlex.split(block)[1:]
+        if words[0] == "train":  # all that is not as on the page: minutes are seconds here
+            words += ["--updates", "8" if words[2] == "runs/night" else "2", "--width", "0.03125"]
+            words = [w for k, w in enumerate(words) if "--from" not in words or k < len(words) - 2]
+        said[" ".join(words[:3])] = lines_of(call, *words)
+    (promised,) = re.findall(r"^    (night: .*)$", PAGE.read_text("utf-8"), re.M)
+    assert said["label night.mcap night"][1].strip() == promised
+    assert "1 unseen" not in said["eval night.onnx night"][0]
+    assert "none added to that of the" in " ".join(said["eval night.onnx night"][0].split())
+    decisions = [json.loads(line) for line in (here / "decisions.jsonl").read_text().splitlines()]
+    assert sum(d["final"] for d in decisions) == 24
+    assert set(load_model(here / "night.onnx")[1].labels) == {"mug", "cup"}
+    manifest = SweepManifest.read(here / "both")
+    assert manifest.period_ns == SweepManifest.read(here / "data" / "robot").period_ns
+    (making, *_) = load_model(here / "night.onnx")[1].provenance["commands"]
+    assert making == "tactile-rt label night.mcap night --split 0.7,0.15,0.15 --seed 0"
+
+
+def fed(model, path):
+    """Samples, offset and sigma of every window that a classifier fed its network."""
+    classifier, windows = Classifier(model, ARRAY), []
+    stepper = classifier._stepper
+    run = stepper.run
+
+    def noted():
+        windows.append(
+            [stepper.samples[0].copy(), stepper._offset.array[0], stepper._sigma.array[0]]
+        )
+        windows[-1][1:] = [a.copy() for a in windows[-1][1:]]
+        return run()
+
+    stepper.run = noted
+    for chunk in Recording(path):
+        classifier.push(chunk)
+    steps = classifier.card.steps
+    taken = [windows[k : k + steps] for k in range(0, len(windows), steps)]
+    return (
+        np.stack([[step[0] for step in one] for one in taken]),
+        np.stack([one[0][1] for one in taken]),
+        np.stack([one[0][2] for one in taken]),
+    )
+
+
+def test_training_gets_what_a_classifier_feeds_its_network(here, night, call, monkeypatch):
+    run = here / "parity"
+    lines_of(call, "train", night, run, *SMALL, "--batch", 8, "--updates", 1)
+    lines_of(call, "export", run / "best.pt", here / "parity.onnx")
+    samples, offset, sigma = fed(here / "parity.onnx", here / "night.mcap")
+    assert samples.shape == (24, 22, 5, *ARRAY.shape)
+    loads = samples - offset[:, None, None]
+    by_time = {}  # what the classifier was fed, by the time of the touch
+    for name in ("train", "validation", "test"):
+        data = SweepSet.read(night, name)
+        faults = {"faults": SOUND}
+        data = replace(
+            data, manifest=replace(data.manifest, recipe={**data.manifest.recipe, **faults})
+        )
+        assert data.manifest.faults == SensorFaults(**SOUND)
+        onsets = [
+            t for n in data.manifest.split[name] for t in np.load(night / f"{n}.npz")["onset_s"]
+        ]
+        place = [round((t - 2.2) / 3.4) for t in onsets]
+        seen = []
+        run_windows(data, lambda *a, seen=seen: seen.append(a) or np.zeros((len(a[0]), 22, 2)))
+        assert np.allclose(seen[0][0], samples[place], rtol=1e-6, atol=0)
+        assert np.allclose(seen[0][1], offset[place], rtol=1e-6, atol=0)
+        assert np.allclose(seen[0][2], sigma[place], rtol=1e-6, atol=0)
+        monkeypatch.setattr(datasets, "JITTER", 0)
+        batches = TrainingBatches(data, len(data.sweeps), seed=3)
+        ((x, o, s, _),) = (tuple(t.numpy() for t in batch) for batch in batches.epoch(0))
+        order = np.random.default_rng([3, 0]).permutation(len(data.sweeps))
+        drawn = np.array(place)[order]
+        unit = sigma[drawn][:, None, None]
+        assert np.abs((x - o[:, None, None] - loads[drawn]) / unit).max() < 1e-6
+        assert np.allclose(s, sigma[drawn], rtol=1e-6, atol=0)
+        by_time |= dict.fromkeys(place)
+    assert len(by_time) == 24, "every touch was compared"
+
+
+def test_no_noise_is_added_to_recorded_sweeps_but_what_is_lacking(night):
+    data = SweepSet.read(night, "train")
+    values, rng = data.sweeps.values, np.random.default_rng(0)
+    assert Disturbance(noise=1.0).of_samples(values, data, rng) == pytest.approx(
+        values - values[:, :200].mean(axis=1, keepdims=True), abs=1e-9
+    )
+    twice = Disturbance(noise=2.0).of_samples(values, data, rng)
+    added = twice - values + values[:, :200].mean(axis=1, keepdims=True)
+    assert added.std(axis=(0, 1, 2)) == pytest.approx(3**0.5 * data.noise, rel=0.05)
+    assert CLEAN.of_samples(values, data, rng) is values
+
+
+def test_a_simulated_and_a_recorded_set_train_together_each_in_its_way(here, night):
+    sets = [SweepSet.read(folder, "train") for folder in (here / "data" / "robot", night)]
+    both = joined(sets)
+    assert both.sweeps.values.shape[1] == 200 + max(110, SAMPLES - LEAD)
+    simulated = ~both.recorded
+    assert simulated.sum() == len(sets[0].sweeps)
+    assert (both.sweeps.values[simulated][:, :200] == 0).all()
+    own = sets[0].sweeps.values
+    assert np.array_equal(
+        both.sweeps.values[simulated][:, 200 : 200 + SAMPLES - LEAD], own[:, LEAD:]
+    )
+    # a sample sooner, as the tare of a lead of 24 samples is ready only after it
+    assert (both.noisy_starts[0][simulated] == 201).all()
+    assert (sets[0].noisy_starts[0] == LEAD + 2).all()
+    assert np.array_equal(both.sweeps.values[both.recorded][:, :310], sets[1].sweeps.values)
+    for mixed, alone in zip(both.tares, sets[1].tares, strict=True):
+        assert np.array_equal(mixed[both.recorded], alone)
+        assert not mixed[simulated].any()
+
+
+def test_touches_without_labels_are_for_pretraining_alone(here, call, refused):
+    folder = here / "bare"
+    lines_of(call, "label", here / "night.mcap", folder, "--unlabelled")
+    manifest = SweepManifest.read(folder)
+    assert manifest.categories == ("unlabelled",) and len(manifest.names()) == 24
+    err = refused("train", folder, here / "no", *SMALL)
+    assert "bare holds touches without labels: learn from them by --recipe simclr" in err
+    err = refused("train", here / "data" / "robot", here / "no", "--also", folder, *SMALL)
+    assert "holds touches without labels" in err
+
+
+def test_sets_of_another_array_or_period_do_not_train_together(here, night, tmp_path, refused):
+    write_tiny_set(tmp_path / "other", spec=plate(1, 4))
+    write_tiny_set(tmp_path / "slow", spec=ARRAY, period_ns=15_000_000)
+    for other, why in (
+        ("other", "elements[2] is"),
+        ("slow", "the period of their samples, 9 ms and 15 ms"),
+    ):
+        err = refused("train", night, tmp_path / "r", "--also", tmp_path / other, *SMALL)
+        assert "cannot be joined" in err and why in err
+
+
+def test_an_earlier_release_would_refuse_it(night):
+    assert SweepManifest.read(night).version == 3
+    with pytest.raises(ConfigError, match="which can be read but not gone on with"):
+        replace(SweepManifest.read(night), version=2).write(night)
+
+
+def test_a_set_is_replaced_on_demand_and_nothing_else_is(here, night, tmp_path, call, refused):
+    recording = here / "night.mcap"
+    out = tmp_path / "set"
+    shutil.copytree(night, out)
+    err = refused("label", recording, out)
+    assert f"{out} is there already: name another folder, or give --force" in err
+    _, err = lines_of(call, "label", recording, out, "--force", "--split", "0.5,0.25,0.25")
+    assert "24 of 24 touches" in err
+    assert "is made of recordings, by `tactile-rt label`" in refused("sweep", out)
+    assert [p.name for p in tmp_path.iterdir()] == ["set"]
+    lines_of(call, "sweep", out, "--verify")
+    err = refused("label", recording, here / "data" / "robot", "--force")
+    assert "is no set of recordings, and stays" in err
+    (out / "notes.txt").touch()
+    err = refused("label", recording, out, "--force")
+    assert f"{out} holds 'notes.txt', too, and stays" in err
+    err = refused("label", recording, tmp_path / "no" / "set")
+    assert "no folder" in err
+
+
+def test_what_is_wrong_is_one_line(here, tmp_path, refused):
+    recording = here / "night.mcap"
+    alone = tmp_path / "alone.mcap"
+    alone.write_bytes(recording.read_bytes())
+    out, said = tmp_path / "set", tmp_path / "said.csv"
+    said.write_text("start_s,end_s,label\n0,10,mug\n5,x,mug\n")
+    for words, why in (
+        ((alone, out), "no labels.csv beside"),
+        ((recording, out, "--labels", said), "said.csv:3: end_s: expected a number, got 'x'"),
+        ((recording, out, "--labels", tmp_path / "no.csv"), "no.csv"),
+        ((recording, out, "--by-name", "--unlabelled"), "exclude one another: give one"),
+        ((recording, recording, out), "is named twice: name it once"),
+        ((recording, out, "--split", "much"), "--split is TRAIN,VALIDATION,TEST"),
+        ((recording, out, "--split", "0,1,1"), "--split is TRAIN,VALIDATION,TEST"),
+        ((tmp_path / "no.mcap", out, "--by-name"), "no recording"),
+        ((recording, out, "--like", tmp_path), "is not a sweep set"),
+    ):
+        assert why in refused("label", *words)
+        assert not out.exists()
+
+
+def test_a_quiet_recording_holds_no_touch(tmp_path, refused):
+    from tactile_rt.testing import cut
+    from tests.helpers.recordings import write
+
+    path = write(tmp_path / "mug.mcap", cut(touched(["mug"])[:500], 250.0), ARRAY)
+    err = refused("label", path, tmp_path / "set", "--by-name")
+    assert "no touch can be used: intervals in which no touch begins: 1" in err
