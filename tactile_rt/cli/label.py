@@ -89,12 +89,16 @@ def label(
 
 
 def _shares(text: str) -> tuple[float, ...]:
+    from tactile_rt.recording.labelling import check_shares
+
     try:
-        return tuple(map(float, text.split(",")))
+        shares = tuple(map(float, text.split(",")))
     except ValueError:
         raise ConfigError(
             f"--split is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15, not {text!r}"
         ) from None
+    check_shares(shares)
+    return shares
 
 
 def _check_out(folder: Path, force: bool) -> None:

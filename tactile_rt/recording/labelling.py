@@ -38,6 +38,7 @@ from tactile_rt.version import VERSION
 __all__ = [
     "SHARES",
     "LabelledTouches",
+    "check_shares",
     "find_labelled",
     "intervals_beside",
     "intervals_by_name",
@@ -239,8 +240,7 @@ def write_set(
     Raises:
         ConfigError: no touch can be used, or shares that cannot be.
     """
-    if len(shares) != len(SPLITS) or not all(0 <= s < inf for s in shares) or not shares[0]:
-        raise ConfigError("--split is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15: train some")
+    check_shares(shares)
     if not touches.used:
         why = "; ".join(touches.left_out) or "no recording holds one"
         raise ConfigError(f"no touch can be used: {why}")
@@ -275,6 +275,18 @@ def write_set(
             write_object(made, name, np.stack([u.touch.values for u in used]), about)
         finish(made)
     return manifest
+
+
+def check_shares(shares: Sequence[float]) -> None:
+    """Refuse shares by which objects cannot be split.
+
+    Raises:
+        ConfigError: not one for each split, a negative one, or nothing to train on.
+    """
+    if len(shares) != len(SPLITS) or not all(0 <= s < inf for s in shares) or not shares[0]:
+        raise ConfigError(
+            "--split is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15: 0 or more each, and some to train"
+        )
 
 
 class _Counted:

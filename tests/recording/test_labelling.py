@@ -99,6 +99,21 @@ def test_if_nothing_is_left_the_reasons_are_the_error(night, tmp_path):
     assert not (tmp_path / "set").exists()
 
 
+def test_a_set_is_there_whole_or_not_at_all(night, tmp_path):
+    found = find_labelled([night], intervals_of_all([night]))
+
+    def fail(folder):
+        assert len(list(folder.glob("*.npz"))) == 4
+        raise OSError("the disk is full")
+
+    before = write_set(tmp_path / "set", found)
+    for name in ("set", "other"):
+        with pytest.raises(OSError, match="full"):
+            write_set(tmp_path / name, found, seed=1, finish=fail)
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]
+    assert SweepManifest.read(tmp_path / "set") == before
+
+
 def test_three_recordings_of_a_label_are_its_objects(tmp_path):
     files = [record_touches(tmp_path / f"mug-{k}.mcap", ["mug"] * 2, seed=k) for k in range(3)]
     files.append(record_touches(tmp_path / "cup.mcap", ["cup"] * 4, seed=9))
