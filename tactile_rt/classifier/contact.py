@@ -74,6 +74,8 @@ class ContactDetector:
         sigma: (element, channel) The noise per sample, one standard deviation, SI; it is never
             below `floor`.
         tared: (element,) Whether `offset` and `sigma` rest on enough samples, bool.
+        doubted: The number of samples before the latest onset that the tare leaves out, as they
+            may be of the touch already.
     """
 
     def __init__(self, shape: tuple[int, int], floor: NDArray[np.float32]) -> None:
@@ -82,6 +84,7 @@ class ContactDetector:
         self.offset = np.zeros(shape, dtype=np.float32)
         self.sigma = np.broadcast_to(self.floor, shape).astype(np.float32)
         self.tared: NDArray[np.bool_] = np.zeros(shape[0], dtype=np.bool_)
+        self.doubted = 0
         # Quiet samples with their validity; an invalid one counts as nothing in every sum.
         self._pending: deque[tuple[NDArray[np.float64], NDArray[np.bool_]]] = deque()
         self._baseline: deque[tuple[NDArray[np.float64], NDArray[np.bool_]]] = deque()
@@ -122,6 +125,7 @@ class ContactDetector:
             self._quiet_for = 0
             # What came before the onset is known to be quiet now, and need not wait.
             self._learn(max(FIRST_GUARD_SAMPLES, int(self._suspicious_for[certain].max())))
+            self.doubted = len(self._pending) + 1  # and the one that was above its threshold first
             self._pending.clear()
         elif self.contact:
             self._quiet_for = 0 if (excess > RELEASE).any() else self._quiet_for + 1

@@ -7,15 +7,15 @@ have fed it: the same resampled samples, the same onset, the same tare.
 
 Plan: the stream goes through the resampler and the detector that a classifier has. An onset begins
 a touch, as long as an episode; while it lasts no other begins. With a touch goes the rest before
-it: the latest samples without contact, as these are what its tare was measured on; enough of them
-that the detector, run on a touch alone, has forgotten how it began when the onset comes, and finds
-it where it found it in the stream. A touch that a classifier would have had no samples for, as the
+it: the latest samples that a tare may be made of, whatever lies between them; enough of them that
+the detector, run on a touch alone, has forgotten how it began when the onset comes, and finds it
+where it found it in the stream. A touch that a classifier would have had no samples for, as the
 stream ended or had a gap, is given with the reason why it is none to learn from.
 """
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +34,6 @@ from tactile_rt.timing import Timing
 __all__ = ["ENDS", "GAP", "REST", "UNSURE", "RecordedTouch", "find_touches"]
 
 REST = 2 * BASELINE_SAMPLES  # samples before the onset: a whole baseline, measured on a whole one
-LEAST_REST = TARE_SAMPLES + FIRST_GUARD_SAMPLES
 SURE = FIRST_GUARD_SAMPLES  # samples by which an onset may be found elsewhere than in the stream
 # why a touch is none to learn from
 ENDS = "before whose window ends the recording ends"
@@ -97,11 +96,17 @@ class _Cutter:
                 yield from self.broken(GAP)
             self._next_seq = seq + 1
             detector = self._detector
+            quiet = not detector.contact  # the sample at which a contact ends is in no tare
             begins = detector.update(values, valid)
             if begins and self._touch is None:
-                tare = detector.offset, detector.tared
-                self._touch = _Growing(t_ns, list(self._rest), *tare, detector.floor, [], [])
-            if not detector.contact:
+                self._touch = _Growing(
+                    t_ns, list(self._rest), detector.doubted, detector.offset, detector.tared,
+                    detector.floor,
+                )  # fmt: skip
+            if begins:  # what was doubted is in no later tare, either
+                for _ in range(min(detector.doubted, len(self._rest))):
+                    self._rest.pop()
+            if quiet and not begins:
                 self._rest.append((values, valid))
             if self._touch is not None:
                 self._touch.values.append(values)
@@ -124,22 +129,24 @@ class _Growing:
 
     onset_ns: int
     rest: list[tuple[NDArray[np.float32], NDArray[np.bool_]]]
+    doubted: int  # of the rest, the last samples
     offset: NDArray[np.float32]  # (element, channel)
     tared: NDArray[np.bool_]  # (element,)
     floor: NDArray[np.float32]  # (channel,)
-    values: list[NDArray[np.float32]]
-    valid: list[NDArray[np.bool_]]
+    values: list[NDArray[np.float32]] = field(default_factory=list)
+    valid: list[NDArray[np.bool_]] = field(default_factory=list)
 
     def done(self, end_ns: int) -> RecordedTouch:
         window, valid = np.stack(self.values), np.stack(self.valid)
         there = valid.any(axis=0) & self.tared  # elements that measure anything
         quiet = [values for values, trusted in self.rest if trusted[there].all()]
-        gap = not valid[:, there].all() or len(quiet) < LEAST_REST
+        gap = not valid[:, there].all() or len(quiet) - self.doubted < TARE_SAMPLES
         if gap or not there.any():
             return RecordedTouch(self.onset_ns, end_ns, window[:0], GAP)
-        # Where there was less rest it is there again and again, the latest last.
-        rest = np.stack(quiet)[np.arange(-REST, 0) % len(quiet)]
-        whole = np.concatenate([rest, window])
+        # Where there was less rest, what the tare rests on is there again and again.
+        sure = np.arange(len(quiet) - REST, 0) % (len(quiet) - self.doubted)
+        rest = np.stack(quiet)
+        whole = np.concatenate([rest[sure], rest, window])
         whole[:, ~there] = self.offset[~there]
         return RecordedTouch(self.onset_ns, end_ns, whole, "" if self._found_in(whole) else UNSURE)
 
