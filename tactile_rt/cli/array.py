@@ -1,4 +1,4 @@
-"""`tactile-rt array fit`: a device measured, and its description brought to that."""
+"""`tactile-rt array`: arrays by name; a device measured, and its description brought to that."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,13 +15,37 @@ if TYPE_CHECKING:
     from tactile_rt.sim_backend.measuring.findings import ArrayFinding
     from tactile_rt.sim_backend.measuring.gains import KnownLoad
 
-array = typer.Typer(help="An array's own file.", no_args_is_help=True)
+array = typer.Typer(help="Arrays by name, and an array's own file.", no_args_is_help=True)
 app.add_typer(array, name="array")
 
 
 @array.callback()
 def _array() -> None:
-    """An array's own file: what it says, and what the device does."""
+    """Arrays by name; an array's own file: what it says, and what the device does."""
+
+
+@array.command("list")
+def show() -> None:
+    """Show the arrays that have a name, for sim:NAME and new --array NAME.
+
+    An animal's name takes a side: mouse-left, mouse-both.
+    """
+    try:
+        with starting():
+            from tactile_rt.sim_backend.arrays.files import load_animals
+            from tactile_rt.sim_backend.arrays.robots import ROBOTS
+            from tactile_rt.sim_backend.arrays.species import SPECIES
+            from tactile_rt.sim_backend.transducer import device_spec
+    except ModuleNotFoundError as error:
+        raise needs("sim", error) from None
+    table = Table("array", "whiskers", "channels", "rate, Hz", header_style="bold")
+    table.add_column("read by", overflow="fold")
+    for name in (*SPECIES, *ROBOTS):
+        spec = device_spec(load_animals(name))
+        channels = f"{' '.join(spec.channels)} ({', '.join(dict.fromkeys(spec.units))})"
+        reader = ROBOTS.get(name, "any device of such channels")
+        table.add_row(name, str(len(spec.elements)), channels, f"{spec.rate_hz:g}", reader)
+    Console().print(table)
 
 
 @array.command()

@@ -18,7 +18,7 @@ ABOUT = ("top-1", "top-1 at rated noise", "RBF SVM top-1", "points above the SVM
 def new(
     folder: Annotated[Path, typer.Argument(help="Where the project begins: a new folder.")],
     array: Annotated[
-        str, typer.Option(help="A .toml file, or mouse, rat-both, ...; default: an example.")
+        str, typer.Option(help="A .toml file, or one of `array list`; default: an example.")
     ] = "",
     kinds: Annotated[
         str, typer.Option(help="Categories of objects to tell apart, comma-separated.")

@@ -20,13 +20,17 @@ from tactile_rt.classifier.model_file import read_model
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.drivers.codec import codec_class
 from tactile_rt.files import write_whole
+from tactile_rt.sensor_faults import LARGEST
+from tactile_rt.sensor_spec import channel_limits
 from tactile_rt.settings import no_such, split_url
 from tactile_rt.sim_backend.arrays.files import ARRAY_FILES, load_animals, read_animals
+from tactile_rt.sim_backend.arrays.robots import ROBOTS, robot_text
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
-from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
+from tactile_rt.sim_backend.datasets.recipes import PARAMETERS, SweepRecipe
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
-from tactile_rt.sim_backend.sweep import Sweep, usual_distance
+from tactile_rt.sim_backend.sweep import usual_distance, usual_size
 from tactile_rt.sim_backend.transducer import device_spec, sensor_of
 from tactile_rt.sim_backend.world import PROFILES
 from tactile_rt.stream import ConfigError
@@ -36,6 +40,12 @@ __all__ = ["KINDS", "DeviceLine", "Project", "new_project"]
 RANGES = {"N": "range_n", "N m": "range_nm"}  # options of the native codec
 KINDS = ("bottle", "car", "chair", "gear", "mug", "pumpkin")
 FILES = ("sweeps.toml", "robot.toml", "test_robot.py", "README.md")
+# What robot.toml says of a device: a robot's codec does not know the places of its whiskers.
+DECLARED = 'array = "model.onnx"         # whose whiskers they are: the codec does not know'
+UNDECLARED = """\
+# A device that speaks another codec (`tactile-rt codecs`) is said to be your array:
+# url = "serial:///dev/ttyUSB0?codec=bota"
+# array = "model.onnx\""""
 SPREAD = (5.5 / 6.5, 8 / 6.5)  # of the distances at which objects pass, as `draw_sweep` draws them
 
 
@@ -116,9 +126,15 @@ class Project:
         return recipe
 
     def source_url(self, objects: Sequence[str], seed: int = 0, **options: object) -> str:
-        """The URL of the simulated array with these objects, as its device would deliver it."""
-        meshes = choose_objects(self.recipe().objects).mesh_options
-        asked = {"objects": ",".join(objects), "seed": seed, **meshes, **options}
+        """The URL of the simulated array with these objects, as its device would deliver it.
+
+        What sweeps.toml holds still is held still; what it draws is drawn as ever.
+        """
+        recipe = self.recipe()
+        meshes = choose_objects(recipe.objects).mesh_options
+        choices = {name: getattr(recipe.sweeps, name) for name in PARAMETERS}
+        still = {name: value for name, value in choices.items() if isinstance(value, int | float)}
+        asked = {"objects": ",".join(objects), "seed": seed, **still, **meshes, **options}
         return f"sim:{self.array}?{urlencode(asked, safe=',')}"
 
     def unseen(self) -> tuple[str, ...]:
@@ -167,8 +183,8 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
 
     Args:
         folder: where.
-        array: the name of an array, or a .toml file, which is copied; empty: eight nylon whiskers
-            on a plate, to be changed into one's own.
+        array: the name of an array, or a .toml file; a file or a robot's is copied. Empty: eight
+            nylon whiskers on a plate, to be changed into one's own.
         kinds: the categories of objects that it is to tell apart.
 
     Raises:
@@ -194,10 +210,13 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
         "kinds": ", ".join(f'"{kind}"' for kind in kinds),
         "near": near,
         "far": far,
-        "usual": f"{Sweep.size_mm:g}",
+        "usual": f"{usual_size(animals):g}",
+        "offset": f"{_wandering(animals):.2g}",
         "profiles": ", ".join(PROFILES),
         "whiskers": str(len(spec.elements)),
         "link": f"/tmp/{folder.resolve().name}",
+        "device": ROBOTS.get(array, "codec=native"),
+        "declared": DECLARED if array in ROBOTS else UNDECLARED,
     }
     folder.mkdir(parents=True, exist_ok=True)
     for name in FILES:
@@ -207,8 +226,21 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
     return Project(folder)
 
 
+def _wandering(animals: tuple[WhiskerArray, ...]) -> float:
+    """The drift of an array's sensor, in units of the rated noise of the network's samples."""
+    sensor = sensor_of(animals)
+    if sensor is None:
+        return 0.0
+    period_ms = max(SweepRecipe.period_ms, 1e3 / sensor.rate_hz)
+    noise = channel_limits(device_spec(animals), sensor, round(period_ms * 1e6)).noise
+    most = max(c.drift / float(n) for c, n in zip(sensor.channels, noise, strict=True))
+    return min(most, LARGEST)
+
+
 def _described(array: str) -> str:
     """The text of the project's own array.toml."""
+    if array in ROBOTS:
+        return robot_text(array)
     path = Path(array)
     if path.suffix.lower() not in ARRAY_FILES:
         return (

@@ -5,7 +5,7 @@ it (see `whisker_array.MOUNT`). The object moves along -y, as things do past a h
 forward.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from types import MappingProxyType
@@ -19,7 +19,7 @@ from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.stream import ConfigError
 
-__all__ = ["NOTHING", "Sweep", "draw_sweep", "usual_distance"]
+__all__ = ["NOTHING", "Sweep", "draw_sweep", "usual_distance", "usual_size"]
 
 NOTHING: Mapping[str, float] = MappingProxyType({})
 
@@ -118,6 +118,15 @@ def usual_distance(animals: tuple[WhiskerArray, ...]) -> float:
     6.5 mm, 19 of a rat's 30 beyond its 8.75.
     """
     return round(Sweep.distance_mm * lateral_reach(animals) / _mouse_reach(), 2)
+
+
+def usual_size(animals: Sequence[WhiskerArray]) -> float:
+    """A mouse's 40 mm, or as far as the base points of an array are apart where that is more, mm.
+
+    So an object is no smaller than what it passes.
+    """
+    apart = [float(np.ptp([w.base for w in a.whiskers], axis=0).max()) for a in animals]
+    return max(Sweep.size_mm, *apart)
 
 
 @cache

@@ -1,4 +1,4 @@
-"""`tactile-rt array fit`: what it shows, what it writes, what it refuses."""
+"""`tactile-rt array`: what it lists; what `fit` shows, writes and refuses."""
 
 import re
 import shlex
@@ -13,6 +13,8 @@ pytest.importorskip("mcap")
 from tactile_rt.project.device import read_fit
 from tactile_rt.project.folder import Project, new_project
 from tactile_rt.sim_backend.arrays.files import load_array
+from tactile_rt.sim_backend.arrays.robots import ROBOTS
+from tactile_rt.sim_backend.arrays.species import SPECIES
 from tests.helpers.plucked import plucked
 from tests.helpers.recordings import write
 from tests.helpers.source_tree import ROOT
@@ -45,6 +47,16 @@ def project(device, tmp_path: Path, monkeypatch) -> Project:
     made = new_project(tmp_path / "whiskers")
     made.array.write_text(device[0].read_text())
     return Project(Path("whiskers"))
+
+
+def test_every_array_that_has_a_name_is_listed(call, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    code, out, err = call("array", "list")
+    assert (code, err) == (0, "")
+    cells = [line.strip("│").split("│") for line in out.splitlines() if line[0] == "│"]
+    rows = {name.strip(): tuple(map(str.strip, rest)) for name, *rest in cells}
+    assert list(rows) == [*SPECIES, *ROBOTS]
+    assert rows["hx711_whisker"] == ("9", "bridge0 bridge1 (V)", "80", "codec=hx711_whisker")
 
 
 def page_commands() -> list[list[str]]:

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from urllib.parse import urlencode
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from tactile_rt.project.folder import KINDS, Project, new_project
 from tactile_rt.project.making import make
 from tactile_rt.project.report import confused
 from tactile_rt.sim_backend.arrays.files import load_array
+from tactile_rt.sim_backend.arrays.robots import ROBOTS, robot_text
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.sources.opening import check_source, open_source
@@ -55,6 +57,44 @@ def test_its_array_is_the_one_that_was_asked_for(array: str, tmp_path: Path) -> 
     assert project.recipe().period_ms == period_ms
 
 
+@pytest.mark.parametrize("name", sorted(ROBOTS))
+def test_a_robot_s_project_is_its_array_behind_its_codec(name: str, tmp_path: Path) -> None:
+    project = new_project(tmp_path / "mine", name, ("mug", "gear"))
+    assert project.array.read_text("utf-8") == robot_text(name), "a copy, to be changed"
+    source = load_config(project.folder / "robot.toml").config.source[0]
+    assert source.url == f"serial:///tmp/mine?{ROBOTS[name]}"
+    assert source.array == str(project.model)
+    line = project.line()
+    assert (line.wire, line.port) == ("serial", "/tmp/mine")
+    assert urlencode({"codec": line.codec, **line.options}) == ROBOTS[name]
+    array = tmp_path / "array.json"
+    array.write_text(device_spec((load_array(str(project.array)),)).to_json())
+    assert check_source(source.url, array=str(array)) == device_spec((load_array(name),))
+
+
+def test_what_the_sweeps_hold_still_the_device_holds_still(tmp_path: Path) -> None:
+    project = new_project(tmp_path / "mine", "hx711_whisker", ("mug", "gear"))
+    sweeps = project.folder / "sweeps.toml"
+    assert "size_mm = 66\n" in sweeps.read_text()
+    sweeps.write_text(re.sub(r"yaw_deg = .*", "yaw_deg = 30", sweeps.read_text()))
+    with open_source(project.source_url(["mug"], sweeps=2, pace="fast")) as source:
+        for _ in source:
+            pass
+        passed = [p.sweep for p in source.passes]
+    assert [(s.size_mm, s.yaw_deg) for s in passed] == [(66, 30)] * 2
+    assert passed[0].speed_mm_s != passed[1].speed_mm_s, "what they draw is drawn"
+
+
+def test_training_draws_the_drift_that_the_sensor_is_said_to_have(tmp_path: Path) -> None:
+    drifting = new_project(tmp_path / "drifting", "hx711_whisker")
+    assert drifting.recipe().faults.offset == pytest.approx(4.0, rel=0.05)
+    array = tmp_path / "wild.toml"
+    array.write_text(drifting.array.read_text().replace("drift = 1e-6", "drift = 1e-3"))
+    assert new_project(tmp_path / "wild", str(array)).recipe().faults.offset == 100
+    for name in ("mouse", str(ROOT / "docs" / "arrays" / "robot.toml")):
+        assert new_project(tmp_path / Path(name).stem, name).recipe().faults.offset == 0
+
+
 def test_full_scale_of_a_codec_that_rounds_is_the_sensor_s(tmp_path: Path) -> None:
     magnets = new_project(tmp_path / "magnets", str(MAGNETS))
     assert magnets.full_scale("native") == {"range_si": "0.0079"}
@@ -86,6 +126,8 @@ def test_what_cannot_begin_is_one_line(refused, tmp_path: Path) -> None:
     assert "no category 'mugg'" in refused("new", tmp_path / "a", "--kinds", "mugg,gear")
     assert "two or more" in refused("new", tmp_path / "a", "--kinds", "mug")
     assert "no simulated array" in refused("new", tmp_path / "a", "--array", "hamster")
+    said = refused("new", tmp_path / "a", "--array", "hx711_whiskers")
+    assert "did you mean hx711_whisker?" in said
     assert "is a .toml file" in refused(
         "new", tmp_path / "a", "--array", MAGNETS.parent / "robot.csv"
     )

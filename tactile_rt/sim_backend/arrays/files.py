@@ -1,4 +1,4 @@
-"""Arrays by name: a species' or a file's, a table of whiskers in CSV or in TOML with more to it.
+"""Arrays by name: a species', a robot's, or a file's, a table in CSV or in TOML with more to it.
 
 Both kinds of file have the columns of ``data/mouse.csv`` and may add those of `whiskers.OPTIONAL`;
 see ``docs/arrays/robot.toml`` and ``robot.csv`` for one array in both. In TOML::
@@ -43,6 +43,7 @@ from tactile_rt.settings import (
     read_csv,
     read_toml,
 )
+from tactile_rt.sim_backend.arrays.robots import ROBOTS, robot_text
 from tactile_rt.sim_backend.arrays.species import species_array
 from tactile_rt.sim_backend.arrays.whisker_array import (
     HEAD_FILES,
@@ -97,7 +98,8 @@ def load_array(name: str) -> WhiskerArray:
     """The one array of a name.
 
     Args:
-        name: of an animal and side, see `species_array`, or a path to a .csv or .toml file.
+        name: of an animal and side, see `species_array`, or of a robot, see `ROBOTS`; or a path
+            to a .csv or .toml file.
 
     Raises:
         ConfigError: no such array, several, or a file with a mistake.
@@ -115,7 +117,11 @@ def load_animals(name: str) -> tuple[WhiskerArray, ...]:
         ConfigError: no such array, or a file with a mistake.
     """
     path = Path(name)
-    return read_animals(path) if path.suffix.lower() in ARRAY_FILES else (species_array(name),)
+    if path.suffix.lower() in ARRAY_FILES:
+        return read_animals(path)
+    if name in ROBOTS:
+        return read_animals(Path(f"{name}.toml"), robot_text(name))
+    return (species_array(name),)
 
 
 def read_animals(path: Path, text: str | None = None) -> tuple[WhiskerArray, ...]:
