@@ -6,6 +6,7 @@ sim:mouse?objects=mug-50,bottle-51&seed=3&pace=fast&profile=realtime&sweeps=10
 sim:mouse?noise_force=1e-5&noise_moment=5e-8&latency_ms=2&drop_probability=0.01
 sim:mouse?friction=0.3&young_modulus=0.2&angles_deg=3&mount_mm=0.5
 sim:springs.toml?base_turns=true
+sim:mouse?recipe=wide24&speed_mm_s=34
 
 An array whose file has a [sensor] delivers what that sensor reads, at its own rate and in its own
 units; the options of `SensorModel` then act on its readings.
@@ -16,19 +17,21 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import Final
 
 import numpy as np
 
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
+from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, promised_object
 from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.remarks import ringing
 from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
-from tactile_rt.sim_backend.sweep import Sweep, usual_distance
+from tactile_rt.sim_backend.sweep import Sweep, draw_sweep, usual_distance
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation, check_sweep, draw_simulation
 from tactile_rt.sim_backend.transducer import Transducer, device_spec, sensor_of
 from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS
@@ -40,6 +43,7 @@ log = logging.getLogger("tactile_rt.sim_backend")
 CHUNK_SAMPLES: Final = 9
 PACES: Final = ("realtime", "fast")
 TURNS: Final = ("turn_y", "turn_z")
+DRAGGED_SAMPLES = 300  # more, while an object that has passed by still drags a whisker along
 REST_SAMPLES = 600  # after an object its episode ends and contact is released; before one, a tare
 
 
@@ -120,6 +124,8 @@ class SimOptions(SensorModel, Randomisation, MeshDetail):
             same seed gives the same stream, and the same objects and sweeps whatever the sensors.
         profile: The name of the simulation profile, one of `world.PROFILES`.
         pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
+        recipe: The name or the .toml file of a recipe (see `datasets.recipes`) as whose sweeps the
+            parameters are drawn that are not given here; empty: as left out below.
         size_mm, speed_mm_s, yaw_deg, height_mm, distance_mm, gap_mm: The parameters of every sweep,
             see `sweep.Sweep`; left out, the size is 40 mm and the others are drawn anew each time.
         roll_deg, pitch_deg, heading_deg, climb_deg, ramp_ms, head_moves, surface_friction, shake_g,
@@ -136,6 +142,7 @@ class SimOptions(SensorModel, Randomisation, MeshDetail):
     seed: int = 0
     profile: str = "realtime"
     pace: str = "realtime"
+    recipe: str = ""
     size_mm: float | None = None
     speed_mm_s: float | None = None
     yaw_deg: float | None = None
@@ -217,7 +224,7 @@ class SimSource(PacedSource):
         self._rng = np.random.default_rng(options.seed)
         # Of its own, so that the objects are the same with and without.
         self._array_rng = np.random.default_rng([options.seed, 1])
-        self._distance_mm = usual_distance(self._animals)
+        self._draw = _drawing(self._animals, options)
         self.passes: list[Pass] = []
         self._strained: set[str] = set()  # whiskers of which it has been told
         if line := ringing(self._animals, PROFILES[options.profile]):
@@ -233,6 +240,7 @@ class SimSource(PacedSource):
         """The array that it would be; raises the `ConfigError` that opening it would raise."""
         animals = load_animals(array or "mouse")
         _check_turns(animals, options)
+        _drawing(animals, options)
         _objects(options)
         return _spec(animals, options)
 
@@ -269,11 +277,14 @@ class SimSource(PacedSource):
         else:
             assert self._simulation is not None
             n = min(CHUNK_SAMPLES, self._left)
-            values = self._simulation.advance(n).astype(np.float32)
+            loads, contacts = self._simulation.advance_with_contacts(n, every=n)
+            values = loads.astype(np.float32)
             if self._feels_turns:
                 turns = self._simulation.turns().astype(np.float32)
                 values = np.concatenate([values, turns], axis=2)
             self._left -= n
+            if not self._left and contacts[-1, :, 0].any():
+                self._left = DRAGGED_SAMPLES
             self._tell_of_strains(self._simulation)
         return self._stamp(values, start_ns)
 
@@ -309,13 +320,26 @@ class SimSource(PacedSource):
         target = self._objects[self._order.pop(0)]()
         draw, profile = self._options.randomisation.draw, PROFILES[self._options.profile]
         animals = tuple(draw(self._array_rng, animal) for animal in self._animals)
-        sweep, self._simulation = draw_simulation(
-            self._rng, animals, target, profile, self._distance_mm, self._options.chosen
-        )
+        sweep, self._simulation = draw_simulation(self._rng, animals, target, profile, self._draw)
         self._rest = REST_SAMPLES
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)
         now = start_ns + round(self._sent * SAMPLE_MS * 1e6)
         self.passes.append(Pass(now, target.name, target.category, sweep))
+
+
+def _drawing(
+    animals: tuple[WhiskerArray, ...], options: SimOptions
+) -> Callable[[np.random.Generator], Sweep]:
+    """What draws the parameters of each sweep."""
+    chosen = options.chosen
+    if not options.recipe:
+        return partial(draw_sweep, distance_mm=usual_distance(animals), chosen=chosen)
+    sweeps = read_recipe(options.recipe).sweeps
+
+    def draw(rng: np.random.Generator) -> Sweep:
+        return replace(sweeps.draw(rng, int(rng.integers(len(sweeps))), rng), **chosen)
+
+    return draw
 
 
 def _spec(animals: tuple[WhiskerArray, ...], options: SimOptions) -> ArraySpec:

@@ -1,6 +1,6 @@
 """A sweep, simulated: the world, the motion, the base loads at 1 kHz."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Protocol
@@ -21,7 +21,7 @@ from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS
 from tactile_rt.sim_backend.mujoco_world import MujocoWorld, sweep_model
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.remarks import strains
-from tactile_rt.sim_backend.sweep import NOTHING, Sweep, draw_sweep
+from tactile_rt.sim_backend.sweep import Sweep, draw_sweep
 from tactile_rt.sim_backend.world import SAMPLE_MS, Profile, engine_of
 from tactile_rt.stream import ConfigError
 
@@ -93,7 +93,8 @@ class SweepSimulation:
 
     Attributes:
         touches: False when the object passes without meeting any resting whisker.
-        duration_ms: The simulated time after which the object has passed all whiskers, ms.
+        duration_ms: The simulated time after which the object has passed where all whiskers rest,
+            ms; it may still drag one along.
     """
 
     def __init__(
@@ -269,17 +270,17 @@ def draw_simulation(
     array: WhiskerArray | tuple[WhiskerArray, ...],
     target: TactileObject,
     profile: Profile,
-    distance_mm: float = Sweep.distance_mm,
-    chosen: Mapping[str, float] = NOTHING,
+    draw: Callable[[np.random.Generator], Sweep] = draw_sweep,
 ) -> tuple[Sweep, SweepSimulation]:
     """Draw sweeps until the object meets the array; give up, with a miss, after many tries.
 
     Args:
-        rng, distance_mm, chosen: see `draw_sweep`.
+        rng: to draw from.
         array, target, profile: see `SweepSimulation`.
+        draw: draws the parameters of one sweep.
     """
     for _ in range(DRAWS):
-        sweep = draw_sweep(rng, distance_mm, chosen)
+        sweep = draw(rng)
         simulation = SweepSimulation(array, target, sweep, profile)
         if simulation.touches:
             break
