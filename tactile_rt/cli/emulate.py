@@ -123,10 +123,9 @@ def _of_project(
     line = project.line()
     if line.wire == "serial" and link is None and not line.port.startswith("/dev/"):
         link = Path(line.port)
-    if codec is None or codec == line.codec:
-        fields = {**line.options, **project.full_scale(line.codec), **fields}
+    codec, fields = project.spoken(codec, fields)
     return (
-        codec or line.codec,
+        codec,
         source or project.source_url(project.unseen()),
         wire or ("serial" if line.wire == "serial" else None),
         link,

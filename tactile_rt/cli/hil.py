@@ -24,8 +24,13 @@ def hil(
         str | None,
         typer.Option(help="What the device measures. Default: sim:mouse with new objects."),
     ] = None,
-    wire: Annotated[str, typer.Option(help="serial, slcan or virtual (a CAN bus).")] = "serial",
-    codec: Annotated[str, typer.Option(help="What the device speaks.")] = "native",
+    wire: Annotated[
+        str | None,
+        typer.Option(help="serial, slcan or virtual (a CAN bus). Default: serial, or a project's."),
+    ] = None,
+    codec: Annotated[
+        str | None, typer.Option(help="What the device speaks. Default: native, or a project's.")
+    ] = None,
     option: Annotated[
         list[str] | None,
         typer.Option(help="Of the codec: NAME=VALUE, e.g. format=int16; may be repeated."),
@@ -66,8 +71,13 @@ def hil(
 
     fields = codec_options(option or [])
     if project is not None:
-        source, model, fields = _of_project(project, source, model, codec, fields, seed)
+        source, model, wire, codec, fields = _of_project(
+            project, source, model, wire, codec, fields, seed
+        )
+    wire, codec = wire or "serial", codec or "native"
     file = model or shipped_model()
+    schedule = read_faults(faults) if faults else None
+    check_line(wire, codec, fields, clock)
     if source is None:
         unseen = load_model(file)[1].provenance.get("unseen_objects", [])
         source = f"sim:mouse?seed={seed}" + (f"&objects={','.join(unseen)}" if unseen else "")
@@ -78,8 +88,6 @@ def hil(
             source = _with(source, "sweeps", str(sweeps or SWEEPS))
     elif sweeps is not None:
         raise ConfigError("--sweeps is of a sim: source; of others give --seconds")
-    schedule = read_faults(faults) if faults else None
-    check_line(wire, codec, fields, clock)
     console = Console(stderr=True)
     with starting():
         opened = open_source(source)
@@ -104,11 +112,12 @@ def _of_project(
     folder: Path,
     source: str | None,
     model: Path | None,
-    codec: str,
+    wire: str | None,
+    codec: str | None,
     fields: dict[str, str],
     seed: int,
-) -> tuple[str, Path, dict[str, str]]:
-    """Source, model and options of the codec that a project has, unless others are asked for."""
+) -> tuple[str, Path, str, str, dict[str, str]]:
+    """Source, model and device that a project has, unless others are asked for."""
     try:
         from tactile_rt.project.folder import Project
     except ModuleNotFoundError as error:
@@ -117,7 +126,8 @@ def _of_project(
     if model is None and not made.model.exists():
         raise ConfigError(f"{folder} has no model yet: `tactile-rt make {folder}`")
     url = source or made.source_url(made.unseen(), seed)
-    return url, model or made.model, {**made.full_scale(codec), **fields}
+    wire = wire or ("serial" if made.line().wire == "serial" else "slcan")
+    return url, model or made.model, wire, *made.spoken(codec, fields)
 
 
 def _with(url: str, name: str, value: str) -> str:
@@ -143,6 +153,8 @@ def _table(report: "LoopReport", source: str, title: str) -> Table:
     table.add_row("identical decisions", share(report.identical, decisions))
     table.add_row("same labels", share(report.same_label, decisions))
     table.add_row("same final labels", share(report.finals_same, report.finals))
+    if report.passed:
+        table.add_row("objects named right", share(report.right, report.passed))
     table.add_row(
         "lost",
         f"{stats.missing} missing, {stats.corrupt} corrupt, {stats.dropped} dropped, "

@@ -6,12 +6,14 @@ source --> emulated device --> pty, slcan or CAN bus --> the real driver --> cla
 
 A decision depends on the times of its samples, as they are resampled. So the driver is asked for
 the device's own time (`clock=device`), and the direct path's samples have the time that the
-device's clock showed: what is compared is what the wire and the driver did, and nothing else. With
-the host's time, as a robot has it, decisions may differ in their last bits from run to run.
+device's clock showed: what is compared is what the wire and the driver did, and nothing else. Of a
+device that sends no time, samples are a period apart on both paths. With the host's time, as a
+robot has it, decisions may differ from run to run.
 """
 
 import os
 import time
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -19,6 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactile_rt.calibration import declare
 from tactile_rt.classifier.classifier import Classification, Classifier
@@ -26,13 +29,23 @@ from tactile_rt.drivers.codec import codec_class
 from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk, ConfigError, Source, SourceError, SourceStats
+from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, Source, SourceError, SourceStats
 
 if TYPE_CHECKING:
     from tactile_rt.drivers.emulation.faults import FaultSchedule
     from tactile_rt.drivers.health import Health
 
-__all__ = ["CLOCKS", "RANGES", "SAME_LABEL", "WIRES", "Loop", "LoopReport", "check_line", "pair"]
+__all__ = [
+    "CLOCKS",
+    "RANGES",
+    "SAME_LABEL",
+    "WIRES",
+    "Loop",
+    "LoopReport",
+    "check_line",
+    "named_right",
+    "pair",
+]
 
 WIRES: Final = ("serial", "slcan", "virtual")
 CLOCKS: Final = ("device", "host")
@@ -58,6 +71,8 @@ class LoopReport:
         same_label: Decisions of the same touch and step that have the same label on both paths.
         finals: Last decisions of a touch on the direct path.
         finals_same: Last decisions of a touch that have the same label on both paths.
+        passed: Number of simulated objects that passed; 0 where nobody knows what did.
+        right: Number of them whose first touch the driver's path ended with their own name.
         exact: Whether all decisions must be identical; else 99 % must have the same label.
         faulty: Whether faults were on the way; then only the account of losses must be right.
         stats: The driver's account of what it delivered and what it lost.
@@ -76,6 +91,8 @@ class LoopReport:
     same_label: int
     finals: int
     finals_same: int
+    passed: int
+    right: int
     exact: bool
     faulty: bool
     stats: SourceStats
@@ -143,7 +160,8 @@ class Loop:
             given.
         faults: What goes wrong on the way; the schedule is used up.
         seconds: How much of the source's stream to send, s; None to send all.
-        clock: Which times the driver's samples have: ``device``, or ``host``, in real time only.
+        clock: Which times the driver's samples have: ``device``, or ``host``, in real time only. Of
+            a device that sends no time, ``device`` is a period from each sample to the next.
 
     Attributes:
         complete: Whether the loop has run to the end; a report is only judged then.
@@ -185,6 +203,9 @@ class Loop:
         own = codec_class(make.wire, codec).Options
         form = self._options.get("format", getattr(own, "format", ""))
         self._exact = codec == "native" and form == "float32" and clock == "device" and not faults
+        period_ns = NS_PER_S / source.spec.rate_hz
+        untimed = clock == "device" and self._device.codec.tick_ns is None
+        self._period_ns = period_ns if untimed else None
         self._first_ns: int | None = None
         self._pending: deque[tuple[int, Chunk, int]] = deque()  # first number, samples, when
         self._samples = self._identical = 0
@@ -212,7 +233,8 @@ class Loop:
         SpecMismatch: what the codec carries cannot be the source's array.
         """
         with self._tee, self._device:
-            url = f"{self._device.url}&clock={self._clock}&start_s={START_S:g}"
+            clock = "host" if self._period_ns else self._clock
+            url = f"{self._device.url}&clock={clock}&start_s={START_S:g}"
             try:
                 driver = open_source(url)
             except SourceError:
@@ -227,6 +249,7 @@ class Loop:
                     came_ns = time.monotonic_ns()
                     self._push_direct()
                     if chunk is not None:
+                        chunk = self._counted(chunk, chunk.seq)
                         self._decided[1].extend(classifier.push(chunk))
                         self._compare(chunk, came_ns)
                     elif self._device.wait(0):
@@ -252,6 +275,8 @@ class Loop:
             same_label=sum(a.label == b.label for a, b in pairs),
             finals=sum(d.final for d in direct),
             finals_same=sum(a.label == b.label for a, b in finals),
+            passed=len(self._passes),
+            right=named_right(self._passes, wire),
             exact=self._exact,
             faulty=self._faulty,
             stats=driver.stats,
@@ -261,14 +286,29 @@ class Loop:
             health=driver.health,
         )
 
+    @property
+    def _passes(self) -> "list[tuple[int, str]]":
+        """When each object began to come by, in the driver's time, ns, and its category."""
+        began_ns = (self._first_ns or 0) if self._clock == "device" else 0
+        passes = getattr(self._tee.inner, "passes", ())
+        return [(p.start_ns - began_ns, p.category) for p in passes]
+
+    def _counted(self, chunk: Chunk, numbers: NDArray[np.int64]) -> Chunk:
+        """A chunk with the times of these sample numbers, where the device sends no time."""
+        if self._period_ns is None:
+            return chunk
+        t_ns = np.round(numbers * self._period_ns).astype(np.int64)
+        return Chunk(chunk.seq, t_ns, chunk.values, chunk.valid)
+
     def _push_direct(self) -> None:
         """The samples that have gone into the device since, straight into the classifier."""
         while self._tee.kept:
             chunk, went_ns = self._tee.kept.popleft()
             if self._first_ns is None:
                 self._first_ns = int(chunk.t_ns[0])
-            if self._clock == "device":
-                tick = self._device.codec.tick_ns or 1.0
+            chunk = self._counted(chunk, self._samples + np.arange(len(chunk)))
+            tick = self._device.codec.tick_ns
+            if self._clock == "device" and tick is not None:
                 ticks = np.floor_divide(chunk.t_ns - self._first_ns, tick)
                 t_ns = np.round(ticks * tick).astype(np.int64)
                 chunk = Chunk(chunk.seq, t_ns, chunk.values, chunk.valid)
@@ -306,6 +346,21 @@ def check_line(wire: str, codec: str, options: dict[str, str], clock: str) -> No
         if given not in known:
             raise ConfigError(f"{name} must be one of {', '.join(known)}, not {given!r}")
     make_codec("serial" if wire == "serial" else "can", codec, options)
+
+
+def named_right(passes: Sequence[tuple[int, str]], decisions: Sequence[Classification]) -> int:
+    """How many of the objects that passed are named by the last decision of their first touch.
+
+    Args:
+        passes: when each began to come by, stream time in ns, and its category; in order.
+        decisions: in order.
+    """
+    named: dict[int, str] = {}
+    for decision in decisions:
+        if decision.final:
+            number = bisect_right(passes, decision.onset_ns, key=lambda p: p[0]) - 1
+            named.setdefault(number, decision.label)
+    return sum(named.get(i) == category for i, (_, category) in enumerate(passes))
 
 
 def pair(

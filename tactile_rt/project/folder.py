@@ -9,11 +9,12 @@ model.onnx, report/, build/  what `tactile-rt make` makes
 fit.json         what `tactile-rt array fit` has measured of the device
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from string import Template
+from types import MappingProxyType
 from urllib.parse import urlencode
 
 from tactile_rt.classifier.model_file import read_model
@@ -28,9 +29,9 @@ from tactile_rt.sim_backend.arrays.robots import ROBOTS, robot_text
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
-from tactile_rt.sim_backend.datasets.recipes import PARAMETERS, SweepRecipe
+from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
-from tactile_rt.sim_backend.sweep import usual_distance, usual_size
+from tactile_rt.sim_backend.sweep import Sweep, usual_distance, usual_size
 from tactile_rt.sim_backend.transducer import device_spec, sensor_of
 from tactile_rt.sim_backend.world import PROFILES
 from tactile_rt.stream import ConfigError
@@ -47,6 +48,8 @@ UNDECLARED = """\
 # url = "serial:///dev/ttyUSB0?codec=bota"
 # array = "model.onnx\""""
 SPREAD = (5.5 / 6.5, 8 / 6.5)  # of the distances at which objects pass, as `draw_sweep` draws them
+# mm/s, of objects of 40 mm. Larger ones are faster: so in a window as much of the array is touched.
+SPEEDS = (28, 40)
 
 
 @dataclass(frozen=True)
@@ -128,13 +131,11 @@ class Project:
     def source_url(self, objects: Sequence[str], seed: int = 0, **options: object) -> str:
         """The URL of the simulated array with these objects, as its device would deliver it.
 
-        What sweeps.toml holds still is held still; what it draws is drawn as ever.
+        They are swept past it as sweeps.toml says.
         """
-        recipe = self.recipe()
-        meshes = choose_objects(recipe.objects).mesh_options
-        choices = {name: getattr(recipe.sweeps, name) for name in PARAMETERS}
-        still = {name: value for name, value in choices.items() if isinstance(value, int | float)}
-        asked = {"objects": ",".join(objects), "seed": seed, **still, **meshes, **options}
+        meshes = choose_objects(self.recipe().objects).mesh_options
+        recipe = self.folder / "sweeps.toml"
+        asked = {"objects": ",".join(objects), "recipe": recipe, "seed": seed, **meshes, **options}
         return f"sim:{self.array}?{urlencode(asked, safe=',')}"
 
     def unseen(self) -> tuple[str, ...]:
@@ -177,6 +178,23 @@ class Project:
         options = {name: value for name, value in fields.items() if name in known}
         return DeviceLine(scheme, target.removeprefix("//"), fields["codec"], options)
 
+    def spoken(
+        self, codec: str | None = None, options: Mapping[str, str] = MappingProxyType({})
+    ) -> tuple[str, dict[str, str]]:
+        """What the device speaks: the name of its codec, and the codec's options.
+
+        Args:
+            codec: instead of that of robot.toml.
+            options: instead of those of robot.toml, or beside them.
+
+        Raises:
+            ConfigError: robot.toml has a mistake, or its source is no device.
+        """
+        line = self.line()
+        codec = codec or line.codec
+        own = line.options if codec == line.codec else {}
+        return codec, {**own, **self.full_scale(codec), **options}
+
 
 def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> Project:
     """Begin a project in a new or an empty folder.
@@ -205,12 +223,16 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
         raise ConfigError(f"{folder} is not empty: name a new folder")
     distance = usual_distance(animals)
     near, far = (f"{share * distance:.3g}" for share in SPREAD)
+    size = usual_size(animals)
+    slow, fast = (f"{speed * size / Sweep.size_mm:.3g}" for speed in SPEEDS)
     words = {
         "name": folder.resolve().name,
         "kinds": ", ".join(f'"{kind}"' for kind in kinds),
         "near": near,
         "far": far,
-        "usual": f"{usual_size(animals):g}",
+        "usual": f"{size:g}",
+        "slow": slow,
+        "fast": fast,
         "offset": f"{_wandering(animals):.2g}",
         "profiles": ", ".join(PROFILES),
         "whiskers": str(len(spec.elements)),

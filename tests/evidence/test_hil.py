@@ -12,7 +12,7 @@ from tactile_rt.classifier.classifier import Classification
 from tactile_rt.drivers.codecs.native import NativeSerial
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.drivers.health import Health, State
-from tactile_rt.evidence.hil import Loop, LoopReport, pair
+from tactile_rt.evidence.hil import Loop, LoopReport, named_right, pair
 from tactile_rt.stream import ConfigError, SourceError, SourceStats, SpecMismatch
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.tiny_model import write_model
@@ -51,6 +51,15 @@ def test_a_codec_with_names_of_its_own_carries_any_array_that_fits(model: Path) 
     measured = [f"W{e}.{c}" for e in range(3) for c in ("temperature:degC", "mz:N m", "fy:N")]
     options = {"columns": ",".join(["count", "time:us", *measured])}
     report = Loop(touches(), model, codec="ascii_line", options=options).run()
+    assert report.failure == "" and report.identical_samples == 3000
+    assert report.direct == report.wire == report.same_label == 8
+
+
+def test_a_device_that_sends_no_time_is_compared_as_if_samples_were_a_period_apart(
+    model: Path,
+) -> None:
+    columns = ",".join(f"W{e}.{c}" for e in range(3) for c in ("fy:N", "mz:N m"))
+    report = Loop(touches(), model, codec="ascii_line", options={"columns": columns}).run()
     assert report.failure == "" and report.identical_samples == 3000
     assert report.direct == report.wire == report.same_label == 8
 
@@ -174,10 +183,22 @@ def test_decisions_are_paired_by_touch_and_step() -> None:
     assert pair(direct, wire) == [(direct[0], wire[0]), (direct[2], wire[1])]
 
 
+def test_an_object_is_named_by_the_last_decision_of_its_first_touch() -> None:
+    passes = [(0, "a"), (100, "b"), (200, "b"), (300, "a")]
+    named = [
+        decision(10, 1, "b"), decision(10, 2, "a", final=True), decision(50, 1, "b", final=True),
+        decision(150, 1, "a", final=True), decision(160, 1, "b", final=True),
+        decision(210, 1, "b", final=True), decision(310, 1, "a"),
+    ]  # fmt: skip
+    assert named_right(passes, named) == 2
+    assert named_right([], named) == 0
+
+
 GOOD = LoopReport(
     samples=1000, identical_samples=1000, direct=100, wire=100, identical=100, same_label=100,
-    finals=5, finals_same=5, exact=True, faulty=False, stats=SourceStats(delivered=1000), sent=1000,
-    latency_s=None, stamp_error_s=None, health=Health(State.STREAMING, 0),
+    finals=5, finals_same=5, passed=0, right=0, exact=True, faulty=False,
+    stats=SourceStats(delivered=1000), sent=1000, latency_s=None, stamp_error_s=None,
+    health=Health(State.STREAMING, 0),
 )  # fmt: skip
 
 

@@ -67,22 +67,25 @@ def test_a_robot_s_project_is_its_array_behind_its_codec(name: str, tmp_path: Pa
     line = project.line()
     assert (line.wire, line.port) == ("serial", "/tmp/mine")
     assert urlencode({"codec": line.codec, **line.options}) == ROBOTS[name]
+    assert project.spoken() == (line.codec, line.options)
+    assert project.spoken("native", {"format": "int16"})[1]["format"] == "int16"
     array = tmp_path / "array.json"
     array.write_text(device_spec((load_array(str(project.array)),)).to_json())
     assert check_source(source.url, array=str(array)) == device_spec((load_array(name),))
 
 
-def test_what_the_sweeps_hold_still_the_device_holds_still(tmp_path: Path) -> None:
+def test_the_device_meets_what_the_sweeps_say(tmp_path: Path) -> None:
     project = new_project(tmp_path / "mine", "hx711_whisker", ("mug", "gear"))
     sweeps = project.folder / "sweeps.toml"
-    assert "size_mm = 66\n" in sweeps.read_text()
+    assert "size_mm = 66\nspeed_mm_s = { between = [46.2, 66] }\n" in sweeps.read_text()
     sweeps.write_text(re.sub(r"yaw_deg = .*", "yaw_deg = 30", sweeps.read_text()))
     with open_source(project.source_url(["mug"], sweeps=2, pace="fast")) as source:
         for _ in source:
             pass
-        passed = [p.sweep for p in source.passes]
-    assert [(s.size_mm, s.yaw_deg) for s in passed] == [(66, 30)] * 2
-    assert passed[0].speed_mm_s != passed[1].speed_mm_s, "what they draw is drawn"
+        first, second = (p.sweep for p in source.passes)
+    assert (first.size_mm, first.yaw_deg) == (second.size_mm, second.yaw_deg) == (66, 30)
+    assert first.speed_mm_s != second.speed_mm_s
+    assert 46.2 <= min(first.speed_mm_s, second.speed_mm_s)
 
 
 def test_training_draws_the_drift_that_the_sensor_is_said_to_have(tmp_path: Path) -> None:
@@ -99,6 +102,7 @@ def test_full_scale_of_a_codec_that_rounds_is_the_sensor_s(tmp_path: Path) -> No
     magnets = new_project(tmp_path / "magnets", str(MAGNETS))
     assert magnets.full_scale("native") == {"range_si": "0.0079"}
     assert magnets.full_scale("bota") == {}
+    assert magnets.spoken(options={"rate_hz": "9"})[1] == {"range_si": "0.0079", "rate_hz": "9"}
     assert new_project(tmp_path / "loads").full_scale("native") == {}
 
 
