@@ -72,7 +72,7 @@ class LoopReport:
         finals: Last decisions of a touch on the direct path.
         finals_same: Last decisions of a touch that have the same label on both paths.
         passed: Number of simulated objects that passed; 0 where nobody knows what did.
-        right: Number of them whose first touch the driver's path ended with their own name.
+        right: Number of objects whose first touch ended, on the driver's path, with the right name.
         exact: Whether all decisions must be identical; else 99 % must have the same label.
         faulty: Whether faults were on the way; then only the account of losses must be right.
         stats: The driver's account of what it delivered and what it lost.

@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -124,8 +125,9 @@ class SimOptions(SensorModel, Randomisation, MeshDetail):
             same seed gives the same stream, and the same objects and sweeps whatever the sensors.
         profile: The name of the simulation profile, one of `world.PROFILES`.
         pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
-        recipe: The name or the .toml file of a recipe (see `datasets.recipes`) as whose sweeps the
-            parameters are drawn that are not given here; empty: as left out below.
+        recipe: The name of a recipe (see `datasets.recipes`), or its .toml file, which names others
+            as seen from its folder: sweeps are drawn as its are, but for the parameters given here.
+            Empty: what is not given is drawn as below.
         size_mm, speed_mm_s, yaw_deg, height_mm, distance_mm, gap_mm: The parameters of every sweep,
             see `sweep.Sweep`; left out, the size is 40 mm and the others are drawn anew each time.
         roll_deg, pitch_deg, heading_deg, climb_deg, ramp_ms, head_moves, surface_friction, shake_g,
@@ -334,7 +336,7 @@ def _drawing(
     chosen = options.chosen
     if not options.recipe:
         return partial(draw_sweep, distance_mm=usual_distance(animals), chosen=chosen)
-    sweeps = read_recipe(options.recipe).sweeps
+    sweeps = read_recipe(options.recipe, Path(options.recipe).parent).sweeps
 
     def draw(rng: np.random.Generator) -> Sweep:
         return replace(sweeps.draw(rng, int(rng.integers(len(sweeps))), rng), **chosen)

@@ -78,12 +78,14 @@ def test_the_device_meets_what_the_sweeps_say(tmp_path: Path) -> None:
     project = new_project(tmp_path / "mine", "hx711_whisker", ("mug", "gear"))
     sweeps = project.folder / "sweeps.toml"
     assert "size_mm = 66\nspeed_mm_s = { between = [46.2, 66] }\n" in sweeps.read_text()
-    sweeps.write_text(re.sub(r"yaw_deg = .*", "yaw_deg = 30", sweeps.read_text()))
+    text = re.sub(r"yaw_deg = .*", "yaw_deg = 30", sweeps.read_text())
+    sweeps.write_text(re.sub(r"distance_mm = .*", "", text))
     with open_source(project.source_url(["mug"], sweeps=2, pace="fast")) as source:
         for _ in source:
             pass
         first, second = (p.sweep for p in source.passes)
     assert (first.size_mm, first.yaw_deg) == (second.size_mm, second.yaw_deg) == (66, 30)
+    assert first.distance_mm == second.distance_mm == pytest.approx(59.4, abs=0.1)
     assert first.speed_mm_s != second.speed_mm_s
     assert 46.2 <= min(first.speed_mm_s, second.speed_mm_s)
 

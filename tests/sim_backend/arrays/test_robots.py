@@ -1,5 +1,6 @@
 """Robots' arrays by name: as their codecs say, in range when touched, the same over the wire."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import parse_qsl
@@ -169,6 +170,24 @@ def test_the_page_says_how_to_begin(name: str) -> None:
     spec = spec_of(name)
     channels = f"`{' '.join(spec.channels)}`, {spec.units[0]}"
     assert row.startswith(f"| `{name}` |") and f"| {channels} | {spec.rate_hz:g} |" in row
+
+
+def test_the_page_s_commands_begin_projects(
+    call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    page = ROOT / "docs" / "published-arrays.md"
+    if not page.exists():
+        pytest.skip("a source archive, without docs")
+    monkeypatch.chdir(tmp_path)
+    begun = re.findall(r"^\| `(\w+ --array .*?)` \| (\d)", page.read_text("utf-8"), re.M)
+    assert len(begun) == len(ROBOTS)
+    for words, kinds in begun:
+        folder, _, name, *_ = words.split()
+        assert call("new", *words.split())[0] == 0
+        assert (tmp_path / folder / "array.toml").read_text("utf-8") == robot_text(name)
+        sweeps = (tmp_path / folder / "sweeps.toml").read_text("utf-8")
+        (categories,) = re.findall(r"^categories = \[(.*)\]", sweeps, re.M)
+        assert len(categories.split(",")) == int(kinds)
 
 
 def test_objects_are_no_smaller_than_an_array() -> None:
