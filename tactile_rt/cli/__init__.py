@@ -40,6 +40,7 @@ def main() -> None:
         replay,
         run,
         sweep,
+        teach,
         top,
         train,
         view,

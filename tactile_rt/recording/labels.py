@@ -20,6 +20,7 @@ from pathlib import Path
 
 import msgspec
 
+from tactile_rt.files import write_whole
 from tactile_rt.settings import check_columns, convert, nearest, read_csv, refusal
 from tactile_rt.stream import ConfigError
 
@@ -30,6 +31,7 @@ __all__ = [
     "check_name",
     "label_of_file",
     "read_labels",
+    "remove_last_label",
 ]
 
 LABELS = "labels.csv"  # beside the recordings
@@ -162,6 +164,18 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> None
             os.fsync(folder)  # the name, too
         finally:
             os.close(folder)
+
+
+def remove_last_label(path: Path) -> None:
+    """Take the last line of a file away; it is there with it or without it, never half.
+
+    Raises:
+        OSError: the file cannot be read or written.
+    """
+    lines = path.read_bytes().splitlines(keepends=True)
+    while lines and not lines.pop().strip():
+        pass
+    write_whole(path, lambda file: file.writelines(lines))
 
 
 def read_columns(path: Path) -> tuple[str, ...]:

@@ -22,7 +22,7 @@ from tactile_rt.daemon.http import HttpLimits, Refused, Request, Response
 from tactile_rt.daemon.page.feed import Line
 from tactile_rt.daemon.page.guard import Guard
 
-__all__ = ["ACTIONS", "LIMITS", "MAX_STREAMS", "PageClient", "PageRoutes"]
+__all__ = ["ACTIONS", "LIMITS", "MAX_STREAMS", "PageClient", "PageRoutes", "json_body", "only"]
 
 LIMITS = HttpLimits(connections=64, head_bytes=16384, head_s=10.0, send_s=20.0)
 MAX_STREAMS = 16
@@ -118,24 +118,24 @@ class PageRoutes:
         path = request.path
         self._guard.check(request.headers, request.method)
         if path in self._files:
-            _only(request, "GET")
+            only(request, "GET")
             body, kind = self._files[path]
             return Response(200, body, kind)
         if path == "/login":
-            _only(request, "POST")
-            return await self._login(await _json(request, _Login))
+            only(request, "POST")
+            return await self._login(await json_body(request, _Login))
         if path not in ("/live", "/control"):
             raise Refused(404, "there is no such page")
         if not self._guard.knows(request.headers):
             raise Refused(401, "a token is needed")
         if path == "/live":
-            _only(request, "GET")
+            only(request, "GET")
             source = parse_qs(request.query[:1024]).get("source", [""])[0]
             return Response(200, self._live(source), "application/x-ndjson")
-        _only(request, "POST")
+        only(request, "POST")
         if self._control is None:
             raise Refused(403, "this page may only look: set control = true in [page]")
-        action = (await _json(request, _Control)).action
+        action = (await json_body(request, _Control)).action
         if action not in ACTIONS:
             raise Refused(400, f"the recorder knows {', '.join(ACTIONS)}")
         if not self._control(action, request.peer):
@@ -167,7 +167,12 @@ class PageRoutes:
             self.dropped += client.dropped
 
 
-async def _json(request: Request, kind: Any) -> Any:
+async def json_body(request: Request, kind: Any) -> Any:
+    """What a request brings, of this msgspec type.
+
+    Raises:
+        Refused: It brings something else.
+    """
     # A form of another site cannot send this type without asking first, and is never allowed.
     sent = request.headers.get("content-type", "").partition(";")[0]
     if sent.strip().lower() != "application/json":
@@ -179,6 +184,7 @@ async def _json(request: Request, kind: Any) -> Any:
         raise Refused(400, "not what is expected here") from None
 
 
-def _only(request: Request, method: str) -> None:
+def only(request: Request, method: str) -> None:
+    """Refuse a request of another method."""
     if request.method != method:
         raise Refused(405, f"only {method}", {"allow": method})

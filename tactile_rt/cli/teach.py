@@ -1,0 +1,239 @@
+"""`tactile-rt teach`: touches of any sensor, what each was, and a model that knows them."""
+
+import os
+import queue
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from tactile_rt.cli.app import Seconds, app, leaving, starting
+from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError
+
+if TYPE_CHECKING:
+    from tactile_rt.teaching.lesson import Lesson
+    from tactile_rt.teaching.teacher import Teacher
+
+POLL_S = 0.1
+REST_S = 2.0  # at rest, to measure the noise by
+DEAF_S = 10.0  # without a sample, before the first one: the device does not talk
+KEYS = {"n": "next", "u": "undo", "q": "done", "\x04": "done"}
+
+
+@app.command()
+def teach(
+    source: Annotated[str, typer.Argument(help="URL of a source, e.g. serial:PORT?codec=bota.")],
+    folder: Annotated[
+        Path, typer.Argument(help="Where the lesson is kept; one that is there goes on.")
+    ],
+    labels: Annotated[
+        str, typer.Option(help="What is to be touched, comma-separated; more may come by key.")
+    ] = "",
+    touches: Annotated[int, typer.Option(min=2, max=1000, help="Of each.")] = 10,
+    page: Annotated[
+        str, typer.Option(help="Serve buttons for a browser here, e.g. 127.0.0.1:8791.")
+    ] = "",
+    seconds: Seconds = None,
+) -> None:
+    """Touch it ten times a class, and it knows the classes: FOLDER/model.onnx.
+
+    Keep the sensor untouched for two seconds, then touch as you are told. Keys: a number chooses
+    a class, n the next one, a adds one, u takes the last touch back, q learns and leaves. Where
+    stdin is no terminal, a line is an order: a class's name, next, undo or done.
+    """
+    from tactile_rt.recording import StreamWriter
+    from tactile_rt.recording.layout import need_mcap
+    from tactile_rt.sources.opening import open_source
+    from tactile_rt.teaching.lesson import BEFORE_NS, FEATURES, MODEL, Lesson, Listener
+    from tactile_rt.teaching.teacher import Teacher
+
+    need_mcap()
+    wanted = [name.strip() for name in labels.split(",") if name.strip()]
+    at = _address(page) if page else None
+    before = Lesson.read(folder) if (folder / FEATURES).exists() else None
+    _check_labels(wanted)
+    with starting():
+        opened = open_source(source)
+    orders: queue.Queue[str] = queue.Queue()
+    with opened, leaving(seconds):
+        lesson = before or _begun(folder, opened)
+        teacher = Teacher(lesson, wanted, touches)
+        listener = Listener(folder / FEATURES, opened.spec)
+        typer.echo(_greeting(lesson, opened))
+        path = lesson.next_recording()
+        with (
+            _page(at, teacher, orders),
+            StreamWriter(path, opened, url=source) as writer,
+            _listening(orders),
+        ):
+            typer.echo(teacher.prompt())
+            label = teacher.label
+            while not teacher.done:
+                try:
+                    chunk = opened.read(POLL_S)
+                except EndOfStream:
+                    break
+                while not orders.empty() and not teacher.done:
+                    _say(teacher.obey(orders.get()))
+                if chunk is None:
+                    continue
+                writer.push(chunk)
+                if not listener.touching:
+                    label = teacher.label
+                for onset, end, felt in listener.push(chunk):
+                    span = listener.seconds(onset - BEFORE_NS), listener.seconds(end)
+                    _say(teacher.take(label, felt, path.name, span))
+                    label = teacher.label
+    if not lesson.taught_enough:
+        raise ConfigError(
+            f"{folder}: {len(lesson.touches)} touches are kept, too few to learn from: two of a "
+            "class are needed; run the same command to go on"
+        )
+    began = time.process_time()
+    card = lesson.learn()
+    for line in teacher.summary():
+        typer.echo(line)
+    typer.echo(
+        f"{folder / MODEL}: {', '.join(card.classes)} and unknown, from {len(lesson.touches)} "
+        f"touches, learnt in {time.process_time() - began:.1f} s; tactile-rt run --source "
+        f"'{source}' --model {folder / MODEL}"
+    )
+
+
+def _check_labels(names: list[str]) -> None:
+    from tactile_rt.teaching.lesson import check_label
+
+    for name in names:
+        check_label(name)
+        if names.count(name) > 1:
+            raise ConfigError(f"--labels names {name!r} twice")
+
+
+def _address(given: str) -> tuple[str, int]:
+    host, colon, port = given.rpartition(":")
+    if not colon or not host or not port.isdigit() or int(port) > 65535:
+        raise ConfigError(f"--page is HOST:PORT, as 127.0.0.1:8791, not {given!r}")
+    return host, int(port)
+
+
+def _begun(folder: Path, source: Source) -> "Lesson":
+    """A new lesson, with the noise of the array at rest."""
+    from tactile_rt.teaching.lesson import Lesson, measured_floor
+
+    typer.echo(f"touch nothing for {REST_S:g} s")
+    chunks: list[Chunk] = []
+    samples, needed = 0, REST_S * source.spec.rate_hz
+    heard = time.monotonic()
+    while samples < needed:
+        try:
+            chunk = source.read(POLL_S)
+        except EndOfStream:
+            break
+        if chunk is not None and len(chunk):
+            chunks.append(chunk)
+            samples += len(chunk)
+            heard = time.monotonic()
+        elif time.monotonic() - heard > DEAF_S:
+            raise SourceError(f"no sample came for {DEAF_S:g} s: is the device on, and its codec?")
+    return Lesson.begun(folder, source.spec, measured_floor(chunks))
+
+
+def _greeting(lesson: "Lesson", source: Source) -> str:
+    spec = source.spec
+    size = f"{len(spec.elements)} elements x {len(spec.channels)} channels at {spec.rate_hz:g} Hz"
+    noise = ", ".join(
+        f"{unit} {value:.2g}"
+        for unit, value in zip(spec.channels, lesson.taught.floor, strict=True)
+    )
+    if not lesson.touches:
+        return f"{size}; the least noise that counts: {noise}"
+    lost = f"; {lesson.lost} lost as it was killed" if lesson.lost else ""
+    counts = ", ".join(f"{lesson.count(name)} {name}" for name in lesson.labels)
+    return f"{size}; there already: {counts}{lost}"
+
+
+def _say(text: str) -> None:
+    if text:
+        typer.echo(text)
+
+
+@contextmanager
+def _page(
+    at: tuple[str, int] | None, teacher: "Teacher", orders: "queue.Queue[str]"
+) -> Iterator[None]:
+    """Buttons in a browser, if they are asked for."""
+    if at is None:
+        yield
+        return
+    from tactile_rt.teaching.page import TeachingPage
+
+    page = TeachingPage(*at, teacher.state, orders.put)
+    typer.echo(f"buttons: {page.url}")
+    try:
+        yield
+    finally:
+        page.close()
+
+
+@contextmanager
+def _listening(orders: "queue.Queue[str]") -> Iterator[None]:
+    """Take keys, or lines where stdin is no terminal, until the block ends."""
+    terminal = sys.stdin is not None and sys.stdin.isatty()
+    if sys.stdin is None or sys.stdin.closed:
+        yield
+        return
+    if not terminal:
+        threading.Thread(target=_take_lines, args=(orders,), daemon=True).start()
+        yield
+        return
+    import termios
+    import tty
+
+    descriptor = sys.stdin.fileno()
+    before = termios.tcgetattr(descriptor)
+    threading.Thread(target=_take_keys, args=(orders, descriptor, before), daemon=True).start()
+    tty.setcbreak(descriptor)
+    try:
+        yield
+    finally:
+        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
+
+
+def _take_lines(orders: "queue.Queue[str]") -> None:
+    try:
+        for line in sys.stdin:
+            if line.strip():
+                orders.put(line.strip())
+    except (OSError, ValueError):
+        return  # closed
+
+
+def _take_keys(orders: "queue.Queue[str]", descriptor: int, before: list[object]) -> None:
+    import termios
+    import tty
+
+    while True:
+        try:
+            key = os.read(descriptor, 1).decode(errors="replace")
+        except OSError:
+            return
+        if not key:
+            return
+        if key == "a":
+            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)  # type: ignore[arg-type]
+            typer.echo("name of the class: ", nl=False)
+            name = bytearray()
+            while (more := os.read(descriptor, 1)) not in (b"", b"\n"):
+                name += more
+            tty.setcbreak(descriptor)
+            if name.strip():
+                orders.put(name.decode(errors="replace").strip())
+        elif key.isdigit() and key != "0":
+            orders.put(key)
+        elif key in KEYS:
+            orders.put(KEYS[key])

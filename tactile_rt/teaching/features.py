@@ -1,0 +1,197 @@
+"""What a touch is like, whatever sensor feels it: a network of nothing that is learnt.
+
+An array's loads become a few signals: of every channel the sum over the elements, and of the
+loads of a unit where they are and how far they spread. Random temporal kernels follow them. Of
+each kernel three numbers are kept: how often since the onset its output was above a threshold, its
+mean, and its largest value (Dempster et al. 2021, doi:10.1145/3447548.3467231; Tan et al. 2022,
+doi:10.1007/s10618-022-00844-1). They are so many that a few touches show which of them matter.
+
+Loads are divided by the largest of their unit since the onset: a soft and a firm touch of a kind
+are alike, and how firm it was is a feature of its own. So neither units nor ranges matter, and the
+network is the same for every sensor of so many elements and channels.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.stream import ArraySpec
+from tactile_rt.teaching.onnx_bytes import Graph
+
+__all__ = ["FeatureNetwork"]
+
+KERNELS = 256
+TAPS = 9
+DILATIONS = (1, 2, 4, 8)  # samples between taps
+MOST_SIGNALS = 3  # that a kernel looks at
+CENTRED = 0.7  # of the kernels do not see a constant
+QUIET = 2.5  # standard deviations of an element's noise that count as no load
+FAINT = 6.0  # standard deviations of the noise: fainter loads are not magnified further
+LEAST = 1e-30  # below any output
+
+Floats = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class FeatureNetwork:
+    """Features of a stream of an array, step by step.
+
+    Attributes:
+        spec: The array.
+        substeps: The number of samples of a step.
+        kernels: (kernel, signal, tap) The temporal kernels.
+        dilations: (kernel,) The number of samples from one tap to the next, ascending.
+        thresholds: (kernel,) Above which the output of a kernel is high.
+    """
+
+    spec: ArraySpec
+    substeps: int
+    kernels: Floats
+    dilations: NDArray[np.int64]
+    thresholds: Floats
+
+    @classmethod
+    def drawn(cls, spec: ArraySpec, substeps: int, steps: int, seed: int = 0) -> "FeatureNetwork":
+        """The network of an array: the same one every time, everywhere.
+
+        Args:
+            spec: the array.
+            substeps: samples of a step.
+            steps: steps of an episode.
+            seed: of the kernels.
+        """
+        rng = np.random.default_rng(seed)
+        signals = sum(cls._signals(spec, unit) for unit in dict.fromkeys(spec.units))
+        reach = [d for d in DILATIONS if d * (TAPS - 1) < 0.8 * steps * substeps] or [1]
+        dilations = np.sort(rng.choice(reach, KERNELS))
+        kernels = np.zeros((KERNELS, signals, TAPS))
+        for kernel in kernels:
+            seen = rng.choice(signals, rng.integers(1, min(MOST_SIGNALS, signals) + 1), False)
+            taps = rng.normal(size=(len(seen), TAPS))
+            taps -= taps.mean(axis=1, keepdims=True) * (rng.random() < CENTRED)
+            kernel[seen] = taps / np.sqrt(np.square(taps).sum())
+        thresholds = 0.5 * rng.normal(size=KERNELS)
+        f = np.float32
+        return cls(spec, substeps, kernels.astype(f), dilations, thresholds.astype(f))
+
+    @staticmethod
+    def _axes(spec: ArraySpec) -> Floats:
+        """(element, axis) where the elements are, along the axes in which they lie, -1 to 1."""
+        places = np.array(spec.positions)
+        if np.ptp(places, axis=0).max() == 0:  # not said
+            places = np.array(spec.grid, dtype=float)
+        places = places - (places.max(axis=0) + places.min(axis=0)) / 2
+        extent = np.abs(places).max()
+        lies = np.ptp(places, axis=0) > 0.05 * extent
+        axes: Floats = (places[:, lies] / max(extent, 1e-12)).astype(np.float32)
+        return axes
+
+    @classmethod
+    def _signals(cls, spec: ArraySpec, unit: str) -> int:
+        """How many signals the loads of a unit become."""
+        of_places = 1 + 2 * cls._axes(spec).shape[1] if len(spec.elements) > 1 else 0
+        return spec.units.count(unit) + of_places
+
+    @property
+    def past(self) -> int:
+        """How many earlier samples a step looks at."""
+        return int(self.dilations.max()) * (TAPS - 1)
+
+    @property
+    def size(self) -> int:
+        """The number of features."""
+        return 3 * len(self.kernels) + len(set(self.spec.units))
+
+    def state(self) -> dict[str, tuple[int, ...]]:
+        """The shape of every state, by name."""
+        n, signals = self.kernels.shape[:2]
+        kept = {"count": (1,), "high": (n,), "total": (n,), "largest": (n,)}
+        return {"past": (self.past, signals), "peak": (len(set(self.spec.units)),), **kept}
+
+    def build(self, g: Graph) -> tuple[str, dict[str, str]]:
+        """Add the network to a graph.
+
+        Returns:
+            The name of the (batch, feature) output, and by name what follows each state.
+        """
+        elements, channels = self.spec.shape
+        samples = g.input("samples", ["batch", self.substeps, elements, channels])
+        offset = g.input("offset", ["batch", elements, channels])
+        sigma = g.input("sigma", ["batch", elements, channels])
+        before = {name: g.input(name, ["batch", *shape]) for name, shape in self.state().items()}
+        load = g("Sub", samples, g("Unsqueeze", offset, g.integers(1)))
+        load = g("Where", g("Less", g("Abs", load), g.constant(np.inf)), load, g.constant(0.0))
+        noise = g("Where", g("Less", sigma, g.constant(np.inf)), sigma, g.constant(1e9))
+        signals, peaks, times = [], [], []
+        for unit in dict.fromkeys(self.spec.units):
+            at = g.integers(*(i for i, u in enumerate(self.spec.units) if u == unit))
+            of_unit = g("Gather", load, at, axis=3), g("Gather", noise, at, axis=2)
+            found, peak = self._of_unit(g, *of_unit)
+            signals.append(found)
+            peaks.append(peak)
+            times.append(self._signals(self.spec, unit))
+        units = range(len(peaks))
+        peak = g("Max", before["peak"], g("Concat", *peaks, axis=1))  # (batch, unit)
+        which = g.integers(*(u for u in units for _ in range(times[u])))
+        over = g("Unsqueeze", g("Gather", peak, which, axis=1), g.integers(1))  # (b, 1, signal)
+        known = g("Concat", before["past"], g("Concat", *signals, axis=2), axis=1)
+        relative = g("Transpose", g("Div", known, over), perm=[0, 2, 1])  # (b, signal, sample)
+        outputs = []
+        for dilation in np.unique(self.dilations).tolist():
+            first = g.integers(self.past - dilation * (TAPS - 1))
+            ends = g.integers(self.past + self.substeps)
+            recent = g("Slice", relative, first, ends, g.integers(2))
+            kernels = g.constant(self.kernels[self.dilations == dilation])
+            shape = {"dilations": [dilation], "kernel_shape": [TAPS]}
+            outputs.append(g("Conv", recent, kernels, **shape))
+        out = g("Concat", *outputs, axis=1)  # (batch, kernel, sub-step)
+        above = g("Greater", out, g.constant(self.thresholds[:, None]))
+        ones = g("ReduceSum", g("Cast", above, to=1), g.integers(2), keepdims=0)
+        high = g("Add", before["high"], ones)
+        total = g("Add", before["total"], g("ReduceSum", out, g.integers(2), keepdims=0))
+        first_step = g("Equal", before["count"], g.constant(0.0))
+        largest = g("Where", first_step, g.constant(-1 / LEAST), before["largest"])
+        largest = g("Max", largest, g("ReduceMax", out, g.integers(2), keepdims=0))
+        count = g("Add", before["count"], g.constant(float(self.substeps)))
+        features = g(
+            "Concat", g("Div", high, count), g("Div", total, count), largest, g("Log", peak), axis=1
+        )
+        end = g.integers(self.substeps + self.past)
+        past = g("Slice", known, g.integers(self.substeps), end, g.integers(1))
+        return features, {
+            "past": past, "peak": peak, "count": count, "high": high, "total": total,
+            "largest": largest,
+        }  # fmt: skip
+
+    def _of_unit(self, g: Graph, load: str, noise: str) -> tuple[str, str]:
+        """Signals (batch, sub-step, signal) of the loads of a unit, and the (batch, 1) peak."""
+        summed = g("ReduceSum", load, g.integers(2), keepdims=0)  # (batch, sub-step, channel)
+        level = g("Sqrt", g("ReduceSum", g("Mul", noise, noise), g.integers(2), keepdims=0))
+        faint = g("Mul", g("ReduceMax", level, g.integers(1), keepdims=1), g.constant(FAINT))
+        size = g("Sqrt", g("ReduceSum", g("Mul", summed, summed), g.integers(2), keepdims=0))
+        peak = g("Max", g("ReduceMax", size, g.integers(1), keepdims=1), faint)  # (batch, 1)
+        peak = g("Max", peak, g.constant(LEAST))
+        if len(self.spec.elements) == 1:
+            return summed, peak
+        strength = g("Sqrt", g("ReduceSum", g("Mul", load, load), g.integers(3), keepdims=0))
+        quiet = g("Mul", g("Unsqueeze", level, g.integers(1)), g.constant(QUIET))
+        strength = g("Relu", g("Sub", strength, quiet))  # (batch, sub-step, element)
+        whole = g("ReduceSum", strength, g.integers(2), keepdims=1)  # (batch, sub-step, 1)
+        peak = g("Max", peak, g("ReduceMax", whole, g.integers(1), keepdims=0))
+        axes = self._axes(self.spec)
+        share = g("Div", strength, g("Max", whole, g.constant(LEAST)))
+        centre = g("MatMul", share, g.constant(axes))  # (batch, sub-step, axis)
+        square = g("MatMul", share, g.constant(axes**2))
+        spread = g("Sqrt", g("Relu", g("Sub", square, g("Mul", centre, centre))))
+        # a place counts as far as there is a load; it is divided by the peak as all signals are
+        there = g("Unsqueeze", peak, g.integers(1))
+        there = g("Min", g("Mul", whole, g.constant(4.0)), there)
+        places = g("Mul", g("Concat", centre, spread, axis=2), there)
+        return g("Concat", summed, whole, places, axis=2), peak
+
+    @property
+    def kinds(self) -> tuple[slice, ...]:
+        """Which features are of one kind: shares of time, means, largest values, and peaks."""
+        n = len(self.kernels)
+        return slice(0, n), slice(n, 2 * n), slice(2 * n, 3 * n), slice(3 * n, None)

@@ -1,0 +1,182 @@
+"""From a few touches of each class to what tells them apart, and from everything else.
+
+At every step, a class is the mean of its touches' features, and all classes share how touches of
+one class differ: a covariance of few directions, and of the same small variance in all others
+(probabilistic principal components: Tipping & Bishop 1999, doi:10.1111/1467-9868.00196). A
+decision is the nearest mean by that measure; what is far from all of them is unknown. How far a
+touch of a class may be from its mean is learnt from touches that are left out in turn.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.stream import ConfigError
+
+__all__ = ["FEWEST", "LeftOut", "TouchClasses", "fit_classes", "leave_out"]
+
+FEWEST = 2  # touches of a class
+AXES = 16  # directions in which touches of a class differ
+SHARE = 0.1  # of the mean variance, added to the shared covariance in every direction
+FOLDS = 10
+REFUSED = 0.06  # of the touches that were left out, at most, are taken for unknown
+LIMIT = 5.0  # standardised features are limited to, either way: one outlier is not the decision
+# A feature's scale is no less than so many times the median one of its kind, and than this share
+# of its whole spread: what never varied in ten touches may still vary in the eleventh.
+LEAST_OF_KIND, LEAST_OF_SPREAD = 4.0, 0.15
+TEMPERATURES = np.geomspace(1.0, 1e4, 81)
+TINY = 1e-9
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TouchClasses:
+    """What tells classes apart, step by step. Standardised features are (f - mean) / scale.
+
+    Attributes:
+        labels: The names of the classes.
+        mean, scale: (step, feature) By which features are standardised, then limited to 5.
+        centres: (step, class, feature) The means of the classes, standardised.
+        axes: (step, feature, axis) The directions in which touches of a class differ, each
+            as long as a unit along it weighs less than a unit across all.
+        rest: (step,) The variance in all other directions.
+        reach: (step,) The squared distance from the nearest class beyond which a touch is unknown.
+        temperature: The number by which half of the squared distances is divided, so that
+            posteriors mean what they say.
+    """
+
+    labels: tuple[str, ...]
+    mean: Floats
+    scale: Floats
+    centres: Floats
+    axes: Floats
+    rest: Floats
+    reach: Floats
+    temperature: float
+
+    def distances(self, features: Floats) -> Floats:
+        """(touch, step, class) squared distances of touches (touch, step, feature)."""
+        found = np.clip((features - self.mean) / self.scale, -LIMIT, LIMIT)
+        away = found[:, :, None] - self.centres
+        along = np.einsum("tscf,sfa->tsca", away, self.axes)
+        squared: Floats = np.square(away).sum(-1) / self.rest[:, None] - np.square(along).sum(-1)
+        return squared
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What was made of every touch when it was left out.
+
+    Attributes:
+        distances: (touch, step, class) Squared distances from the classes of the others.
+        right: (touch,) Whether the nearest class at the last step was its own.
+    """
+
+    distances: Floats
+    right: NDArray[np.bool_]
+
+
+def fit_classes(
+    features: Floats, labels: Sequence[str], kinds: Sequence[slice], left_out: LeftOut | None = None
+) -> TouchClasses:
+    """Learn classes.
+
+    Args:
+        features: (touch, step, feature) of all touches.
+        labels: (touch,) the class of each.
+        kinds: which features are of one kind, and so of one scale.
+        left_out: what `leave_out` said of these touches; None: it is asked.
+
+    Raises:
+        ConfigError: a class with fewer than two touches.
+    """
+    _check(labels)
+    left_out = left_out or leave_out(features, labels, kinds)
+    nearest = left_out.distances.min(axis=2)  # (touch, step)
+    rank = min(len(labels) - 1, int(np.ceil((1 - REFUSED) * (len(labels) + 1))) - 1)
+    reach = np.sort(nearest, axis=0)[rank]
+    classes, own = np.unique(np.asarray(labels), return_inverse=True)
+    temperature = _temperature(left_out.distances[:, -1], own)
+    names = tuple(str(name) for name in classes)
+    return TouchClasses(names, *_shared(features, own, kinds), reach, temperature)
+
+
+def leave_out(features: Floats, labels: Sequence[str], kinds: Sequence[slice]) -> LeftOut:
+    """Leave every touch out in turn, a tenth of each class at a time, and learn from the others.
+
+    Args:
+        features: (touch, step, feature) of all touches.
+        labels: (touch,) the class of each; at least two touches of each class.
+        kinds: as `fit_classes` takes them.
+
+    Raises:
+        ConfigError: a class with fewer than two touches.
+    """
+    _check(labels)
+    classes, own = np.unique(np.asarray(labels), return_inverse=True)
+    turn = np.empty(len(own), dtype=int)
+    for k in range(len(classes)):
+        turn[own == k] = np.arange((own == k).sum())
+    distances = np.empty((*features.shape[:2], len(classes)))
+    few = int(np.bincount(own).min())
+    turn %= min(FOLDS, few)
+    for fold in range(turn.max() + 1):
+        out = turn == fold
+        learnt = TouchClasses(
+            tuple(classes), *_shared(features[~out], own[~out], kinds), np.zeros(0), 1.0
+        )
+        distances[out] = learnt.distances(features[out])
+    return LeftOut(distances, distances[:, -1].argmin(axis=1) == own)
+
+
+def _check(labels: Sequence[str]) -> None:
+    for name in dict.fromkeys(labels):
+        if list(labels).count(name) < FEWEST:
+            raise ConfigError(f"there is one touch of {name!r}; a class needs {FEWEST} at least")
+
+
+def _shared(
+    features: Floats, own: NDArray[np.intp], kinds: Sequence[slice]
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """mean, scale, centres, axes and rest, as `TouchClasses` has them."""
+    count = int(own.max()) + 1
+    freedom = max(1, len(own) - count)
+    mean = features.mean(axis=0)
+    scale = np.sqrt(np.square(features - _means(features, own)[own]).sum(axis=0) / freedom)
+    spread = features.std(axis=0)
+    for kind in kinds:
+        usual = LEAST_OF_KIND * np.median(scale[:, kind], axis=1, keepdims=True)
+        least = np.hypot(usual, LEAST_OF_SPREAD * spread[:, kind])
+        scale[:, kind] = np.hypot(scale[:, kind], least) + TINY
+    found = np.clip((features - mean) / scale, -LIMIT, LIMIT)
+    centres = _means(found, own)
+    apart = np.swapaxes(found - centres[own], 0, 1)  # (step, touch, feature)
+    # The covariance has no more directions than touches: they are found among these.
+    values, vectors = np.linalg.eigh(apart @ np.swapaxes(apart, 1, 2) / freedom)
+    values, vectors = values[:, ::-1][:, :AXES], vectors[:, :, ::-1][:, :, :AXES]
+    average = np.square(apart).sum(axis=(1, 2)) / (freedom * apart.shape[2])  # variance
+    rest = SHARE * average + TINY
+    along = np.swapaxes(apart, 1, 2) @ vectors  # (step, feature, axis)
+    along /= np.linalg.norm(along, axis=1, keepdims=True) + TINY
+    kept = (1 - SHARE) * np.maximum(values, 0) + rest[:, None]
+    less = np.sqrt(np.maximum(0, 1 / rest[:, None] - 1 / kept))
+    return mean, scale, np.swapaxes(centres, 0, 1), along * less[:, None], rest
+
+
+def _means(features: Floats, own: NDArray[np.intp]) -> Floats:
+    """(class, step, feature)."""
+    return np.stack([features[own == k].mean(axis=0) for k in range(int(own.max()) + 1)])
+
+
+def _temperature(distances: Floats, own: NDArray[np.intp]) -> float:
+    """That with the likeliest posteriors of the touches' own classes."""
+    if distances.shape[1] == 1:
+        return float(max(1.0, np.median(distances)))
+    least = distances - distances.min(axis=1, keepdims=True)
+    rows = np.arange(len(own))
+    scored = least / 2 / TEMPERATURES[:, None, None]
+    losses = scored[:, rows, own] + np.log(np.exp(-scored).sum(axis=2))
+    return float(TEMPERATURES[losses.mean(axis=1).argmin()])

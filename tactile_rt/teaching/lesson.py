@@ -1,0 +1,364 @@
+"""A lesson: touches of one array, what each of them was, and what is learnt from them.
+
+    Source --> Classifier(features.onnx) --> touches + labels --> model.onnx
+
+A lesson is a folder, so that it can be gone on with, looked at and corrected:
+
+    features.onnx      what is looked at: the array, and its noise when the lesson began
+    session-1.mcap     everything that was felt, one recording each time
+    labels.csv         which part of it was which touch; a line is written as a touch ends
+    model.onnx         what was learnt: runs like any other model
+
+`tactile-rt label` makes a sweep set of such a folder, for networks that learn longer.
+"""
+
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.classifier.model_card import ModelCard
+from tactile_rt.classifier.model_file import hash_of, load_model
+from tactile_rt.recording import Recording, recover
+from tactile_rt.recording.labels import (
+    LABELS,
+    LabelledInterval,
+    append_label,
+    check_name,
+    read_labels,
+    remove_last_label,
+)
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError
+from tactile_rt.teaching.head import FEWEST, LeftOut, fit_classes, leave_out
+from tactile_rt.teaching.model import Taught, write_features, write_taught
+
+__all__ = [
+    "BEFORE_NS",
+    "FEATURES",
+    "MODEL",
+    "Lesson",
+    "Listener",
+    "Progress",
+    "Touch",
+    "check_label",
+    "measured_floor",
+]
+
+FEATURES, MODEL = "features.onnx", "model.onnx"
+BEFORE_NS = 20_000_000  # before its onset a touch's interval begins
+ODD = 3.0  # times as far from its class as its others are, a touch is odd
+QUIET = 0.3  # of the noise at rest: the least noise that the contact detector assumes
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Touch:
+    """One touch.
+
+    Attributes:
+        label: The name of what it was.
+        features: (step, feature) What was felt, step by step.
+        recording: The name of the recording that it is in.
+    """
+
+    label: str
+    features: NDArray[np.float32]
+    recording: str
+
+
+@dataclass
+class Lesson:
+    """Touches and what is learnt from them, kept in a folder.
+
+    Attributes:
+        folder: Where all is kept.
+        taught: What the model will be of.
+        touches: All touches, in their order.
+        lost: The number of touches in the list that are not in the recordings, as their last
+            moment was not written when the program was killed.
+    """
+
+    folder: Path
+    taught: Taught
+    touches: list[Touch] = field(default_factory=list)
+    lost: int = 0
+
+    @classmethod
+    def begun(cls, folder: Path, spec: ArraySpec, floor: NDArray[np.float32]) -> "Lesson":
+        """A new lesson.
+
+        Args:
+            folder: where to; made if it is not there.
+            spec: the array.
+            floor: (channel,) the smallest noise that the contact detector is to assume.
+
+        Raises:
+            ConfigError: there is a lesson already.
+        """
+        if (folder / FEATURES).exists():
+            raise ConfigError(f"{folder} holds a lesson already")
+        folder.mkdir(parents=True, exist_ok=True)
+        taught = Taught(spec, floor)
+        write_features(folder / FEATURES, taught)
+        return cls(folder, taught)
+
+    @classmethod
+    def read(cls, folder: Path) -> "Lesson":
+        """A lesson that was begun before, with all its touches.
+
+        Raises:
+            ConfigError, ModelError, RecordingError: a file of it is not there, or is wrong.
+        """
+        path = folder / FEATURES
+        if not path.exists():
+            raise ConfigError(f"{folder} holds no lesson: there is no {FEATURES}")
+        card = load_model(path)[1]
+        lesson = cls(folder, Taught(card.array, np.array(card.floor, dtype=np.float32)))
+        if (folder / LABELS).exists():
+            lesson._read_touches()
+        return lesson
+
+    def _read_touches(self) -> None:
+        recordings = sorted(self.folder.glob("session-*.mcap"), key=_number)
+        for path, intervals in read_labels(self.folder / LABELS, recordings).items():
+            if not intervals:
+                continue
+            felt = self._felt(_whole(path))
+            for interval in intervals:
+                inside = [
+                    features for at_s, features in felt if interval.start_s <= at_s < interval.end_s
+                ]
+                self.lost += not inside
+                self.touches += [Touch(interval.label, inside[0], path.name)] if inside else []
+
+    def _felt(self, path: Path) -> list[tuple[float, NDArray[np.float32]]]:
+        """Onset, in seconds since the beginning, and features of every touch in a recording."""
+        recording = Recording(path)
+        listener = Listener(self.folder / FEATURES, recording.spec)
+        found = []
+        for chunk in recording:
+            found += [(listener.seconds(onset), felt) for onset, _, felt in listener.push(chunk)]
+        return found
+
+    def next_recording(self) -> Path:
+        """The path of the recording that goes on with the lesson."""
+        numbers = [_number(path) for path in self.folder.glob("session-*.mcap")]
+        return self.folder / f"session-{max(numbers, default=0) + 1}.mcap"
+
+    def add(
+        self, label: str, features: NDArray[np.float32], recording: str, span_s: tuple[float, float]
+    ) -> None:
+        """Take a touch; on return it is on the disk, but for what the recording has not written.
+
+        Args:
+            label: what it was.
+            features: (step, feature).
+            recording: name of the recording that it is in.
+            span_s: where in it, seconds since its first sample.
+        """
+        interval = LabelledInterval(label=label, start_s=max(0.0, span_s[0]), end_s=span_s[1])
+        append_label(self.folder / LABELS, recording, interval)
+        self.touches.append(Touch(label, features, recording))
+
+    def undo(self) -> Touch | None:
+        """Take the last touch back; None: there is none."""
+        if not self.touches:
+            return None
+        remove_last_label(self.folder / LABELS)
+        return self.touches.pop()
+
+    def count(self, label: str) -> int:
+        """How many touches there are of a label."""
+        return sum(touch.label == label for touch in self.touches)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The names of all classes, in the order in which they came."""
+        return tuple(dict.fromkeys(touch.label for touch in self.touches))
+
+    @property
+    def taught_enough(self) -> tuple[str, ...]:
+        """The classes of which there are enough touches to learn from."""
+        return tuple(name for name in self.labels if self.count(name) >= FEWEST)
+
+    def left_out(self) -> "Progress":
+        """How well touches are told apart by the others, at their last step."""
+        used = [k for k, t in enumerate(self.touches) if t.label in self.taught_enough]
+        if not used:
+            return Progress((), (), ())
+        names = [self.touches[k].label for k in used]
+        found = leave_out(self._features(used)[:, -1:], names, self.taught.network.kinds)
+        return _progress(used, names, found)
+
+    def learn(self) -> ModelCard:
+        """Write the model of all classes with enough touches.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        used = [k for k, t in enumerate(self.touches) if t.label in self.taught_enough]
+        if not used:
+            raise ConfigError(
+                f"{self.folder}: nothing to learn from: no class has {FEWEST} touches yet"
+            )
+        names = [self.touches[k].label for k in used]
+        classes = fit_classes(self._features(used), names, self.taught.network.kinds)
+        return write_taught(
+            self.folder / MODEL, self.taught, classes, self.folder.resolve().name,
+            {
+                "taught": {name: names.count(name) for name in classes.labels},
+                "labels_sha256": hash_of(self.folder / LABELS),
+            },
+        )  # fmt: skip
+
+    def _features(self, used: Sequence[int]) -> Floats:
+        return np.stack([self.touches[k].features for k in used]).astype(float)
+
+
+@dataclass(frozen=True)
+class Progress:
+    """How well touches are told apart when each is left out in turn.
+
+    Attributes:
+        classes: By class: its name, the number of its touches, and how many of them were right.
+        odd: Touches that are unlike the others of their class: their number, counted from 1, and
+            the class that they are most like.
+        confused: Pairs of classes that are taken for one another, the most often first.
+    """
+
+    classes: tuple[tuple[str, int, int], ...]
+    odd: tuple[tuple[int, str], ...]
+    confused: tuple[tuple[str, str], ...]
+
+    @property
+    def right(self) -> tuple[int, int]:
+        """How many touches were right, and of how many."""
+        return sum(c[2] for c in self.classes), sum(c[1] for c in self.classes)
+
+
+def _progress(used: Sequence[int], names: Sequence[str], found: LeftOut) -> Progress:
+    classes = np.unique(np.asarray(names))
+    own = np.searchsorted(classes, names)
+    distances = found.distances[:, -1]
+    nearest = distances.argmin(axis=1)
+    mine = distances[np.arange(len(own)), own]
+    odd = []
+    for k in range(len(own)):
+        others = mine[(own == own[k]) & (np.arange(len(own)) != k)]
+        if mine[k] > ODD * np.median(others) and len(others) > FEWEST:
+            odd.append((used[k] + 1, str(classes[nearest[k]])))
+    wrong = [
+        (str(classes[own[k]]), str(classes[nearest[k]]))
+        for k in range(len(own))
+        if nearest[k] != own[k]
+    ]
+    pairs = sorted(dict.fromkeys(wrong), key=lambda pair: -wrong.count(pair))
+    told = tuple(
+        (name, names.count(name), int(found.right[own == np.searchsorted(classes, name)].sum()))
+        for name in dict.fromkeys(names)
+    )
+    return Progress(told, tuple(odd), tuple(pairs))
+
+
+class Listener:
+    """Takes a stream, gives the touches in it: onset, end and features of each.
+
+    Args:
+        model: ``features.onnx``.
+        spec: the array of the stream.
+
+    Attributes:
+        classifier: That runs the features, and knows whether something is touched.
+
+    Raises:
+        SpecMismatch: the stream is of another array than the lesson.
+    """
+
+    def __init__(self, model: Path, spec: ArraySpec) -> None:
+        self.classifier = Classifier(model, spec, embedding=True)
+        self._first_ns: int | None = None
+        self._steps: list[Classification] = []
+
+    def push(self, chunk: Chunk) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
+        """Take samples; gives (onset, end, features (step, feature)) of touches that are whole."""
+        if self._first_ns is None and len(chunk):
+            self._first_ns = int(chunk.t_ns[0])
+        for decision in self.classifier.push(chunk):
+            if decision.step == 1:
+                self._steps = []
+            self._steps.append(decision)
+            if decision.final and len(self._steps) == self.classifier.card.steps:
+                felt = np.stack(
+                    [step.embedding for step in self._steps if step.embedding is not None]
+                )
+                yield decision.onset_ns, decision.t_ns, felt
+
+    @property
+    def touching(self) -> bool:
+        """Whether something is touched now."""
+        return self.classifier.detector.contact
+
+    def seconds(self, t_ns: int) -> float:
+        """Stream time in seconds since the first sample."""
+        return (t_ns - (self._first_ns or 0)) / NS_PER_S
+
+
+def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:
+    """(channel,) the least noise that a contact detector should assume, from an array at rest.
+
+    A share of the noise of the median element; of a channel that never changes, the smallest
+    difference between its readings, or a millionth of the largest.
+
+    Args:
+        chunks: what the array delivers while nothing touches it.
+
+    Raises:
+        RecordingError: there is nothing, or nothing valid.
+    """
+    values = np.concatenate([c.values for c in chunks]) if chunks else np.empty((0, 0, 0))
+    valid = np.concatenate([c.valid for c in chunks]) if chunks else np.empty((0, 0))
+    there = valid.all(axis=0) if len(valid) else np.zeros(0, bool)
+    if len(values) < 2 or not there.any():
+        raise RecordingError("the array delivered nothing at rest: is it connected and powered?")
+    values = values[:, there].astype(float)
+    noise = np.median(values.std(axis=0), axis=0)
+    floor: NDArray[np.float64] = QUIET * noise
+    for channel in range(values.shape[2]):
+        levels = np.unique(values[:, :, channel])
+        steps = np.diff(levels)
+        step = float(steps.min()) if len(steps) else max(1e-6 * float(abs(levels).max()), 1e-9)
+        floor[channel] = max(floor[channel], step / np.sqrt(12))
+    found: NDArray[np.float32] = floor.astype(np.float32)
+    return found
+
+
+def check_label(name: str) -> str:
+    """The label itself.
+
+    Raises:
+        ConfigError: it cannot be one.
+    """
+    if why := check_name(name):
+        raise ConfigError(f"label {name!r}: {why}")
+    return name
+
+
+def _whole(path: Path) -> Path:
+    """The recording, made whole if it was cut short."""
+    try:
+        for _ in Recording(path).raw():
+            pass
+    except RecordingError:
+        new = recover(path, path.with_suffix(".recovered"), force=True)
+        shutil.move(new, path)
+    return path
+
+
+def _number(path: Path) -> int:
+    digits = path.stem.removeprefix("session-")
+    return int(digits) if digits.isdigit() else 0

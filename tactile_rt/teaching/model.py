@@ -1,0 +1,162 @@
+"""Model files made of touches, without torch and without the package `onnx`.
+
+    features, classes --> an .onnx file that runs like any other
+
+Before anything is learnt, `write_features` writes a model of one class whose embedding are the
+features: run on a stream by an ordinary `Classifier`, it gives for every touch the very numbers
+that the model learnt from it will see.
+"""
+
+import platform
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from tactile_rt.classifier.decision_rules import POSTERIOR, UNKNOWN, UnknownRule
+from tactile_rt.classifier.model_card import ModelCard, StateTensor
+from tactile_rt.classifier.model_file import METADATA_KEY, load_model
+from tactile_rt.classifier.model_runs import probe_logits
+from tactile_rt.classifier.onnx_check import graph_sha256
+from tactile_rt.files import write_whole
+from tactile_rt.stream import NS_PER_S, ArraySpec
+from tactile_rt.teaching.features import FeatureNetwork
+from tactile_rt.teaching.head import LIMIT, TouchClasses
+from tactile_rt.teaching.onnx_bytes import OPSET, Graph
+from tactile_rt.timing import Timing
+
+__all__ = ["FASTEST_NS", "Taught", "write_features", "write_taught"]
+
+FASTEST_NS = 9_000_000  # period of the samples that are looked at; a slower sensor's is its own
+TOUCH = "touch"  # the class of a model that has learnt nothing
+MAYBE = 0.5  # posterior of `unknown` above which a touch is unknown
+
+
+@dataclass(frozen=True)
+class Taught:
+    """What a model that is taught is of.
+
+    Attributes:
+        spec: The array.
+        floor: (channel,) The smallest noise that the contact detector assumes, in the channel's
+            unit.
+    """
+
+    spec: ArraySpec
+    floor: NDArray[np.float32]
+
+    @property
+    def period_ns(self) -> int:
+        """The period of the samples that the network takes, ns."""
+        return max(FASTEST_NS, round(NS_PER_S / self.spec.rate_hz))
+
+    @property
+    def timing(self) -> Timing:
+        """How a touch is cut."""
+        return Timing.of(self.period_ns)
+
+    @property
+    def network(self) -> FeatureNetwork:
+        """That gives the features."""
+        return FeatureNetwork.drawn(self.spec, self.timing.substeps, self.timing.steps)
+
+
+def write_features(path: Path, taught: Taught) -> ModelCard:
+    """Write the model of one class, of which the embedding are the features of a touch."""
+    graph, network = Graph(), taught.network
+    features, after = network.build(graph)
+    graph.output("logits", graph("Slice", features, *_first(graph, 1)), ["batch", 1])
+    return _write(path, taught, graph, features, after, {"labels": (TOUCH,)})
+
+
+def write_taught(
+    path: Path, taught: Taught, classes: TouchClasses, name: str, provenance: dict[str, Any]
+) -> ModelCard:
+    """Write the model of the classes; it appears whole or not at all."""
+    graph, network = Graph(), taught.network
+    features, after = network.build(graph)
+    logits = _head(graph, features, after["count"], taught.timing, classes)
+    graph.output("logits", logits, ["batch", len(classes.labels) + 1])
+    told = {
+        "name": name,
+        "labels": (*classes.labels, UNKNOWN),
+        "refusals": (UNKNOWN,),
+        "unknown": UnknownRule(POSTERIOR, "logits", (MAYBE,)),
+        "temperature": classes.temperature,
+        "provenance": {
+            "tactile_rt": version("tactile-rt"),
+            "onnxruntime": onnxruntime.__version__,
+            "python": platform.python_version(),
+            **provenance,
+        },
+    }
+    return _write(path, taught, graph, features, after, told)
+
+
+def _head(g: Graph, features: str, count: str, timing: Timing, classes: TouchClasses) -> str:
+    """(batch, class and unknown) logits: half of each squared distance, and of the reach."""
+    done = g("Div", count, g.constant(float(timing.substeps)))
+    step = g("Cast", g("Sub", done, g.constant(1.0)), to=7)
+    step = g("Clip", step, g.constant(0, np.int64), g.constant(timing.steps - 1, np.int64))
+    step = g("Squeeze", step, g.integers(1))  # (batch,)
+
+    def now(values: NDArray[np.float64]) -> str:
+        return g("Gather", g.constant(values), step, axis=0)
+
+    found = g("Mul", g("Sub", features, now(classes.mean)), now(1 / classes.scale))
+    found = g("Clip", found, g.constant(-LIMIT), g.constant(LIMIT))
+    away = g("Sub", g("Unsqueeze", found, g.integers(1)), now(classes.centres))  # b, class, feature
+    along = g("MatMul", away, now(classes.axes))
+    whole = g("ReduceSum", g("Mul", away, away), g.integers(2), keepdims=0)
+    whole = g("Mul", whole, now(1 / classes.rest[:, None]))
+    less = g("ReduceSum", g("Mul", along, along), g.integers(2), keepdims=0)
+    distances = g("Concat", g("Sub", whole, less), now(classes.reach[:, None]), axis=1)
+    return g("Mul", distances, g.constant(-0.5))
+
+
+def _first(g: Graph, size: int) -> tuple[str, str, str]:
+    return g.integers(0), g.integers(size), g.integers(1)
+
+
+def _write(
+    path: Path,
+    taught: Taught,
+    graph: Graph,
+    features: str,
+    after: dict[str, str],
+    told: dict[str, Any],
+) -> ModelCard:
+    network, timing = taught.network, taught.timing
+    graph.output("embedding", features, ["batch", network.size])
+    for name, shape in network.state().items():
+        graph.output(f"{name}_next", after[name], ["batch", *shape])
+    floor = tuple(float(value) for value in taught.floor)
+    card = ModelCard(
+        **{"name": path.stem, **told},
+        spec=taught.spec.to_json(),
+        period_ns=taught.period_ns,
+        substeps=timing.substeps,
+        steps=timing.steps,
+        state=tuple(StateTensor(n, s, "float32") for n, s in network.state().items()),
+        clip=tuple(1e6 * value for value in floor),
+        scale=floor,
+        floor=floor,
+        embedding=network.size,
+        opset=OPSET,
+    )  # fmt: skip
+    write_whole(path, lambda file: file.write(_bytes(graph, card)))
+    session, _ = load_model(path)
+    probe = tuple(tuple(map(float, row)) for row in probe_logits(session, card))
+    hashes = {"graph": graph_sha256(path.read_bytes())}
+    card = msgspec.structs.replace(card, probe=probe, hashes=hashes)
+    write_whole(path, lambda file: file.write(_bytes(graph, card)))
+    return card
+
+
+def _bytes(graph: Graph, card: ModelCard) -> bytes:
+    return graph.serialised(card.name, {METADATA_KEY: msgspec.json.encode(card).decode()})

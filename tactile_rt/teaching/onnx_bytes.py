@@ -1,0 +1,136 @@
+"""ONNX files written byte by byte, where no robot has the package `onnx`.
+
+What a graph of a few operators needs of ``onnx.proto`` (IR version 10), and no more. Numbers are
+protocol buffers' varints; a message within a message is its length and then its bytes.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+__all__ = ["Graph"]
+
+IR_VERSION, OPSET = 10, 20
+PRODUCER = "tactile_rt"
+FLOAT, INT, STRING, INTS = 1, 2, 3, 7  # kinds of attributes
+TYPES = {"float32": 1, "int64": 7, "bool": 9}  # of tensors
+
+
+def _varint(number: int) -> bytes:
+    out = bytearray()
+    number &= 2**64 - 1  # a negative one is as large as a number of 64 bits can be
+    while number > 0x7F:
+        out.append(number & 0x7F | 0x80)
+        number >>= 7
+    out.append(number)
+    return bytes(out)
+
+
+def _number(field_number: int, value: int) -> bytes:
+    return _varint(field_number << 3) + _varint(value)
+
+
+def _bytes(field_number: int, value: bytes | str) -> bytes:
+    data = value.encode() if isinstance(value, str) else value
+    return _varint(field_number << 3 | 2) + _varint(len(data)) + data
+
+
+def _tensor(name: str, array: NDArray[Any]) -> bytes:
+    shape = b"".join(_number(1, size) for size in array.shape)
+    data = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<")).tobytes()
+    return shape + _number(2, TYPES[array.dtype.name]) + _bytes(8, name) + _bytes(9, data)
+
+
+def _value(name: str, shape: Sequence[int | str], dtype: DTypeLike) -> bytes:
+    sizes = (_number(1, size) if isinstance(size, int) else _bytes(2, size) for size in shape)
+    dimensions = b"".join(_bytes(1, size) for size in sizes)
+    tensor = _number(1, TYPES[np.dtype(dtype).name]) + _bytes(2, dimensions)
+    return _bytes(1, name) + _bytes(2, _bytes(1, tensor))
+
+
+def _attribute(name: str, value: int | float | str | Sequence[int]) -> bytes:
+    if isinstance(value, str):
+        told = _bytes(4, value) + _number(20, STRING)
+    elif isinstance(value, int):
+        told = _number(3, value) + _number(20, INT)
+    elif isinstance(value, float):
+        told = _varint(2 << 3 | 5) + np.float32(value).tobytes() + _number(20, FLOAT)
+    else:
+        told = b"".join(_number(8, one) for one in value) + _number(20, INTS)
+    return _bytes(1, name) + told
+
+
+@dataclass
+class Graph:
+    """A graph that is built operator by operator, in the order in which they run.
+
+    Attributes:
+        parts: The serialised nodes, tensors, inputs and outputs.
+    """
+
+    parts: list[bytes] = field(default_factory=list)
+    _names: int = 0
+
+    def constant(self, values: ArrayLike, dtype: DTypeLike = np.float32) -> str:
+        """Store a tensor; returns its name."""
+        name = self._new("constant")
+        self.parts.append(_bytes(5, _tensor(name, np.asarray(values, dtype))))
+        return name
+
+    def integers(self, *values: int) -> str:
+        """Store a list of integers, as operators take axes; returns its name."""
+        return self.constant(values, np.int64)
+
+    def input(self, name: str, shape: Sequence[int | str]) -> str:
+        """Declare an input; a size that is a name is free."""
+        self.parts.append(_bytes(11, _value(name, shape, np.float32)))
+        return name
+
+    def output(self, name: str, value: str, shape: Sequence[int | str]) -> None:
+        """Give a value out under a name."""
+        self._node("Identity", [value], [name], {})
+        self.parts.append(_bytes(12, _value(name, shape, np.float32)))
+
+    def __call__(self, operator: str, *inputs: str, **attributes: Any) -> str:
+        """Apply an ONNX operator of one output; returns the name of that."""
+        name = self._new(operator)
+        self._node(operator, inputs, [name], attributes)
+        return name
+
+    def serialised(self, name: str, metadata: Mapping[str, str]) -> bytes:
+        """The file."""
+        graph = b"".join(self.parts) + _bytes(2, name)
+        pairs = (_bytes(14, _bytes(1, key) + _bytes(2, text)) for key, text in metadata.items())
+        return b"".join(
+            (
+                _number(1, IR_VERSION),
+                _bytes(2, PRODUCER),
+                _bytes(7, graph),
+                _bytes(8, _bytes(1, "") + _number(2, OPSET)),
+                *pairs,
+            )
+        )
+
+    def _node(
+        self,
+        operator: str,
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        attributes: Mapping[str, Any],
+    ) -> None:
+        node = b"".join(
+            (
+                *(_bytes(1, name) for name in inputs),
+                *(_bytes(2, name) for name in outputs),
+                _bytes(4, operator),
+                *(_bytes(5, _attribute(*pair)) for pair in attributes.items()),
+            )
+        )
+        self.parts.append(_bytes(1, node))
+
+    def _new(self, what: str) -> str:
+        self._names += 1
+        return f"{what.lower()}_{self._names}"

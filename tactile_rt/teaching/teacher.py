@@ -1,0 +1,166 @@
+"""Who teaches says what is touched, and hears how well it is told apart.
+
+orders (keys, lines, a page's buttons) --> Teacher <-- touches
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.stream import ConfigError
+from tactile_rt.teaching.lesson import Lesson, Progress, check_label
+
+__all__ = ["ORDERS", "Teacher"]
+
+ORDERS = ("next", "undo", "done")  # any other word is the label from now on
+
+
+@dataclass
+class Teacher:
+    """What is asked of who touches.
+
+    Attributes:
+        lesson: Where touches go.
+        wanted: The names of the classes to be taught, in their order; more come as they are named.
+        each: The number of touches of each class.
+        label: The name of what is touched now; empty: nobody has said.
+        done: Whether who teaches has had enough, or all that was wanted is there.
+    """
+
+    lesson: Lesson
+    wanted: list[str]
+    each: int
+    label: str = ""
+    done: bool = False
+    progress: Progress = field(default_factory=lambda: Progress((), (), ()))
+
+    def __post_init__(self) -> None:
+        for name in self.wanted:
+            check_label(name)
+        self.wanted += [name for name in self.lesson.labels if name not in self.wanted]
+        self.progress = self.lesson.left_out()
+        self._go_on()
+
+    def obey(self, order: str) -> str:
+        """Do what is asked: one of `ORDERS`, a class's number, or its name. What to say of it."""
+        order = order.strip()
+        if order == "done":
+            self.done = True
+            return ""
+        if order == "undo":
+            return self._undo()
+        if order == "next":
+            return self._next()
+        if order.isdigit() and 1 <= int(order) <= len(self.wanted):
+            order = self.wanted[int(order) - 1]
+        try:
+            self.label = check_label(order)
+        except ConfigError as error:
+            return str(error)
+        if order not in self.wanted:
+            self.wanted.append(order)
+        return self.prompt()
+
+    def take(
+        self,
+        label: str,
+        features: NDArray[np.float32],
+        recording: str,
+        span_s: tuple[float, float],
+    ) -> str:
+        """Take a touch that was begun under a label; what to say of it."""
+        if not label:
+            return "touched, but what? say so first: nothing was learnt"
+        self.lesson.add(label, features, recording, span_s)
+        said = [f"{len(self.lesson.touches):3d}  {label} {self.lesson.count(label)}"]
+        before = set(self.progress.odd)
+        self.progress = self.lesson.left_out()
+        said.append(self._told_apart())
+        said += [
+            f"touch {number} is unlike the others of {self.lesson.touches[number - 1].label}"
+            + ("" if like == self.lesson.touches[number - 1].label else f", more like {like}")
+            for number, like in self.progress.odd
+            if (number, like) not in before
+        ]
+        changed = self.label == label and self.lesson.count(label) >= self.each
+        if changed:
+            self._go_on()
+        if self.done or changed:
+            said.append(self.prompt())
+        return "\n".join([", ".join(filter(None, said[:2])), *said[2:]])
+
+    def prompt(self) -> str:
+        """What to do now."""
+        if self.done:
+            return "all touches are there"
+        if not self.label:
+            return "what is to be touched first?"
+        count = self.lesson.count(self.label)
+        of = f" of {self.each}" if count < self.each else ""
+        return f"touch it: {self.label} ({count + 1}{of})"
+
+    def state(self) -> dict[str, Any]:
+        """What a page shows."""
+        right, of = self.progress.right
+        rows = {name: (count, good) for name, count, good in self.progress.classes}
+        return {
+            "label": self.label,
+            "each": self.each,
+            "done": self.done,
+            "prompt": self.prompt(),
+            "classes": [
+                {
+                    "name": name,
+                    "touches": self.lesson.count(name),
+                    "right": rows[name][1] if name in rows else None,
+                }
+                for name in self.wanted
+            ],
+            "right": right,
+            "of": of,
+            "odd": [[n, self.lesson.touches[n - 1].label, like] for n, like in self.progress.odd],
+            "confused": [list(pair) for pair in self.progress.confused[:3]],
+        }
+
+    def summary(self) -> Sequence[str]:
+        """What was learnt, line by line."""
+        lines = [
+            f"{name}: {good} of {count} left-out touches right"
+            for name, count, good in self.progress.classes
+        ]
+        lines += [f"{a} is taken for {b}" for a, b in self.progress.confused[:3]]
+        return lines
+
+    def _told_apart(self) -> str:
+        right, of = self.progress.right
+        if len(self.progress.classes) < 2:
+            return ""
+        worst = min(self.progress.classes, key=lambda c: c[2] / c[1])
+        weak = f"; weakest: {worst[0]}, {worst[2]} of {worst[1]}" if worst[2] < worst[1] else ""
+        return f"told apart: {right} of {of} left-out touches{weak}"
+
+    def _undo(self) -> str:
+        gone = self.lesson.undo()
+        if gone is None:
+            return "there is no touch to take back"
+        self.progress = self.lesson.left_out()
+        self.label, self.done = gone.label, False
+        return f"touch {len(self.lesson.touches) + 1} ({gone.label}) is taken back\n{self.prompt()}"
+
+    def _next(self) -> str:
+        if not self.wanted:
+            return self.prompt()
+        at = self.wanted.index(self.label) + 1 if self.label in self.wanted else 0
+        self.label = self.wanted[at % len(self.wanted)]
+        return self.prompt()
+
+    def _go_on(self) -> None:
+        """To the next class that lacks touches; to the end if none does."""
+        short = [name for name in self.wanted if self.lesson.count(name) < self.each]
+        if short:
+            self.label = short[0]
+        elif self.wanted:
+            self.done = True
