@@ -7,7 +7,7 @@ fields that it does not know; a version is raised only when an older reader woul
 import math
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import msgspec
 import numpy as np
@@ -27,6 +27,7 @@ from tactile_rt.sensor_spec import SensorSpec, channel_limits
 from tactile_rt.stream import ArraySpec, ConfigError, ModelError, SpecMismatch
 
 __all__ = [
+    "EmbeddingStatistics",
     "Kind",
     "ModelCard",
     "StateTensor",
@@ -59,6 +60,39 @@ class StateTensor(msgspec.Struct, frozen=True):
     shape: tuple[int, ...]
     dtype: str
     in_place: bool = False
+
+
+class EmbeddingStatistics(msgspec.Struct, frozen=True):
+    """Where touches of the known classes lie, by the mean of their steps' embeddings.
+
+    Attributes:
+        means: (class, unit) The mean of each class's touches, float16, little-endian.
+        covariance: (unit, unit) How touches of one class differ, float16, little-endian.
+    """
+
+    means: bytes
+    covariance: bytes
+
+    @classmethod
+    def of(cls, means: NDArray[np.float64], covariance: NDArray[np.float64]) -> Self:
+        """Those of arrays."""
+        return cls(*(array.astype("<f2").tobytes() for array in (means, covariance)))
+
+    def arrays(self, classes: int, units: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """(class, unit) means and (unit, unit) covariance.
+
+        Raises:
+            ValueError: there are not so many numbers, or some are none.
+        """
+        means, covariance = (
+            np.frombuffer(data, "<f2").astype(float).reshape(-1, units)
+            for data in (self.means, self.covariance)
+        )
+        if len(means) != classes or len(covariance) != units:
+            raise ValueError(f"{len(means)} means, {len(covariance)} rows of covariance")
+        if not (np.isfinite(means).all() and np.isfinite(covariance).all()):
+            raise ValueError("numbers that are none")
+        return means, covariance
 
 
 class ModelCard(msgspec.Struct, frozen=True):
@@ -101,6 +135,8 @@ class ModelCard(msgspec.Struct, frozen=True):
             is unknown, or what is wrong with the loads.
         loads: Statistics of the loads, tare removed, that training saw: by name a table
             (element, channel), SI.
+        embeddings: Where touches of the known classes lie, so that others can be told from them
+            without the data; None if it is not told.
     """
 
     name: str
@@ -130,6 +166,7 @@ class ModelCard(msgspec.Struct, frozen=True):
     unknown: UnknownRule | None = None
     candidates: tuple[CandidateRule, ...] = ()
     loads: dict[str, tuple[tuple[float, ...], ...]] = {}
+    embeddings: EmbeddingStatistics | None = None
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -274,6 +311,11 @@ def parse_card(path: Path, text: str) -> ModelCard:
         raise damaged("refusals are not the last of the labels")
     if len(card.refusals) == len(card.labels):
         raise damaged("there are no labels but refusals")
+    if card.embeddings is not None:
+        try:
+            card.embeddings.arrays(len(card.classes), card.embedding)
+        except ValueError as error:
+            raise damaged(f"embeddings: {error}") from None
     for what, table in card.loads.items():
         if not named(what):
             raise damaged(f"names of loads must be 1 to {MAX_NAME} printable characters")

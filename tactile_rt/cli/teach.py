@@ -38,6 +38,10 @@ def teach(
     page: Annotated[
         str, typer.Option(help="Serve buttons for a browser here, e.g. 127.0.0.1:8791.")
     ] = "",
+    model: Annotated[
+        str,
+        typer.Option(help="Teach this model further classes: an .onnx file, or `shipped`."),
+    ] = "",
     seconds: Seconds = None,
 ) -> None:
     """Touch it ten times a class, and it knows the classes: FOLDER/model.onnx.
@@ -46,16 +50,19 @@ def teach(
     a class, n the next one, a adds one, u takes the last touch back, q learns and leaves. Where
     stdin is no terminal, a line is an order: a class's name, next, undo or done.
     """
+    from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.recording import StreamWriter
     from tactile_rt.recording.layout import need_mcap
     from tactile_rt.sources.opening import open_source
-    from tactile_rt.teaching.lesson import BEFORE_NS, FEATURES, MODEL, Lesson, Listener
+    from tactile_rt.teaching.lesson import BEFORE_NS, FEATURES, MODEL, Lesson
     from tactile_rt.teaching.teacher import Teacher
 
     need_mcap()
     wanted = [name.strip() for name in labels.split(",") if name.strip()]
     at = _address(page) if page else None
     before = Lesson.read(folder) if (folder / FEATURES).exists() else None
+    if before is None and model:
+        before = Lesson.on(folder, shipped_model() if model == "shipped" else Path(model))
     _check_labels(wanted)
     with starting():
         opened = open_source(source)
@@ -63,7 +70,7 @@ def teach(
     with opened, leaving(seconds):
         lesson = before or _begun(folder, opened)
         teacher = Teacher(lesson, wanted, touches)
-        listener = Listener(folder / FEATURES, opened.spec)
+        listener = lesson.listener(opened.spec)
         typer.echo(_greeting(lesson, opened))
         path = lesson.next_recording()
         with (

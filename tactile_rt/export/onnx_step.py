@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 
 from tactile_rt.classifier.decision_rules import CandidateRule, UnknownRule
-from tactile_rt.classifier.model_card import CARD_VERSION, Kind
+from tactile_rt.classifier.model_card import CARD_VERSION, EmbeddingStatistics, Kind
 from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, StateTensor, load_model
 from tactile_rt.classifier.model_runs import file_outputs, probe_logits
 from tactile_rt.classifier.onnx_check import graph_sha256
@@ -84,6 +84,7 @@ def export_checkpoint(
     name: str,
     temperature: float = 1.0,
     rules: tuple[UnknownRule | None, tuple[CandidateRule, ...]] = (None, ()),
+    embeddings: EmbeddingStatistics | None = None,
     figures: dict[str, Any] | None = None,
     commands: Sequence[str] = (),
     precision: Precision = "fp32",
@@ -98,6 +99,7 @@ def export_checkpoint(
         name: of the model.
         temperature: divides the logits at run time.
         rules: when the model refuses to name a class, and what it promises of candidates.
+        embeddings: where touches of the known classes lie.
         figures: measured accuracies to store in the file.
         commands: that remake the file.
         precision: of the weights, and of products with them.
@@ -123,6 +125,7 @@ def export_checkpoint(
         refusals=refusals,
         unknown=rules[0],
         candidates=rules[1],
+        embeddings=embeddings,
         state=(),
         clip=tuple(model.inputs.clip.tolist()),
         scale=tuple(model.inputs.scale.tolist()),

@@ -8,9 +8,10 @@ from typing import Any
 import msgspec
 import numpy as np
 import onnx
+import torch
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.model_card import Kind
+from tactile_rt.classifier.model_card import EmbeddingStatistics, Kind
 from tactile_rt.classifier.model_file import METADATA_KEY, ModelCard, load_model
 from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.export.onnx_step import export_checkpoint
@@ -19,8 +20,9 @@ from tactile_rt.export.promises import fitted_rules
 from tactile_rt.models.checkpoints import NETWORK
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet, joined, relabelled
-from tactile_rt.models.evaluation import Step, among, hits, predict
+from tactile_rt.models.evaluation import Step, among, hits, predict, run_windows
 from tactile_rt.models.training import (
+    TactileClassifier,
     TrainingConfig,
     load_checkpoint,
     read_recipe,
@@ -79,6 +81,7 @@ def release(
         name,
         temperature=temperature,
         rules=(unknown, candidates),
+        embeddings=embedding_statistics(model, validation, len(known)),
         figures={"validation_top1": right[0], "validation_top1_noisy": right[1]},
         commands=(
             *(_making(folder, SweepManifest.read(folder)) for folder in folders),
@@ -93,6 +96,30 @@ def release(
     if precision == "fp32":
         return card
     return _described(path, card, quantisation_figures(run_on(model), path, validation))
+
+
+def embedding_statistics(
+    model: TactileClassifier, data: SweepSet, classes: int
+) -> EmbeddingStatistics | None:
+    """Where labelled sweeps of the known classes lie; None if a class has fewer than two."""
+
+    def embed(
+        samples: NDArray[np.float32], offset: NDArray[np.float32], sigma: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        device = model.inputs.clip.device
+        windows = (torch.from_numpy(a).to(device) for a in (samples, offset, sigma))
+        with torch.inference_mode():
+            steps = model.eval().network.embed(model.inputs(*windows))
+            mean: NDArray[np.float32] = steps.mean(dim=1).float().cpu().numpy()
+        return mean
+
+    found, touched = run_windows(data, embed)
+    found, labels = found[touched].astype(float), data.sweeps.labels[touched]
+    if np.bincount(labels, minlength=classes)[:classes].min() < 2:
+        return None
+    means = np.stack([found[labels == k].mean(axis=0) for k in range(classes)])
+    apart = found - means[labels]
+    return EmbeddingStatistics.of(means, apart.T @ apart / len(apart))
 
 
 def run_file(path: Path) -> Step:

@@ -4,7 +4,8 @@
 
 A lesson is a folder, so that it can be gone on with, looked at and corrected:
 
-    features.onnx      what is looked at: the array, and its noise when the lesson began
+    features.onnx      what is looked at: the array, and its noise when the lesson began; or the
+                       network that is taught further classes
     session-1.mcap     everything that was felt, one recording each time
     labels.csv         which part of it was which touch; a line is written as a touch ends
     model.onnx         what was learnt: runs like any other model
@@ -13,7 +14,7 @@ A lesson is a folder, so that it can be gone on with, looked at and corrected:
 """
 
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import hash_of, load_model
+from tactile_rt.files import write_whole
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.labels import (
     LABELS,
@@ -33,8 +35,9 @@ from tactile_rt.recording.labels import (
     remove_last_label,
 )
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError
-from tactile_rt.teaching.head import FEWEST, LeftOut, fit_classes, leave_out
-from tactile_rt.teaching.model import Taught, write_features, write_taught
+from tactile_rt.teaching.further import check_further
+from tactile_rt.teaching.head import FEWEST, LeftOut
+from tactile_rt.teaching.model import TOUCH, Taught, TaughtFurther, write_features
 
 __all__ = [
     "BEFORE_NS",
@@ -84,7 +87,7 @@ class Lesson:
     """
 
     folder: Path
-    taught: Taught
+    taught: Taught | TaughtFurther
     touches: list[Touch] = field(default_factory=list)
     lost: int = 0
 
@@ -108,6 +111,26 @@ class Lesson:
         return cls(folder, taught)
 
     @classmethod
+    def on(cls, folder: Path, model: Path) -> "Lesson":
+        """A new lesson that teaches a network further classes.
+
+        Args:
+            folder: where to; made if it is not there.
+            model: the network's file, which is copied.
+
+        Raises:
+            ConfigError: there is a lesson already, or the file does not tell what is needed.
+            ModelError: the file cannot be used.
+        """
+        if (folder / FEATURES).exists():
+            raise ConfigError(f"{folder} holds a lesson already")
+        taught = TaughtFurther(model)
+        folder.mkdir(parents=True, exist_ok=True)
+        data = model.read_bytes()
+        write_whole(folder / FEATURES, lambda file: file.write(data))
+        return cls(folder, taught)
+
+    @classmethod
     def read(cls, folder: Path) -> "Lesson":
         """A lesson that was begun before, with all its touches.
 
@@ -118,7 +141,12 @@ class Lesson:
         if not path.exists():
             raise ConfigError(f"{folder} holds no lesson: there is no {FEATURES}")
         card = load_model(path)[1]
-        lesson = cls(folder, Taught(card.array, np.array(card.floor, dtype=np.float32)))
+        lesson = cls(
+            folder,
+            Taught(card.array, np.array(card.floor, dtype=np.float32))
+            if card.labels == (TOUCH,)
+            else TaughtFurther(path),
+        )
         if (folder / LABELS).exists():
             lesson._read_touches()
         return lesson
@@ -139,11 +167,19 @@ class Lesson:
     def _felt(self, path: Path) -> list[tuple[float, NDArray[np.float32]]]:
         """Onset, in seconds since the beginning, and features of every touch in a recording."""
         recording = Recording(path)
-        listener = Listener(self.folder / FEATURES, recording.spec)
+        listener = self.listener(recording.spec)
         found = []
         for chunk in recording:
             found += [(listener.seconds(onset), felt) for onset, _, felt in listener.push(chunk)]
         return found
+
+    def listener(self, spec: ArraySpec) -> "Listener":
+        """That finds touches in a stream of an array.
+
+        Raises:
+            SpecMismatch: it is another array than the lesson's.
+        """
+        return Listener(self.folder / FEATURES, spec, self.taught.felt)
 
     def next_recording(self) -> Path:
         """The path of the recording that goes on with the lesson."""
@@ -172,6 +208,16 @@ class Lesson:
         remove_last_label(self.folder / LABELS)
         return self.touches.pop()
 
+    def check(self, label: str) -> str:
+        """The label itself.
+
+        Raises:
+            ConfigError: no class of this lesson can be named so.
+        """
+        if isinstance(self.taught, TaughtFurther):
+            check_further(self.taught.card, (label,))
+        return check_label(label)
+
     def count(self, label: str) -> int:
         """How many touches there are of a label."""
         return sum(touch.label == label for touch in self.touches)
@@ -192,7 +238,7 @@ class Lesson:
         if not used:
             return Progress((), (), ())
         names = [self.touches[k].label for k in used]
-        found = leave_out(self._features(used)[:, -1:], names, self.taught.network.kinds)
+        found = self.taught.left_out(self._features(used), names)
         return _progress(used, names, found)
 
     def learn(self) -> ModelCard:
@@ -207,14 +253,13 @@ class Lesson:
                 f"{self.folder}: nothing to learn from: no class has {FEWEST} touches yet"
             )
         names = [self.touches[k].label for k in used]
-        classes = fit_classes(self._features(used), names, self.taught.network.kinds)
-        return write_taught(
-            self.folder / MODEL, self.taught, classes, self.folder.resolve().name,
-            {
-                "taught": {name: names.count(name) for name in classes.labels},
-                "labels_sha256": hash_of(self.folder / LABELS),
-            },
-        )  # fmt: skip
+        told = {
+            "taught": {name: names.count(name) for name in dict.fromkeys(names)},
+            "labels_sha256": hash_of(self.folder / LABELS),
+        }
+        return self.taught.learn(
+            self.folder / MODEL, self._features(used), names, self.folder.resolve().name, told
+        )
 
     def _features(self, used: Sequence[int]) -> Floats:
         return np.stack([self.touches[k].features for k in used]).astype(float)
@@ -271,6 +316,7 @@ class Listener:
     Args:
         model: ``features.onnx``.
         spec: the array of the stream.
+        felt: makes features of a touch's steps.
 
     Attributes:
         classifier: That runs the features, and knows whether something is touched.
@@ -279,8 +325,13 @@ class Listener:
         SpecMismatch: the stream is of another array than the lesson.
     """
 
-    def __init__(self, model: Path, spec: ArraySpec) -> None:
-        self.classifier = Classifier(model, spec, embedding=True)
+    def __init__(
+        self,
+        model: Path,
+        spec: ArraySpec,
+        felt: Callable[[Sequence[Classification]], NDArray[np.float32]],
+    ) -> None:
+        self.classifier, self._felt = Classifier(model, spec, embedding=True), felt
         self._first_ns: int | None = None
         self._steps: list[Classification] = []
 

@@ -8,6 +8,7 @@ that the model learnt from it will see.
 """
 
 import platform
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -18,23 +19,35 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
+from tactile_rt.classifier.classifier import Classification
 from tactile_rt.classifier.decision_rules import POSTERIOR, UNKNOWN, UnknownRule
 from tactile_rt.classifier.model_card import ModelCard, StateTensor
-from tactile_rt.classifier.model_file import METADATA_KEY, load_model
+from tactile_rt.classifier.model_file import METADATA_KEY, load_model, read_model
 from tactile_rt.classifier.model_runs import probe_logits
 from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.files import write_whole
 from tactile_rt.stream import NS_PER_S, ArraySpec
 from tactile_rt.teaching.features import FeatureNetwork
-from tactile_rt.teaching.head import LIMIT, TouchClasses
+from tactile_rt.teaching.further import (
+    check_further,
+    fit_further,
+    further_card,
+    further_graph,
+    leave_out_further,
+    taught_features,
+)
+from tactile_rt.teaching.head import LIMIT, LeftOut, TouchClasses, fit_classes, leave_out
 from tactile_rt.teaching.onnx_bytes import OPSET, Graph
 from tactile_rt.timing import Timing
 
-__all__ = ["FASTEST_NS", "Taught", "write_features", "write_taught"]
+__all__ = ["FASTEST_NS", "TOUCH", "Taught", "TaughtFurther", "write_features", "write_taught"]
 
 FASTEST_NS = 9_000_000  # period of the samples that are looked at; a slower sensor's is its own
 TOUCH = "touch"  # the class of a model that has learnt nothing
+TINY = 1e-12  # least posterior
 MAYBE = 0.5  # posterior of `unknown` above which a touch is unknown
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -65,6 +78,62 @@ class Taught:
         """That gives the features."""
         return FeatureNetwork.drawn(self.spec, self.timing.substeps, self.timing.steps)
 
+    def felt(self, steps: Sequence[Classification]) -> NDArray[np.float32]:
+        """(step, feature) of a touch, from what `write_features`' model said of it."""
+        return np.stack([step.embedding for step in steps if step.embedding is not None])
+
+    def left_out(self, features: Floats, labels: Sequence[str]) -> LeftOut:
+        """What is made of touches, at their last step, when each is left out in turn."""
+        return leave_out(features[:, -1:], labels, self.network.kinds)
+
+    def learn(
+        self, path: Path, features: Floats, labels: Sequence[str], name: str, told: dict[str, Any]
+    ) -> ModelCard:
+        """Write the model of the classes of these touches (touch, step, feature)."""
+        return write_taught(
+            path, self, fit_classes(features, labels, self.network.kinds), name, told
+        )
+
+
+class TaughtFurther:
+    """What a network is taught further classes of.
+
+    Args:
+        model: its file.
+
+    Raises:
+        ModelError: it cannot be used.
+        ConfigError: it does not tell what is needed.
+    """
+
+    def __init__(self, model: Path) -> None:
+        self.card, _, self._data = read_model(model)
+        self.spec = self.card.array
+        self.floor = np.array(self.card.floor, dtype=np.float32)
+        check_further(self.card, ())
+
+    def felt(self, steps: Sequence[Classification]) -> NDArray[np.float32]:
+        """(step, unit and label) of a touch, from what the model said of it."""
+        embeddings = np.stack([step.embedding for step in steps if step.embedding is not None])
+        posteriors = np.stack([step.probabilities for step in steps])
+        logits = np.log(np.maximum(posteriors, TINY)) * np.float32(self.card.temperature)
+        return taught_features(embeddings, logits).astype(np.float32)
+
+    def left_out(self, features: Floats, labels: Sequence[str]) -> LeftOut:
+        """What is made of touches, at their last step, when each is left out in turn."""
+        return leave_out_further(self.card, features[:, -1], labels)
+
+    def learn(
+        self, path: Path, features: Floats, labels: Sequence[str], name: str, told: dict[str, Any]
+    ) -> ModelCard:
+        """Write the network with the classes of these touches beside its own."""
+        classes = fit_further(self.card, features[:, -1], labels)
+        card = further_card(self.card, classes)
+        card = msgspec.structs.replace(
+            card, name=name, provenance={**card.provenance, **_made_by(), **told}
+        )
+        return write_checked(path, further_graph(self._data, self.card, classes), card)
+
 
 def write_features(path: Path, taught: Taught) -> ModelCard:
     """Write the model of one class, of which the embedding are the features of a touch."""
@@ -88,12 +157,7 @@ def write_taught(
         "refusals": (UNKNOWN,),
         "unknown": UnknownRule(POSTERIOR, "logits", (MAYBE,)),
         "temperature": classes.temperature,
-        "provenance": {
-            "tactile_rt": version("tactile-rt"),
-            "onnxruntime": onnxruntime.__version__,
-            "python": platform.python_version(),
-            **provenance,
-        },
+        "provenance": {**_made_by(), **provenance},
     }
     return _write(path, taught, graph, features, after, told)
 
@@ -149,13 +213,30 @@ def _write(
         embedding=network.size,
         opset=OPSET,
     )  # fmt: skip
-    write_whole(path, lambda file: file.write(_bytes(graph, card)))
-    session, _ = load_model(path)
-    probe = tuple(tuple(map(float, row)) for row in probe_logits(session, card))
-    hashes = {"graph": graph_sha256(path.read_bytes())}
+    return write_checked(path, graph, card)
+
+
+def write_checked(path: Path, graph: Graph, card: ModelCard) -> ModelCard:
+    """Write a file that stores its own hash and what it computes here, for `model verify`."""
+    whole = path.with_name(f".{path.name}")
+    whole.write_bytes(_bytes(graph, card))
+    try:
+        session, _ = load_model(whole)
+        probe = tuple(tuple(map(float, row)) for row in probe_logits(session, card))
+        hashes = {"graph": graph_sha256(whole.read_bytes())}
+    finally:
+        whole.unlink(missing_ok=True)
     card = msgspec.structs.replace(card, probe=probe, hashes=hashes)
     write_whole(path, lambda file: file.write(_bytes(graph, card)))
     return card
+
+
+def _made_by() -> dict[str, str]:
+    return {
+        "tactile_rt": version("tactile-rt"),
+        "onnxruntime": onnxruntime.__version__,
+        "python": platform.python_version(),
+    }
 
 
 def _bytes(graph: Graph, card: ModelCard) -> bytes:

@@ -4,7 +4,7 @@ What a graph of a few operators needs of ``onnx.proto`` (IR version 10), and no 
 protocol buffers' varints; a message within a message is its length and then its bytes.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -63,16 +63,82 @@ def _attribute(name: str, value: int | float | str | Sequence[int]) -> bytes:
     return _bytes(1, name) + told
 
 
+def _fields(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
+    """(number, value, the whole field) of what a message holds; the value of numbers is empty."""
+    at = 0
+    while at < len(data):
+        begin = at
+        tag, at = _read_varint(data, at)
+        value = b""
+        if tag & 7 == 2:
+            length, at = _read_varint(data, at)
+            value, at = data[at : at + length], at + length
+        elif tag & 7 == 0:
+            _, at = _read_varint(data, at)
+        else:
+            at += 4 if tag & 7 == 5 else 8
+        yield tag >> 3, value, data[begin:at]
+
+
+def _read_varint(data: bytes, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while True:
+        byte = data[at]
+        value |= (byte & 0x7F) << shift
+        at, shift = at + 1, shift + 7
+        if byte < 0x80:
+            return value, at
+
+
+def _name(value: bytes) -> str:
+    """Of an input or output."""
+    return next(text.decode() for number, text, _ in _fields(value) if number == 1)
+
+
+def _renamed(node: bytes, name: str) -> bytes:
+    """A node with another name for one of the values that it reads or writes."""
+    return b"".join(
+        _bytes(number, f"hidden_{name}") if number in (1, 2) and value == name.encode() else whole
+        for number, value, whole in _fields(node)
+    )
+
+
 @dataclass
 class Graph:
     """A graph that is built operator by operator, in the order in which they run.
 
     Attributes:
         parts: The serialised nodes, tensors, inputs and outputs.
+        opsets: The serialised versions of the sets of operators.
     """
 
     parts: list[bytes] = field(default_factory=list)
+    opsets: list[bytes] = field(
+        default_factory=lambda: [_bytes(8, _bytes(1, "") + _number(2, OPSET))]
+    )
     _names: int = 0
+
+    @classmethod
+    def of(cls, data: bytes, hidden: str) -> "Graph":
+        """The graph of a model file, to be gone on with.
+
+        Args:
+            data: the file, one that `onnx_check` lets pass, of the operators' version that is
+                written here.
+            hidden: an output that it is to have no more; its values are ``hidden_NAME`` now.
+        """
+        graph = cls(opsets=[])
+        for number, value, whole in _fields(data):
+            if number == 8:
+                graph.opsets.append(whole)
+            if number != 7:
+                continue
+            for kind, part, raw in _fields(value):
+                if kind == 1:
+                    graph.parts.append(_bytes(1, _renamed(part, hidden)))
+                elif kind == 5 or (kind in (11, 12) and _name(part) != hidden):
+                    graph.parts.append(raw)
+        return graph
 
     def constant(self, values: ArrayLike, dtype: DTypeLike = np.float32) -> str:
         """Store a tensor; returns its name."""
@@ -109,7 +175,7 @@ class Graph:
                 _number(1, IR_VERSION),
                 _bytes(2, PRODUCER),
                 _bytes(7, graph),
-                _bytes(8, _bytes(1, "") + _number(2, OPSET)),
+                *self.opsets,
                 *pairs,
             )
         )
@@ -133,4 +199,4 @@ class Graph:
 
     def _new(self, what: str) -> str:
         self._names += 1
-        return f"{what.lower()}_{self._names}"
+        return f"taught_{what.lower()}_{self._names}"

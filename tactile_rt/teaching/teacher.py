@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.stream import ConfigError
-from tactile_rt.teaching.lesson import Lesson, Progress, check_label
+from tactile_rt.teaching.lesson import Lesson, Progress
 
 __all__ = ["ORDERS", "Teacher"]
 
@@ -39,7 +39,7 @@ class Teacher:
 
     def __post_init__(self) -> None:
         for name in self.wanted:
-            check_label(name)
+            self.lesson.check(name)
         self.wanted += [name for name in self.lesson.labels if name not in self.wanted]
         self.progress = self.lesson.left_out()
         self._go_on()
@@ -57,7 +57,7 @@ class Teacher:
         if order.isdigit() and 1 <= int(order) <= len(self.wanted):
             order = self.wanted[int(order) - 1]
         try:
-            self.label = check_label(order)
+            self.label = self.lesson.check(order)
         except ConfigError as error:
             return str(error)
         if order not in self.wanted:
