@@ -45,7 +45,11 @@ def show(file: File) -> None:
         f"({card.steps * card.substeps * period_ms / 1e3:.3g} s)",
         "classes": f"{len(card.classes)}: {', '.join(card.classes[:MANY])}{rest}",
         "refusals": ", ".join(card.refusals),
-        "embedding": f"{card.embedding} units" if card.embedding else "none before version 3",
+        "embedding": (
+            f"{card.embedding} units" + (", and where its classes lie" if card.embeddings else "")
+            if card.embedding
+            else "none before version 3"
+        ),
         "state": f"{len(card.state)} tensors, {state} values" if card.state else "none",
         "sensor": _pairs(card.sensor),
         "clip": _channels(spec, card.clip),

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 POLL_S = 0.1
 REST_S = 2.0  # at rest, to measure the noise by
+HINT_S = 20.0  # without a touch, before it is said how strong the readings are
 DEAF_S = 10.0  # without a sample, before the first one: the device does not talk
 KEYS = {"n": "next", "u": "undo", "q": "done", "\x04": "done"}
 
@@ -80,7 +81,11 @@ def teach(
         ):
             typer.echo(teacher.prompt())
             label = teacher.label
+            quiet_since = time.monotonic()
             while not teacher.done:
+                if time.monotonic() - quiet_since > HINT_S:
+                    _say(listener.hint())
+                    quiet_since = time.monotonic()
                 try:
                     chunk = opened.read(POLL_S)
                 except EndOfStream:
@@ -93,6 +98,7 @@ def teach(
                 if not listener.touching:
                     label = teacher.label
                 for onset, end, felt in listener.push(chunk):
+                    quiet_since = time.monotonic()
                     span = listener.seconds(onset - BEFORE_NS), listener.seconds(end)
                     _say(teacher.take(label, felt, path.name, span))
                     label = teacher.label
@@ -105,11 +111,13 @@ def teach(
     card = lesson.learn()
     for line in teacher.summary():
         typer.echo(line)
+    others = len(card.classes) - len(lesson.taught_enough)
+    knows = ", ".join(lesson.taught_enough) + (f" beside {others} others" if others else "")
     typer.echo(
-        f"{folder / MODEL}: {', '.join(card.classes)} and unknown, from {len(lesson.touches)} "
-        f"touches, learnt in {time.process_time() - began:.1f} s; tactile-rt run --source "
-        f"'{source}' --model {folder / MODEL}"
+        f"{folder / MODEL}: knows {knows}, and what it does not know; "
+        f"{len(lesson.touches)} touches, learnt in {time.process_time() - began:.1f} s"
     )
+    typer.echo(f"now: tactile-rt run --source '{source}' --model {folder / MODEL}")
 
 
 def _check_labels(names: list[str]) -> None:

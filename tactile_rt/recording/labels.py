@@ -29,6 +29,7 @@ __all__ = [
     "LabelledInterval",
     "append_label",
     "check_name",
+    "drop_torn_label",
     "label_of_file",
     "read_labels",
     "remove_last_label",
@@ -164,6 +165,20 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> None
             os.fsync(folder)  # the name, too
         finally:
             os.close(folder)
+
+
+def drop_torn_label(path: Path) -> bool:
+    """Take away what an interruption has left of a last line; whether there was any.
+
+    Raises:
+        OSError: the file cannot be read or written.
+    """
+    data = path.read_bytes()
+    if not data or data.endswith(b"\n"):
+        return False
+    whole = data[: data.rfind(b"\n") + 1]
+    write_whole(path, lambda file: file.write(whole))
+    return True
 
 
 def remove_last_label(path: Path) -> None:

@@ -31,6 +31,7 @@ from tactile_rt.recording.labels import (
     LabelledInterval,
     append_label,
     check_name,
+    drop_torn_label,
     read_labels,
     remove_last_label,
 )
@@ -152,6 +153,7 @@ class Lesson:
         return lesson
 
     def _read_touches(self) -> None:
+        self.lost += drop_torn_label(self.folder / LABELS)
         recordings = sorted(self.folder.glob("session-*.mcap"), key=_number)
         for path, intervals in read_labels(self.folder / LABELS, recordings).items():
             if not intervals:
@@ -333,13 +335,21 @@ class Listener:
     ) -> None:
         self.classifier, self._felt = Classifier(model, spec, embedding=True), felt
         self._first_ns: int | None = None
+        self._heard = 0  # samples since the last hint
+        self._strongest = 0.0  # since then, in units of the noise
         self._steps: list[Classification] = []
 
     def push(self, chunk: Chunk) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
         """Take samples; gives (onset, end, features (step, feature)) of touches that are whole."""
         if self._first_ns is None and len(chunk):
             self._first_ns = int(chunk.t_ns[0])
-        for decision in self.classifier.push(chunk):
+        self._heard += len(chunk)
+        decisions = self.classifier.push(chunk)
+        detector = self.classifier.detector
+        if detector.ready and detector.tared.any():
+            now = np.abs(self.classifier.tared / detector.sigma)[detector.tared].max()
+            self._strongest = max(self._strongest, float(now))
+        for decision in decisions:
             if decision.step == 1:
                 self._steps = []
             self._steps.append(decision)
@@ -348,6 +358,18 @@ class Listener:
                     [step.embedding for step in self._steps if step.embedding is not None]
                 )
                 yield decision.onset_ns, decision.t_ns, felt
+
+    def hint(self) -> str:
+        """Why no touch may have been found for a while."""
+        heard, strongest = self._heard, self._strongest
+        self._heard, self._strongest = 0, 0.0
+        if not heard:
+            return "no sample came for a while: is the device still on?"
+        if self.touching:
+            return "it has been touched all the while: let go for a second"
+        if not self.classifier.detector.ready:
+            return "there was no second at rest yet: let go"
+        return f"no touch was noticed: the strongest reading was {strongest:.1f} times the noise"
 
     @property
     def touching(self) -> bool:

@@ -36,13 +36,15 @@ class Teacher:
     label: str = ""
     done: bool = False
     progress: Progress = field(default_factory=lambda: Progress((), (), ()))
+    _planned: bool = False  # whether there is a list to be worked through, and then an end
 
     def __post_init__(self) -> None:
         for name in self.wanted:
             self.lesson.check(name)
-        self.wanted += [name for name in self.lesson.labels if name not in self.wanted]
         self.progress = self.lesson.left_out()
-        self._go_on()
+        self.label = next(iter(self._short()), "")
+        self._planned = bool(self.label)
+        self.wanted += [name for name in self.lesson.labels if name not in self.wanted]
 
     def obey(self, order: str) -> str:
         """Do what is asked: one of `ORDERS`, a class's number, or its name. What to say of it."""
@@ -97,7 +99,7 @@ class Teacher:
         if self.done:
             return "all touches are there"
         if not self.label:
-            return "what is to be touched first?"
+            return "what is touched next? name it, or choose its number"
         count = self.lesson.count(self.label)
         of = f" of {self.each}" if count < self.each else ""
         return f"touch it: {self.label} ({count + 1}{of})"
@@ -158,9 +160,13 @@ class Teacher:
         return self.prompt()
 
     def _go_on(self) -> None:
-        """To the next class that lacks touches; to the end if none does."""
-        short = [name for name in self.wanted if self.lesson.count(name) < self.each]
+        """To the next class that lacks touches; to the end of the list if none does."""
+        short = self._short()
         if short:
             self.label = short[0]
-        elif self.wanted:
-            self.done = True
+        else:
+            self.done = self._planned
+
+    def _short(self) -> list[str]:
+        """The wanted classes of which there are too few touches."""
+        return [name for name in self.wanted if self.lesson.count(name) < self.each]

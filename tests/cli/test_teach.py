@@ -1,0 +1,207 @@
+"""`tactile-rt teach`, over a real serial line: taught, gone on with, killed, and used."""
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+
+import msgspec
+import numpy as np
+import pytest
+
+pytest.importorskip("mcap")
+
+from tactile_rt.classifier.classifier import Classifier
+from tactile_rt.classifier.model_file import load_model
+from tactile_rt.recording.labels import LABELS
+from tactile_rt.sources.opening import open_source
+from tactile_rt.teaching.lesson import Lesson
+from tactile_rt.teaching.page import TeachingPage
+from tactile_rt.testing import FakeSerial
+from tests.helpers.made_up_touches import KINDS, felt
+
+EACH = 4
+COMMAND = [sys.executable, "-c", "from tactile_rt.cli import main; main()", "teach"]
+
+
+def device(kinds, seed, pace="fast"):
+    signal = felt(kinds, seed)
+    return FakeSerial(np.concatenate([signal, signal[:300]]), "bota", pace=pace)
+
+
+def url(line, clock="device"):
+    return f"{line.url}&clock={clock}&start_s=30"
+
+
+@pytest.fixture(scope="module")
+def lesson(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("teach") / "gestures"
+    with device([kind for kind in KINDS for _ in range(EACH)], 1) as line:
+        done = subprocess.run(
+            [*COMMAND, url(line), folder, "--labels", ",".join(KINDS), "--touches", str(EACH)],
+            stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return folder, done.stdout
+
+
+def test_ten_lines_tell_what_to_do_and_what_was_learnt(lesson):
+    folder, out = lesson
+    lines = out.splitlines()
+    assert lines[0] == "touch nothing for 2 s"
+    assert "1 elements x 6 channels at 100 Hz" in lines[1]
+    assert lines[2] == f"touch it: press (1 of {EACH})"
+    assert f"touch it: slide (1 of {EACH})" in lines
+    assert "all touches are there" in lines
+    assert f"press: {EACH} of {EACH} left-out touches right" in lines
+    assert f"{folder}/model.onnx: knows press, slide, double, and what it does not know" in out
+    assert load_model(folder / "model.onnx")[1].refusals == ("unknown",)
+
+
+def test_what_was_taught_is_decided_over_the_same_line(lesson):
+    folder, _ = lesson
+    others = [kind for kind in KINDS for _ in range(3)]
+    with device(others, 2) as line, open_source(url(line)) as source:
+        classifier, found = Classifier(folder / "model.onnx", source.spec), []
+        ends = time.monotonic() + 30
+        while len(found) < len(others) and time.monotonic() < ends:
+            if (chunk := source.read(0.1)) is not None:
+                found += [d.label for d in classifier.push(chunk) if d.final]
+    assert np.mean([a == b for a, b in zip(found, others, strict=True)]) >= 7 / 9
+
+
+def test_a_lesson_goes_on_and_lines_are_orders(lesson):
+    folder, _ = lesson
+    with device(["twist"] * 3, 5) as line:
+        done = subprocess.run(
+            [*COMMAND, url(line), folder, "--labels", "twist", "--touches", "2"],
+            input="press\ntwist\n", capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert f"there already: {EACH} press, {EACH} slide, {EACH} double" in done.stdout
+    assert f"touch it: press ({EACH + 1})" in done.stdout, "stdin's lines are orders"
+    assert "touch it: twist (1 of 2)" in done.stdout
+    assert load_model(folder / "model.onnx")[1].classes == ("double", "press", "slide", "twist")
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_killed_at_any_moment_it_loses_one_touch_at_most(tmp_path, seed):
+    rng = random.Random(seed)
+    with device(["press"] * 12, seed, pace="realtime") as line:
+        process = subprocess.Popen(
+            [*COMMAND, url(line), tmp_path / "a", "--labels", "press", "--touches", "50"],
+            stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
+        )  # fmt: skip
+        said = []
+        reader = threading.Thread(target=lambda: said.extend(process.stdout), daemon=True)
+        reader.start()
+        while not any("press 2" in line for line in said):
+            assert process.poll() is None
+            time.sleep(0.02)
+        time.sleep(rng.uniform(0, 2))
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        reader.join()
+        process.stdout.close()
+    told = sum(" press " in line and "touch it" not in line for line in said)
+    again = Lesson.read(tmp_path / "a")
+    assert told - 1 <= len(again.touches) <= told + 1
+    assert again.learn().classes == ("press",)
+
+
+def test_mistakes_are_one_line(call, lesson, tmp_path):
+    folder, _ = lesson
+    for arguments, said in (
+        (("synthetic:3x2", tmp_path / "a", "--labels", "a/b"), "cannot be part of a file's name"),
+        (("synthetic:3x2", tmp_path / "a", "--labels", "a,a"), "names 'a' twice"),
+        (("synthetic:3x2", tmp_path / "a", "--labels", "unknown"), "has a meaning of its own"),
+        (("synthetic:3x2", tmp_path / "a", "--page", "here"), "--page is HOST:PORT"),
+        (("synthetic:3x2", folder, "--labels", "a"), "elements"),
+        (("synthetic:3x2", tmp_path / "a", "--model", tmp_path / "no"), "no model file"),
+        (("synthetic:mouse", tmp_path / "a", "--model", "shipped", "--labels", "mug"), "knows"),
+    ):
+        code, _, err = call("teach", *arguments, "--seconds", "2")
+        assert code == 2 and said in err and err.count("\n") == 1, (arguments, err)
+    assert (folder / LABELS).exists()
+
+
+def test_a_mouse_is_taught_what_the_shipped_model_does_not_know(call, tmp_path):
+    pytest.importorskip("numba")
+    objects = ",".join(f"teapot-{i}" for i in range(3))
+    source = f"sim:mouse?objects={objects}&sweeps=3&pace=fast"
+    more = ("--labels", "teapot", "--touches", "3", "--model", "shipped")
+    code, out, err = call("teach", source, tmp_path / "a", *more)
+    assert (code, err) == (0, "")
+    assert "knows teapot beside 44 others, and what it does not know" in out
+    assert "teapot" in load_model(tmp_path / "a" / "model.onnx")[1].classes
+
+
+def test_the_page_shows_and_obeys():
+    orders = []
+    page = TeachingPage("127.0.0.1", 0, lambda: {"prompt": "touch it"}, orders.append)
+    try:
+
+        def ask(path, data=None, **headers):
+            request = urllib.request.Request(page.url + path, data, headers)
+            with urllib.request.urlopen(request, timeout=5) as answer:
+                return answer.status, answer.read()
+
+        assert b"<title>Teach touches" in ask("")[1]
+        assert msgspec.json.decode(ask("state")[1]) == {"prompt": "touch it"}
+        assert ask("order", b'{"order": "undo"}', **{"content-type": "application/json"})[0] == 202
+        assert orders == ["undo"]
+        for path, data, headers, status in (
+            ("order", b'{"order": ""}', {"content-type": "application/json"}, 400),
+            ("order", b"order=undo", {}, 415),
+            ("state", b"{}", {"content-type": "application/json"}, 405),
+            ("order", b'{"order": "undo"}',
+             {"content-type": "application/json", "origin": "http://elsewhere.example"}, 403),
+            ("nothing", None, {}, 404),
+        ):  # fmt: skip
+            with pytest.raises(urllib.error.HTTPError) as refused:
+                ask(path, data, **headers)
+            assert refused.value.code == status
+        assert orders == ["undo"]
+    finally:
+        page.close()
+
+
+def test_keys_are_orders(tmp_path):
+    """In a terminal: a number chooses, n goes to the next, a asks for a name, q learns."""
+    pty = pytest.importorskip("pty")
+    ours, theirs = pty.openpty()
+    with device(["press"] * 2, 1, pace="realtime") as line:
+        process = subprocess.Popen(
+            [*COMMAND, url(line), tmp_path / "a", "--labels", "press,slide", "--touches", "9"],
+            stdin=theirs, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+        )  # fmt: skip
+        said: list[str] = []
+        reader = threading.Thread(target=lambda: said.extend(process.stdout), daemon=True)
+        reader.start()
+
+        def until(what: str) -> None:
+            ends = time.monotonic() + 20
+            while not any(what in line for line in said):
+                assert time.monotonic() < ends, said
+                time.sleep(0.02)
+
+        until("touch it: press")
+        os.write(ours, b"n")
+        until("touch it: slide (1 of 9)")
+        os.write(ours, b"a")
+        time.sleep(0.3)  # the terminal takes lines from now on
+        os.write(ours, b"rub\n")
+        until("touch it: rub (1 of 9)")
+        os.write(ours, b"1")
+        os.write(ours, b"q")
+        process.wait(20)
+        reader.join(5)
+        process.stdout.close()
+    os.close(ours)
+    os.close(theirs)
+    assert process.returncode == 2
+    assert "too few to learn from: two of a class are needed" in said[-1]

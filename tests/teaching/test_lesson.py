@@ -1,0 +1,224 @@
+"""Touches become a model: features, classes, the folder that keeps them, who teaches."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from tactile_rt.classifier.classifier import Classifier
+from tactile_rt.classifier.model_file import load_model
+from tactile_rt.classifier.model_runs import verify_model
+from tactile_rt.recording import StreamWriter
+from tactile_rt.recording.labels import LABELS
+from tactile_rt.stream import ConfigError, RecordingError, SpecMismatch
+from tactile_rt.teaching.head import fit_classes, leave_out
+from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson, measured_floor
+from tactile_rt.teaching.onnx_bytes import Graph
+from tactile_rt.teaching.teacher import Teacher
+from tactile_rt.testing import ArraySource, cut, small_spec
+from tests.helpers.made_up_touches import KINDS, NOISE, RATE_HZ, felt, wrench_spec
+
+EACH = 6
+TAUGHT = [kind for kind in KINDS for _ in range(EACH)]
+FLOOR = (0.3 * NOISE).astype(np.float32)
+
+
+def teach(lesson: Lesson, labels: list[str], seed: int) -> None:
+    """Touch, as the command does."""
+    chunks = cut(felt(labels, seed), RATE_HZ)
+    path = lesson.next_recording()
+    source = ArraySource(wrench_spec(), chunks)
+    listener, told = lesson.listener(source.spec), iter(labels)
+    with StreamWriter(path, source) as writer:
+        for chunk in chunks:
+            writer.push(chunk)
+            for onset, end, features in listener.push(chunk):
+                span = listener.seconds(onset - 20_000_000), listener.seconds(end)
+                lesson.add(next(told), features, path.name, span)
+    assert next(told, None) is None, "every touch was found"
+
+
+@pytest.fixture(scope="module")
+def taught(tmp_path_factory):
+    pytest.importorskip("mcap")
+    lesson = Lesson.begun(tmp_path_factory.mktemp("lesson") / "a", wrench_spec(), FLOOR)
+    teach(lesson, TAUGHT, seed=1)
+    lesson.learn()
+    return lesson
+
+
+def decided(lesson: Lesson, kinds: list[str], seed: int) -> list[str]:
+    classifier = Classifier(lesson.folder / MODEL, wrench_spec())
+    found = [d for chunk in cut(felt(kinds, seed), RATE_HZ) for d in classifier.push(chunk)]
+    return [d.label for d in found if d.final]
+
+
+def test_touches_are_known_and_what_was_never_taught_is_not(taught):
+    others = [kind for kind in KINDS for _ in range(10)]
+    found = decided(taught, others, seed=2)
+    assert np.mean([a == b for a, b in zip(found, others, strict=True)]) >= 0.9
+    assert decided(taught, ["twist"] * 10, seed=3).count("unknown") >= 9
+
+
+def test_the_model_is_one_like_any_other(taught):
+    card = load_model(taught.folder / MODEL)[1]
+    assert card.labels == (*sorted(KINDS), "unknown") and card.refusals == ("unknown",)
+    assert card.provenance["taught"] == dict.fromkeys(KINDS, EACH)
+    said = verify_model(taught.folder / MODEL)
+    assert any(line.startswith("bad samples") for line in said)
+
+
+def test_nothing_that_a_robot_lacks_is_imported():
+    code = (
+        "import sys, tactile_rt.teaching.page, tactile_rt.teaching.teacher;"
+        "print([m for m in ('torch', 'onnx', 'mujoco', 'sklearn', 'scipy') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_lesson_that_is_read_again_has_felt_the_same(taught):
+    again = Lesson.read(taught.folder)
+    assert [t.label for t in again.touches] == TAUGHT and not again.lost
+    for one, other in zip(again.touches, taught.touches, strict=True):
+        np.testing.assert_allclose(one.features, other.features, rtol=1e-5, atol=1e-5)
+
+
+def test_a_lesson_goes_on(taught, tmp_path):
+    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    teach(lesson, ["press", "press", "slide"], seed=4)
+    assert lesson.taught_enough == ("press",)
+    lesson = Lesson.read(tmp_path / "b")
+    teach(lesson, ["slide", "slide"], seed=5)
+    assert lesson.undo().label == "slide"
+    assert [t.label for t in Lesson.read(tmp_path / "b").touches] == ["press"] * 2 + ["slide"] * 2
+    assert lesson.learn().classes == ("press", "slide")
+
+
+def test_what_an_interruption_leaves_is_dropped_and_counted(taught, tmp_path):
+    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    teach(lesson, ["press"] * 3, seed=6)
+    path, recording = tmp_path / "b" / LABELS, tmp_path / "b" / "session-1.mcap"
+    path.write_text(path.read_text() + "session-1.mcap,99.5,100.5,press,\nsession-1.mcap,12")
+    recording.write_bytes(recording.read_bytes()[:-200])  # its end was not written
+    again = Lesson.read(tmp_path / "b")
+    assert (len(again.touches), again.lost) == (3, 2)
+    teach(again, ["press"], seed=7)
+    assert [t.recording for t in again.touches][-1] == "session-2.mcap"
+
+
+def test_what_cannot_be_is_one_line(taught, tmp_path):
+    with pytest.raises(ConfigError, match="holds a lesson already"):
+        Lesson.begun(taught.folder, wrench_spec(), FLOOR)
+    with pytest.raises(ConfigError, match=r"holds no lesson: there is no features\.onnx"):
+        Lesson.read(tmp_path)
+    empty = Lesson.begun(tmp_path / "c", wrench_spec(), FLOOR)
+    with pytest.raises(ConfigError, match="no class has 2 touches yet"):
+        empty.learn()
+    with pytest.raises(SpecMismatch):
+        empty.listener(small_spec())
+    with pytest.raises(RecordingError, match="delivered nothing at rest"):
+        measured_floor([])
+    with pytest.raises(ConfigError, match="a class needs 2"):
+        fit_classes(np.zeros((3, 2, 5)), ["a", "a", "b"], [slice(None)])
+
+
+def test_the_floor_is_that_of_the_noise_or_of_the_steps():
+    rng = np.random.default_rng(0)
+    values = rng.normal(scale=[1e-3, 5.0], size=(400, 3, 2))
+    values[..., 1] = np.round(values[..., 1] / 4) * 4  # in steps of 4
+    floor = measured_floor(cut(values, 100.0))
+    assert floor[0] == pytest.approx(0.3e-3, rel=0.1)
+    assert floor[1] == pytest.approx(0.3 * 5.1, rel=0.1)
+    still = measured_floor(cut(np.full((400, 3, 2), 235.0), 100.0))
+    assert (still > 0).all() and (still < 1).all()
+
+
+def test_units_do_not_matter(taught):
+    """A sensor that tells ten times as much teaches the same classes."""
+    features = np.stack([t.features for t in taught.touches]).astype(float)
+    kinds = taught.taught.network.kinds
+    found = leave_out(features, TAUGHT, kinds)
+    assert found.right.mean() >= 0.9
+    loud = Lesson.begun(taught.folder.parent / "loud", wrench_spec(), 10 * FLOOR)
+    listener = loud.listener(wrench_spec())
+    chunks = cut(10 * felt(TAUGHT, seed=1), RATE_HZ)
+    loudly = [f for chunk in chunks for _, _, f in listener.push(chunk)]
+    peaks = features.shape[2] - 2
+    np.testing.assert_allclose(
+        np.stack(loudly)[..., :peaks], features[..., :peaks], rtol=2e-3, atol=2e-3
+    )
+
+
+def test_a_touch_under_a_wrong_name_is_found(taught):
+    names = list(TAUGHT)
+    names[1] = "slide"
+    features = np.stack([t.features for t in taught.touches]).astype(float)
+    found = leave_out(features[:, -1:], names, taught.taught.network.kinds)
+    assert not found.right[1] and found.right[2:].mean() >= 0.9
+
+
+def test_who_teaches_is_led_and_obeyed(tmp_path):
+    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    teacher = Teacher(lesson, ["press", "slide"], 2)
+    rng = np.random.default_rng(0)
+    size = lesson.taught.network.size
+
+    def take(at: float) -> str:
+        features = np.full((22, size), at, np.float32) + rng.normal(size=(22, size)).astype("f")
+        return teacher.take(teacher.label, features, "session-1.mcap", (at, at + 1))
+
+    assert teacher.prompt() == "touch it: press (1 of 2)"
+    assert "press 1" in take(0)
+    assert take(0).endswith("touch it: slide (1 of 2)")
+    assert teacher.obey("undo").splitlines() == [
+        "touch 2 (press) is taken back", "touch it: press (2 of 2)"
+    ]  # fmt: skip
+    assert "told apart" not in take(0), "there is one class yet"
+    assert teacher.obey("next") == "touch it: press (3)"
+    assert teacher.obey("2") == "touch it: slide (1 of 2)"
+    take(9)
+    said = take(9)
+    assert "told apart: 4 of 4 left-out touches" in said and said.endswith("all touches are there")
+    assert teacher.done
+    teacher.done = False
+    assert "cannot be part of a file's name" in teacher.obey("a/b")
+    assert teacher.obey("rub") == "touch it: rub (1 of 2)"
+    state = teacher.state()
+    assert [c["name"] for c in state["classes"]] == ["press", "slide", "rub"]
+    assert (state["right"], state["of"], state["label"]) == (4, 4, "rub")
+    teacher.obey("done")
+    assert teacher.done
+    quiet = Teacher(Lesson.begun(tmp_path / "c", wrench_spec(), FLOOR), [], 2)
+    assert quiet.prompt() == "what is touched next? name it, or choose its number"
+    assert "nothing was learnt" in quiet.take("", np.zeros((22, size), "f"), "x", (0, 1))
+    assert quiet.obey("undo") == "there is no touch to take back"
+
+
+def test_the_writer_of_graphs_is_understood_by_others():
+    onnx = pytest.importorskip("onnx")
+    ort = pytest.importorskip("onnxruntime")
+    g = Graph()
+    x = g.input("x", ["batch", 3])
+    y = g("Concat", g("Mul", x, g.constant(-2.5)), g("ReduceSum", x, g.integers(1)), axis=1)
+    g.output("y", y, ["batch", 4])
+    data = g.serialised("two", {"a": "b"})
+    model = onnx.load_from_string(data)
+    onnx.checker.check_model(model, full_check=True)
+    assert {p.key: p.value for p in model.metadata_props} == {"a": "b"}
+    values = np.random.default_rng(0).normal(size=(2, 3)).astype("f")
+    (found,) = ort.InferenceSession(data).run(None, {"x": values})
+    expected = np.concatenate([-2.5 * values, values.sum(1, keepdims=True)], 1)
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    on = Graph.of(data, "y")
+    on.output("z", on("Neg", "hidden_y"), ["batch", 4])
+    (negative,) = ort.InferenceSession(on.serialised("three", {})).run(None, {"x": values})
+    np.testing.assert_array_equal(negative, -found)
+
+
+def test_features_of_a_folder_stay_as_they_were(taught):
+    """A lesson that another release began goes on with its own features."""
+    card = load_model(taught.folder / FEATURES)[1]
+    assert card.embedding == taught.taught.network.size
+    assert tuple(card.floor) == pytest.approx(tuple(FLOOR))
