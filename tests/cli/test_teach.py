@@ -2,6 +2,8 @@
 
 import os
 import random
+import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -23,6 +25,7 @@ from tactile_rt.teaching.lesson import Lesson
 from tactile_rt.teaching.page import TeachingPage
 from tactile_rt.testing import FakeSerial
 from tests.helpers.made_up_touches import KINDS, felt
+from tests.helpers.source_tree import ROOT
 
 EACH = 4
 COMMAND = [sys.executable, "-c", "from tactile_rt.cli import main; main()", "teach"]
@@ -88,10 +91,9 @@ def test_a_lesson_goes_on_and_lines_are_orders(lesson):
     assert load_model(folder / "model.onnx")[1].classes == ("double", "press", "slide", "twist")
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_killed_at_any_moment_it_loses_one_touch_at_most(tmp_path, seed):
-    rng = random.Random(seed)
-    with device(["press"] * 12, seed, pace="realtime") as line:
+def test_killed_at_any_moment_it_loses_one_touch_at_most(tmp_path):
+    seed = random.randrange(1000)  # another moment every time
+    with device(["press"] * 8, seed, pace="realtime") as line:
         process = subprocess.Popen(
             [*COMMAND, url(line), tmp_path / "a", "--labels", "press", "--touches", "50"],
             stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
@@ -99,17 +101,17 @@ def test_killed_at_any_moment_it_loses_one_touch_at_most(tmp_path, seed):
         said = []
         reader = threading.Thread(target=lambda: said.extend(process.stdout), daemon=True)
         reader.start()
-        while not any("press 2" in line for line in said):
+        while not any("press 3" in line for line in said):
             assert process.poll() is None
             time.sleep(0.02)
-        time.sleep(rng.uniform(0, 2))
+        time.sleep(random.uniform(0, 2))
         process.send_signal(signal.SIGKILL)
         process.wait()
         reader.join()
         process.stdout.close()
     told = sum(" press " in line and "touch it" not in line for line in said)
     again = Lesson.read(tmp_path / "a")
-    assert told - 1 <= len(again.touches) <= told + 1
+    assert told - 1 <= len(again.touches) <= told + 1, seed
     assert again.learn().classes == ("press",)
 
 
@@ -165,6 +167,7 @@ def test_the_page_shows_and_obeys():
             with pytest.raises(urllib.error.HTTPError) as refused:
                 ask(path, data, **headers)
             assert refused.value.code == status
+            refused.value.close()
         assert orders == ["undo"]
     finally:
         page.close()
@@ -205,3 +208,30 @@ def test_keys_are_orders(tmp_path):
     os.close(theirs)
     assert process.returncode == 2
     assert "too few to learn from: two of a class are needed" in said[-1]
+
+
+PAGE = ROOT / "docs" / "teaching.md"
+FIVE = ("press", "slide", "double", "push", "twist")
+
+
+@pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
+def test_the_tutorial_does_what_it_says(call, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    page = PAGE.read_text("utf-8")
+    taught, decided, check, _, mouse, met = re.findall(r"```sh\n(.*?)```", page, re.S)
+    (table,) = re.findall(r"```toml\n(.*?)```", page, re.S)
+    assert ",".join(FIVE) in taught
+    with device([kind for kind in FIVE for _ in range(3)], 1) as line:
+        command = taught.replace("serial:///dev/ttyUSB0?codec=bota", url(line))
+        code, out, _ = call(*shlex.split(command)[1:], "--touches", "3")
+    assert code == 0 and "knows press, slide, double, push, twist" in out
+    with device(["slide"], 2, pace="realtime") as line:
+        command = decided.replace("serial:///dev/ttyUSB0?codec=bota", url(line, "host"))
+        code, out, _ = call(*shlex.split(command)[1:], "--seconds", "6")
+    assert code == 0 and '"label":"slide"' in out.replace(" ", "")
+    (tmp_path / "robot.toml").write_text(table)
+    assert call(*shlex.split(check)[1:])[0] == 0
+    pytest.importorskip("numba")
+    assert call(*shlex.split(mouse)[1:])[0] == 0
+    code, out, _ = call(*shlex.split(met)[1:])
+    assert code == 0 and '"label":"teapot"' in out.replace(" ", "")

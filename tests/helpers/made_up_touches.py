@@ -31,7 +31,8 @@ def touch(kind: str, rng: np.random.Generator) -> NDArray[np.float32]:
         along = np.clip(np.minimum(u / 0.15, (1 - u) / 0.15), 0, 1)
     if kind == "slide":
         across = 0.6 * along
-    if kind == "twist":
+    if kind in ("push", "twist"):
+        across = (kind == "push") * 1.2 * along
         along = 0.2 * along
     turn = np.sin(2 * np.pi * u) if kind == "twist" else np.zeros_like(u)
     lever = 0.02 * rng.uniform(-1, 1, 2)
