@@ -67,7 +67,7 @@ class EmbeddingStatistics(msgspec.Struct, frozen=True):
 
     Attributes:
         means: (class, unit) The mean of each class's touches, float16, little-endian.
-        covariance: (unit, unit) How touches of one class differ, float16, little-endian.
+        covariance: (unit, unit) The covariance within a class, float16, little-endian.
     """
 
     means: bytes

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.stream import ArraySpec
-from tactile_rt.teaching.onnx_bytes import Graph
+from tactile_rt.teaching.onnx_bytes import OnnxGraph
 
 __all__ = ["FeatureNetwork"]
 
@@ -38,11 +38,11 @@ class FeatureNetwork:
     """Features of a stream of an array, step by step.
 
     Attributes:
-        spec: The array.
+        spec: The array that delivers the samples.
         substeps: The number of samples of a step.
-        kernels: (kernel, signal, tap) The temporal kernels.
+        kernels: (kernel, signal, tap) The weights of the temporal kernels.
         dilations: (kernel,) The number of samples from one tap to the next, ascending.
-        thresholds: (kernel,) Above which the output of a kernel is high.
+        thresholds: (kernel,) The output of a kernel above which it counts as high.
     """
 
     spec: ArraySpec
@@ -109,7 +109,7 @@ class FeatureNetwork:
         kept = {"count": (1,), "high": (n,), "total": (n,), "largest": (n,)}
         return {"past": (self.past, signals), "peak": (len(set(self.spec.units)),), **kept}
 
-    def build(self, g: Graph) -> tuple[str, dict[str, str]]:
+    def build(self, g: OnnxGraph) -> tuple[str, dict[str, str]]:
         """Add the network to a graph.
 
         Returns:
@@ -164,7 +164,7 @@ class FeatureNetwork:
             "largest": largest,
         }  # fmt: skip
 
-    def _of_unit(self, g: Graph, load: str, noise: str) -> tuple[str, str]:
+    def _of_unit(self, g: OnnxGraph, load: str, noise: str) -> tuple[str, str]:
         """Signals (batch, sub-step, signal) of the loads of a unit, and the (batch, 1) peak."""
         summed = g("ReduceSum", load, g.integers(2), keepdims=0)  # (batch, sub-step, channel)
         level = g("Sqrt", g("ReduceSum", g("Mul", noise, noise), g.integers(2), keepdims=0))

@@ -17,7 +17,7 @@ from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_card import ModelCard, StateTensor
 from tactile_rt.stream import ConfigError
 from tactile_rt.teaching.head import FEWEST, LeftOut
-from tactile_rt.teaching.onnx_bytes import OPSET, Graph
+from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph
 
 __all__ = [
     "FurtherClasses",
@@ -46,9 +46,11 @@ class FurtherClasses:
 
     Attributes:
         labels: The names of the new classes.
-        whitening: (unit, unit) By which differences within a class become alike in all directions.
+        whitening: (unit, unit) The map by which differences within a class become alike in all
+            directions.
         known, new: (class, unit) The means of touches of the classes, whitened.
-        share: (class,) Of the squared distance from a new class that is not for its mean of few.
+        share: (class,) The part of the squared distance from a new class that is left when what
+            comes from its mean of few touches is taken off.
         usual: The mean squared distance of a touch from its class.
         knows: The number of the network's classes, of its labels, and where `unknown` is among
             the latter; -1 if it is not.
@@ -158,9 +160,9 @@ def leave_out_further(card: ModelCard, features: Floats, labels: Sequence[str]) 
     return LeftOut(away, right)
 
 
-def further_graph(data: bytes, card: ModelCard, classes: FurtherClasses) -> Graph:
+def further_graph(data: bytes, card: ModelCard, classes: FurtherClasses) -> OnnxGraph:
     """The network's graph with logits of the new classes after those of its own."""
-    g = Graph.of(data, "logits")
+    g = OnnxGraph.of(data, "logits")
     units, (known, told, unknown) = card.embedding, classes.knows
     total = g("Add", g.input(SUM, ["batch", units]), "embedding")
     count = g("Add", g.input(COUNT, ["batch", 1]), g.constant(1.0))
@@ -209,7 +211,7 @@ def further_card(card: ModelCard, classes: FurtherClasses) -> ModelCard:
     )
 
 
-def _distances(g: Graph, at: str, means: Floats) -> str:
+def _distances(g: OnnxGraph, at: str, means: Floats) -> str:
     """(batch, class) squared distances."""
     own = g("ReduceSum", g("Mul", at, at), g.integers(1), keepdims=1)
     both = g("MatMul", at, g.constant(-2 * means.T))

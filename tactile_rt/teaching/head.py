@@ -38,7 +38,8 @@ class TouchClasses:
 
     Attributes:
         labels: The names of the classes.
-        mean, scale: (step, feature) By which features are standardised, then limited to 5.
+        mean, scale: (step, feature) The numbers by which features are standardised; then they are
+            limited to 5.
         centres: (step, class, feature) The means of the classes, standardised.
         axes: (step, feature, axis) The directions in which touches of a class differ, each
             as long as a unit along it weighs less than a unit across all.

@@ -45,9 +45,9 @@ __all__ = [
     "FEATURES",
     "MODEL",
     "Lesson",
+    "LessonProgress",
     "Listener",
-    "Progress",
-    "Touch",
+    "TaughtTouch",
     "check_label",
     "measured_floor",
 ]
@@ -61,7 +61,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Touch:
+class TaughtTouch:
     """One touch.
 
     Attributes:
@@ -80,7 +80,7 @@ class Lesson:
     """Touches and what is learnt from them, kept in a folder.
 
     Attributes:
-        folder: Where all is kept.
+        folder: The folder that keeps everything.
         taught: What the model will be of.
         touches: All touches, in their order.
         lost: The number of touches in the list that are not in the recordings, as their last
@@ -89,7 +89,7 @@ class Lesson:
 
     folder: Path
     taught: Taught | TaughtFurther
-    touches: list[Touch] = field(default_factory=list)
+    touches: list[TaughtTouch] = field(default_factory=list)
     lost: int = 0
 
     @classmethod
@@ -164,7 +164,9 @@ class Lesson:
                     features for at_s, features in felt if interval.start_s <= at_s < interval.end_s
                 ]
                 self.lost += not inside
-                self.touches += [Touch(interval.label, inside[0], path.name)] if inside else []
+                self.touches += (
+                    [TaughtTouch(interval.label, inside[0], path.name)] if inside else []
+                )
 
     def _felt(self, path: Path) -> list[tuple[float, NDArray[np.float32]]]:
         """Onset, in seconds since the beginning, and features of every touch in a recording."""
@@ -201,9 +203,9 @@ class Lesson:
         """
         interval = LabelledInterval(label=label, start_s=max(0.0, span_s[0]), end_s=span_s[1])
         append_label(self.folder / LABELS, recording, interval)
-        self.touches.append(Touch(label, features, recording))
+        self.touches.append(TaughtTouch(label, features, recording))
 
-    def undo(self) -> Touch | None:
+    def undo(self) -> TaughtTouch | None:
         """Take the last touch back; None: there is none."""
         if not self.touches:
             return None
@@ -234,11 +236,11 @@ class Lesson:
         """The classes of which there are enough touches to learn from."""
         return tuple(name for name in self.labels if self.count(name) >= FEWEST)
 
-    def left_out(self) -> "Progress":
+    def left_out(self) -> "LessonProgress":
         """How well touches are told apart by the others, at their last step."""
         used = [k for k, t in enumerate(self.touches) if t.label in self.taught_enough]
         if not used:
-            return Progress((), (), ())
+            return LessonProgress((), (), ())
         names = [self.touches[k].label for k in used]
         found = self.taught.left_out(self._features(used), names)
         return _progress(used, names, found)
@@ -268,11 +270,12 @@ class Lesson:
 
 
 @dataclass(frozen=True)
-class Progress:
+class LessonProgress:
     """How well touches are told apart when each is left out in turn.
 
     Attributes:
-        classes: By class: its name, the number of its touches, and how many of them were right.
+        classes: The name of each class, the number of its touches, and how many of them were
+            right.
         odd: Touches that are unlike the others of their class: their number, counted from 1, and
             the class that they are most like.
         confused: Pairs of classes that are taken for one another, the most often first.
@@ -288,7 +291,7 @@ class Progress:
         return sum(c[2] for c in self.classes), sum(c[1] for c in self.classes)
 
 
-def _progress(used: Sequence[int], names: Sequence[str], found: LeftOut) -> Progress:
+def _progress(used: Sequence[int], names: Sequence[str], found: LeftOut) -> LessonProgress:
     classes = np.unique(np.asarray(names))
     own = np.searchsorted(classes, names)
     distances = found.distances[:, -1]
@@ -309,7 +312,7 @@ def _progress(used: Sequence[int], names: Sequence[str], found: LeftOut) -> Prog
         (name, names.count(name), int(found.right[own == np.searchsorted(classes, name)].sum()))
         for name in dict.fromkeys(names)
     )
-    return Progress(told, tuple(odd), tuple(pairs))
+    return LessonProgress(told, tuple(odd), tuple(pairs))
 
 
 class Listener:
@@ -321,7 +324,7 @@ class Listener:
         felt: makes features of a touch's steps.
 
     Attributes:
-        classifier: That runs the features, and knows whether something is touched.
+        classifier: The classifier that runs the features, and knows whether something is touched.
 
     Raises:
         SpecMismatch: the stream is of another array than the lesson.

@@ -37,7 +37,7 @@ from tactile_rt.teaching.further import (
     taught_features,
 )
 from tactile_rt.teaching.head import LIMIT, LeftOut, TouchClasses, fit_classes, leave_out
-from tactile_rt.teaching.onnx_bytes import OPSET, Graph
+from tactile_rt.teaching.onnx_bytes import OPSET, OnnxGraph
 from tactile_rt.timing import Timing
 
 __all__ = ["FASTEST_NS", "TOUCH", "Taught", "TaughtFurther", "write_features", "write_taught"]
@@ -55,7 +55,7 @@ class Taught:
     """What a model that is taught is of.
 
     Attributes:
-        spec: The array.
+        spec: The array that was touched.
         floor: (channel,) The smallest noise that the contact detector assumes, in the channel's
             unit.
     """
@@ -137,7 +137,7 @@ class TaughtFurther:
 
 def write_features(path: Path, taught: Taught) -> ModelCard:
     """Write the model of one class, of which the embedding are the features of a touch."""
-    graph, network = Graph(), taught.network
+    graph, network = OnnxGraph(), taught.network
     features, after = network.build(graph)
     graph.output("logits", graph("Slice", features, *_first(graph, 1)), ["batch", 1])
     return _write(path, taught, graph, features, after, {"labels": (TOUCH,)})
@@ -147,7 +147,7 @@ def write_taught(
     path: Path, taught: Taught, classes: TouchClasses, name: str, provenance: dict[str, Any]
 ) -> ModelCard:
     """Write the model of the classes; it appears whole or not at all."""
-    graph, network = Graph(), taught.network
+    graph, network = OnnxGraph(), taught.network
     features, after = network.build(graph)
     logits = _head(graph, features, after["count"], taught.timing, classes)
     graph.output("logits", logits, ["batch", len(classes.labels) + 1])
@@ -162,7 +162,7 @@ def write_taught(
     return _write(path, taught, graph, features, after, told)
 
 
-def _head(g: Graph, features: str, count: str, timing: Timing, classes: TouchClasses) -> str:
+def _head(g: OnnxGraph, features: str, count: str, timing: Timing, classes: TouchClasses) -> str:
     """(batch, class and unknown) logits: half of each squared distance, and of the reach."""
     done = g("Div", count, g.constant(float(timing.substeps)))
     step = g("Cast", g("Sub", done, g.constant(1.0)), to=7)
@@ -183,14 +183,14 @@ def _head(g: Graph, features: str, count: str, timing: Timing, classes: TouchCla
     return g("Mul", distances, g.constant(-0.5))
 
 
-def _first(g: Graph, size: int) -> tuple[str, str, str]:
+def _first(g: OnnxGraph, size: int) -> tuple[str, str, str]:
     return g.integers(0), g.integers(size), g.integers(1)
 
 
 def _write(
     path: Path,
     taught: Taught,
-    graph: Graph,
+    graph: OnnxGraph,
     features: str,
     after: dict[str, str],
     told: dict[str, Any],
@@ -216,7 +216,7 @@ def _write(
     return write_checked(path, graph, card)
 
 
-def write_checked(path: Path, graph: Graph, card: ModelCard) -> ModelCard:
+def write_checked(path: Path, graph: OnnxGraph, card: ModelCard) -> ModelCard:
     """Write a file that stores its own hash and what it computes here, for `model verify`."""
     whole = path.with_name(f".{path.name}")
     whole.write_bytes(_bytes(graph, card))
@@ -239,5 +239,5 @@ def _made_by() -> dict[str, str]:
     }
 
 
-def _bytes(graph: Graph, card: ModelCard) -> bytes:
+def _bytes(graph: OnnxGraph, card: ModelCard) -> bytes:
     return graph.serialised(card.name, {METADATA_KEY: msgspec.json.encode(card).decode()})

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-__all__ = ["Graph"]
+__all__ = ["OnnxGraph"]
 
 IR_VERSION, OPSET = 10, 20
 PRODUCER = "tactile_rt"
@@ -104,7 +104,7 @@ def _renamed(node: bytes, name: str) -> bytes:
 
 
 @dataclass
-class Graph:
+class OnnxGraph:
     """A graph that is built operator by operator, in the order in which they run.
 
     Attributes:
@@ -119,7 +119,7 @@ class Graph:
     _names: int = 0
 
     @classmethod
-    def of(cls, data: bytes, hidden: str) -> "Graph":
+    def of(cls, data: bytes, hidden: str) -> "OnnxGraph":
         """The graph of a model file, to be gone on with.
 
         Args:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.stream import ConfigError
-from tactile_rt.teaching.lesson import Lesson, Progress
+from tactile_rt.teaching.lesson import Lesson, LessonProgress
 
 __all__ = ["ORDERS", "Teacher"]
 
@@ -23,7 +23,7 @@ class Teacher:
     """What is asked of who touches.
 
     Attributes:
-        lesson: Where touches go.
+        lesson: The lesson that takes the touches.
         wanted: The names of the classes to be taught, in their order; more come as they are named.
         each: The number of touches of each class.
         label: The name of what is touched now; empty: nobody has said.
@@ -35,7 +35,7 @@ class Teacher:
     each: int
     label: str = ""
     done: bool = False
-    progress: Progress = field(default_factory=lambda: Progress((), (), ()))
+    progress: LessonProgress = field(default_factory=lambda: LessonProgress((), (), ()))
     _planned: bool = False  # whether there is a list to be worked through, and then an end
 
     def __post_init__(self) -> None:

@@ -14,7 +14,7 @@ from tactile_rt.recording.labels import LABELS
 from tactile_rt.stream import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.teaching.head import fit_classes, leave_out
 from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson, measured_floor
-from tactile_rt.teaching.onnx_bytes import Graph
+from tactile_rt.teaching.onnx_bytes import OnnxGraph
 from tactile_rt.teaching.teacher import Teacher
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.made_up_touches import KINDS, NOISE, RATE_HZ, felt, wrench_spec
@@ -25,7 +25,7 @@ FLOOR = (0.3 * NOISE).astype(np.float32)
 
 
 def teach(lesson: Lesson, labels: list[str], seed: int) -> None:
-    """Touch, as the command does."""
+    """TaughtTouch, as the command does."""
     chunks = cut(felt(labels, seed), RATE_HZ)
     path = lesson.next_recording()
     source = ArraySource(wrench_spec(), chunks)
@@ -199,7 +199,7 @@ def test_who_teaches_is_led_and_obeyed(tmp_path):
 def test_the_writer_of_graphs_is_understood_by_others():
     onnx = pytest.importorskip("onnx")
     ort = pytest.importorskip("onnxruntime")
-    g = Graph()
+    g = OnnxGraph()
     x = g.input("x", ["batch", 3])
     y = g("Concat", g("Mul", x, g.constant(-2.5)), g("ReduceSum", x, g.integers(1)), axis=1)
     g.output("y", y, ["batch", 4])
@@ -211,7 +211,7 @@ def test_the_writer_of_graphs_is_understood_by_others():
     (found,) = ort.InferenceSession(data).run(None, {"x": values})
     expected = np.concatenate([-2.5 * values, values.sum(1, keepdims=True)], 1)
     np.testing.assert_allclose(found, expected, rtol=1e-6)
-    on = Graph.of(data, "y")
+    on = OnnxGraph.of(data, "y")
     on.output("z", on("Neg", "hidden_y"), ["batch", 4])
     (negative,) = ort.InferenceSession(on.serialised("three", {})).run(None, {"x": values})
     np.testing.assert_array_equal(negative, -found)
