@@ -51,7 +51,7 @@ def teach(
     a class, n the next one, a adds one, u takes the last touch back, q learns and leaves. Where
     stdin is no terminal, a line is an order: a class's name, next, undo or done.
     """
-    from tactile_rt.classifier.model_file import shipped_model
+    from tactile_rt.classifier.model_file import hash_of, shipped_model
     from tactile_rt.recording import StreamWriter
     from tactile_rt.recording.layout import need_mcap
     from tactile_rt.sources.opening import open_source
@@ -62,8 +62,14 @@ def teach(
     wanted = [name.strip() for name in labels.split(",") if name.strip()]
     at = _address(page) if page else None
     before = Lesson.read(folder) if (folder / FEATURES).exists() else None
-    if before is None and model:
-        before = Lesson.on(folder, shipped_model() if model == "shipped" else Path(model))
+    if model:
+        base = shipped_model() if model == "shipped" else Path(model)
+        if before is None:
+            before = Lesson.on(folder, base)
+        elif hash_of(base) != hash_of(folder / FEATURES):
+            raise ConfigError(
+                f"{folder} holds a lesson of another model than {model}: name another"
+            )
     _check_labels(wanted)
     with starting():
         opened = open_source(source)
@@ -97,11 +103,14 @@ def teach(
                 writer.push(chunk)
                 if not listener.touching:
                     label = teacher.label
+                hasty = listener.hasty
                 for onset, end, felt in listener.push(chunk):
                     quiet_since = time.monotonic()
                     span = listener.seconds(onset - BEFORE_NS), listener.seconds(end)
                     _say(teacher.take(label, felt, path.name, span))
                     label = teacher.label
+                if listener.hasty > hasty:
+                    _say("that came too soon after the last touch to be one: wait a second")
     if not lesson.taught_enough:
         raise ConfigError(
             f"{folder}: {len(lesson.touches)} touches are kept, too few to learn from: two of a "

@@ -54,6 +54,8 @@ __all__ = [
 
 FEATURES, MODEL = "features.onnx", "model.onnx"
 BEFORE_NS = 20_000_000  # before its onset a touch's interval begins
+HASTY_NS = 300_000_000  # after the end of a contact, within which another is not a touch of its own
+LONG_AGO_NS = 2**62
 ODD = 3.0  # times as far from its class as its others are, a touch is odd
 QUIET = 0.3  # of the noise at rest: the least noise that the contact detector assumes
 
@@ -325,6 +327,8 @@ class Listener:
 
     Attributes:
         classifier: The classifier that runs the features, and knows whether something is touched.
+        hasty: The number of touches that came so soon after another that they may be its rest; they
+            are not given.
 
     Raises:
         SpecMismatch: the stream is of another array than the lesson.
@@ -341,12 +345,16 @@ class Listener:
         self._heard = 0  # samples since the last hint
         self._strongest = 0.0  # since then, in units of the noise
         self._steps: list[Classification] = []
+        self._released_ns = -LONG_AGO_NS  # stream time
+        self._counts = True  # the touch under way
+        self.hasty = 0
 
     def push(self, chunk: Chunk) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
         """Take samples; gives (onset, end, features (step, feature)) of touches that are whole."""
         if self._first_ns is None and len(chunk):
             self._first_ns = int(chunk.t_ns[0])
         self._heard += len(chunk)
+        touched = self.touching
         decisions = self.classifier.push(chunk)
         detector = self.classifier.detector
         if detector.ready and detector.tared.any():
@@ -355,12 +363,13 @@ class Listener:
         for decision in decisions:
             if decision.step == 1:
                 self._steps = []
+                hasty = decision.onset_ns - self._released_ns < HASTY_NS
+                self.hasty, self._counts = self.hasty + hasty, not hasty
             self._steps.append(decision)
-            if decision.final and len(self._steps) == self.classifier.card.steps:
-                felt = np.stack(
-                    [step.embedding for step in self._steps if step.embedding is not None]
-                )
-                yield decision.onset_ns, decision.t_ns, felt
+            if decision.final and self._counts:
+                yield decision.onset_ns, decision.t_ns, self._felt(self._steps)
+        if touched and not self.touching:
+            self._released_ns = int(chunk.t_ns[-1])
 
     def hint(self) -> str:
         """Why no touch may have been found for a while."""

@@ -18,7 +18,7 @@ import pytest
 pytest.importorskip("mcap")
 
 from tactile_rt.classifier.classifier import Classifier
-from tactile_rt.classifier.model_file import load_model
+from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.recording.labels import LABELS
 from tactile_rt.sources.opening import open_source
 from tactile_rt.teaching.lesson import Lesson
@@ -140,6 +140,11 @@ def test_a_mouse_is_taught_what_the_shipped_model_does_not_know(call, tmp_path):
     assert (code, err) == (0, "")
     assert "knows teapot beside 44 others, and what it does not know" in out
     assert "teapot" in load_model(tmp_path / "a" / "model.onnx")[1].classes
+    base = load_model(shipped_model())[1]
+    (first, *_) = Lesson.read(tmp_path / "a").touches
+    assert first.features.shape == (base.steps, base.embedding + len(base.labels))
+    code, _, err = call("teach", source, tmp_path / "a", "--model", tmp_path / "a" / "model.onnx")
+    assert code == 2 and "holds a lesson of another model" in err
 
 
 def test_the_page_shows_and_obeys():

@@ -17,7 +17,7 @@ from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson, measured_floor
 from tactile_rt.teaching.onnx_bytes import OnnxGraph
 from tactile_rt.teaching.teacher import Teacher
 from tactile_rt.testing import ArraySource, cut, small_spec
-from tests.helpers.made_up_touches import KINDS, NOISE, RATE_HZ, felt, wrench_spec
+from tests.helpers.made_up_touches import KINDS, NOISE, RATE_HZ, felt, touch, wrench_spec
 
 EACH = 6
 TAUGHT = [kind for kind in KINDS for _ in range(EACH)]
@@ -222,3 +222,14 @@ def test_features_of_a_folder_stay_as_they_were(taught):
     card = load_model(taught.folder / FEATURES)[1]
     assert card.embedding == taught.taught.network.size
     assert tuple(card.floor) == pytest.approx(tuple(FLOOR))
+
+
+def test_what_comes_too_soon_is_the_rest_of_a_touch(taught):
+    rng = np.random.default_rng(8)
+    rest, touches = felt([], seed=8), [touch("press", rng) for _ in range(3)]
+    slow = np.repeat(touches[0], 2, axis=0)  # longer than what is looked at of it
+    # the second begins half a second after the first has ended, the third two seconds
+    signal = np.concatenate([rest, slow[:-145], touches[1][100:], touches[2]])
+    listener = taught.listener(wrench_spec())
+    found = [one for chunk in cut(signal, RATE_HZ) for one in listener.push(chunk)]
+    assert (len(found), listener.hasty) == (2, 1)
