@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import typer
 
 from tactile_rt.cli.app import Seconds, app, leaving, starting
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError
+from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError, SpecMismatch
 
 if TYPE_CHECKING:
     from tactile_rt.teaching.lesson import Lesson
@@ -65,6 +65,8 @@ def teach(
     wanted = [name.strip() for name in labels.split(",") if name.strip()]
     at = _address(page) if page else None
     _check_labels(wanted)
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"{folder} is not a folder")
     base = shipped_model() if model == "shipped" else Path(model) if model else None
     lesson = _begun_before(folder, base)
     with starting():
@@ -75,7 +77,7 @@ def teach(
         _teach(buttons.teacher, opened, source, buttons.orders)
     if lesson is None or buttons.teacher is None or not lesson.taught_enough:
         raise ConfigError(
-            f"{folder}: {len(lesson.touches) if lesson else 0} touches are kept, too few to learn "
+            f"{folder}: touches kept: {len(lesson.touches) if lesson else 0}, too few to learn "
             "from: two of a class are needed; run the same command to go on"
         )
     began = time.process_time()
@@ -99,7 +101,10 @@ def _teach(teacher: "Teacher", source: Source, url: str, orders: "queue.Queue[st
     from tactile_rt.teaching.lesson import BEFORE_NS
 
     lesson = teacher.lesson
-    listener = lesson.listener(source.spec)
+    try:
+        listener = lesson.listener(source.spec)
+    except SpecMismatch as error:
+        raise SpecMismatch(f"{error}, or teach in another folder") from None
     typer.echo(_greeting(lesson, source))
     path = lesson.next_recording()
     with StreamWriter(path, source, url=url) as writer, _listening(orders):

@@ -107,8 +107,7 @@ class Lesson:
         Raises:
             ConfigError: there is a lesson already.
         """
-        if (folder / FEATURES).exists():
-            raise ConfigError(f"{folder} holds a lesson already")
+        _check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
         taught = Taught(spec, floor)
         write_features(folder / FEATURES, taught)
@@ -126,8 +125,7 @@ class Lesson:
             ConfigError: there is a lesson already, or the file does not tell what is needed.
             ModelError: the file cannot be used.
         """
-        if (folder / FEATURES).exists():
-            raise ConfigError(f"{folder} holds a lesson already")
+        _check_free(folder)
         taught = TaughtFurther(model)
         folder.mkdir(parents=True, exist_ok=True)
         data = model.read_bytes()
@@ -432,6 +430,13 @@ def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:
         floor[channel] = max(floor[channel], step / np.sqrt(12))
     found: NDArray[np.float32] = floor.astype(np.float32)
     return found
+
+
+def _check_free(folder: Path) -> None:
+    if (folder / FEATURES).exists():
+        raise ConfigError(f"{folder} holds a lesson already")
+    if (folder / LABELS).exists():
+        raise ConfigError(f"{folder} holds {LABELS}, but no {FEATURES}: teach in another folder")
 
 
 def check_label(name: str) -> str:
