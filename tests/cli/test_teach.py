@@ -272,7 +272,9 @@ FIVE = ("press", "slide", "double", "push", "twist")
 def test_the_tutorial_does_what_it_says(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = PAGE.read_text("utf-8")
-    taught, decided, check, _, mouse, met = re.findall(r"```sh\n(.*?)```", page, re.S)
+    taught, decided, check, _, emulated, again, mouse, met = re.findall(
+        r"```sh\n(.*?)```", page, re.S
+    )
     (table,) = re.findall(r"```toml\n(.*?)```", page, re.S)
     assert ",".join(FIVE) in taught
     with device([kind for kind in FIVE for _ in range(3)], 1) as line:
@@ -283,6 +285,12 @@ def test_the_tutorial_does_what_it_says(call, tmp_path, monkeypatch):
         command = decided.replace("serial:///dev/ttyUSB0?codec=bota", url(line, "host"))
         code, out, _ = call(*shlex.split(command)[1:], "--seconds", "6")
     assert code == 0 and '"label":"slide"' in out.replace(" ", "")
+    words = shlex.split(emulated)[1:]
+    with subprocess.Popen([*COMMAND[:-1], *words], stdout=subprocess.PIPE, text=True) as there:
+        assert "hand?codec=bota" in there.stdout.readline()
+        code, out, _ = call(*shlex.split(again)[1:], "--seconds", "7")
+        there.terminate()
+    assert code == 0 and '"label":"press"' in out.replace(" ", "")
     (tmp_path / "robot.toml").write_text(table)
     assert call(*shlex.split(check)[1:])[0] == 0
     pytest.importorskip("numba")
