@@ -2,27 +2,31 @@
 
 import os
 import queue
+import shlex
 import sys
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
 from tactile_rt.cli.app import Seconds, app, leaving, starting
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError
+from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError, SpecMismatch
 
 if TYPE_CHECKING:
     from tactile_rt.teaching.lesson import Lesson
+    from tactile_rt.teaching.page import TeachingPage
     from tactile_rt.teaching.teacher import Teacher
 
 POLL_S = 0.1
 REST_S = 2.0  # at rest, to measure the noise by
-HINT_S = 20.0  # without a touch, before it is said how strong the readings are
+HINT_S = 20.0  # without a touch, before it is said how strong the readings are; then twice as long
 DEAF_S = 10.0  # without a sample, before the first one: the device does not talk
+RESTING = f"touch nothing for {REST_S:g} s"
+HASTY = "that came too soon after the last touch to be one: wait a second"
 KEYS = {"n": "next", "u": "undo", "q": "done", "\x04": "done"}
 
 
@@ -51,74 +55,34 @@ def teach(
     a class, n the next one, a adds one, u takes the last touch back, q learns and leaves. Where
     stdin is no terminal, a line is an order: a class's name, next, undo or done.
     """
-    from tactile_rt.classifier.model_file import hash_of, shipped_model
-    from tactile_rt.recording import StreamWriter
+    from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.recording.layout import need_mcap
     from tactile_rt.sources.opening import open_source
-    from tactile_rt.teaching.lesson import BEFORE_NS, FEATURES, MODEL, Lesson
+    from tactile_rt.teaching.lesson import MODEL, Lesson
     from tactile_rt.teaching.teacher import Teacher
 
     need_mcap()
     wanted = [name.strip() for name in labels.split(",") if name.strip()]
     at = _address(page) if page else None
-    before = Lesson.read(folder) if (folder / FEATURES).exists() else None
-    if model:
-        base = shipped_model() if model == "shipped" else Path(model)
-        if before is None:
-            before = Lesson.on(folder, base)
-        elif hash_of(base) != hash_of(folder / FEATURES):
-            raise ConfigError(
-                f"{folder} holds a lesson of another model than {model}: name another"
-            )
     _check_labels(wanted)
+    if folder.exists() and not folder.is_dir():
+        raise ConfigError(f"{folder} is not a folder")
+    base = shipped_model() if model == "shipped" else Path(model) if model else None
+    lesson = _begun_before(folder, base)
     with starting():
         opened = open_source(source)
-    orders: queue.Queue[str] = queue.Queue()
-    with opened, leaving(seconds):
-        lesson = before or _begun(folder, opened)
-        teacher = Teacher(lesson, wanted, touches)
-        listener = lesson.listener(opened.spec)
-        typer.echo(_greeting(lesson, opened))
-        path = lesson.next_recording()
-        with (
-            _page(at, teacher, orders),
-            StreamWriter(path, opened, url=source) as writer,
-            _listening(orders),
-        ):
-            typer.echo(teacher.prompt())
-            label = teacher.label
-            quiet_since = time.monotonic()
-            while not teacher.done:
-                if time.monotonic() - quiet_since > HINT_S:
-                    _say(listener.hint())
-                    quiet_since = time.monotonic()
-                try:
-                    chunk = opened.read(POLL_S)
-                except EndOfStream:
-                    break
-                while not orders.empty() and not teacher.done:
-                    _say(teacher.obey(orders.get()))
-                if chunk is None:
-                    continue
-                writer.push(chunk)
-                if not listener.touching:
-                    label = teacher.label
-                hasty = listener.hasty
-                for onset, end, felt in listener.push(chunk):
-                    quiet_since = time.monotonic()
-                    span = listener.seconds(onset - BEFORE_NS), listener.seconds(end)
-                    _say(teacher.take(label, felt, path.name, span))
-                    label = teacher.label
-                if listener.hasty > hasty:
-                    _say("that came too soon after the last touch to be one: wait a second")
-    if not lesson.taught_enough:
+    with opened, _Buttons(at) as buttons, leaving(seconds):
+        lesson = lesson or (_begun(folder, opened) if base is None else Lesson.on(folder, base))
+        buttons.teacher = Teacher(lesson, wanted, touches)
+        _teach(buttons.teacher, opened, source, buttons.orders)
+    if lesson is None or buttons.teacher is None or not lesson.taught_enough:
         raise ConfigError(
-            f"{folder}: {len(lesson.touches)} touches are kept, too few to learn from: two of a "
-            "class are needed; run the same command to go on"
+            f"{folder}: touches kept: {len(lesson.touches) if lesson else 0}, too few to learn "
+            "from: two of a class are needed; run the same command to go on"
         )
     began = time.process_time()
     card = lesson.learn()
-    for line in teacher.summary():
+    for line in (*buttons.teacher.summary(), *_losses(opened)):
         typer.echo(line)
     others = len(card.classes) - len(lesson.taught_enough)
     knows = ", ".join(lesson.taught_enough) + (f" beside {others} others" if others else "")
@@ -126,7 +90,75 @@ def teach(
         f"{folder / MODEL}: knows {knows}, and what it does not know; "
         f"{len(lesson.touches)} touches, learnt in {time.process_time() - began:.1f} s"
     )
-    typer.echo(f"now: tactile-rt run --source '{source}' --model {folder / MODEL}")
+    typer.echo(
+        f"now: tactile-rt run --source '{source}' --model {shlex.quote(str(folder / MODEL))}"
+    )
+
+
+def _teach(teacher: "Teacher", source: Source, url: str, orders: "queue.Queue[str]") -> None:
+    """Take touches until there are enough, the stream ends, or who teaches has had enough."""
+    from tactile_rt.recording import StreamWriter
+    from tactile_rt.teaching.lesson import BEFORE_NS
+
+    lesson = teacher.lesson
+    try:
+        listener = lesson.listener(source.spec)
+    except SpecMismatch as error:
+        raise SpecMismatch(f"{error}, or teach in another folder") from None
+    typer.echo(_greeting(lesson, source))
+    path = lesson.next_recording()
+    with StreamWriter(path, source, url=url) as writer, _listening(orders):
+        typer.echo(teacher.prompt())
+        label = teacher.label  # of the touch under way, or of the next
+        quiet_since, patience_s = time.monotonic(), HINT_S
+        while not teacher.done:
+            if time.monotonic() - quiet_since > patience_s:
+                _say(teacher.note(listener.hint()))
+                quiet_since, patience_s = time.monotonic(), 2 * patience_s
+            try:
+                chunk = source.read(POLL_S)
+            except EndOfStream:
+                break
+            while not orders.empty() and not teacher.done:
+                _say(teacher.obey(orders.get()))
+            if chunk is None:
+                continue
+            writer.push(chunk)
+            if not listener.touching:
+                label = teacher.label
+            hasty = listener.hasty
+            for onset, end, felt in listener.push(chunk):
+                quiet_since, patience_s = time.monotonic(), HINT_S
+                writer.flush()  # what a line of the labels tells of is there
+                span = listener.seconds(onset - BEFORE_NS), listener.seconds(end)
+                _say(teacher.take(label, felt, path.name, span))
+                label = teacher.label
+            if listener.hasty > hasty:
+                _say(teacher.note(HASTY))
+
+
+def _losses(source: Source) -> list[str]:
+    stats = source.stats
+    if not stats.corrupt and not stats.missing:
+        return []
+    return [f"lost on the wire: {stats.corrupt} damaged, {stats.missing} missing samples"]
+
+
+def _begun_before(folder: Path, base: Path | None) -> "Lesson | None":
+    """The lesson that a folder holds; None: none.
+
+    Args:
+        folder: of the lesson.
+        base: the model that is taught further classes, if one is.
+    """
+    from tactile_rt.classifier.model_file import hash_of
+    from tactile_rt.teaching.lesson import FEATURES, Lesson
+
+    if not (folder / FEATURES).exists():
+        return None
+    if base is not None and hash_of(base) != hash_of(folder / FEATURES):
+        raise ConfigError(f"{folder} holds a lesson of another model than {base}: name another")
+    return Lesson.read(folder)
 
 
 def _check_labels(names: list[str]) -> None:
@@ -149,7 +181,7 @@ def _begun(folder: Path, source: Source) -> "Lesson":
     """A new lesson, with the noise of the array at rest."""
     from tactile_rt.teaching.lesson import Lesson, measured_floor
 
-    typer.echo(f"touch nothing for {REST_S:g} s")
+    typer.echo(RESTING)
     chunks: list[Chunk] = []
     samples, needed = 0, REST_S * source.spec.rate_hz
     heard = time.monotonic()
@@ -186,22 +218,37 @@ def _say(text: str) -> None:
         typer.echo(text)
 
 
-@contextmanager
-def _page(
-    at: tuple[str, int] | None, teacher: "Teacher", orders: "queue.Queue[str]"
-) -> Iterator[None]:
-    """Buttons in a browser, if they are asked for."""
-    if at is None:
-        yield
-        return
-    from tactile_rt.teaching.page import TeachingPage
+class _Buttons:
+    """A page in a browser, if it is asked for, and what is ordered there.
 
-    page = TeachingPage(*at, teacher.state, orders.put)
-    typer.echo(f"buttons: {page.url}")
-    try:
-        yield
-    finally:
-        page.close()
+    Args:
+        at: host and port; None: no page.
+
+    Attributes:
+        orders: What is asked for, there and elsewhere.
+        teacher: The teacher whose state is shown; None: there is none yet.
+    """
+
+    def __init__(self, at: tuple[str, int] | None) -> None:
+        self.orders: queue.Queue[str] = queue.Queue()
+        self.teacher: Teacher | None = None
+        self._at = at
+        self._page: TeachingPage | None = None
+
+    def __enter__(self) -> Self:
+        if self._at is not None:
+            from tactile_rt.teaching.page import TeachingPage
+
+            self._page = TeachingPage(*self._at, self._state, self.orders.put)
+            typer.echo(f"buttons: {self._page.url}")
+        return self
+
+    def __exit__(self, *why: object) -> None:
+        if self._page is not None:
+            self._page.close()
+
+    def _state(self) -> dict[str, Any]:
+        return self.teacher.state() if self.teacher else {"prompt": RESTING}
 
 
 @contextmanager

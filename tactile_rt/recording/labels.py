@@ -170,13 +170,17 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> None
 def drop_torn_label(path: Path) -> bool:
     """Take away what an interruption has left of a last line; whether there was any.
 
+    A line that lacks nothing but its end stays: an editor may have left it so.
+
     Raises:
         OSError: the file cannot be read or written.
     """
     data = path.read_bytes()
-    if not data or data.endswith(b"\n"):
+    end = data.rfind(b"\n") + 1
+    whole, last = data[:end], data[end:].decode(errors="replace")
+    cells = next(csv.reader([last]), [])
+    if not last or (whole and len(cells) == len(read_columns(path))):
         return False
-    whole = data[: data.rfind(b"\n") + 1]
     write_whole(path, lambda file: file.write(whole))
     return True
 

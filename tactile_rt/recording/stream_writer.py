@@ -88,7 +88,7 @@ class StreamWriter:
         self._rotation = rotation if rotate_mb or rotate_s else None
         self._flush_s = flush_s
         self._queue = BoundedQueue[Entry](size=queue_bytes, measure=_measure, kinds=(SAMPLES, WIRE))
-        self._stop = threading.Event()
+        self._stop, self._asked, self._flushed = (threading.Event() for _ in range(3))
         self._error: Exception | None = None
         self._closed = False
         self._prelude: list[tuple[Packet, int]] = []
@@ -126,6 +126,19 @@ class StreamWriter:
         # Times of a device's own clock would put the samples far from all else in the file.
         own = self.about.clock == "device"
         self._queue.put((SAMPLES, chunk, time.monotonic_ns() if own else int(chunk.t_ns[-1]), size))
+
+    def flush(self) -> None:
+        """Wait until the system has all that was pushed: whatever becomes of us, it is kept.
+
+        Raises:
+            RecordingError: the file cannot be written any more.
+        """
+        self._flushed.clear()
+        self._asked.set()
+        while not self._flushed.wait(WAKE_S) and self._thread.is_alive():
+            pass
+        if self._error is not None:
+            raise self._broken()
 
     def close(self) -> None:
         """Write what waits, and the index; safe to call twice.
@@ -191,13 +204,17 @@ class StreamWriter:
         flush_at = time.monotonic() + self._flush_s
         while True:
             stopping = self._stop.wait(WAKE_S)
+            asked = self._asked.is_set()  # before all that waits is written, so that none is left
             try:
                 while (entry := self._queue.get(0)) is not None:
                     self._write(*entry)
                     if time.monotonic() >= flush_at:
                         flush_at = self._flush()
-                if time.monotonic() >= flush_at:
+                if asked or time.monotonic() >= flush_at:
                     flush_at = self._flush()
+                if asked:
+                    self._asked.clear()
+                    self._flushed.set()
                 self._counted().tell()
             except Exception as error:  # whatever it is, it belongs to the user's thread
                 self._error = error

@@ -55,6 +55,7 @@ __all__ = [
 FEATURES, MODEL = "features.onnx", "model.onnx"
 BEFORE_NS = 20_000_000  # before its onset a touch's interval begins
 HASTY_NS = 300_000_000  # after the end of a contact, within which another is not a touch of its own
+FELT = 6.0  # times the noise, for two samples running, is felt
 LONG_AGO_NS = 2**62
 ODD = 3.0  # times as far from its class as its others are, a touch is odd
 QUIET = 0.3  # of the noise at rest: the least noise that the contact detector assumes
@@ -106,8 +107,7 @@ class Lesson:
         Raises:
             ConfigError: there is a lesson already.
         """
-        if (folder / FEATURES).exists():
-            raise ConfigError(f"{folder} holds a lesson already")
+        _check_free(folder)
         folder.mkdir(parents=True, exist_ok=True)
         taught = Taught(spec, floor)
         write_features(folder / FEATURES, taught)
@@ -125,8 +125,7 @@ class Lesson:
             ConfigError: there is a lesson already, or the file does not tell what is needed.
             ModelError: the file cannot be used.
         """
-        if (folder / FEATURES).exists():
-            raise ConfigError(f"{folder} holds a lesson already")
+        _check_free(folder)
         taught = TaughtFurther(model)
         folder.mkdir(parents=True, exist_ok=True)
         data = model.read_bytes()
@@ -155,12 +154,15 @@ class Lesson:
         return lesson
 
     def _read_touches(self) -> None:
-        self.lost += drop_torn_label(self.folder / LABELS)
+        labels = self.folder / LABELS
+        self.lost += drop_torn_label(labels)
+        if not labels.stat().st_size:
+            return  # its first line was torn
         recordings = sorted(self.folder.glob("session-*.mcap"), key=_number)
-        for path, intervals in read_labels(self.folder / LABELS, recordings).items():
+        for path, intervals in read_labels(labels, [_whole(one) for one in recordings]).items():
             if not intervals:
                 continue
-            felt = self._felt(_whole(path))
+            felt = self._felt(path)
             for interval in intervals:
                 inside = [
                     features for at_s, features in felt if interval.start_s <= at_s < interval.end_s
@@ -341,9 +343,10 @@ class Listener:
         felt: Callable[[Sequence[Classification]], NDArray[np.float32]],
     ) -> None:
         self.classifier, self._felt = Classifier(model, spec, embedding=True), felt
+        self._spec = spec
         self._first_ns: int | None = None
         self._heard = 0  # samples since the last hint
-        self._strongest = 0.0  # since then, in units of the noise
+        self._strongest, self._where = 0.0, ""  # since then, in units of the noise
         self._steps: list[Classification] = []
         self._released_ns = -LONG_AGO_NS  # stream time
         self._counts = True  # the touch under way
@@ -358,8 +361,11 @@ class Listener:
         decisions = self.classifier.push(chunk)
         detector = self.classifier.detector
         if detector.ready and detector.tared.any():
-            now = np.abs(self.classifier.tared / detector.sigma)[detector.tared].max()
-            self._strongest = max(self._strongest, float(now))
+            now = np.abs(self.classifier.tared / detector.sigma)
+            element, channel = np.unravel_index(now.argmax(), now.shape)
+            if now[element, channel] > self._strongest:
+                self._strongest = float(now[element, channel])
+                self._where = f"{self._spec.elements[element]} {self._spec.channels[channel]}"
         for decision in decisions:
             if decision.step == 1:
                 self._steps = []
@@ -381,7 +387,11 @@ class Listener:
             return "it has been touched all the while: let go for a second"
         if not self.classifier.detector.ready:
             return "there was no second at rest yet: let go"
-        return f"no touch was noticed: the strongest reading was {strongest:.1f} times the noise"
+        advice = "touch more firmly" if strongest < FELT else "touch longer"
+        return (
+            f"no touch was noticed: the strongest reading was {strongest:.1f} times the noise "
+            f"({self._where}), and {FELT:g} is felt: {advice}"
+        )
 
     @property
     def touching(self) -> bool:
@@ -420,6 +430,13 @@ def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:
         floor[channel] = max(floor[channel], step / np.sqrt(12))
     found: NDArray[np.float32] = floor.astype(np.float32)
     return found
+
+
+def _check_free(folder: Path) -> None:
+    if (folder / FEATURES).exists():
+        raise ConfigError(f"{folder} holds a lesson already")
+    if (folder / LABELS).exists():
+        raise ConfigError(f"{folder} holds {LABELS}, but no {FEATURES}: teach in another folder")
 
 
 def check_label(name: str) -> str:

@@ -28,6 +28,7 @@ class Teacher:
         each: The number of touches of each class.
         label: The name of what is touched now; empty: nobody has said.
         done: Whether who teaches has had enough, or all that was wanted is there.
+        said: What was said last.
     """
 
     lesson: Lesson
@@ -35,6 +36,7 @@ class Teacher:
     each: int
     label: str = ""
     done: bool = False
+    said: str = ""
     progress: LessonProgress = field(default_factory=lambda: LessonProgress((), (), ()))
     _planned: bool = False  # whether there is a list to be worked through, and then an end
 
@@ -48,7 +50,14 @@ class Teacher:
 
     def obey(self, order: str) -> str:
         """Do what is asked: one of `ORDERS`, a class's number, or its name. What to say of it."""
-        order = order.strip()
+        return self.note(self._obey(order.strip()))
+
+    def note(self, said: str) -> str:
+        """Let the page show what is said, too; the same."""
+        self.said = said
+        return said
+
+    def _obey(self, order: str) -> str:
         if order == "done":
             self.done = True
             return ""
@@ -74,6 +83,15 @@ class Teacher:
         span_s: tuple[float, float],
     ) -> str:
         """Take a touch that was begun under a label; what to say of it."""
+        return self.note(self._take(label, features, recording, span_s))
+
+    def _take(
+        self,
+        label: str,
+        features: NDArray[np.float32],
+        recording: str,
+        span_s: tuple[float, float],
+    ) -> str:
         if not label:
             return "touched, but what? say so first: nothing was learnt"
         self.lesson.add(label, features, recording, span_s)
@@ -106,9 +124,12 @@ class Teacher:
 
     def state(self) -> dict[str, Any]:
         """What a page shows."""
-        right, of = self.progress.right
-        rows = {name: (count, good) for name, count, good in self.progress.classes}
+        # Asked for in another thread: what is looked at twice must not change in between.
+        progress, touches = self.progress, tuple(self.lesson.touches)
+        right, of = progress.right
+        rows = {name: (count, good) for name, count, good in progress.classes}
         return {
+            "said": self.said,
             "label": self.label,
             "each": self.each,
             "done": self.done,
@@ -116,15 +137,17 @@ class Teacher:
             "classes": [
                 {
                     "name": name,
-                    "touches": self.lesson.count(name),
+                    "touches": sum(touch.label == name for touch in touches),
                     "right": rows[name][1] if name in rows else None,
                 }
-                for name in self.wanted
+                for name in tuple(self.wanted)
             ],
             "right": right,
             "of": of,
-            "odd": [[n, self.lesson.touches[n - 1].label, like] for n, like in self.progress.odd],
-            "confused": [list(pair) for pair in self.progress.confused[:3]],
+            "odd": [
+                [n, touches[n - 1].label, like] for n, like in progress.odd if n <= len(touches)
+            ],
+            "confused": [list(pair) for pair in progress.confused[:3]],
         }
 
     def summary(self) -> Sequence[str]:
@@ -134,7 +157,8 @@ class Teacher:
             for name, count, good in self.progress.classes
         ]
         lines += [f"{a} is taken for {b}" for a, b in self.progress.confused[:3]]
-        return lines
+        few = [name for name in self.lesson.labels if name not in self.lesson.taught_enough]
+        return [*lines, *(f"{name}: one touch is too few, and was not learnt" for name in few)]
 
     def _told_apart(self) -> str:
         right, of = self.progress.right

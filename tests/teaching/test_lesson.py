@@ -1,7 +1,9 @@
 """Touches become a model: features, classes, the folder that keeps them, who teaches."""
 
+import re
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -108,7 +110,66 @@ def test_what_an_interruption_leaves_is_dropped_and_counted(taught, tmp_path):
     assert [t.recording for t in again.touches][-1] == "session-2.mcap"
 
 
+def test_wherever_a_line_was_torn_the_others_stay(taught, tmp_path):
+    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    teach(lesson, ["press"] * 2, seed=6)
+    path = tmp_path / "b" / LABELS
+    whole = path.read_bytes()
+    last = whole.rfind(b"\n", 0, -1) + 1
+    for end in (last + 1, last + 9, len(whole) - 3):
+        path.write_bytes(whole[:end])
+        assert len(Lesson.read(tmp_path / "b").touches) == 1
+        assert path.read_bytes() == whole[:last]
+    path.write_bytes(whole[:-1])  # as an editor may leave it
+    assert len(Lesson.read(tmp_path / "b").touches) == 2
+    path.write_bytes(whole[:12])
+    again = Lesson.read(tmp_path / "b")
+    assert not again.touches
+    teach(again, ["slide"], seed=7)
+    assert [t.label for t in Lesson.read(tmp_path / "b").touches] == ["slide"]
+
+
+def test_a_page_may_look_at_any_moment(taught, tmp_path):
+    """It looks from a thread of its own: also between a touch that goes and what is made of it."""
+    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    teach(lesson, ["press"] * 4, seed=8)
+    teacher = Teacher(lesson, ["press"], 9)
+    teacher.progress = replace(teacher.progress, odd=((4, "press"),))
+    assert teacher.state()["odd"] == [[4, "press", "press"]]
+    lesson.undo()  # and the progress is that of before
+    assert teacher.state()["odd"] == []
+    assert teacher.obey("a/b") == teacher.state()["said"] != ""
+
+
+def test_one_touch_of_a_class_is_told_to_be_too_few(taught, tmp_path):
+    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    teach(lesson, ["press", "press", "slide"], seed=8)
+    assert Teacher(lesson, [], 2).summary()[-1] == "slide: one touch is too few, and was not learnt"
+
+
+def test_it_says_why_nothing_was_felt(taught):
+    listener = taught.listener(wrench_spec())
+    assert "no sample came" in listener.hint()
+    values = felt([], seed=9)
+    for chunk in cut(values[:15], RATE_HZ):
+        assert not list(listener.push(chunk))
+    assert "there was no second at rest yet" in listener.hint()
+    for chunk in cut(values[15:], RATE_HZ, start_ns=150_000_000):
+        assert not list(listener.push(chunk))
+    said = listener.hint()
+    (strongest,) = re.findall(r"strongest reading was (\d\.\d) times the noise \(sensor ", said)
+    assert 2 < float(strongest) < 6 and said.endswith("and 6 is felt: touch more firmly")
+    held = np.tile(values[-1:] + 9, (300, 1, 1))
+    for chunk in cut(held, RATE_HZ, start_ns=3_000_000_000):
+        list(listener.push(chunk))
+    assert "touched all the while: let go" in listener.hint()
+
+
 def test_what_cannot_be_is_one_line(taught, tmp_path):
+    (tmp_path / "others").mkdir()
+    (tmp_path / "others" / LABELS).touch()
+    with pytest.raises(ConfigError, match=r"holds labels\.csv, but no features\.onnx"):
+        Lesson.begun(tmp_path / "others", wrench_spec(), FLOOR)
     with pytest.raises(ConfigError, match="holds a lesson already"):
         Lesson.begun(taught.folder, wrench_spec(), FLOOR)
     with pytest.raises(ConfigError, match=r"holds no lesson: there is no features\.onnx"):

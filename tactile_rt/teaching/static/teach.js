@@ -8,7 +8,7 @@ async function order(text) {
       headers: { "content-type": "application/json" },
       body: JSON.stringify({ order: text }),
     });
-    $("note").textContent = answer.ok ? "" : await answer.text();
+    if (!answer.ok) $("note").textContent = await answer.text();
   } catch {
     $("note").textContent = "The teaching program does not answer.";
   }
@@ -30,6 +30,8 @@ function button(each, entry, chosen) {
 
 function show(state) {
   $("prompt").textContent = state.prompt;
+  if (!state.classes) return; // at rest, before the first touch
+  $("note").textContent = state.said;
   $("classes").replaceChildren(
     ...state.classes.map((entry) => button(state.each, entry, entry.name === state.label)),
   );
