@@ -27,6 +27,7 @@ HINT_S = 20.0  # without a touch, before it is said how strong the readings are;
 DEAF_S = 10.0  # without a sample, before the first one: the device does not talk
 RESTING = f"touch nothing for {REST_S:g} s"
 HASTY = "that came too soon after the last touch to be one: wait a second"
+HELP = "keys: 1 to 9 a class, n the next, a another one, u takes a touch back, q learns and leaves"
 KEYS = {"n": "next", "u": "undo", "q": "done", "\x04": "done"}
 
 
@@ -84,11 +85,12 @@ def teach(
     card = lesson.learn()
     for line in (*buttons.teacher.summary(), *_losses(opened)):
         typer.echo(line)
-    others = len(card.classes) - len(lesson.taught_enough)
-    knows = ", ".join(lesson.taught_enough) + (f" beside {others} others" if others else "")
+    learnt = lesson.taught_enough
+    others = len(card.classes) - len(learnt)
+    knows = ", ".join(learnt) + (f" beside {others} others" if others else "")
     typer.echo(
         f"{folder / MODEL}: knows {knows}, and what it does not know; "
-        f"{len(lesson.touches)} touches, learnt in {time.process_time() - began:.1f} s"
+        f"{sum(map(lesson.count, learnt))} touches, learnt in {time.process_time() - began:.1f} s"
     )
     typer.echo(
         f"now: tactile-rt run --source '{source}' --model {shlex.quote(str(folder / MODEL))}"
@@ -108,6 +110,8 @@ def _teach(teacher: "Teacher", source: Source, url: str, orders: "queue.Queue[st
     typer.echo(_greeting(lesson, source))
     path = lesson.next_recording()
     with StreamWriter(path, source, url=url) as writer, _listening(orders):
+        if sys.stdin is not None and sys.stdin.isatty() and not teacher.done:
+            typer.echo(HELP)
         typer.echo(teacher.prompt())
         label = teacher.label  # of the touch under way, or of the next
         quiet_since, patience_s = time.monotonic(), HINT_S

@@ -246,6 +246,7 @@ def test_keys_are_orders(tmp_path):
         def hear(what: str) -> None:
             until(lambda: any(what in line for line in said))
 
+        hear("keys: 1 to 9 a class")
         hear("touch it: press")
         os.write(ours, b"n")
         hear("touch it: slide (1 of 9)")

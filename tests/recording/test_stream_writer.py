@@ -146,6 +146,23 @@ def test_a_full_disk_is_told_and_what_is_written_can_be_recovered(path, disk, no
     assert all_parts(back) == all_parts(chunks[: len(back)])
 
 
+def test_what_is_flushed_is_there_whatever_happens_next(path, tmp_path, disk, no_thread_left):
+    chunks, now = cut(noise(300), 1000.0, samples=10), tmp_path / "now.mcap"
+    recorder = StreamWriter(path, ArraySource(SPEC, chunks, live=True), flush_s=1e9)
+    for k, chunk in enumerate(chunks):
+        recorder.push(chunk)
+        if k % 10 == 9:
+            recorder.flush()
+            now.write_bytes(path.read_bytes())  # what a kill would leave
+            assert all_parts(Recording(recover(now, force=True))) == all_parts(chunks[: k + 1])
+    disk[0].most = 0
+    recorder.push(chunks[0])
+    with pytest.raises(RecordingError, match="No space left"):
+        recorder.flush()
+    with pytest.raises(RecordingError):
+        recorder.close()
+
+
 PROGRAM = """
 import sys
 from tactile_rt.sources.opening import open_source
