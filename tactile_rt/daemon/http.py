@@ -216,6 +216,7 @@ class HttpServer:
         )
         await self._over.wait()
         server.close()
+        await asyncio.sleep(0.01)  # who has been accepted is met, and turned away
         for task in self._asking:
             task.cancel()
         if self._tasks:
@@ -223,7 +224,7 @@ class HttpServer:
         # The runner cancels those that are left.
 
     def _meet(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if len(self._tasks) >= self._limits.connections:
+        if len(self._tasks) >= self._limits.connections or self._over.is_set():
             self._drop()
             writer.transport.abort()
             return
@@ -232,6 +233,8 @@ class HttpServer:
         self._asking.add(task)
         task.add_done_callback(self._tasks.discard)
         task.add_done_callback(self._asking.discard)
+        # A task that is cancelled before it has begun does not even come to its end.
+        task.add_done_callback(lambda _: writer.transport.abort())
 
     def _drop(self) -> None:
         self.dropped += 1
