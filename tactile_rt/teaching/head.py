@@ -22,6 +22,7 @@ AXES = 16  # directions in which touches of a class differ
 SHARE = 0.1  # of the mean variance, added to the shared covariance in every direction
 FOLDS = 10
 REFUSED = 0.06  # of the touches that were left out, at most, are taken for unknown
+MAD, FARTHEST = 1.4826, 2.5  # standard deviations of the logarithm of the distance, at most
 LIMIT = 5.0  # standardised features are limited to, either way: one outlier is not the decision
 # A feature's scale is no less than so many times the median one of its kind, and than this share
 # of its whole spread: what never varied in ten touches may still vary in the eleventh.
@@ -98,7 +99,11 @@ def fit_classes(
     left_out = left_out or leave_out(features, labels, kinds)
     nearest = left_out.distances.min(axis=2)  # (touch, step)
     rank = min(len(labels) - 1, int(np.ceil((1 - REFUSED) * (len(labels) + 1))) - 1)
-    reach = np.sort(nearest, axis=0)[rank]
+    # A touch under a wrong name is far from its class; it is not to let everything through.
+    logs = np.log(nearest + TINY)
+    middle = np.median(logs, axis=0)
+    spread = MAD * np.median(np.abs(logs - middle), axis=0)
+    reach = np.minimum(np.sort(nearest, axis=0)[rank], np.exp(middle + FARTHEST * spread))
     classes, own = np.unique(np.asarray(labels), return_inverse=True)
     temperature = _temperature(left_out.distances[:, -1], own)
     names = tuple(str(name) for name in classes)

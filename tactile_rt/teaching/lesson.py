@@ -54,7 +54,7 @@ __all__ = [
 
 FEATURES, MODEL = "features.onnx", "model.onnx"
 BEFORE_NS = 20_000_000  # before its onset a touch's interval begins
-HASTY_NS = 300_000_000  # after the end of a contact, within which another is not a touch of its own
+HASTY_NS = 100_000_000  # after the end of a contact, within which another is not a touch of its own
 FELT = 6.0  # times the noise, for two samples running, is felt
 LONG_AGO_NS = 2**62
 ODD = 3.0  # times as far from its class as its others are, a touch is odd

@@ -290,7 +290,7 @@ def test_what_comes_too_soon_is_the_rest_of_a_touch(taught):
     rest, touches = felt([], seed=8), [touch("press", rng) for _ in range(3)]
     slow = np.repeat(touches[0], 2, axis=0)  # longer than what is looked at of it
     # the second begins half a second after the first has ended, the third two seconds
-    signal = np.concatenate([rest, slow[:-145], touches[1][100:], touches[2]])
+    signal = np.concatenate([rest, slow[:-150], touches[1][100:], touches[2]])
     listener = taught.listener(wrench_spec())
     found = [one for chunk in cut(signal, RATE_HZ) for one in listener.push(chunk)]
     assert (len(found), listener.hasty) == (2, 1)
