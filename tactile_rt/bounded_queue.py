@@ -20,6 +20,7 @@ reader by itself.
 
 import sys
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
@@ -42,6 +43,7 @@ class QueueState:
         taken: The number of each kind that the reader took so far.
         dropped: The number of each kind that was dropped so far.
         waiting_bytes: The size of all that waits now, bytes.
+        oldest_s: The time that the oldest of all that waits has waited, s; 0 if nothing waits.
     """
 
     waiting: dict[str, int] = field(default_factory=dict)
@@ -49,6 +51,7 @@ class QueueState:
     taken: dict[str, int] = field(default_factory=dict)
     dropped: dict[str, int] = field(default_factory=dict)
     waiting_bytes: int = 0
+    oldest_s: float = 0.0
 
 
 def _one(item: Any) -> tuple[str, int, int]:
@@ -84,7 +87,8 @@ class BoundedQueue(Generic[T]):
         self._items, self._half, self._size = items, items // 2, size
         self._measured = measure
         self._urgent, self._gather_s = frozenset(urgent), gather_s
-        self._queue: deque[tuple[T, str, int, int]] = deque()  # item, kind, count, bytes
+        # item, kind, count, bytes, since when
+        self._queue: deque[tuple[T, str, int, int, float]] = deque()
         self._bytes = self._urgent_ones = 0
         self._lock = threading.Lock()
         self._changed = threading.Condition(self._lock)
@@ -106,7 +110,7 @@ class BoundedQueue(Generic[T]):
             if self._closed:
                 self._dropped[kind] += n
                 return
-            queue.append((item, kind, n, size))
+            queue.append((item, kind, n, size, time.monotonic()))
             self._bytes += size
             urgent = kind in self._urgent
             if urgent:
@@ -124,7 +128,7 @@ class BoundedQueue(Generic[T]):
                 self._wait(lambda: self._queue or self._closed, timeout)
                 if not self._queue:
                     return None
-            item, kind, n, size = self._queue.popleft()
+            item, kind, n, size, _ = self._queue.popleft()
             self._taken[kind] += n
             self._bytes -= size
             if kind in self._urgent:
@@ -144,7 +148,7 @@ class BoundedQueue(Generic[T]):
                     self._gather_s,
                 )
             items = []
-            for item, kind, n, _ in self._queue:
+            for item, kind, n, *_ in self._queue:
                 self._taken[kind] += n
                 items.append(item)
             self._queue.clear()
@@ -194,10 +198,11 @@ class BoundedQueue(Generic[T]):
 
     def _counts(self) -> QueueState:
         waiting = dict.fromkeys(self._put, 0)
-        for _, kind, n, _ in self._queue:
+        for _, kind, n, *_ in self._queue:
             waiting[kind] += n
+        oldest = time.monotonic() - self._queue[0][-1] if self._queue else 0.0
         return QueueState(
-            waiting, dict(self._put), dict(self._taken), dict(self._dropped), self._bytes
+            waiting, dict(self._put), dict(self._taken), dict(self._dropped), self._bytes, oldest
         )
 
     def _wait(self, until: Callable[[], object], timeout: float | None) -> None:
@@ -210,7 +215,7 @@ class BoundedQueue(Generic[T]):
 
     def _drop(self) -> None:
         """Let the oldest go."""
-        _, kind, n, size = self._queue.popleft()
+        _, kind, n, size, _ = self._queue.popleft()
         self._dropped[kind] += n
         self._bytes -= size
         if kind in self._urgent:

@@ -9,11 +9,12 @@ Contact onset starts an episode, and without contact there is no decision. There
 - ``sliding``: as before until the first final decision; from there on, as long as the contact
   lasts, one every few steps, each equal to that of an episode which began so many steps later.
 
-A silence too long for the resampler to bridge ends an episode early.
+A silence too long for the resampler to bridge ends an episode early, and so does a stretch that is
+skipped, see `tactile_rt.classifier.skips`.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -27,6 +28,7 @@ from tactile_rt.classifier.exits import IN_A_ROW, Deadline, EarlyExit, Lanes, Po
 from tactile_rt.classifier.model_card import decided, rated_noise
 from tactile_rt.classifier.model_file import fit_source, load_model
 from tactile_rt.classifier.runtime import onnxruntime_names
+from tactile_rt.classifier.skips import CatchUp, Skip, Skips
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, ModelError
@@ -35,6 +37,9 @@ __all__ = ["Classification", "Classifier", "ClassifierStats", "fuse", "without_b
 
 Mode = Literal["episode", "sliding"]
 EVERY = 4
+# How far a live network may be behind before it skips to the newest sample: so many steps, and at
+# least so long.
+BEHIND_STEPS, BEHIND_S = 3, 0.15
 # Far beyond any load, and far below where squares of float32 overflow.
 ABSURD = 1e9
 
@@ -99,6 +104,7 @@ class ClassifierStats:
         steps: The number of steps that the network took.
         late: The number of steps that missed the deadline.
         withheld: The number of decisions that were not returned because they were late.
+        skips: The number of stretches of the stream that were skipped.
         bad_samples: The number of samples of one element that were no number, infinite or absurd
             though marked valid; they were taken for invalid.
         bad_steps: The number of steps whose logits were not finite; they gave no decision.
@@ -107,6 +113,7 @@ class ClassifierStats:
     steps: int = 0
     late: int = 0
     withheld: int = 0
+    skips: int = 0
     bad_samples: int = 0
     bad_steps: int = 0
 
@@ -125,11 +132,18 @@ class Classifier:
         sure: probability of the best class at which an episode ends early, or None: accuracy
             given for time, see `tactile_rt.classifier.exits`. Of ``episode`` only.
         in_a_row: steps running in which the same class must be so sure.
-        deadline_s: work that may gather before a step is late, s; None is the step's length.
+        deadline_s: work that may gather, and age of its newest sample, before a step is late, s;
+            None is the step's length.
         late: what becomes of a late decision, see `tactile_rt.classifier.exits.Deadline`.
         providers: execution providers, first choice first: cpu, cuda, tensorrt, openvino, coreml.
         threads: that may share one operator of the network.
         embedding: whether decisions carry the step's embedding, a copy each.
+        age: of a live stream: how old the sample of a stream time (ns) is now, s.
+        catch_up: what is done where a live stream's decisions would be older than `behind_s`: the
+            network skips to the ``newest`` sample, or takes ``all`` steps.
+        behind_s: the greatest age of a step's newest sample when its decision is there, s; None:
+            three steps, or 0.15 s if that is more.
+        skips: stretches to skip, as a recording tells them.
 
     Attributes:
         card: The metadata of the model file.
@@ -137,6 +151,7 @@ class Classifier:
         tared: (element, channel) The last resampled sample less the tare, SI; zeros before the
             tare. The next `push` overwrites it.
         stats: The counters of steps, late steps and bad samples.
+        skips: The stretches of the stream that the network skips.
         providers: Names of the execution providers in use, as onnxruntime has them.
 
     Raises:
@@ -159,6 +174,10 @@ class Classifier:
         providers: Sequence[str] = ("cpu",),
         threads: int = 1,
         embedding: bool = False,
+        age: Callable[[int], float] | None = None,
+        catch_up: CatchUp = "all",
+        behind_s: float | None = None,
+        skips: Iterable[Skip] = (),
     ) -> None:
         if mode not in get_args(Mode):
             raise ConfigError(f"mode: {mode!r}; it can be {', '.join(get_args(Mode))}")
@@ -182,7 +201,11 @@ class Classifier:
         every = min(EVERY, steps) if every is None else every
         self._lanes = Lanes(steps, every if self._sliding else steps)
         step_s = self.card.substeps * self.card.period_ns / NS_PER_S
-        self._deadline = Deadline(step_s if deadline_s is None else deadline_s, late)
+        self._deadline = Deadline(step_s if deadline_s is None else deadline_s, late, age)
+        if catch_up not in get_args(CatchUp):
+            raise ConfigError(f"catch_up: {catch_up!r}; it can be {', '.join(get_args(CatchUp))}")
+        most_s = max(BEHIND_S, BEHIND_STEPS * step_s) if behind_s is None else behind_s
+        self.skips = Skips(skips, most_s, age if catch_up == "newest" else None)
         self._stepper = Stepper(session, self.card, self._lanes.count)
         self._resampler = Resampler(self.card.period_ns, spec.rate_hz)
         self._order = order  # where the array has the model's elements
@@ -193,6 +216,7 @@ class Classifier:
         self._step = 0  # steps done since the onset
         self._onset_ns: int | None = None  # None when no episode is under way
         self._decided = False  # the episode has had its final decision
+        self._skipping = False
         self._next_seq = 0
         self._rated = rated_noise(self.card)
         self._promise: CandidateRule | None = None  # of the episode
@@ -223,8 +247,16 @@ class Classifier:
         untouched = ~(valid & self.detector.tared)
         np.subtract(sample, self.detector.offset, out=self.tared)
         self.tared[untouched] = 0
+        before = self._skipping
+        if self.skips.covers(t_ns):
+            self._skip()
+            return None
+        self._skipping = False
         if begins and (self._onset_ns is None or self._decided):
             self._begin(t_ns)
+        elif before and self._sliding and self.detector.contact:
+            self._begin(t_ns)  # a window within a contact, as others of this mode
+            self._promise = None
         if self._onset_ns is None:
             return None
         if self._decided and not self.detector.contact:
@@ -237,7 +269,15 @@ class Classifier:
         self._filled += 1
         if self._filled < self.card.substeps:
             return None
+        if self.skips.before_step(t_ns):
+            self._skip()
+            return None
         return self._advance(t_ns, self._onset_ns)
+
+    def _skip(self) -> None:
+        """Leave the sample out, and with it the episode."""
+        self.stats.skips += not self._skipping
+        self._skipping, self._onset_ns = True, None
 
     def _begin(self, t_ns: int) -> None:
         self._onset_ns = t_ns
@@ -267,6 +307,9 @@ class Classifier:
         self.stats.steps += 1
         late = self._deadline.missed(t_ns, latency)
         self.stats.late = self._deadline.late
+        if self.skips.after_step(t_ns, latency):
+            self._skip()
+            return None
         if asked is None:
             return None
         lane, step = asked

@@ -28,7 +28,7 @@ either side, and wider for sweeps of the same objects.
 """
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -181,19 +181,21 @@ class Lanes:
 
 
 class Deadline:
-    """Does the network keep up? Of every step: would its decision have been in time, live?
+    """Does the network keep up? Of every step: is its decision in time?
 
     The work that waits shrinks with the stream's time and grows with every step's. A step is late
     if more than `limit_s` of work has gathered by its end: because it took so long itself, or
     because those before it did. That depends neither on how the stream was cut into chunks nor on
-    how fast it is read, so a replay says what a robot would have met.
+    how fast it is read, so a replay says what a robot would have met. Of a live stream a step is
+    late, too, if its newest sample is older than `limit_s` by then, whatever kept it.
 
     Args:
-        limit_s: work that may gather, s.
+        limit_s: work that may gather, and age of the newest sample that a step may have, s.
         policy: what becomes of a late decision. ``count``: it is returned, marked and counted;
             ``report``: and an episode's first is logged as a warning; ``skip``: it is counted and
             withheld, as one that a robot must not act upon. The network takes every step in any
             case: with one left out, the later decisions would be of another signal.
+        age: how old the sample of a stream time (ns) is now, s; None: the stream is not live.
 
     Attributes:
         behind_s: The work that had gathered at the end of the last step, s.
@@ -203,12 +205,17 @@ class Deadline:
         ConfigError: no such policy, or a limit that is not positive.
     """
 
-    def __init__(self, limit_s: float, policy: Policy = "count") -> None:
+    def __init__(
+        self,
+        limit_s: float,
+        policy: Policy = "count",
+        age: Callable[[int], float] | None = None,
+    ) -> None:
         if policy not in get_args(Policy):
             raise ConfigError(f"late: {policy!r}; it can be {', '.join(get_args(Policy))}")
         if not limit_s > 0:
             raise ConfigError(f"deadline_s: {limit_s}; it must be positive")
-        self.limit_s, self.policy = limit_s, policy
+        self.limit_s, self.policy, self._age = limit_s, policy, age
         self.behind_s = 0.0
         self.late = 0
         self._last_ns: int | None = None
@@ -228,14 +235,15 @@ class Deadline:
         passed = 0.0 if self._last_ns is None else (t_ns - self._last_ns) / 1e9
         self._last_ns = t_ns
         self.behind_s = max(0.0, self.behind_s - passed) + took_s
-        if self.behind_s <= self.limit_s:
+        age = self.behind_s if self._age is None else self._age(t_ns)
+        if max(age, self.behind_s) <= self.limit_s:
             return False
         self.late += 1
         if self.policy == "report" and not self._reported:
             self._reported = True
             log.warning(
-                "late: a step took %.1f ms and %.1f ms of work have gathered (limit %.1f ms); "
-                "%d late steps so far",
-                1e3 * took_s, 1e3 * self.behind_s, 1e3 * self.limit_s, self.late,
+                "late: a step took %.1f ms, %.1f ms of work have gathered, its newest sample is "
+                "%.1f ms old (limit %.1f ms); %d late steps so far",
+                1e3 * took_s, 1e3 * self.behind_s, 1e3 * age, 1e3 * self.limit_s, self.late,
             )  # fmt: skip
         return True

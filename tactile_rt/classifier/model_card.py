@@ -37,6 +37,7 @@ __all__ = [
     "one_line",
     "parse_card",
     "rated_noise",
+    "sensor_of",
 ]
 
 CARD_VERSION = 3
@@ -351,10 +352,17 @@ def rated_noise(card: ModelCard) -> NDArray[np.float32]:
     Where neither the card nor a unit tells it, that from which the floor is derived.
     """
     try:
-        sensor = msgspec.convert(card.sensor, SensorSpec) if card.sensor else None
-        return channel_limits(card.array, sensor, card.period_ns).noise
-    except (ConfigError, msgspec.ValidationError):
+        return channel_limits(card.array, sensor_of(card), card.period_ns).noise
+    except ConfigError:
         return np.array(card.floor, dtype=np.float32)
+
+
+def sensor_of(card: ModelCard) -> SensorSpec | None:
+    """The sensor that a model was made for; None where the card does not tell it."""
+    try:
+        return msgspec.convert(card.sensor, SensorSpec) if card.sensor else None
+    except (ConfigError, msgspec.ValidationError):
+        return None
 
 
 def one_line(reason: object) -> str:

@@ -13,9 +13,10 @@ from tactile_rt.stream import ConfigError, RecordingError
 if TYPE_CHECKING:
     from tactile_rt.classifier.classifier import Classification, Classifier
     from tactile_rt.recording import Recording
+    from tactile_rt.stream import Chunk
 
 DIFFERENT = 1
-TIMING = ("model_ms", "latency_ms", "late")  # of a decision's message: not the same twice
+TIMING = ("model_ms", "latency_ms", "age_ms", "late")  # of a decision's message: not the same twice
 
 
 @app.command()
@@ -98,6 +99,8 @@ class _Replay:
         self._begins_at = 0
         self._live = live_model(str(files[0].path), files[0].description, name, model, check)
         self._model = file_of_model(model, self._live)
+        name = self._live.name if self._live and check else ""
+        self._skips = [s for f in files for s in f.skips(name)] if name else []
         sha256 = hash_of(self._model)
         known = self._live.sha256 if self._live else ""
         if check and known and known != sha256:
@@ -130,10 +133,17 @@ class _Replay:
                         self._first, self._begins_at = int(chunk.t_ns[0]), int(chunk.seq[0])
                     after, self._last = int(chunk.seq[-1]) + 1, int(chunk.t_ns[-1])
                     self.samples += len(chunk)
-                    for decision in classifier.push(chunk):
+                    for decision in self._decide(classifier, chunk):
                         message = self._message(decision, recording)
                         self.decided.append(message)
                         yield msgspec.json.encode(message)
+
+    def _decide(self, classifier: "Classifier", chunk: "Chunk") -> "list[Classification]":
+        """What the model says of those samples that it was given live."""
+        from tactile_rt.recording.checking import samples_given
+
+        given = samples_given(chunk, self._skips)
+        return classifier.push(given) if given is not None else []
 
     def compare(self) -> None:
         """Tell whether the decisions are the recorded ones; leave with `DIFFERENT` if not."""
@@ -155,6 +165,8 @@ class _Replay:
         said = [f"{checked.same} decisions of {self._live.name} are as recorded"]
         if checked.before:
             said.append(f"{checked.before} recorded ones are about samples before the first")
+        if self._skips:
+            said.append(f"{len(self._skips)} stretches were skipped live, the model being behind")
         if checked.withheld:
             said.append(f"{checked.withheld} were withheld live as late")
         if checked.late:
@@ -174,12 +186,14 @@ class _Replay:
 
     def _classifier(self, spec: Any) -> "Classifier":
         from tactile_rt.classifier.classifier import Classifier
+        from tactile_rt.classifier.skips import Skip
 
         table = self._live.table if self._live else {}
         return Classifier(
             self._model, spec, mode=table.get("mode", "episode"), every=table.get("every") or None,
             sure=table.get("sure") or None, in_a_row=table.get("in_a_row", 2),
             providers=tuple(table.get("providers", ("cpu",))),
+            skips=[Skip(s["from_ns"], s["until_ns"]) for s in self._skips],
         )  # fmt: skip
 
     def _message(self, decision: "Classification", recording: "Recording") -> dict[str, Any]:

@@ -52,12 +52,16 @@ class SourceConfig(_Table, frozen=True, kw_only=True):
             samples are used as they come.
         array: A file of the array that the source is, as `tactile-rt describe` writes it, or an
             ``.onnx`` model, whose array it then is; empty if it is what the URL says.
+        frozen_s: Time without any change of any value from which the device is taken to hang, s; 0
+            for what follows from the sensor's noise, where a model on the source tells it, else
+            for ever: a coarse sensor at rest does not change either.
     """
 
     name: Name
     url: str
     calibration: str = ""
     array: str = ""
+    frozen_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 0.0
 
 
 class ModelConfig(_Table, frozen=True, kw_only=True):
@@ -76,9 +80,14 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
         sure: Probability that ends an episode early when one class reaches it `in_a_row` steps
             running; 0 for never.
         in_a_row: Number of steps running for `sure`, at most those of an episode.
-        deadline_ms: Longest time that a step may take, ms; 0 for the duration of the step itself.
-        late: What becomes of a step that took longer than `deadline_ms`: ``count``, ``report`` in
-            the log, or ``skip``, so that the decision is not published.
+        deadline_ms: Longest time that a step may take, and greatest age of its newest sample when
+            its decision is published, ms; 0 for the duration of the step itself.
+        late: What becomes of a step beyond `deadline_ms`: ``count``, ``report`` in the log, or
+            ``skip``, so that the decision is not published.
+        catch_up: What the model does when its decisions would be older than `behind_ms`: it skips
+            to the ``newest`` sample, ending the episode, or takes ``all`` steps, marked as late.
+        behind_ms: Greatest age of a decision's newest sample with `catch_up` ``newest``, ms; 0 for
+            three steps, at least 150 ms.
         providers: Execution providers of onnxruntime, best first: ``cpu``, ``cuda``, ``tensorrt``.
     """
 
@@ -92,6 +101,8 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
     in_a_row: Annotated[int, msgspec.Meta(ge=1)] = 2
     deadline_ms: Annotated[float, msgspec.Meta(ge=0, le=10_000)] = 0.0
     late: Literal["count", "report", "skip"] = "count"
+    catch_up: Literal["newest", "all"] = "newest"
+    behind_ms: Annotated[float, msgspec.Meta(ge=0, le=60_000)] = 0.0
     providers: Annotated[tuple[Text, ...], msgspec.Meta(min_length=1)] = ("cpu",)
 
 
@@ -183,6 +194,12 @@ class LimitsConfig(_Table, frozen=True, kw_only=True):
             less is sooner, more takes less of the processor.
         stop_s: Longest time that closing may take, s.
         stall_s: Duration from which a call is told as stalled, s.
+        sample_age_s: Age of a live source's newest sample from which the daemon is degraded, s;
+            three periods of a slow sensor, if that is more.
+        behind_s: Time that items may wait for a model or a consumer before the daemon is degraded,
+            s.
+        record_age_s: Age that the newest sample of a recording may have, less that of its source,
+            before the daemon is degraded, s.
         retry_first_s: Pause before a part that broke is tried again for the first time, s.
         retry_last_s: Longest pause before a part that broke is tried again, s; from the first on
             pauses double up to this.
@@ -194,6 +211,9 @@ class LimitsConfig(_Table, frozen=True, kw_only=True):
     gather_ms: Annotated[float, msgspec.Meta(ge=0, le=100)] = 2.0
     stop_s: Annotated[float, msgspec.Meta(ge=0.2, le=60)] = 2.0
     stall_s: Annotated[float, msgspec.Meta(ge=0.5, le=3600)] = 5.0
+    sample_age_s: Annotated[float, msgspec.Meta(ge=0.05, le=3600)] = 0.5
+    behind_s: Annotated[float, msgspec.Meta(ge=0.05, le=3600)] = 0.75
+    record_age_s: Annotated[float, msgspec.Meta(ge=0.5, le=3600)] = 1.0
     retry_first_s: Annotated[float, msgspec.Meta(ge=0.01, le=60)] = 0.1
     retry_last_s: Annotated[float, msgspec.Meta(ge=0.01, le=3600)] = 2.0
 
@@ -246,12 +266,17 @@ version = 1
 name = "whiskers"
 url = "synthetic:mouse"        # a device: serial:///dev/ttyACM0?codec=native
 # calibration = "cell-3"       # file, or id of a device: tactile-rt calibrate
+# frozen_s = 0                 # no change for so long: the device hangs; 0: if its noise is known
 # array = "array.json"         # what the device is, if its codec cannot know; or a model's .onnx
 
 # [[model]]                    # none: nothing is classified
 # source = "whiskers"          # needed if there are several
 # file = "model.onnx"          # default: the one that comes with the package
 # decisions = "every_step"     # or "final": one per contact
+# deadline_ms = 0              # older, or longer to make, is late; 0: one step
+# late = "count"               # or "report" in the log, "skip": late decisions are not published
+# catch_up = "newest"          # what is behind skips to the newest sample; "all": takes every step
+# behind_ms = 0                # how far it may be behind; 0: three steps, at least 150 ms
 
 [[publisher]]
 kind = "jsonl"                 # also zmq, zenoh, foxglove
@@ -289,6 +314,9 @@ model_queue_items = 1024       # chunks that may wait for one model
 gather_ms = 2                  # more takes less of the processor, and adds to the latency
 stop_s = 2                     # how long closing may take
 stall_s = 5                    # a call that takes longer is told as stalled
+sample_age_s = 0.5             # what is older than these makes the daemon degraded: a sample,
+behind_s = 0.75                # what waits for a model or a publisher,
+record_age_s = 1               # a sample that is not on the disk
 retry_first_s = 0.1            # pause before a part that broke is tried again, doubling
 retry_last_s = 2
 """

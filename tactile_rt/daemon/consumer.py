@@ -7,10 +7,20 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Protocol
 
 from tactile_rt.daemon.config import LimitsConfig
-from tactile_rt.daemon.health import ConsumerState, LatencyMeter, Snapshot
-from tactile_rt.daemon.items import Closed, Contact, Control, Decision, Event, Item, Opened
+from tactile_rt.daemon.health import ConsumerState, LatencyMeter, OnDisk, Snapshot
+from tactile_rt.daemon.items import (
+    Closed,
+    Contact,
+    Control,
+    Decision,
+    Event,
+    Item,
+    Opened,
+    Skipped,
+)
 from tactile_rt.daemon.mailbox import Mailbox
 from tactile_rt.daemon.part import Part, Report
+from tactile_rt.daemon.troubles import LossWindow
 
 __all__ = ["Consumer", "ConsumerPart", "View"]
 
@@ -61,7 +71,7 @@ class Consumer(abc.ABC):
     """
 
     Options: ClassVar[Any] = None
-    wants: frozenset[type] = frozenset({Opened, Closed, Decision, Contact, Event, Control})
+    wants: frozenset[type] = frozenset({Opened, Closed, Decision, Contact, Skipped, Event, Control})
     gather_s: float = 0.02
     tick_s: float = 0.0
 
@@ -82,6 +92,15 @@ class Consumer(abc.ABC):
 
     def details(self) -> dict[str, str | int | float]:
         """What to tell in the snapshot; called from any thread, must be quick."""
+        return {}
+
+    def trouble(self) -> str:
+        """What keeps it from its work now, in words that hold no number that counts on; empty:
+        nothing. Called from any thread, must be quick."""
+        return ""
+
+    def on_disk(self) -> Mapping[str, OnDisk]:
+        """Of a consumer that records: what is on the disk, by source; as `details`."""
         return {}
 
 
@@ -112,15 +131,24 @@ class ConsumerPart(Part):
         )
         self._view = view
         self._latency = LatencyMeter()
+        self._age_s = 0.0
+        self._losses = LossWindow()
 
     @property
     def consumer_state(self) -> ConsumerState:
         """For the snapshot."""
         try:
-            details = self.consumer.details()
+            details, trouble = self.consumer.details(), self.consumer.trouble()
+            on_disk = self.consumer.on_disk()
         except Exception as error:  # telling of itself must not break the snapshot of all others
-            details = {"error": f"{type(error).__name__}: {error}"}
-        return ConsumerState(self.state, self.kind, self.box.state, self._latency.state, details)
+            trouble, on_disk = f"cannot tell how it is: {type(error).__name__}: {error}", {}
+            details = {}
+        queue = self.box.state
+        return ConsumerState(
+            self.state, self.kind, queue, self._latency.state, details, 1e3 * self._age_s,
+            max(queue.oldest_s, self.silent_s), self._losses.add(sum(queue.dropped.values())),
+            trouble, dict(on_disk),
+        )  # fmt: skip
 
     def stop(self) -> None:
         super().stop()
@@ -146,7 +174,8 @@ class ConsumerPart(Part):
             due = now / 1e9 + consumer.tick_s
             for item in items:
                 if isinstance(item, Decision):
-                    self._latency.add((now - item.sample_ns) / 1e9)
+                    self._age_s = (now - item.sample_ns) / 1e9
+                    self._latency.add(self._age_s)
 
     def _release(self) -> None:
         self.box.taking = False

@@ -11,7 +11,7 @@ from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import config_text
 from tactile_rt.daemon.consumer import ConsumerPart
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
-from tactile_rt.daemon.health import Snapshot, degraded
+from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.lock import Locks, lock_keys
@@ -19,12 +19,15 @@ from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.model_part import ModelPart, file_stamp, model_path
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.source_part import SourcePart
+from tactile_rt.daemon.troubles import troubles
 from tactile_rt.version import VERSION
 
 __all__ = ["Daemon"]
 
 WATCH_S = 0.25
 STARTED_S = 5.0  # what has not started by then is told as degraded instead
+STARVED_S = 1.0  # a watch that has no turn for so long: neither has anybody else
+LATELY_NS = 1_000_000_000  # how long it is told that it was so, and that the wall clock has jumped
 
 
 class Daemon:
@@ -65,6 +68,8 @@ class Daemon:
         self._degraded: tuple[str, ...] = ()
         self._reloads = self._clock_steps = 0
         self._turns: dict[str, int] = {}  # threads that are no parts: when they last turned
+        self._starved = (0, 0.0)  # when that ended last, CLOCK_MONOTONIC, ns; how long it was, s
+        self._stepped_ns = 0  # when the wall clock last jumped, CLOCK_MONOTONIC
         self._unwatch = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="tactile-rt watch", daemon=True)
         self._ready = [(w, w.make()) for w in wanted_consumers(loaded)]
@@ -154,13 +159,18 @@ class Daemon:
         sources = tuple(p.source_state for p in self._sources.copy().values())
         models = tuple(p.model_state for _, p in self._models.copy().values())
         consumers = tuple(p.consumer_state for _, p in self._consumers.copy().values())
-        lines = degraded(sources, models, consumers)
-        state = "degraded" if lines else "running"
+        now = self._clock.monotonic_ns()
+        found = troubles(
+            sources, models, consumers, self._loaded.config.limits, now, self._starved_s(),
+            bool(self._stepped_ns) and now - self._stepped_ns < LATELY_NS,
+        )  # fmt: skip
+        state = "degraded" if found else "running"
         state = "stopping" if self._stopping else "starting" if self._starting else state
         return Snapshot(
-            VERSION, os.getpid(), str(self._loaded.path), self._clock.monotonic_ns(),
-            self._clock.utc_ns(), self._started_ns, self._reloads, state, lines,
-            self._clock_steps, sources, models, consumers,
+            VERSION, os.getpid(), str(self._loaded.path), now,
+            self._clock.utc_ns(), self._started_ns, self._reloads, state,
+            tuple(trouble.line for trouble in found), self._clock_steps, sources, models, consumers,
+            found,
         )  # fmt: skip
 
     def streams(self) -> Mapping[str, Opened]:
@@ -187,6 +197,16 @@ class Daemon:
     def utc_offset_ns(self) -> int:
         """UTC less monotonic time, now."""
         return self._clock.utc_offset_ns()
+
+    def _starved_s(self) -> float:
+        """How long the whole process had no turn, lately, s."""
+        now = time.monotonic_ns()
+        since = self._turns.get("watch")
+        waiting = (now - since) / 1e9 if since and not self._stopping else 0.0
+        ended_ns, lasted_s = self._starved
+        if waiting > STARVED_S:
+            return waiting
+        return lasted_s if ended_ns and now - ended_ns < LATELY_NS else 0.0
 
     def turned(self, name: str) -> None:
         """A thread that must go on, and is no part, tells that it does."""
@@ -262,13 +282,19 @@ class Daemon:
                 self.report(part.name, "abandoned", "it did not end in time", "error")
 
     def _watch(self) -> None:
+        self.turned("watch")
         while not self._unwatch.wait(WATCH_S):
+            self._notice_starving()
             self.turned("watch")
+            for name, source in self._sources.copy().items():
+                on_it = (p for _, p in self._models.copy().values() if p.config.source == name)
+                source.judge(next((p.sensor for p in on_it if p.sensor is not None), None))
             for part in self._parts():
                 part.watch()
             step = self._clock.stepped_ns()
             if step:
                 self._clock_steps += 1
+                self._stepped_ns = self._clock.monotonic_ns()
                 self.report("daemon", "clock", f"the wall clock jumped by {step / 1e9:+.3f} s")
             if self._starting and self._settled():
                 self._starting = False
@@ -286,6 +312,14 @@ class Daemon:
                 done, self._on_over = self._on_over, None
                 if done is not None:
                     done()
+
+    def _notice_starving(self) -> None:
+        now = time.monotonic_ns()
+        lasted_s = (now - self._turns["watch"]) / 1e9
+        if lasted_s > STARVED_S:
+            self._starved = now, lasted_s
+            why = f"it had no turn for {lasted_s:.1f} s: it was stopped, or the processor was taken"
+            self.report("daemon", "starved", why, "warning")
 
     def _parts(self) -> list[Part]:
         return [

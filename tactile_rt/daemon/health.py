@@ -1,30 +1,32 @@
-"""How the daemon is: all states, counts and latencies at one moment, and what does not work.
+"""How the daemon is: all states, counts, ages and latencies at one moment.
 
 A `Snapshot` is frozen, and `msgspec.json.encode` takes it as it is: the page, the metrics and the
 ``state`` message all tell it. Its counts only ever grow while the daemon runs, also over restarts
-of a part. `degraded` says in words what does not work; `LatencyMeter` measures what takes time.
+of a part. What does not work follows from it, see `tactile_rt.daemon.troubles`; `LatencyMeter`
+measures what takes time.
 """
 
 import bisect
 import threading
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from tactile_rt.bounded_queue import QueueState
-from tactile_rt.drivers.health import Health, State
+from tactile_rt.drivers.health import Health
 from tactile_rt.stream import SourceStats
 
 __all__ = [
     "ConsumerState",
     "Latency",
     "LatencyMeter",
+    "Losses",
     "ModelState",
+    "OnDisk",
     "PartState",
     "QueueState",
     "Snapshot",
     "SourceState",
-    "degraded",
+    "Trouble",
 ]
 
 EDGES_S = (
@@ -32,6 +34,7 @@ EDGES_S = (
     0.5, 1.0, 5.0,
 )  # fmt: skip
 NEWEST = 1000  # measurements that percentiles are taken of
+BREAKS = ("fails", "has failed", "stalls")  # what a part does, not what is the matter with it
 
 
 @dataclass(frozen=True)
@@ -57,12 +60,26 @@ class Latency:
 
 
 @dataclass(frozen=True)
+class Losses:
+    """How much was lost lately of what is counted beside.
+
+    Attributes:
+        second: The number that was lost within the newest second.
+        minute: The number that was lost within the newest minute.
+    """
+
+    second: int = 0
+    minute: int = 0
+
+
+@dataclass(frozen=True)
 class PartState:
     """A supervised part.
 
     Attributes:
         name: The name of the part, as in `Event.part`.
-        state: ``starting``; ``running``; ``stalled``: in a call that does not return; ``waiting``:
+        state: ``starting``; ``running``; ``stalled``: in a call that does not return, also while it
+            starts; ``waiting``:
             it broke and is tried again after a pause; ``failed``: it cannot work as it is
             configured, and is not tried again; ``ended``: its stream is over; ``stopped``.
         reason: The reason why the part is not running, in words.
@@ -92,8 +109,15 @@ class SourceState:
         device: The health of the device; None: there is no device, or it is not open.
         stats: The samples delivered and lost, summed over all times that the source was opened.
         samples: The number of samples read.
-        newest_ns: The time at which the newest sample was read, host CLOCK_MONOTONIC, ns; 0: none
-            was read yet.
+        newest_ns: The time at which the newest sample was taken, host CLOCK_MONOTONIC, ns; of a
+            device whose own clock is kept that at which it came; 0: there is none yet.
+        read_ns: The time at which the newest sample was read, host CLOCK_MONOTONIC, ns.
+        live: Whether samples come whether or not anyone reads them, so that they can be too old.
+        losses: The number of samples that were corrupt, missing or dropped lately.
+        bad: The number of samples that held no number or an absurd one lately, though no element
+            was marked as invalid.
+        frozen_s: The time for which no value has changed though the sensor's noise should change
+            some, s; 0: they change, or nothing is known of the noise.
     """
 
     part: PartState
@@ -108,6 +132,11 @@ class SourceState:
     stats: SourceStats = field(default_factory=SourceStats)
     samples: int = 0
     newest_ns: int = 0
+    read_ns: int = 0
+    live: bool = False
+    losses: Losses = field(default_factory=Losses)
+    bad: Losses = field(default_factory=Losses)
+    frozen_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -128,7 +157,12 @@ class ModelState:
             and 0 before the first one.
         latency: The time from the sample that completed a step to the decision.
         step: The time that the network alone took for a step.
-        late: The number of steps that took longer than they may.
+        decision_age_ms: The age of the newest sample of the newest decision when that decision was
+            there, ms.
+        behind_s: The time that the oldest samples that are not yet classified have waited, s.
+        late: The number of steps that took longer than they may, or whose samples were too old.
+        skips: The number of times that it skipped to the newest sample lately.
+        lost: The number of samples that were dropped from its mailbox lately.
         bad_samples: The number of samples that held what is no number, and were left out.
     """
 
@@ -147,6 +181,39 @@ class ModelState:
     step: Latency = field(default_factory=Latency)
     late: int = 0
     bad_samples: int = 0
+    decision_age_ms: float = 0.0
+    behind_s: float = 0.0
+    skips: Losses = field(default_factory=Losses)
+    lost: Losses = field(default_factory=Losses)
+
+
+@dataclass(frozen=True)
+class OnDisk:
+    """What is on the disk of a source.
+
+    Attributes:
+        written_ns: The host monotonic time of the newest sample that the operating system has, so
+            that it outlives the process, ns; 0 if there is none.
+        synced_ns: The host monotonic time of the newest sample that is on the medium, so that it
+            outlives a power cut, ns; 0 if there is none.
+        samples: The number of samples that are recorded.
+        lost_samples: The number of samples that should have been recorded and are not; those that
+            did not reach the recorder are counted in its queue.
+        lost_ns: The host monotonic time at which samples were lost last, ns; 0 if none were.
+        lost_why: The reason for which samples were lost last; empty if none were.
+        open: Whether a file is open for it.
+        meant: Whether samples are to be recorded now: the source is open, nobody has stopped the
+            recorder, and in the mode ``trigger`` there is a trigger.
+    """
+
+    written_ns: int = 0
+    synced_ns: int = 0
+    samples: int = 0
+    lost_samples: int = 0
+    lost_ns: int = 0
+    lost_why: str = ""
+    open: bool = False
+    meant: bool = False
 
 
 @dataclass(frozen=True)
@@ -160,6 +227,12 @@ class ConsumerState:
         latency: The time from the sample that completed a step to the decision having been
             published.
         details: Whatever the consumer tells of itself, by name.
+        decision_age_ms: The age of the newest sample of the newest decision when that decision had
+            been published, ms.
+        behind_s: The time that the oldest item that is not yet handled has waited, s.
+        losses: The number of items that were dropped from its mailbox, or by itself, lately.
+        trouble: What keeps the consumer from its work now, in words; empty if nothing does.
+        on_disk: What is known of each source's recording, of the recorder alone, by source.
     """
 
     part: PartState
@@ -167,6 +240,35 @@ class ConsumerState:
     queue: QueueState = field(default_factory=QueueState)
     latency: Latency = field(default_factory=Latency)
     details: dict[str, str | int | float] = field(default_factory=dict)
+    decision_age_ms: float = 0.0
+    behind_s: float = 0.0
+    losses: Losses = field(default_factory=Losses)
+    trouble: str = ""
+    on_disk: dict[str, OnDisk] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """A thing that does not work.
+
+    Attributes:
+        part: The name of the part that does not do its work: ``source.NAME``, ``model.NAME``,
+            ``publisher.NAME``, ``recorder``, ``page``, ``metrics``, ``log``, or ``daemon``.
+        what: What is missing, in a few words.
+        why: The reason in words; of a part that breaks what it does, such as ``fails: no port``.
+        still: What goes on all the same; may be empty.
+    """
+
+    part: str
+    what: str
+    why: str
+    still: str = ""
+
+    @property
+    def line(self) -> str:
+        """All of it in one line."""
+        gap = " " if self.why.startswith(BREAKS) else ": "
+        return f"{self.what}: {self.part}{gap}{self.why}{f'; {self.still}' if self.still else ''}"
 
 
 @dataclass(frozen=True)
@@ -184,6 +286,7 @@ class Snapshot:
         degraded: The lines, one for each thing that does not work, with what
             goes on all the same.
         clock_steps: The number of times that the wall clock jumped.
+        troubles: The same things as `degraded`, in their pieces.
         sources, models, consumers: The states of all sources, models and consumers.
     """
 
@@ -200,6 +303,7 @@ class Snapshot:
     sources: tuple[SourceState, ...] = ()
     models: tuple[ModelState, ...] = ()
     consumers: tuple[ConsumerState, ...] = ()
+    troubles: tuple[Trouble, ...] = ()
 
 
 class LatencyMeter:
@@ -237,46 +341,3 @@ class LatencyMeter:
 def _rank(ordered: list[float], share: float) -> float:
     """The smallest value that at least this share of all are not above."""
     return ordered[max(0, -(-len(ordered) * round(1000 * share) // 1000) - 1)]
-
-
-def degraded(
-    sources: Sequence[SourceState],
-    models: Sequence[ModelState],
-    consumers: Sequence[ConsumerState],
-) -> tuple[str, ...]:
-    """One line for each part that does not work. Reasons that count on are left out, so that a
-    line stays the same as long as what it says."""
-    lines = []
-    recording = any(c.kind == "recorder" and c.part.state == "running" for c in consumers)
-    for source in sources:
-        device = source.device
-        if _broken(source.part):
-            lines.append(f"no samples: {_why(source.part)}")
-        elif device is not None and device.state in (State.STALE, State.LOST):
-            lines.append(f"no samples: {source.part.name}: the device is {device.state}")
-    for model in models:
-        if _broken(model.part):
-            goes_on = "recording goes on" if recording else "acquisition goes on"
-            lines.append(f"no decisions: {_why(model.part)}; {goes_on}")
-    for consumer in consumers:
-        if _broken(consumer.part):
-            lines.append(f"{_what(consumer)}: {_why(consumer.part)}; acquisition goes on")
-    return tuple(lines)
-
-
-def _broken(part: PartState) -> bool:
-    # While it is tried again it is not well yet.
-    broken = part.state in ("waiting", "stalled", "failed")
-    return broken or (part.state == "starting" and part.failures > 0)
-
-
-def _why(part: PartState) -> str:
-    if part.state == "stalled":
-        return f"{part.name} stalls"
-    return f"{part.name} {'has failed' if part.state == 'failed' else 'fails'}: {part.reason}"
-
-
-def _what(consumer: ConsumerState) -> str:
-    return {"recorder": "no recording", "page": "no page", "log": "no log"}.get(
-        consumer.kind, "not published" if consumer.part.name.startswith("publisher.") else "missing"
-    )

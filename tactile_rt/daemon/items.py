@@ -15,6 +15,7 @@ __all__ = [
     "Item",
     "Opened",
     "Packet",
+    "Skipped",
     "SourceChunk",
 ]
 
@@ -91,6 +92,7 @@ class Decision:
         sample_ns: The host time of the sample that completed the step, CLOCK_MONOTONIC, ns.
         made_ns: The host time at which the decision was there, CLOCK_MONOTONIC, ns.
         utc_offset_ns: UTC less monotonic time then, ns.
+        deadline_ns: The age of that sample from which the decision is late, ns; 0: there is none.
     """
 
     source: str
@@ -100,6 +102,7 @@ class Decision:
     sample_ns: int
     made_ns: int
     utc_offset_ns: int
+    deadline_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -110,6 +113,31 @@ class Contact:
     model: str
     frame: str
     touching: bool
+    t_ns: int
+    utc_offset_ns: int
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A model skipped a stretch of its stream: it was behind, and goes on at the newest sample.
+
+    Attributes:
+        source, model: The names of the source and of the model in the configuration.
+        frame: The mount frame of the array.
+        from_ns, until_ns: The stream times of the first sample that was skipped, and of the first
+            one that was not, ns.
+        lost: The number of samples of the stretch that did not even reach the model's contact
+            detector: they were dropped from its mailbox.
+        t_ns: The host time at which this was decided, CLOCK_MONOTONIC, ns.
+        utc_offset_ns: UTC less monotonic time then, ns.
+    """
+
+    source: str
+    model: str
+    frame: str
+    from_ns: int
+    until_ns: int
+    lost: int
     t_ns: int
     utc_offset_ns: int
 
@@ -148,4 +176,4 @@ class Control:
     argument: str = ""
 
 
-Item = Opened | Closed | SourceChunk | Packet | Decision | Contact | Event | Control
+Item = Opened | Closed | SourceChunk | Packet | Decision | Contact | Skipped | Event | Control

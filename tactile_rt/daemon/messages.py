@@ -6,6 +6,7 @@ its mount ``frame``. A field is never renamed and never changes its unit within 
 may come.
 """
 
+import time
 from typing import Any, ClassVar, TypeAlias
 from urllib.parse import quote
 
@@ -14,7 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.daemon.health import Snapshot
-from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
+from tactile_rt.daemon.items import (
+    Contact,
+    Decision,
+    Event,
+    Item,
+    Opened,
+    Skipped,
+    SourceChunk,
+)
 
 __all__ = [
     "MESSAGE_VERSION",
@@ -24,6 +33,7 @@ __all__ = [
     "HealthMessage",
     "Message",
     "SamplesMessage",
+    "SkipMessage",
     "StateMessage",
     "encode",
     "message_of",
@@ -74,7 +84,10 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
         model_ms: The time that the network took, ms.
         latency_ms: The time from the sample that completed the step until the decision was there,
             ms.
-        late: Whether the step took longer than it may.
+        age_ms: The age of that sample when the message was written, ms: what reads the message may
+            add the time since, by the computer's own monotonic clock.
+        late: Whether the step took longer than it may, or the sample was older than that when the
+            message was written.
         candidates: The classes that are still possible, the most probable first; empty if the model
             makes no promise.
         coverage: The promise: in this share of touches of known kinds the true class is among the
@@ -90,6 +103,7 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
     probabilities: dict[str, float]
     model_ms: float
     latency_ms: float
+    age_ms: float = 0.0
     late: bool = False
     candidates: tuple[str, ...] = ()
     coverage: float | None = None
@@ -101,6 +115,19 @@ class ContactMessage(_FromSource, frozen=True, tag="contact", kw_only=True):
     topic: ClassVar[str] = "contact"
     model: str
     touching: bool
+
+
+class SkipMessage(_FromSource, frozen=True, tag="skip", kw_only=True):
+    """A model was behind its stream and skipped to the newest sample; it decides nothing about what
+    is between `from_ns` and `until_ns`, the stream times of the first sample that was skipped and
+    of the first one that was not. `lost` samples of them did not even reach its contact detector.
+    """
+
+    topic: ClassVar[str] = "skip"
+    model: str
+    from_ns: int
+    until_ns: int
+    lost: int = 0
 
 
 class HealthMessage(_Message, frozen=True, tag="health", kw_only=True):
@@ -142,10 +169,17 @@ class StateMessage(_Message, frozen=True, tag="state", kw_only=True):
 
 
 Message: TypeAlias = (
-    ArrayMessage | ContactMessage | DecisionMessage | HealthMessage | SamplesMessage | StateMessage
+    ArrayMessage
+    | ContactMessage
+    | DecisionMessage
+    | HealthMessage
+    | SamplesMessage
+    | SkipMessage
+    | StateMessage
 )
 
 _encoder = msgspec.json.Encoder()
+_now_ns = time.monotonic_ns  # to be stopped by a test
 
 
 def encode(message: Message) -> bytes:
@@ -185,6 +219,12 @@ def message_of(item: Item) -> Message | None:
             t_ns=item.t_ns, utc_ns=item.t_ns + item.utc_offset_ns, source=item.source,
             frame=item.frame, model=item.model, touching=item.touching,
         )  # fmt: skip
+    if isinstance(item, Skipped):
+        return SkipMessage(
+            t_ns=item.t_ns, utc_ns=item.t_ns + item.utc_offset_ns, source=item.source,
+            frame=item.frame, model=item.model, from_ns=item.from_ns, until_ns=item.until_ns,
+            lost=item.lost,
+        )  # fmt: skip
     if isinstance(item, Opened):
         return ArrayMessage(
             t_ns=item.t_ns, utc_ns=item.t_ns + item.utc_offset_ns, source=item.source,
@@ -195,6 +235,7 @@ def message_of(item: Item) -> Message | None:
 
 def _decision(item: Decision) -> DecisionMessage:
     d = item.decision
+    age_ns = _now_ns() - item.sample_ns
     return DecisionMessage(
         t_ns=d.t_ns, utc_ns=d.t_ns + item.utc_offset_ns, source=item.source, frame=item.frame,
         model=item.model, onset_ns=d.onset_ns, step=d.step, final=d.final, label=d.label,
@@ -203,7 +244,8 @@ def _decision(item: Decision) -> DecisionMessage:
             for label, p in zip(d.labels, d.probabilities.tolist(), strict=True)
         },
         model_ms=round(1e3 * d.latency_s, 3),
-        latency_ms=round((item.made_ns - item.sample_ns) / 1e6, 3), late=d.late,
+        latency_ms=round((item.made_ns - item.sample_ns) / 1e6, 3), age_ms=round(age_ns / 1e6, 3),
+        late=d.late or (0 < item.deadline_ns < age_ns),
         candidates=d.candidates, coverage=d.coverage,
     )  # fmt: skip
 

@@ -8,14 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.classifier.model_card import sensor_of
 from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.health import LatencyMeter, ModelState
-from tactile_rt.daemon.items import Contact, Decision, Item, Opened, SourceChunk
+from tactile_rt.daemon.items import Contact, Decision, Item, Opened, Skipped, SourceChunk
 from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.part import Part, Report
-from tactile_rt.drivers.device_source import device_of
+from tactile_rt.daemon.source_part import keeps_host_time
+from tactile_rt.daemon.troubles import LossWindow
+from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.stream import (
     NS_PER_S,
     ConfigError,
@@ -28,11 +31,10 @@ from tactile_rt.stream import (
 __all__ = ["ModelPart", "file_stamp", "model_path"]
 
 MODEL_BYTES = 64 << 20
-APART_NS = 60 * NS_PER_S  # a sample's time further from its arrival is of another clock
 
 
 class ModelPart(Part):
-    """Posts `Decision` and `Contact` of one model."""
+    """Posts `Decision`, `Contact` and `Skipped` of one model."""
 
     def __init__(
         self, config: ModelConfig, hub: Hub, report: Report, limits: LimitsConfig, clock: Clock
@@ -49,25 +51,34 @@ class ModelPart(Part):
         self._classifier: Classifier | None = None
         self._refused: tuple[object, TactileError] | None = None
         self._half_ns = 0  # half the resampler's kernel
+        self._deadline_ns = 0
+        self._ahead_ns = 0  # host time less stream time
+        self._last_ns: int | None = None  # stream time of the newest sample that was taken
+        self._dropped = self._hole = 0  # samples that the mailbox has dropped; since that one
         self._sha256 = ""
         self._hashed: tuple[int, ...] = ()
         self._hash()  # a recording tells it from its first byte
         self._labels: tuple[str, ...] = ()
+        self.sensor: SensorSpec | None = None  # what the model was made for, if it tells
         self._decisions = self._final = self._late = self._bad_samples = 0
         self._newest: Classification | None = None
         self._touching = False
         self._latency, self._step = LatencyMeter(), LatencyMeter()
+        self._skips, self._age_s = 0, 0.0
+        self._skipped, self._losses = LossWindow(), LossWindow()
 
     @property
     def model_state(self) -> ModelState:
         """For the snapshot."""
-        newest = self._newest
+        newest, queue = self._newest, self.box.state
         return ModelState(
             self.state, self.config.source, str(self.file), self._sha256, self._labels,
-            self.box.state, self._decisions, self._final, self._touching,
+            queue, self._decisions, self._final, self._touching,
             newest.label if newest else "",
             newest.probability if newest else 0.0,
             self._latency.state, self._step.state, self._late, self._bad_samples,
+            1e3 * self._age_s, max(queue.oldest_s, self.silent_s), self._skipped.add(self._skips),
+            self._losses.add(queue.dropped["samples"]),
         )  # fmt: skip
 
     def stop(self) -> None:
@@ -120,7 +131,8 @@ class ModelPart(Part):
                 self.file, opened.spec, mode=config.mode, every=config.every or None,
                 sure=config.sure or None, in_a_row=config.in_a_row,
                 deadline_s=config.deadline_ms / 1e3 or None, late=config.late,
-                providers=config.providers,
+                providers=config.providers, age=self._age if opened.stream.live else None,
+                catch_up=config.catch_up, behind_s=config.behind_ms / 1e3 or None,
             )  # fmt: skip
         except SpecMismatch as error:
             self._refused = (tried, SpecMismatch(f"source {opened.source}: {error}"))
@@ -130,9 +142,13 @@ class ModelPart(Part):
             raise
         self._opened = opened
         self._labels = self._classifier.card.labels
+        self.sensor = sensor_of(self._classifier.card)
         self._hash()
         card = self._classifier.card
         self._half_ns = max(card.period_ns, round(NS_PER_S / opened.spec.rate_hz))
+        step_ns = card.substeps * card.period_ns
+        self._deadline_ns = round(1e6 * self.config.deadline_ms) or step_ns
+        self._last_ns = None
 
     def _hash(self) -> None:
         """Note the file's hash, anew only if it is another file; loading tells if it is none."""
@@ -143,6 +159,8 @@ class ModelPart(Part):
 
     def _take(self, items: list[Item]) -> None:
         run: list[SourceChunk] = []
+        dropped = self.box.dropped["samples"]  # the oldest: they came before all these
+        self._hole, self._dropped = dropped - self._dropped, dropped
         for item in items:
             if isinstance(item, SourceChunk):
                 run.append(item)
@@ -161,7 +179,11 @@ class ModelPart(Part):
             return
         chunk = concatenate([s.chunk for s in run]) if len(run) > 1 else run[0].chunk
         before = replace(classifier.stats)
+        arrived, newest = run[-1].arrived_ns, int(chunk.t_ns[-1])
+        self._ahead_ns = 0 if keeps_host_time(opened.stream) else arrived - newest
+        lost = self._lost(classifier, int(chunk.t_ns[0]))
         decisions = classifier.push(chunk)
+        self._last_ns = newest
         self._late += classifier.stats.late - before.late
         self._bad_samples += classifier.stats.bad_samples - before.bad_samples
         offset = run[-1].utc_offset_ns
@@ -172,16 +194,44 @@ class ModelPart(Part):
             self._newest = d
             self._decisions += 1
             self._final += d.final
-            self._latency.add((made - sample) / 1e9)
+            self._age_s = (made - sample) / 1e9
+            self._latency.add(self._age_s)
             self._step.add(d.latency_s)
             if d.final or self.config.decisions == "every_step":
                 self._hub.post(
-                    Decision(self.config.source, self.config.name, frame, d, sample, made, offset)
+                    Decision(
+                        self.config.source, self.config.name, frame, d, sample, made, offset,
+                        self._deadline_ns if opened.stream.live else 0,
+                    )
+                )  # fmt: skip
+        self._skips += len(classifier.skips.found)
+        for skip in classifier.skips.found:
+            self._hub.post(
+                Skipped(
+                    self.config.source, self.config.name, frame, skip.from_ns, skip.until_ns, lost,
+                    time.monotonic_ns(), offset,
                 )
+            )  # fmt: skip
+            lost = 0
+        classifier.skips.found.clear()
         self._touch(classifier.detector.contact, int(chunk.t_ns[-1]), frame, offset)
         if not opened.stream.live:
             for box in self._hub.wanted(Decision):
                 box.wait_for_room(1.0)
+
+    def _lost(self, classifier: Classifier, t_ns: int) -> int:
+        """How many samples the mailbox dropped before this one: a stream with a hole, which no
+        network is fed."""
+        lost, self._hole = self._hole, 0
+        if not lost or self._last_ns is None:
+            return 0
+        classifier.skips.add(self._last_ns + 1, t_ns)
+        return lost
+
+    def _age(self, t_ns: int) -> float:
+        """How old the step is whose newest resampled sample has this stream time, s."""
+        end = t_ns + self._half_ns + self._ahead_ns
+        return max(0, time.monotonic_ns() - end) / 1e9
 
     def _completed(self, d: Classification, run: list[SourceChunk], stream: Source) -> int:
         """Host time of the sample that completed a step."""
@@ -191,10 +241,10 @@ class ModelPart(Part):
             if t_ns[-1] < end and samples is not run[-1]:
                 continue
             arrived = samples.arrived_ns
-            if not stream.live or not _host_time(stream):
+            if not stream.live or not keeps_host_time(stream):
                 return arrived
             taken = int(t_ns[min(int(np.searchsorted(t_ns, end)), len(t_ns) - 1)])
-            return taken if 0 <= arrived - taken < APART_NS else arrived
+            return min(taken, arrived)
         return run[-1].arrived_ns
 
     def _touch(self, touching: bool, t_ns: int, frame: str = "", offset: int = 0) -> None:
@@ -204,11 +254,6 @@ class ModelPart(Part):
         if not frame and self._opened is not None:
             frame, offset = self._opened.spec.frame, self._clock.utc_offset_ns()
         self._hub.post(Contact(self.config.source, self.config.name, frame, touching, t_ns, offset))
-
-
-def _host_time(stream: Source) -> bool:
-    device = device_of(stream)
-    return device is None or device.options.clock == "host"
 
 
 def model_path(config: ModelConfig) -> Path:

@@ -65,7 +65,7 @@ class Part(abc.ABC):
         """Now; from any thread."""
         state, reason, since = self._state, self._reason, self._since_ns
         silent = self.silent_s
-        if state == "running" and silent > self.limits.stall_s:
+        if state in ("starting", "running") and silent > self.limits.stall_s:
             state, since = "stalled", time.monotonic_ns() - round(1e9 * silent)
             reason = f"in a call that has not returned for {silent:.0f} s"
         return PartState(self.name, state, reason, since, self._starts, self._failures)

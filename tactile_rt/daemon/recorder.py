@@ -25,6 +25,7 @@ from tactile_rt.daemon.items import (
     Item,
     Opened,
     Packet,
+    Skipped,
     SourceChunk,
 )
 from tactile_rt.daemon.messages import encode, message_of
@@ -101,7 +102,9 @@ class Recorder(Consumer):
         ConfigError: the extra is not installed.
     """
 
-    wants = frozenset({Opened, Closed, SourceChunk, Packet, Decision, Contact, Event, Control})
+    wants = frozenset(
+        {Opened, Closed, SourceChunk, Packet, Decision, Contact, Skipped, Event, Control}
+    )
     gather_s = 0.05
     tick_s = 0.2
 
@@ -184,8 +187,8 @@ class Recorder(Consumer):
         else:
             self._tell(item)
 
-    def _tell(self, item: Decision | Contact | Event) -> None:
-        """A decision or contact goes to its source's file, an event to all."""
+    def _tell(self, item: Decision | Contact | Skipped | Event) -> None:
+        """A decision, contact or skip goes to its source's file, an event to all."""
         message = message_of(item)
         if message is None:
             return

@@ -1,22 +1,27 @@
 """A source in a thread of its own: opened, read, closed, and opened again when it broke."""
 
 import dataclasses
+import math
 import threading
 import time
 from typing import Any
 
+from tactile_rt.classifier.classifier import without_bad_samples
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, SourceConfig
+from tactile_rt.daemon.frozen import FrozenJudge, frozen_after
 from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
+from tactile_rt.daemon.troubles import LossWindow
 from tactile_rt.drivers.device_source import DeviceSource, device_of
 from tactile_rt.drivers.health import Health, State
+from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ArraySpec, EndOfStream, Source, SourceStats
 
-__all__ = ["SourcePart"]
+__all__ = ["SourcePart", "keeps_host_time"]
 
 POLL_S = 0.1  # how soon it notices that it should stop
 LOOK_NS = 50_000_000  # between two looks at a device's health
@@ -24,7 +29,12 @@ AWAY_S = 0.3  # how long a source whose device is away may take to end
 
 
 class SourcePart(Part):
-    """Posts `Opened`, `Packet`, `SourceChunk` and `Closed` of one source."""
+    """Posts `Opened`, `Packet`, `SourceChunk` and `Closed` of one source.
+
+    Args:
+        config: its table.
+        hub, report, limits, clock: of the daemon.
+    """
 
     def __init__(
         self, config: SourceConfig, hub: Hub, report: Report, limits: LimitsConfig, clock: Clock
@@ -36,7 +46,9 @@ class SourcePart(Part):
         self._device: DeviceSource | None = None
         self._spec: ArraySpec | None = None
         self._before = SourceStats()  # of all streams before this one
-        self._samples, self._newest_ns = 0, 0
+        self._samples = self._newest_ns = self._read_ns = self._bad = 0
+        self._frozen = FrozenJudge()
+        self._losses, self._bads = LossWindow(), LossWindow()
         self._offset_ns = 0
         self._look_ns = 0
         self._told: tuple[Any, ...] = ()
@@ -51,7 +63,10 @@ class SourcePart(Part):
         stats = self._before if stream is None else _sum(self._before, stream.stats)
         about = SourceState(
             self.state, self.config.url, device=device.health if device else None, stats=stats,
-            samples=self._samples, newest_ns=self._newest_ns,
+            samples=self._samples, newest_ns=self._newest_ns, read_ns=self._read_ns,
+            live=stream is not None and stream.live,
+            losses=self._losses.add(stats.corrupt + stats.missing + stats.dropped),
+            bad=self._bads.add(self._bad), frozen_s=self._frozen.seconds,
         )  # fmt: skip
         if spec is None:
             return about
@@ -64,6 +79,14 @@ class SourcePart(Part):
     def silent_s(self) -> float:
         """As of every part; but to wait for a device that is away is no silence."""
         return 0.0 if self._away else super().silent_s
+
+    def judge(self, sensor: SensorSpec | None) -> None:
+        """Say what the sensor of a model on this source is, if there is one that tells."""
+        spec, device = self._spec, self._device
+        after_s = self.config.frozen_s
+        if not after_s and spec is not None and device is not None and sensor is not None:
+            after_s = frozen_after(spec, sensor)
+        self._frozen.after_s = after_s or math.inf
 
     def stop(self) -> None:
         self._stopped_s = self._stopped_s or time.monotonic()
@@ -113,7 +136,11 @@ class SourcePart(Part):
             if chunk is None:
                 continue
             self._samples += len(chunk)
-            self._newest_ns = now
+            # A host's time that is ahead of the host would hide for how long nothing came.
+            self._read_ns, taken = now, int(chunk.t_ns[-1])
+            self._newest_ns = min(now, taken) if stream.live and keeps_host_time(stream) else now
+            self._bad += without_bad_samples(chunk)[1]
+            self._frozen.add(chunk)
             self._hub.post(SourceChunk(self.config.name, stream.spec, chunk, now, self._offset_ns))
             if not stream.live:
                 self._await_room()
@@ -189,6 +216,12 @@ class SourcePart(Part):
         for box in self._hub.wanted(SourceChunk):
             self._busy_ns = time.monotonic_ns()
             box.wait_for_room(min(1.0, self.limits.stall_s / 2))
+
+
+def keeps_host_time(stream: Source) -> bool:
+    """Whether a stream's times are host CLOCK_MONOTONIC, and not those of a device's own clock."""
+    device = device_of(stream)
+    return device is None or device.options.clock == "host"
 
 
 def _told(health: Health, before: tuple[Any, ...]) -> str:

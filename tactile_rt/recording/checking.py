@@ -10,10 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.recording.description import Description
 from tactile_rt.settings import parse_toml
-from tactile_rt.stream import NS_PER_S, ConfigError
+from tactile_rt.stream import NS_PER_S, Chunk, ConfigError
 
 __all__ = [
     "FACTS",
@@ -23,6 +25,7 @@ __all__ = [
     "file_of_model",
     "live_model",
     "recorded_models",
+    "samples_given",
 ]
 
 FACTS = ("onset_ns", "step", "t_ns", "final", "label", "probabilities",
@@ -180,6 +183,24 @@ def check_decisions(
     if left and not may_withhold and left[0]["t_ns"] < span_ns[1] - END_NS:
         return Checked(same, before, 0, withheld, f"a decision ({_of(left[0])}) was not recorded")
     return Checked(same, before, len(left), withheld)
+
+
+def samples_given(chunk: Chunk, skips: Sequence[Fields]) -> Chunk | None:
+    """The samples of a chunk that reached the model live; None: no one did.
+
+    Args:
+        chunk: as recorded.
+        skips: as `Recording.skips` gives them; where samples were lost, the model had none of them.
+    """
+    kept = np.ones(len(chunk), bool)
+    for skip in skips:
+        if skip["lost"]:
+            kept &= (chunk.t_ns < skip["from_ns"]) | (chunk.t_ns >= skip["until_ns"])
+    if kept.all():
+        return chunk
+    if not kept.any():
+        return None
+    return Chunk(chunk.seq[kept], chunk.t_ns[kept], chunk.values[kept], chunk.valid[kept])
 
 
 def _of(decision: Fields) -> str:

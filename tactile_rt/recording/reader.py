@@ -90,6 +90,10 @@ class Recording:
         """What changed in the daemon meanwhile: contacts, and states of its parts."""
         return self._decoded(EVENTS, _fields)
 
+    def skips(self, model: str) -> list[dict[str, Any]]:
+        """The stretches that a model skipped as it was behind, fields as in docs/messages.md."""
+        return [e for e in self.events() if e.get("type") == "skip" and e.get("model") == model]
+
     def raw(self, *topics: str) -> Generator[Raw, None, None]:
         """The messages of these channels, undecoded; of none, the file is only checked."""
         from mcap.records import Channel, Message

@@ -150,6 +150,7 @@ def loaded(name):
     return namespace
 
 
+@pytest.mark.usefixtures("still_clock")
 def test_the_mqtt_example_does_as_it_says_to_a_stub(monkeypatch):
     client = mock.MagicMock()
     client.loop_start.return_value = 0
@@ -175,6 +176,7 @@ def test_the_mqtt_example_does_as_it_says_to_a_stub(monkeypatch):
     client.loop_stop.assert_called_once_with()
 
 
+@pytest.mark.usefixtures("still_clock")
 def test_the_ros_2_example_does_as_it_says_to_a_stub(monkeypatch):
     node, text = mock.MagicMock(), mock.MagicMock()
     stubs(

@@ -17,7 +17,16 @@ from foxglove.messages import Log, LogLevel, Timestamp
 from foxglove.websocket import WebSocketServer
 
 from tactile_rt.daemon.consumer import Consumer, View
-from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Item, Opened, SourceChunk
+from tactile_rt.daemon.items import (
+    Closed,
+    Contact,
+    Decision,
+    Event,
+    Item,
+    Opened,
+    Skipped,
+    SourceChunk,
+)
 from tactile_rt.daemon.messages import (
     DecisionMessage,
     HealthMessage,
@@ -59,7 +68,7 @@ class FoxglovePublisher(Consumer):
     """Serves the Foxglove WebSocket protocol (``foxglove.sdk.v1``)."""
 
     Options = FoxgloveOptions
-    wants = frozenset({Opened, Closed, SourceChunk, Decision, Contact, Event})
+    wants = frozenset({Opened, Closed, SourceChunk, Decision, Contact, Skipped, Event})
     tick_s = REPEAT_S
 
     def __init__(self, name: str, options: FoxgloveOptions) -> None:

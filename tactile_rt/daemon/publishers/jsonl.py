@@ -7,7 +7,7 @@ import time
 import msgspec
 
 from tactile_rt.daemon.consumer import Consumer, View
-from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
+from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Skipped, SourceChunk
 from tactile_rt.daemon.messages import Message, encode, message_of, state_message
 
 __all__ = ["JsonlOptions", "JsonlPublisher"]
@@ -41,7 +41,7 @@ class JsonlPublisher(Consumer):
 
     def __init__(self, name: str, options: JsonlOptions) -> None:
         self._options = options
-        wants = {Opened, Decision, Contact, Event}
+        wants = {Opened, Decision, Contact, Skipped, Event}
         self.wants = frozenset(wants | {SourceChunk} if options.samples else wants)
         self.tick_s = options.state_s
         self._handle = -1

@@ -8,7 +8,7 @@ import msgspec
 
 from tactile_rt.daemon.config import is_loopback
 from tactile_rt.daemon.consumer import Consumer, View
-from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, SourceChunk
+from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Skipped, SourceChunk
 from tactile_rt.daemon.messages import Message, message_of, state_message
 
 __all__ = ["Repeated", "Sender", "SenderOptions", "is_port", "tell_exposed"]
@@ -68,7 +68,7 @@ class Sender(Consumer):
 
     def __init__(self, name: str, options: SenderOptions) -> None:
         self.name = name
-        wants = {Opened, Decision, Contact, Event}
+        wants = {Opened, Decision, Contact, Skipped, Event}
         self.wants = frozenset(wants | {SourceChunk} if options.samples else wants)
         self.tick_s = options.state_s
         self._repeated = Repeated(options.state_s)

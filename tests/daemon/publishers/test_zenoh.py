@@ -61,6 +61,7 @@ def heard(session, key):
     return got
 
 
+@pytest.mark.usefixtures("still_clock")
 def test_each_message_comes_under_its_key_expression(peers):
     at = f"tcp/127.0.0.1:{free_port()}"
     publisher = ZenohPublisher("z", ZenohOptions(listen=(at,), state_s=0))

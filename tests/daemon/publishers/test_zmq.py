@@ -58,6 +58,7 @@ def settle(publisher, *sockets):
             pass
 
 
+@pytest.mark.usefixtures("still_clock")
 def test_each_message_comes_with_its_topic_and_as_it_is(subscribe):
     publisher = ZmqPublisher("zmq", ZmqOptions(bind=FREE, samples=True, state_s=0, prefix="r/t"))
     items = [

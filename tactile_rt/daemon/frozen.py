@@ -1,0 +1,78 @@
+"""A device that hangs on one value: its samples come, in time and in order, and say nothing.
+
+A sensor whose noise is above its resolution cannot give the same values twice; one that is coarse
+gives the same ones for as long as it rests. So equal samples are a fault only where the noise is
+known, or somebody says for how long is too long.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.sensor_spec import SensorSpec
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
+
+__all__ = ["FrozenJudge", "frozen_after"]
+
+LEAST_S = 0.25  # a hiccup of a driver that repeats a sample is no device that hangs
+LEAST_PAIRS = 3
+IMPOSSIBLE = 1e-12  # probability
+
+
+class FrozenJudge:
+    """For how long have the values been the same?
+
+    Attributes:
+        after_s: The time for which they may be, s; infinite: for ever, and nothing is looked at.
+        seconds: The time for which no value has changed, s; 0 unless that is longer than it may be.
+    """
+
+    def __init__(self) -> None:
+        self.after_s = math.inf
+        self._last: NDArray[np.float32] | None = None
+        self._since_ns = 0
+        self.seconds = 0.0
+
+    def add(self, chunk: Chunk) -> None:
+        """Take the next samples of the stream."""
+        if math.isinf(self.after_s):
+            self._last, self.seconds = None, 0.0
+            return
+        values = chunk.values.view(np.uint32)  # bits: what is no number is equal to itself, too
+        last, self._last = self._last, values[-1]
+        changed = (values[1:] != values[:-1]).any(axis=(1, 2))
+        first = last is None or last.shape != values[0].shape or bool((values[0] != last).any())
+        if changed.any():
+            self._since_ns = int(chunk.t_ns[1 + int(np.flatnonzero(changed)[-1])])
+        elif first:
+            self._since_ns = int(chunk.t_ns[0])
+        same_s = (int(chunk.t_ns[-1]) - self._since_ns) / NS_PER_S
+        self.seconds = same_s if same_s > self.after_s else 0.0
+
+
+def frozen_after(spec: ArraySpec, sensor: SensorSpec) -> float:
+    """From when on equal samples are impossible, s, by the noise of a sensor; infinite: never.
+
+    Two readings of a channel with white noise of standard deviation s, rounded to steps of q, are
+    equal with a probability of about q / (2 s sqrt(pi)), and at most 1; channels are independent.
+
+    Args:
+        spec: the array, for its elements and rate.
+        sensor: what its channels are.
+    """
+    log_p = 0.0
+    for channel in sensor.channels:
+        s = channel.noise_density * math.sqrt(spec.rate_hz / 2)
+        if not s:
+            continue
+        if not channel.resolution:
+            log_p = -math.inf
+            break
+        log_p += len(spec.elements) * min(
+            0.0, math.log(channel.resolution / (2 * s * math.sqrt(math.pi)))
+        )
+    if not log_p:
+        return math.inf
+    pairs = max(LEAST_PAIRS, math.ceil(math.log(IMPOSSIBLE) / log_p))
+    return max(LEAST_S, pairs / spec.rate_hz)

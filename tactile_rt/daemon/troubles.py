@@ -1,0 +1,209 @@
+"""What the daemon does not do as it should, said from facts at the end of each promise.
+
+That a thread runs says nothing of whether its work is done. So what counts is how old the newest
+sample is, whether it is on the disk, how long what is to be published has waited, and what was lost
+within the newest second; each against a limit of the configuration. `troubles` names them.
+
+What is the consequence of something else is not told besides it: with no samples there are no
+decisions, and while the whole process had no turn none of its parts is to blame.
+
+A trouble is one line that stays the same as long as what it says is true: it holds no number that
+counts on. The numbers are in the snapshot.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Sequence
+
+from tactile_rt.daemon.config import LimitsConfig
+from tactile_rt.daemon.health import (
+    ConsumerState,
+    Losses,
+    ModelState,
+    PartState,
+    SourceState,
+    Trouble,
+)
+from tactile_rt.drivers.health import State
+
+__all__ = ["LossWindow", "troubles"]
+
+NS = 1e9
+MINUTE_S, SECOND_S, LOOK_S = 60.0, 1.0, 0.05
+PERIODS = 3  # of a slow sensor, before a sample of it is old
+
+
+class LossWindow:
+    """How much of a count that only grows was added within the newest second and minute.
+
+    Args:
+        first: the count now.
+    """
+
+    def __init__(self, first: int = 0) -> None:
+        self._lock = threading.Lock()
+        self._seen: deque[tuple[float, int]] = deque([(time.monotonic(), first)])
+
+    def add(self, count: int) -> Losses:
+        """Take the count as it is now; what was added. From any thread."""
+        now = time.monotonic()
+        with self._lock:
+            if now - self._seen[-1][0] >= LOOK_S:  # whoever looks more often is no burden
+                self._seen.append((now, count))
+            while len(self._seen) > 1 and self._seen[1][0] <= now - MINUTE_S:
+                self._seen.popleft()
+            before = minute = self._seen[0][1]
+            for seen, n in reversed(self._seen):
+                before = n
+                if seen <= now - SECOND_S:
+                    break
+        return Losses(count - before, count - minute)
+
+
+def troubles(
+    sources: Sequence[SourceState],
+    models: Sequence[ModelState],
+    consumers: Sequence[ConsumerState],
+    limits: LimitsConfig,
+    now_ns: int,
+    starved_s: float = 0.0,
+    clock_stepped: bool = False,
+) -> tuple[Trouble, ...]:
+    """All that do not do what they promise, in the order of the stream.
+
+    Args:
+        sources, models, consumers: how they are.
+        limits: what is too old.
+        now_ns: when all this is true, host CLOCK_MONOTONIC, ns.
+        starved_s: how long the whole process had no turn, within the newest second, s.
+        clock_stepped: whether the wall clock jumped within the newest second.
+    """
+    found = []
+    if starved_s:
+        why = "it had no turn: it was stopped, or another program took the processor"
+        found.append(Trouble("daemon", "late", why))
+    if clock_stepped:
+        found.append(Trouble("daemon", "UTC has jumped", "the wall clock was set"))
+    for source in sources:
+        found += _of_source(source, limits, now_ns, bool(starved_s))
+    recording = any(c.kind == "recorder" and c.part.state == "running" for c in consumers)
+    on = "recording goes on" if recording else "acquisition goes on"
+    for model in models:
+        found += _of_model(model, limits, on, bool(starved_s))
+    for consumer in consumers:
+        found += _of_consumer(consumer, sources, limits, now_ns, bool(starved_s))
+    return tuple(found)
+
+
+def _of_source(
+    source: SourceState, limits: LimitsConfig, now_ns: int, starved: bool
+) -> list[Trouble]:
+    part, device = source.part, source.device
+    name = part.name
+    if _broken(part):
+        return (
+            [] if starved and part.state == "stalled" else [Trouble(name, "no samples", _why(part))]
+        )
+    if part.state != "running":
+        return []
+    if device is not None and device.state in (State.STALE, State.LOST):
+        return [Trouble(name, "no samples", f"the device is {device.state}")]
+    found = []
+    if source.live and source.newest_ns:
+        most = max(limits.sample_age_s, PERIODS / source.rate_hz)
+        read_s, taken_s = (now_ns - source.read_ns) / NS, (now_ns - source.newest_ns) / NS
+        if read_s > most:
+            found.append(Trouble(name, "no samples", f"none has come for {most:g} s"))
+        elif taken_s > most:
+            why = f"when they come they are older than {most:g} s"
+            found.append(Trouble(name, "late samples", why))
+    if source.frozen_s:
+        why = "the values do not change at all, as no sensor's do: the device hangs"
+        found.append(Trouble(name, "frozen samples", why))
+    if source.losses.second:
+        found.append(Trouble(name, "lost samples", "some did not come, or came damaged"))
+    if source.bad.second:
+        found.append(Trouble(name, "bad samples", "some values are no numbers, or absurd"))
+    return found
+
+
+def _of_model(model: ModelState, limits: LimitsConfig, still: str, starved: bool) -> list[Trouble]:
+    part = model.part
+    if _broken(part):
+        if starved and part.state == "stalled":
+            return []
+        return [Trouble(part.name, "no decisions", _why(part), still)]
+    if part.state != "running":
+        return []
+    if model.behind_s > limits.behind_s and not starved:
+        return [
+            Trouble(
+                part.name, "late decisions", f"it is more than {limits.behind_s:g} s behind", still
+            )
+        ]
+    if model.skips.second:
+        why = "it cannot keep up, and skips to the newest sample"
+        return [Trouble(part.name, "missing decisions", why, still)]
+    if model.lost.second:
+        return [Trouble(part.name, "missing decisions", "it was too slow for its samples", still)]
+    return []
+
+
+def _of_consumer(
+    consumer: ConsumerState,
+    sources: Sequence[SourceState],
+    limits: LimitsConfig,
+    now_ns: int,
+    starved: bool,
+) -> list[Trouble]:
+    part, still = consumer.part, "acquisition goes on"
+    missing = {"recorder": "no recording", "page": "no page", "log": "no log"}.get(
+        consumer.kind, "not published" if part.name.startswith("publisher.") else "missing"
+    )
+    if _broken(part):
+        if starved and part.state == "stalled":
+            return []
+        return [Trouble(part.name, missing, _why(part), still)]
+    if part.state not in ("running", "starting"):
+        return []
+    if consumer.behind_s > limits.behind_s and not starved:
+        why = f"it is more than {limits.behind_s:g} s behind"
+    elif consumer.trouble:
+        why = consumer.trouble
+    elif consumer.losses.second:
+        why = "it was too slow, and some of it was dropped"
+    else:
+        why = "" if starved else _unrecorded(consumer, sources, limits, now_ns)
+    return [Trouble(part.name, missing, why, still)] if why else []
+
+
+def _unrecorded(
+    consumer: ConsumerState, sources: Sequence[SourceState], limits: LimitsConfig, now_ns: int
+) -> str:
+    """What of the sources is not on the disk, in words."""
+    for source in sources:
+        name = source.part.name.partition(".")[2]
+        disk = consumer.on_disk.get(name)
+        if disk is None:
+            continue
+        if disk.lost_ns and now_ns - disk.lost_ns < SECOND_S * NS:
+            return f"samples of {name} are lost: {disk.lost_why}"
+        if not disk.meant or not source.live or not source.read_ns:
+            continue
+        written_ns = max(disk.written_ns, source.part.since_ns, consumer.part.since_ns)
+        if source.read_ns - written_ns > limits.record_age_s * NS:
+            return f"samples of {name} are not on the disk after {limits.record_age_s:g} s"
+    return ""
+
+
+def _broken(part: PartState) -> bool:
+    # While it is tried again it is not well yet.
+    broken = part.state in ("waiting", "stalled", "failed")
+    return broken or (part.state == "starting" and part.failures > 0)
+
+
+def _why(part: PartState) -> str:
+    if part.state == "stalled":
+        return "stalls"
+    return f"{'has failed' if part.state == 'failed' else 'fails'}: {part.reason}"
