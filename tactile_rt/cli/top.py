@@ -168,7 +168,7 @@ def _table(*columns: str) -> Table:
 def _sources(now: "Snapshot", before: "Snapshot | None") -> Table:
     table = _table(
         "SOURCE", "STATE", ">HZ", ">OF", ">SAMPLES", ">MISS", ">BAD", ">DROP", ">DUP",
-        ">AGE MS", "ARRAY",
+        ">LOST/MIN", ">AGE MS", "ARRAY",
     )  # fmt: skip
     old = {s.part.name: s.samples for s in before.sources} if before is not None else {}
     for s in now.sources:
@@ -183,7 +183,7 @@ def _sources(now: "Snapshot", before: "Snapshot | None") -> Table:
         table.add_row(
             _name(s.part), state, rate, f"{s.rate_hz:g}" if s.rate_hz else "", f"{s.samples}",
             _bad(s.stats.missing), _bad(s.stats.corrupt), _bad(s.stats.dropped),
-            f"{s.stats.duplicates}", f"{(now.t_ns - s.newest_ns) / 1e6:.0f}" if s.newest_ns else "",
+            f"{s.stats.duplicates}", _bad(s.losses.minute), f"{(now.t_ns - s.newest_ns) / 1e6:.0f}" if s.newest_ns else "",
             _line(why, "red") if why else _line(shape),
         )  # fmt: skip
     return table
@@ -191,8 +191,8 @@ def _sources(now: "Snapshot", before: "Snapshot | None") -> Table:
 
 def _models(now: "Snapshot", before: "Snapshot | None") -> Table:
     table = _table(
-        "MODEL", "STATE", ">DECISIONS", ">FINAL", ">P50 MS", ">P99", ">MAX", ">STEP", ">DROP",
-        "NEWEST",
+        "MODEL", "STATE", ">DECISIONS", ">FINAL", ">P50 MS", ">P99", ">MAX", ">STEP", ">LATE",
+        ">SKIP", ">DROP", "NEWEST",
     )  # fmt: skip
     for m in now.models:
         newest = _line(f"{m.label} {m.probability:.0%}" if m.label else "")
@@ -202,7 +202,8 @@ def _models(now: "Snapshot", before: "Snapshot | None") -> Table:
             newest = _line(m.part.reason, "red")
         table.add_row(
             _name(m.part), _state(m.part), f"{m.decisions}", f"{m.final}", *_latency(m.latency),
-            f"{m.step.p50_ms:.1f}" if m.step.count else "", _bad(_dropped(m.queue)), newest,
+            f"{m.step.p50_ms:.1f}" if m.step.count else "", _bad(m.late), _bad(m.skipped),
+            _bad(_dropped(m.queue)), newest,
         )  # fmt: skip
     return table
 
@@ -214,7 +215,8 @@ def _consumers(now: "Snapshot", before: "Snapshot | None") -> Table:
     )  # fmt: skip
     for c in now.consumers:
         said = ", ".join(f"{k} {_value(v)}" for k, v in c.details.items() if v != "")
-        tells = _line(c.part.reason, "red") if c.part.reason else _line(said)
+        why = c.part.reason or c.trouble
+        tells = _line(why, "red") if why else _line(said)
         name = c.part.name.removeprefix("publisher.")
         table.add_row(
             name, _state(c.part), f"{c.part.starts}", f"{sum(c.queue.waiting.values())}",

@@ -114,8 +114,9 @@ class SourceState:
         read_ns: The time at which the newest sample was read, host CLOCK_MONOTONIC, ns.
         live: Whether samples come whether or not anyone reads them, so that they can be too old.
         losses: The number of samples that were corrupt, missing or dropped lately.
-        bad: The number of samples that held no number or an absurd one lately, though no element
-            was marked as invalid.
+        bad_samples: The number of samples of one element that held no number, or an absurd one,
+            though the element was not marked as invalid.
+        bad: The number of these lately.
         frozen_s: The time for which no value has changed though the sensor's noise should change
             some, s; 0: they change, or nothing is known of the noise.
     """
@@ -135,6 +136,7 @@ class SourceState:
     read_ns: int = 0
     live: bool = False
     losses: Losses = field(default_factory=Losses)
+    bad_samples: int = 0
     bad: Losses = field(default_factory=Losses)
     frozen_s: float = 0.0
 
@@ -161,7 +163,8 @@ class ModelState:
             there, ms.
         behind_s: The time that the oldest samples that are not yet classified have waited, s.
         late: The number of steps that took longer than they may, or whose samples were too old.
-        skips: The number of times that it skipped to the newest sample lately.
+        skipped: The number of times that it skipped to the newest sample.
+        skips: The number of times that it did so lately.
         lost: The number of samples that were dropped from its mailbox lately.
         bad_samples: The number of samples that held what is no number, and were left out.
     """
@@ -183,6 +186,7 @@ class ModelState:
     bad_samples: int = 0
     decision_age_ms: float = 0.0
     behind_s: float = 0.0
+    skipped: int = 0
     skips: Losses = field(default_factory=Losses)
     lost: Losses = field(default_factory=Losses)
 

@@ -94,6 +94,7 @@ class Metrics(Consumer):
             body = {
                 "state": snapshot.state,
                 "degraded": snapshot.degraded,
+                "troubles": snapshot.troubles,
                 "version": snapshot.version,
                 "uptime_s": (snapshot.t_ns - snapshot.started_ns) / 1e9,
             }
@@ -166,6 +167,10 @@ def _daemon(out: _Text, s: Snapshot) -> None:
         [({"state": x}, x == s.state) for x in STATES],
     )  # fmt: skip
     out.add("degraded_parts", "gauge", "Things that do not work.", [({}, len(s.degraded))])
+    out.add(
+        "trouble", "gauge", "1 for each thing that does not work.",
+        [({"part": t.part, "what": t.what}, 1) for t in s.troubles],
+    )  # fmt: skip
     out.add("config_reloads_total", "counter", "Times it was reloaded.", [({}, s.reloads)])
     out.add("clock_steps_total", "counter", "Jumps of the wall clock.", [({}, s.clock_steps)])
     used = resource.getrusage(resource.RUSAGE_SELF)
@@ -217,8 +222,12 @@ def _sources(out: _Text, s: Snapshot) -> None:
         [({"source": n}, x.rate_hz) for n, x in named],
     )  # fmt: skip
     out.add(
-        "source_newest_sample_age_seconds", "gauge", "Since the newest sample was read.",
+        "source_newest_sample_age_seconds", "gauge", "Since the newest sample was taken.",
         [({"source": n}, (s.t_ns - x.newest_ns) / 1e9) for n, x in named if x.newest_ns],
+    )  # fmt: skip
+    out.add(
+        "source_bad_samples_total", "counter", "Samples of an element that were no number.",
+        [({"source": n}, x.bad_samples) for n, x in named],
     )  # fmt: skip
     devices = [(n, x.device) for n, x in named if x.device is not None]
     out.add(
@@ -254,6 +263,25 @@ def _models(out: _Text, s: Snapshot) -> None:
     out.add(
         "model_contact", "gauge", "Whether there is contact.", [(n, x.touching) for n, x in named]
     )
+    out.add(
+        "model_skips_total", "counter", "Times it was behind and skipped to the newest sample.",
+        [(n, x.skipped) for n, x in named],
+    )  # fmt: skip
+    out.add(
+        "model_late_steps_total",
+        "counter",
+        "Steps that were late.",
+        [(n, x.late) for n, x in named],
+    )
+    out.add(
+        "model_behind_seconds", "gauge", "How long the oldest samples wait to be classified.",
+        [(n, x.behind_s) for n, x in named],
+    )  # fmt: skip
+    out.add(
+        "model_decision_age_seconds", "gauge",
+        "Age of the newest decision's newest sample when the decision was there.",
+        [(n, x.decision_age_ms / 1e3) for n, x in named if x.decisions],
+    )  # fmt: skip
     out.histogram(
         "model_latency_seconds", "From the sample that completes a step to the decision.",
         [(n, x.latency) for n, x in named],
@@ -270,6 +298,16 @@ def _consumers(out: _Text, s: Snapshot) -> None:
         "publish_latency_seconds", "From the sample that completes a step to its publication.",
         [(n, x.latency) for n, x in named if x.latency.count],
     )  # fmt: skip
+    out.add(
+        "consumer_behind_seconds", "gauge", "How long the oldest item waits to be handled.",
+        [(n, x.behind_s) for n, x in named],
+    )  # fmt: skip
+    out.add(
+        "decision_age_seconds", "gauge",
+        "Age of the newest decision's newest sample when it had been published.",
+        [(n, x.decision_age_ms / 1e3) for n, x in named if x.latency.count],
+    )  # fmt: skip
+    _recorded(out, s)
     _queues(out, "consumer_queue", [(n, x.queue) for n, x in named])
     out.add(
         "consumer_detail", "gauge", "What a consumer tells of itself, as it names it.",
@@ -279,6 +317,28 @@ def _consumers(out: _Text, s: Snapshot) -> None:
             for key, value in sorted(x.details.items())
             if not isinstance(value, str)
         ],
+    )  # fmt: skip
+
+
+def _recorded(out: _Text, s: Snapshot) -> None:
+    disks = [({"source": name}, d) for c in s.consumers for name, d in c.on_disk.items()]
+    out.add(
+        "recorded_samples_total", "counter", "Samples that are in a recording.",
+        [(n, d.samples) for n, d in disks],
+    )  # fmt: skip
+    out.add(
+        "recorder_lost_samples_total", "counter", "Samples that should be in a recording.",
+        [(n, d.lost_samples) for n, d in disks],
+    )  # fmt: skip
+    out.add(
+        "recorder_written_sample_age_seconds", "gauge",
+        "Since the newest sample that the system has of the recording, while it is recorded.",
+        [(n, (s.t_ns - d.written_ns) / 1e9) for n, d in disks if d.meant and d.written_ns],
+    )  # fmt: skip
+    out.add(
+        "recorder_synced_sample_age_seconds", "gauge",
+        "Since the newest sample of the recording that is on the medium, while it is recorded.",
+        [(n, (s.t_ns - d.synced_ns) / 1e9) for n, d in disks if d.meant and d.synced_ns],
     )  # fmt: skip
 
 

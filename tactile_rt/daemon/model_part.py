@@ -77,8 +77,8 @@ class ModelPart(Part):
             newest.label if newest else "",
             newest.probability if newest else 0.0,
             self._latency.state, self._step.state, self._late, self._bad_samples,
-            1e3 * self._age_s, max(queue.oldest_s, self.silent_s), self._skipped.add(self._skips),
-            self._losses.add(queue.dropped["samples"]),
+            1e3 * self._age_s, max(queue.oldest_s, self.silent_s), self._skips,
+            self._skipped.add(self._skips), self._losses.add(queue.dropped["samples"]),
         )  # fmt: skip
 
     def stop(self) -> None:

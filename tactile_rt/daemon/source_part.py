@@ -66,7 +66,7 @@ class SourcePart(Part):
             samples=self._samples, newest_ns=self._newest_ns, read_ns=self._read_ns,
             live=stream is not None and stream.live,
             losses=self._losses.add(stats.corrupt + stats.missing + stats.dropped),
-            bad=self._bads.add(self._bad), frozen_s=self._frozen.seconds,
+            bad_samples=self._bad, bad=self._bads.add(self._bad), frozen_s=self._frozen.seconds,
         )  # fmt: skip
         if spec is None:
             return about

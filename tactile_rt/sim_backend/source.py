@@ -45,6 +45,7 @@ CHUNK_SAMPLES: Final = 9
 PACES: Final = ("realtime", "fast")
 TURNS: Final = ("turn_y", "turn_z")
 DRAGGED_SAMPLES = 300  # more, while an object that has passed by still drags a whisker along
+LATEST_NS = 100_000_000  # how far a live simulation may be behind real time
 REST_SAMPLES = 600  # after an object its episode ends and contact is released; before one, a tare
 
 
@@ -57,7 +58,10 @@ def check_pace(pace: str) -> None:
 class PacedSource(Source):
     """What all simulated arrays have in common; implementations give `_simulate`.
 
-    Time is simulated: it starts at the first read, and in real time the reader waits for it.
+    Time is simulated: it starts at the first read, and in real time the reader waits for it. A
+    simulation that is more than 0.1 s behind real time, as the processor was taken from it, stands
+    still for as long as it is behind and goes on from there: samples of the past help nobody. What
+    a device would have measured meanwhile counts as dropped.
 
     Args:
         spec: what the samples are.
@@ -72,6 +76,8 @@ class PacedSource(Source):
         self.live = pace == "realtime"
         self._start_ns: int | None = None
         self._next: Chunk | None = None  # simulated, not yet due
+        self._begun = False
+        self._skipped = 0  # samples that were not simulated in time
         self._closed = False
 
     @abc.abstractmethod
@@ -92,6 +98,8 @@ class PacedSource(Source):
             if self._closed:
                 raise EndOfStream
             self._next = self._simulate(self._start_ns)
+            if self._next is not None and self.live:
+                self._next = self._in_time(self._next)
         chunk = self._next
         if self.live:
             wait = (int(chunk.t_ns[-1]) - time.monotonic_ns()) / NS_PER_S
@@ -106,6 +114,22 @@ class PacedSource(Source):
     def close(self) -> None:
         self._closed = True
         self._next = None
+
+    def _in_time(self, chunk: Chunk) -> Chunk:
+        """The chunk at a time that is not long past, numbered as if none had been left out."""
+        assert self._start_ns is not None
+        behind_ns = time.monotonic_ns() - int(chunk.t_ns[-1])
+        shift_ns = 0
+        if not self._begun:  # the first samples may wait for code to be compiled
+            self._begun, shift_ns = True, max(0, behind_ns)
+            self._start_ns += shift_ns
+        elif behind_ns > LATEST_NS:
+            lost = round(behind_ns * self.spec.rate_hz / NS_PER_S)
+            shift_ns = round(lost * NS_PER_S / self.spec.rate_hz)
+            self._start_ns += shift_ns
+            self._skipped += lost
+            self.stats.dropped += lost
+        return Chunk(chunk.seq + self._skipped, chunk.t_ns + shift_ns, chunk.values, chunk.valid)
 
 
 @dataclass(frozen=True)

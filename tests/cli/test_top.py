@@ -22,12 +22,12 @@ SHOWN = """\
 tactile_rt 1.2.3 degraded  up 0:00:10  pid 77  reloaded 1x  clock stepped 2x  /etc/robot.toml
   no samples: source.finger: the device is lost
 
-SOURCE    STATE        HZ    OF  SAMPLES  MISS  BAD  DROP  DUP  AGE MS  ARRAY
-whiskers  streaming  1000  1000     7000     3    4     2    1       4  2 x 3 mouse
-finger    lost          0   110        0     0    0     0    0          unplugged
+SOURCE    STATE        HZ    OF  SAMPLES  MISS  BAD  DROP  DUP  LOST/MIN  AGE MS  ARRAY
+whiskers  streaming  1000  1000     7000     3    4     2    1         0       4  2 x 3 mouse
+finger    lost          0   110        0     0    0     0    0         0          unplugged
 
-MODEL     STATE    DECISIONS  FINAL  P50 MS  P99  MAX  STEP  DROP  NEWEST
-whiskers  running         40      4     5.0  9.5  9.5   5.0     2  mug 93% touching
+MODEL     STATE    DECISIONS  FINAL  P50 MS  P99  MAX  STEP  LATE  SKIP  DROP  NEWEST
+whiskers  running         40      4     5.0  9.5  9.5   5.0     0     0     2  mug 93% touching
 
 CONSUMER  STATE         STARTS  WAIT  TAKEN  DROP  P50 MS  P99  MAX  TELLS
 zmq       running            1     1      9     2     5.0  9.5  9.5  end\

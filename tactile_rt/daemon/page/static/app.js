@@ -310,11 +310,12 @@ function figures(s, now) {
     const gone = corrupt + missing + dropped;
     const rate = then ? (here.samples - then.samples) / ((s.t_ns - before.t_ns) / 1e9) : NaN;
     tiles.push(["Samples per second", Number.isFinite(rate) ? rate.toFixed(0) : "–"]);
-    tiles.push(["Lost samples", `${gone} (${percent(gone, gone + delivered)})`, gone > 0,
+    const late = here.losses.minute ? `, ${here.losses.minute} in a minute` : "";
+    tiles.push(["Lost samples", `${gone} (${percent(gone, gone + delivered)})${late}`, here.losses.minute > 0,
       `missing ${missing}, corrupt ${corrupt}, dropped ${dropped}, duplicates ${duplicates}`]);
     tiles.push(["Newest sample", here.newest_ns
       ? `${((s.t_ns - here.newest_ns) / 1e6).toFixed(0)} ms ago` : "none yet",
-    here.newest_ns > 0 && s.t_ns - here.newest_ns > 1e9]);
+    s.troubles.some((t) => t.part === here.part.name && t.what !== "lost samples"), "since it was taken"]);
   }
   if (now) {
     const { p50_ms, p99_ms, count } = now.latency;
@@ -355,12 +356,14 @@ function parts(s) {
     lines.push([c.part, [...gone, ...about].join(", ")]);
   }
   $("parts").replaceChildren(...lines.map(([part, about, worry]) => {
-    const row = make("tr"), state = make("td", part.state);
-    const good = part.state === "running" && !worry;
+    const trouble = s.troubles.find((t) => t.part === part.name);
+    const row = make("tr"), state = make("td", trouble && part.state === "running" ? trouble.what : part.state);
+    const good = part.state === "running" && !worry && !trouble;
     state.className = "dot " + (good ? "good" : ["waiting", "stalled", "failed"].includes(part.state) ? "bad" : "warn");
     const again = part.failures ? `broke ${part.failures} ×` : "";
+    const why = part.state === "running" ? trouble && trouble.why : part.reason;
     row.append(make("td", part.name.replace(".", " ")), state,
-      make("td", [part.state === "running" ? "" : part.reason, again, about].filter(Boolean).join("; ")));
+      make("td", [why, again, about].filter(Boolean).join("; ")));
     return row;
   }));
 }
@@ -369,7 +372,7 @@ function recording(recorder) {
   $("recording").hidden = $("recorder-chip").hidden = !recorder;
   if (!recorder) return;
   const d = recorder.details;
-  const on = recorder.part.state === "running" && d.recording > 0;
+  const on = recorder.part.state === "running" && d.recording > 0 && !recorder.trouble;
   $("recorder-chip").textContent = on ? "recording" : d.state === "on" ? "recorder waits" : `recorder ${d.state || recorder.part.state}`;
   $("recorder-chip").className = "chip " + (on ? "bad" : d.state === "disk full" ? "warn" : "");
   $("recording-state").textContent = `${on ? "Recording" : "Not recording"} (mode ${d.mode}), ${d.megabytes} MB in ${d.files} ${d.files === 1 ? "file" : "files"}, ${d.lost_samples} samples lost. ${d.newest ? "Newest: " + d.newest : ""}`;
