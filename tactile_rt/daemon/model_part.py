@@ -31,6 +31,7 @@ from tactile_rt.stream import (
 __all__ = ["ModelPart", "file_stamp", "model_path"]
 
 MODEL_BYTES = 64 << 20
+BEGINNING_NS = 60 * NS_PER_S  # more than waits for a model that is still being loaded
 
 
 class ModelPart(Part):
@@ -223,9 +224,9 @@ class ModelPart(Part):
         """How many samples the mailbox dropped before this one: a stream with a hole, which no
         network is fed."""
         lost, self._hole = self._hole, 0
-        if not lost or self._last_ns is None:
-            return 0
-        classifier.skips.add(self._last_ns + 1, t_ns)
+        if lost:
+            first = t_ns - BEGINNING_NS if self._last_ns is None else self._last_ns + 1
+            classifier.skips.add(first, t_ns)
         return lost
 
     def _age(self, t_ns: int) -> float:

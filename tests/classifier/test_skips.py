@@ -1,0 +1,144 @@
+"""A model that falls behind skips to the newest sample, and never sees a stream with a hole."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+pytest.importorskip("onnx")
+
+from tactile_rt.classifier.classifier import BEHIND_S, Classification, Classifier
+from tactile_rt.classifier.exits import Deadline
+from tactile_rt.classifier.skips import Skip, Skips
+from tactile_rt.stream import ConfigError
+from tests.helpers.tiny_model import PERIOD_NS, STEPS, SUBSTEPS, write_model
+from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, signal, stream
+
+TOUCHES = [(start, start + 60, 1.0) for start in range(QUIET, 900, 110)]
+VALUES = signal(TOUCHES, 950)
+FACTS = ("onset_ns", "t_ns", "step", "final", "label", "candidates", "coverage")
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_model(tmp_path_factory.mktemp("model") / "tiny.onnx")
+
+
+def same(a: list[Classification], b: list[Classification]) -> bool:
+    facts = [[tuple(getattr(d, f) for f in FACTS) for d in which] for which in (a, b)]
+    return facts[0] == facts[1] and all(
+        np.array_equal(x.probabilities, y.probabilities) for x, y in zip(a, b, strict=True)
+    )
+
+
+class Ages:
+    """How old samples are, as a script says: each look takes the next."""
+
+    def __init__(self, ages: list[float]) -> None:
+        self.ages, self.looks = ages, 0
+
+    def __call__(self, t_ns: int) -> float:
+        self.looks += 1
+        return self.ages[self.looks % len(self.ages)]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    ages=st.lists(
+        st.sampled_from([0.0, 0.0, 0.0, 0.01, 0.14, 0.151, 0.3, 1.0, 2.5]), min_size=3, max_size=40
+    ),
+    mode=st.sampled_from(["episode", "sliding"]),
+    samples=st.integers(1, 40),
+)
+def test_what_was_skipped_live_and_is_skipped_again_gives_the_same_decisions(
+    model: Path, ages: list[float], mode: str, samples: int
+) -> None:
+    live = Classifier(
+        model, SAME_RATE, mode=mode, age=Ages(ages), catch_up="newest", behind_s=BEHIND_S
+    )
+    decisions = push_all(live, stream(VALUES))
+    skips = list(live.skips.found)
+    again = Classifier(model, SAME_RATE, mode=mode, skips=skips)
+    assert same(push_all(again, stream(VALUES, samples)), decisions)
+    assert again.stats.skips <= live.stats.skips == len(skips)
+    for d in decisions:
+        assert not any(s.from_ns <= d.t_ns < s.until_ns for s in skips)
+        # the network has taken every step of the episode, and none of a skip
+        taken = d.t_ns - d.onset_ns + PERIOD_NS
+        assert taken == d.step * SUBSTEPS * PERIOD_NS or mode == "sliding"
+        assert not any(d.onset_ns <= s.from_ns <= d.t_ns for s in skips)
+
+
+def test_who_is_never_behind_decides_as_if_nobody_looked(model: Path) -> None:
+    watched = Classifier(model, SAME_RATE, age=lambda t_ns: 0.149, catch_up="newest")
+    plain = Classifier(model, SAME_RATE)
+    decisions = push_all(plain, stream(VALUES))
+    assert same(push_all(watched, stream(VALUES)), decisions) and watched.stats.skips == 0
+    assert len(decisions) == STEPS * len(TOUCHES)
+
+
+def test_a_late_episode_ends_and_the_next_onset_begins_one(model: Path) -> None:
+    """Behind once, in the second touch: its later steps are missing, and no other decision."""
+    plain = push_all(Classifier(model, SAME_RATE), stream(VALUES))
+    second = [d for d in plain if d.onset_ns == plain[STEPS].onset_ns]
+    at = second[1].t_ns
+
+    def age(t_ns: int) -> float:
+        return 0.2 if t_ns == at else 0.0
+
+    live = Classifier(model, SAME_RATE, age=age, catch_up="newest")
+    decisions = push_all(live, stream(VALUES))
+    assert live.skips.found == [Skip(at, at + 200_000_000)] and live.stats.skips == 1
+    assert same(decisions, [d for d in plain if d not in second[1:]])
+
+
+def test_all_computes_every_step_and_marks_what_is_late(model: Path) -> None:
+    old = Classifier(model, SAME_RATE, age=lambda t_ns: 3.0, catch_up="all")
+    plain = push_all(Classifier(model, SAME_RATE), stream(VALUES))
+    decisions = push_all(old, stream(VALUES))
+    assert same(decisions, plain) and all(d.late for d in decisions)
+    assert not any(d.late for d in plain) and old.stats.late == old.stats.steps
+
+
+def test_windows_that_slide_go_on_within_a_contact(model: Path) -> None:
+    values = signal([(QUIET, 600, 1.0)], 650)
+    plain = push_all(Classifier(model, SAME_RATE, mode="sliding", every=1), stream(values))
+    middle = plain[len(plain) // 2].t_ns
+    skips = [Skip(middle, middle + 30 * PERIOD_NS)]
+    found = push_all(
+        Classifier(model, SAME_RATE, mode="sliding", every=1, skips=skips), stream(values)
+    )
+    after = [d for d in found if d.t_ns >= skips[0].until_ns]
+    assert after and after[0].onset_ns >= skips[0].until_ns and after[0].coverage is None
+    assert abs(after[-1].t_ns - plain[-1].t_ns) < SUBSTEPS * PERIOD_NS
+
+
+def test_a_step_that_would_be_late_is_not_begun() -> None:
+    skips = Skips(most_s=0.15, age=lambda t_ns: 0.1)
+    assert not skips.before_step(10)  # what a step takes is not known yet
+    for _ in range(50):
+        assert not skips.after_step(10, 0.06)
+    assert skips.before_step(20) and skips.found == [Skip(20, 20 + 100_000_000)]
+    assert skips.covers(20) and skips.covers(100_000_019) and not skips.covers(100_000_020)
+
+
+def test_one_slow_step_does_not_silence_a_model_for_ever() -> None:
+    age = [0.0]
+    skips = Skips(most_s=0.15, age=lambda t_ns: age[0])
+    skips.after_step(1, 60.0)
+    assert not skips.before_step(2)  # fresh samples are tried
+    age[0] = 0.02
+    assert skips.before_step(3)
+
+
+def test_age_makes_a_step_late_as_work_does() -> None:
+    assert not Deadline(0.1, age=lambda t_ns: 0.1).missed(0, 0.01)
+    assert Deadline(0.1, age=lambda t_ns: 0.1001).missed(0, 0.01)
+    assert Deadline(0.1, age=lambda t_ns: 0.0).missed(0, 0.1001)
+
+
+def test_an_unknown_way_to_catch_up_is_refused(model: Path) -> None:
+    with pytest.raises(ConfigError, match="catch_up: 'oldest'; it can be newest, all"):
+        Classifier(model, SAME_RATE, catch_up="oldest")  # type: ignore[arg-type]
