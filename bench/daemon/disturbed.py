@@ -4,6 +4,7 @@ import os
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,6 +71,7 @@ class DisturbedDaemon:
 
     Args:
         before: called in the daemon's process before it becomes the daemon.
+        prepare: called with the path of the model of ``whiskers`` before the daemon is started.
 
     Attributes:
         folder: The folder of the daemon's files.
@@ -80,8 +82,10 @@ class DisturbedDaemon:
         pipe: Descriptor from which the lines of the jsonl publisher can be read, some 200 kB/s.
     """
 
-    def __init__(self, before: Any = None) -> None:
-        self._before = before
+    def __init__(
+        self, before: Any = None, prepare: Callable[[Path], None] = lambda path: None
+    ) -> None:
+        self._before, self._prepare = before, prepare
         self._stack = ExitStack()
         self._told: list[DaemonEvent] = []
         self._over = threading.Event()
@@ -97,6 +101,7 @@ class DisturbedDaemon:
         specs = {"whiskers": whisker_array(), "finger": finger_array()}
         self.model = self.folder / "wide.onnx"
         write_wide_model(self.model, specs["whiskers"])
+        self._prepare(self.model)
         self.arrays = {
             name: stack.enter_context(
                 Helper(play, ArrayScript(

@@ -49,7 +49,7 @@ def show(records: list[Record], console: Console) -> None:
     table.columns[0].overflow = "fold"  # a name is one long word
     for column in table.columns[1:]:
         column.no_wrap = True
-    marks = {True: "[green]yes[/]", False: "[bold red]NO[/]", None: ""}
+    marks = {True: "[green]yes[/]", False: "[bold red]MISSED[/]", None: ""}
     for r in records:
         how = "; ".join(part for part in (r.anchor, r.how) if part)
         figure = f"[bold]{escape(r.name)}[/]\n[dim]{escape(how)}[/]"
