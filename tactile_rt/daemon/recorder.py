@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from tactile_rt.daemon.config import RecorderConfig
@@ -31,6 +32,7 @@ from tactile_rt.daemon.items import (
 )
 from tactile_rt.daemon.ledger import Ledger, OnDisk
 from tactile_rt.daemon.messages import encode, message_of
+from tactile_rt.files import sync_folder
 from tactile_rt.recording.description import describe
 from tactile_rt.recording.layout import (
     DECISIONS,
@@ -119,7 +121,6 @@ class Recorder(Consumer):
         self._folder = Path(config.folder)
         self._tracks: dict[str, _Track] = {}
         self._ledgers: dict[str, Ledger] = {}
-        self._syncer: Syncer | None = None
         self._on = True
         self._state, self._why = "on", ""  # of the disk
         self._files = self._bytes = 0
@@ -129,8 +130,8 @@ class Recorder(Consumer):
 
     def open(self, view: View) -> None:
         self._view = view
-        self._folder.mkdir(parents=True, exist_ok=True)
         self._syncer = Syncer()
+        self._make_folder(parents=True)
         with os.scandir(self._folder) as found:  # a pipe or a dead mount is not even looked at
             files = sorted(f.name for f in found if f.is_file(follow_symlinks=False))
         cut = [f for f in files if f.endswith(".mcap") and not is_finished(self._folder / f)]
@@ -167,10 +168,8 @@ class Recorder(Consumer):
                 self._end(name)
         finally:
             self._tracks.clear()
-            if self._syncer is not None:
-                self._syncer.close()
-                self._syncer = None
-                self._settle()
+            self._syncer.close()
+            self._settle()
 
     def on_disk(self) -> Mapping[str, OnDisk]:
         """What of each source that was ever open is on the disk; from any thread, at once."""
@@ -344,6 +343,12 @@ class Recorder(Consumer):
         file, track.file = track.file, None
         if file is None:
             return
+        if file.whereabouts() == "deleted":
+            why = f"{file.path} was deleted while it was written"
+            samples, packets = file.disown(Extent())
+            self._count_lost(track, samples, packets, why)
+            self._view.report(self._name, "running", f"{why}: {samples} samples are lost", "error")
+            finish, told = False, True
         try:
             file.close(finish)
         except OSError as error:
@@ -385,7 +390,16 @@ class Recorder(Consumer):
                 elif self._on and (self._config.mode == "always" or track.until_ns):
                     self._start_file(track)  # there is room again
                 continue
-            if not self._is_there(track, file) or not self._sync(track, sync):
+            where = file.whereabouts()
+            if where == "moved":
+                self._view.report(
+                    self._name, "running", f"{file.path} was moved while it was written: another "
+                    "file is begun", "warning",
+                )  # fmt: skip
+            if where != "there":
+                self._rotate(track)
+                continue
+            if not self._sync(track, sync):
                 continue
             if self._state == "disk full" and self._why:
                 self._finish_file(track)
@@ -393,24 +407,6 @@ class Recorder(Consumer):
                 self._finish_file(track)
             elif track.rotation.is_due(file):
                 self._rotate(track)
-
-    def _is_there(self, track: _Track, file: RecordingWriter) -> bool:
-        """Whether the file is still where it was; else another one is begun."""
-        what = file.whereabouts()
-        if what == "there":
-            return True
-        why = f"{file.path} was {what} while it was written"
-        samples = 0
-        if what == "deleted":
-            samples, packets = file.disown(Extent())
-            self._count_lost(track, samples, packets, why)
-        self._finish_file(track, finish=what == "moved", told=True)
-        self._view.report(
-            self._name, "running", f"{why}: {samples} samples are lost; recording goes on in "
-            f"another file of {self._folder}", "error" if what == "deleted" else "warning",
-        )  # fmt: skip
-        self._start_file(track)
-        return False
 
     def _sync(self, track: _Track, sync: bool = True) -> bool:
         """Flush, at least; whether that could be done, and the sync before."""
@@ -440,11 +436,19 @@ class Recorder(Consumer):
                 if track is not None:
                     track.lost = track.lost[0] + samples, track.lost[1] + packets
 
+    def _make_folder(self, parents: bool) -> None:
+        """Unless it is there; a power cut does not take it then."""
+        made = [f for f in (self._folder, *self._folder.parents) if not f.exists()]
+        self._folder.mkdir(parents=parents, exist_ok=True)
+        for folder in made:
+            self._syncer.add(partial(_sync_name, folder))
+
     def _room(self) -> bool:
         """Whether there is a folder, with room; told when that changes."""
         state, why = "on", ""
         try:
-            self._folder.mkdir(exist_ok=True)  # it may have been deleted
+            # Deleted, perhaps; a parent that is gone, too, may be the place of a medium that is.
+            self._make_folder(parents=False)
             free = shutil.disk_usage(self._folder).free / MB
         except OSError as error:
             state, why = "no folder", _words(self._folder, error)
@@ -477,6 +481,11 @@ class Recorder(Consumer):
             kept = file.flushed if file.failed is None else file.synced
             self._count_lost(track, *file.disown(kept), why)
             self._finish_file(track, finish=file.failed is None, told=True)
+
+
+def _sync_name(folder: Path) -> None:
+    with suppress(OSError):  # what is wrong with the disk, its files will tell
+        sync_folder(folder.parent)
 
 
 def _words(path: Path, error: OSError) -> str:

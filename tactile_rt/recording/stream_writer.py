@@ -5,6 +5,7 @@ source --> push ----+
 device --> tap -----+                                (or one after another)
 """
 
+import errno
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -167,6 +168,11 @@ class StreamWriter:
         self._queue.close()
         writer = self._counted()
         try:
+            if self._error is None:
+                _check_there(writer)
+        except OSError as error:
+            self._error = error
+        try:
             writer.close(finish=self._error is None)
         except OSError as error:  # also what is still buffered may find no room
             self._error = self._error or error
@@ -254,8 +260,7 @@ class StreamWriter:
             writer.sync()
         else:
             writer.flush()
-        if writer.whereabouts() == "deleted":
-            raise OSError("deleted while it was written")
+        _check_there(writer)
         for file in (*self._past, writer):
             if file.failed is not None:
                 raise file.failed
@@ -276,6 +281,11 @@ class StreamWriter:
         writer.stats.dropped_samples = dropped[SAMPLES] - past.dropped_samples
         writer.stats.dropped_packets = dropped[WIRE] - past.dropped_packets
         return writer
+
+
+def _check_there(writer: RecordingWriter) -> None:
+    if writer.whereabouts() == "deleted":
+        raise OSError(errno.ENOENT, "deleted while it was written")
 
 
 def _measure(entry: Entry) -> tuple[str, int, int]:
