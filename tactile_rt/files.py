@@ -1,14 +1,58 @@
-"""Files and folders that are there whole or not at all."""
+"""Files and folders that are there whole or not at all, and files that are none."""
 
+import errno
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["whole_folder", "write_whole"]
+__all__ = ["open_regular", "sync_folder", "whole_folder", "write_whole"]
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a file to read. A pipe, socket or device is refused, and never waited for.
+
+    Raises:
+        OSError: it is no file, or cannot be read.
+    """
+    _check_regular(path, os.stat(path))  # opening a device may do something to it
+    file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb")
+    try:
+        _check_regular(path, os.fstat(file.fileno()))  # nor what has come in its place since
+    except OSError:
+        file.close()
+        raise
+    return file
+
+
+def _check_regular(path: Path, status: os.stat_result) -> None:
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(errno.EINVAL, "a pipe, socket or device, no file", str(path))
+
+
+def sync_folder(folder: Path) -> None:
+    """Put the names of a folder's files on the medium; without it a power cut may take them.
+
+    Raises:
+        OSError: the medium failed, or there is no such folder.
+    """
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except PermissionError:  # who may write into a folder need not be allowed to read it
+        return
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # a file system that knows no such thing
+            raise
+    finally:
+        os.close(handle)
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:

@@ -47,7 +47,7 @@ class Killed:
 
     Attributes:
         after_s: Time from the first sample that the device sent to the kill, s.
-        lost_s: Age at the kill of the first sample that is lost, s; 0: none is.
+        lost_s: Age at the kill of the first sample that is lost, wherever it is, s; 0: none is.
         files: Number of files that the recording has.
         cut: Number of files that had no end.
         unreadable: Files that, recovered, the MCAP library's own reader does not read to their end.
@@ -120,7 +120,11 @@ def records_of(found: Sequence[Killed]) -> list[Record]:
 
 
 def killed_once(
-    folder: Path, moment: Callable[[DaemonProcess], object], rotate_s: float = 0
+    folder: Path,
+    moment: Callable[[DaemonProcess], object],
+    rotate_s: float = 0,
+    environment: Mapping[str, str] | None = None,
+    left: Callable[[Path], Path] | None = None,
 ) -> Killed:
     """Start a daemon, kill it, and look.
 
@@ -128,6 +132,8 @@ def killed_once(
         folder: for its files.
         moment: called when the first samples are recorded; returns when it is to be killed.
         rotate_s: when the next file begins; 0: never.
+        environment: of the daemon.
+        left: makes of the folder of the recordings one of what is left; None: it is that.
 
     Raises:
         TimeoutError, EOFError: the daemon does not record.
@@ -138,7 +144,7 @@ def killed_once(
     script = ArrayScript("serial", spec, SAMPLES)
     with EmulatedArray(script, signal) as device:
         text = CONFIGURATION.format(url=device.url, rotate_s=rotate_s, port=port)
-        with DaemonProcess(folder, text, port) as daemon:
+        with DaemonProcess(folder, text, port, environment=environment) as daemon:
             daemon.await_state(_recording, every_s=0.01)
             moment(daemon)
             killed_ns = time.monotonic_ns()
@@ -148,7 +154,10 @@ def killed_once(
     sent = np.flatnonzero(
         (played.fate == Fate.SENT) & (played.at_ns > 0) & (played.at_ns < killed_ns)
     )
-    return _looked_at(folder / "recordings", killed_ns, signal, sent, played.at_ns)
+    recordings = folder / "recordings"
+    return _looked_at(
+        left(recordings) if left is not None else recordings, killed_ns, signal, sent, played.at_ns
+    )
 
 
 def _recording(state: Mapping[str, Any]) -> bool:
@@ -203,7 +212,7 @@ def _looked_at(
         there = whole.seq - whole.seq[0] + begin
         wrong += int((signal[there] != whole.values).any(axis=(1, 2)).sum())
     end = int(there[-1]) if len(there) else -1
-    lost = sent[sent > end]
+    lost = np.setdiff1d(sent, there)
     return Killed(
         (killed_ns - int(at_ns[sent[0]])) / 1e9,
         (killed_ns - int(at_ns[lost[0]])) / 1e9 if len(lost) else 0.0,

@@ -32,6 +32,10 @@ def record(
     rotate_s: Annotated[
         float, typer.Option(min=0, help="Go on in a new file after so many seconds.")
     ] = 0,
+    sync_s: Annotated[
+        float,
+        typer.Option(min=0, help="What a power cut may take, s; 0: all that is not written yet."),
+    ] = 1.0,
     force: Force = False,
 ) -> None:
     """Record a source's samples and, of a device, its raw packets and health.
@@ -56,7 +60,7 @@ def record(
         opened,
         StreamWriter(
             output, opened, url=source, session=session, force=force,
-            rotate_mb=rotate_mb, rotate_s=rotate_s,
+            rotate_mb=rotate_mb, rotate_s=rotate_s, sync_s=sync_s,
         ) as writer,
         leaving(seconds),
     ):  # fmt: skip

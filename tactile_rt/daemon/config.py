@@ -129,6 +129,8 @@ class RecorderConfig(_Table, frozen=True, kw_only=True):
         rotate_mb: Size at which a new file begins, MB; 0 for never.
         rotate_s: Age at which a new file begins, s; 0 for never.
         min_free_mb: Free space below which nothing is recorded, MB.
+        sync_s: Time between two syncs of a file, which put it on the medium so that it outlives a
+            power cut, s; 0 to sync it only at its end.
         mode: ``always`` records all samples; ``trigger`` only those around contacts and faults.
         before_s: Time before a trigger that is kept, s.
         after_s: Time after a trigger that is kept, s.
@@ -138,6 +140,7 @@ class RecorderConfig(_Table, frozen=True, kw_only=True):
     rotate_mb: Megabytes = 512.0
     rotate_s: Seconds = 3600.0
     min_free_mb: Megabytes = 1024.0
+    sync_s: Annotated[float, msgspec.Meta(ge=0, le=3600)] = 1.0
     mode: Literal["always", "trigger"] = "always"
     before_s: Annotated[float, msgspec.Meta(ge=0, le=600)] = 10.0
     after_s: Annotated[float, msgspec.Meta(ge=0, le=600)] = 5.0
@@ -287,6 +290,7 @@ options = { samples = false }  # file: default standard output; state_s: how oft
 # rotate_mb = 512              # a new file after so much; 0: never
 # rotate_s = 3600
 # min_free_mb = 1024           # with less free space nothing is recorded
+# sync_s = 1                   # what a power cut may take; 0: all that the system has not written
 # mode = "always"              # or "trigger": around contacts and faults
 # before_s = 10
 # after_s = 5

@@ -4,14 +4,17 @@
 
 A file holds samples, raw packets, decisions, health and events of one source, and in its metadata
 the configuration in force and the hash of every model. Whatever ends the process, `tactile-rt
-recover` gets back all but the last moment; files that were left so are named when the recorder
-begins.
+recover` gets back all but the last moment, and after a power cut all but the last second or so;
+files that were left so are named when the recorder begins.
 """
 
+import os
 import shutil
 import time
 from collections import deque
+from collections.abc import Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 from tactile_rt.daemon.config import RecorderConfig
@@ -28,7 +31,9 @@ from tactile_rt.daemon.items import (
     Skipped,
     SourceChunk,
 )
+from tactile_rt.daemon.ledger import Ledger, OnDisk
 from tactile_rt.daemon.messages import encode, message_of
+from tactile_rt.files import sync_folder
 from tactile_rt.recording.description import describe
 from tactile_rt.recording.layout import (
     DECISIONS,
@@ -43,8 +48,8 @@ from tactile_rt.recording.layout import (
 )
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.recording.rotation import Rotation
+from tactile_rt.recording.syncing import Extent, Syncer
 from tactile_rt.recording.writer import PART, RecordingWriter
-from tactile_rt.stream import RecordingError
 from tactile_rt.version import VERSION
 
 __all__ = ["Recorder"]
@@ -59,8 +64,8 @@ MB, NS = 1e6, 1e9
 class _Track:
     """A source, the file that is open for it, and what is kept for a trigger."""
 
-    def __init__(self, opened: Opened, rotation: Rotation) -> None:
-        self.opened, self.rotation = opened, rotation
+    def __init__(self, opened: Opened, rotation: Rotation, ledger: Ledger) -> None:
+        self.opened, self.rotation, self.ledger = opened, rotation, ledger
         self.wire = describe(opened.stream).wire
         self.prelude_ns = opened.prelude[-1][1] if opened.prelude else -1
         self.file: RecordingWriter | None = None
@@ -68,16 +73,20 @@ class _Track:
         self.ring_bytes = 0
         self.until_ns = 0  # of a trigger; 0: none
         self.closed_ns = 0  # when its source ended; 0: it has not
-        self.lost = (0, 0)  # samples and packets, for want of room on the disk
+        self.lost = (0, 0)  # samples and packets since the last file was begun
+        self.trouble = ""  # why there is no file, or was none before this one
 
-    def keep(self, message: Raw, before_ns: int) -> None:
-        """Into the ring, from which the oldest goes."""
+    def keep(self, message: Raw, before_ns: int) -> list[Raw]:
+        """Into the ring, from which the oldest goes: these."""
         self.ring.append(message)
         self.ring_bytes += len(message.data)
+        gone = []
         while self.ring and (
             self.ring[0].t_ns < message.t_ns - before_ns or self.ring_bytes > RING_BYTES
         ):
-            self.ring_bytes -= len(self.ring.popleft().data)
+            gone.append(self.ring.popleft())
+            self.ring_bytes -= len(gone[-1].data)
+        return gone
 
     def empty(self) -> list[Raw]:
         """All of the ring."""
@@ -92,7 +101,8 @@ class Recorder(Consumer):
 
     It knows the controls ``start``, ``stop``, ``trigger`` (as if something had happened) and
     ``rotate`` (begin new files). When the disk has less room than ``min_free_mb`` the files are
-    closed, what is not recorded is counted, and it goes on when there is room again.
+    closed, what is not recorded is counted, and it goes on when there is room again. So it does
+    when the folder is deleted, moved or may not be written any more.
 
     Args:
         name: for the log.
@@ -113,25 +123,32 @@ class Recorder(Consumer):
         self._name, self._config = name, config
         self._folder = Path(config.folder)
         self._tracks: dict[str, _Track] = {}
+        self._ledgers: dict[str, Ledger] = {}
         self._on = True
-        self._full = False
+        self._state, self._why = "on", ""  # of the disk
         self._files = self._bytes = 0
         self._lost_samples = 0
         self._newest = ""
-        self._flush_at = 0.0
+        self._flush_at = self._sync_at = 0.0
 
     def open(self, view: View) -> None:
         self._view = view
-        self._folder.mkdir(parents=True, exist_ok=True)
-        cut = [p.name for p in sorted(self._folder.glob("*.mcap")) if not is_finished(p)]
+        self._syncer = Syncer()
+        self._make_folder(parents=True)
+        with os.scandir(self._folder) as found:  # a pipe or a dead mount is not even looked at
+            files = sorted(f.name for f in found if f.is_file(follow_symlinks=False))
+        cut = [f for f in files if f.endswith(".mcap") and not is_finished(self._folder / f)]
         if cut:
             some = ", ".join(cut[:3]) + (f" and {len(cut) - 3} more" if len(cut) > 3 else "")
             view.report(
                 self._name, "running", f"{self._folder}: cut short: {some}; `tactile-rt recover` "
                 "makes whole ones of them", "warning",
             )  # fmt: skip
-        for left in self._folder.glob(f".*{PART}"):  # of one who was killed as it began a file
+        for name in files:  # of one who was killed as it began a file
+            left = self._folder / name
             with suppress(OSError):
+                if not (name.startswith(".") and name.endswith(PART)):
+                    continue
                 if time.time() - left.stat().st_mtime > STALE_S:  # else it is just being begun
                     left.unlink()
         for opened in view.streams().values():
@@ -140,10 +157,13 @@ class Recorder(Consumer):
     def handle(self, items: list[Item]) -> None:
         for item in items:
             self._take(item)
-        now = time.monotonic()
-        if now >= self._flush_at:
+        now, sync_s = time.monotonic(), self._config.sync_s
+        sync = sync_s > 0 and now >= self._sync_at
+        if sync:
+            self._sync_at = now + sync_s
+        if sync or now >= self._flush_at:
             self._flush_at = now + FLUSH_S
-            self._look_after()
+            self._look_after(sync)
 
     def close(self) -> None:
         try:
@@ -151,13 +171,28 @@ class Recorder(Consumer):
                 self._end(name)
         finally:
             self._tracks.clear()
+            self._syncer.close()
+            self._settle()
+
+    def on_disk(self) -> Mapping[str, OnDisk]:
+        """What of each source that was ever open is on the disk; from any thread, at once."""
+        return {name: self._on_disk(name, ledger) for name, ledger in list(self._ledgers.items())}
+
+    def _on_disk(self, name: str, ledger: Ledger) -> OnDisk:
+        track = self._tracks.get(name)
+        if track is None:
+            return ledger.on_disk(open=False, meant=False)
+        wanted = self._config.mode == "always" or track.until_ns > 0
+        return ledger.on_disk(
+            open=track.file is not None, meant=self._on and wanted and not track.closed_ns
+        )
 
     def details(self) -> dict[str, str | int | float]:
         tracks = list(self._tracks.values())
         recording = sum(track.file is not None for track in tracks)
         size = self._bytes + sum(t.file.stats.bytes for t in tracks if t.file is not None)
         return {
-            "state": "disk full" if self._full else ("on" if self._on else "off"),
+            "state": self._state if self._why else ("on" if self._on else "off"),
             "mode": self._config.mode,
             "recording": recording,
             "files": self._files,
@@ -207,7 +242,9 @@ class Recorder(Consumer):
     def _add(self, track: _Track, message: Raw) -> None:
         if track.file is None and self._config.mode == "trigger":
             if self._on:
-                track.keep(message, round(self._config.before_s * NS))
+                gone = track.keep(message, round(self._config.before_s * NS))
+                if track.until_ns:  # there is a trigger, and no file can be begun
+                    self._lose(track, *gone)
             return
         if track.file is None:
             if self._on:
@@ -222,11 +259,12 @@ class Recorder(Consumer):
     def _lose(self, track: _Track, *messages: Raw) -> None:
         self._count_lost(
             track, sum(samples_in(m.data) for m in messages if m.topic == SAMPLES),
-            sum(m.topic == WIRE for m in messages),
+            sum(m.topic == WIRE for m in messages), self._why or track.trouble,
         )  # fmt: skip
 
-    def _count_lost(self, track: _Track, samples: int, packets: int) -> None:
+    def _count_lost(self, track: _Track, samples: int, packets: int, why: str) -> None:
         track.lost = track.lost[0] + samples, track.lost[1] + packets
+        track.ledger.lose(samples, why)
         self._lost_samples += samples
 
     def _trigger(self, track: _Track) -> None:
@@ -246,6 +284,7 @@ class Recorder(Consumer):
             self._on = False
             for track in self._tracks.values():
                 self._finish_file(track)
+                track.until_ns = 0
                 track.empty()
         elif control.action == "trigger":
             for track in self._tracks.values():
@@ -258,7 +297,8 @@ class Recorder(Consumer):
         self._end(opened.source)
         config = self._config
         rotation = Rotation(self._folder, opened.source, config.rotate_mb, config.rotate_s)
-        track = self._tracks[opened.source] = _Track(opened, rotation)
+        ledger = self._ledgers.setdefault(opened.source, Ledger())
+        track = self._tracks[opened.source] = _Track(opened, rotation, ledger)
         if self._config.mode == "always" and self._on:
             self._start_file(track)
 
@@ -280,29 +320,40 @@ class Recorder(Consumer):
         try:
             about = describe(opened.stream, opened.url, session)
             track.file = track.rotation.begin(
-                opened.stream, about, prelude=opened.prelude, dropped=track.lost
-            )
+                opened.stream, about, prelude=opened.prelude, dropped=track.lost,
+                syncer=self._syncer,
+            )  # fmt: skip
         except OSError as error:
             self._no_room(track, error)
             return
         track.lost = (0, 0)
+        track.ledger.begin(track.file)
         kept = track.empty()
         for n, message in enumerate(kept):
             try:
                 track.file.add(message.topic, message.data, message.t_ns)
             except OSError as error:
-                self._lose(track, *kept[n:])
                 self._no_room(track, error)
+                self._lose(track, *kept[n:])
                 return
         self._files += 1
         self._newest = track.file.path.name
+        # At once: so a power cut hardly ever leaves a name without what the file is of.
+        if self._config.sync_s == 0 or self._sync(track):
+            track.trouble = ""
 
-    def _finish_file(self, track: _Track, told: bool = False) -> None:
-        file, track.file, track.until_ns = track.file, None, 0
+    def _finish_file(self, track: _Track, finish: bool = True, told: bool = False) -> None:
+        file, track.file = track.file, None
         if file is None:
             return
+        if file.whereabouts() == "deleted":
+            why = f"{file.path} was deleted while it was written"
+            samples, packets = file.disown(Extent())
+            self._count_lost(track, samples, packets, why)
+            self._view.report(self._name, "running", f"{why}: {samples} samples are lost", "error")
+            finish, told = False, True
         try:
-            file.close()
+            file.close(finish)
         except OSError as error:
             if not told:
                 self._view.report(
@@ -310,7 +361,7 @@ class Recorder(Consumer):
                     f"({error.strerror or error}); `tactile-rt recover` keeps what is in it",
                     "error",
                 )  # fmt: skip
-            self._count_lost(track, *file.unsafe())
+            self._count_lost(track, *file.disown(file.flushed), _words(file.path, error))
         self._bytes += file.stats.bytes
 
     def _rotate(self, track: _Track) -> None:
@@ -318,9 +369,10 @@ class Recorder(Consumer):
             self._finish_file(track)
             self._start_file(track)
 
-    def _look_after(self) -> None:
+    def _look_after(self, sync: bool) -> None:
         """Flush, rotate, end what a trigger began or whose source ended, look at the disk."""
         self._room()
+        self._settle()
         now = time.monotonic_ns()
         closed = [
             n for n, t in self._tracks.items() if t.closed_ns and now > t.closed_ns + LINGER_NS
@@ -331,48 +383,113 @@ class Recorder(Consumer):
                 if name not in deciding:
                     self._end(name)
         for track in self._tracks.values():
+            over = 0 < track.until_ns < now
+            if over:
+                track.until_ns = 0
             file = track.file
             if file is None:
-                if self._config.mode == "always" and self._on:
+                if over:
+                    self._lose(track, *track.empty())
+                elif self._on and (self._config.mode == "always" or track.until_ns):
                     self._start_file(track)  # there is room again
                 continue
-            try:
-                file.flush()
-            except OSError as error:
-                self._no_room(track, error)
+            where = file.whereabouts()
+            if where == "moved":
+                self._view.report(
+                    self._name, "running", f"{file.path} was moved while it was written: another "
+                    "file is begun", "warning",
+                )  # fmt: skip
+            if where != "there":
+                self._rotate(track)
                 continue
-            if self._full:
+            if not self._sync(track, sync):
+                continue
+            if self._state == "disk full" and self._why:
                 self._finish_file(track)
-            elif track.until_ns and now > track.until_ns:
+            elif over:
                 self._finish_file(track)
             elif track.rotation.is_due(file):
                 self._rotate(track)
 
-    def _room(self) -> bool:
-        """Whether the disk has room; told when that changes."""
+    def _sync(self, track: _Track, sync: bool = True) -> bool:
+        """Flush, at least; whether that could be done, and the sync before."""
+        file = track.file
+        assert file is not None
         try:
+            if file.failed is not None:
+                raise file.failed
+            file.sync() if sync else file.flush()
+        except OSError as error:
+            self._no_room(track, error)
+            return False
+        return True
+
+    def _settle(self) -> None:
+        """Count what files lost that were closed, and could not be synced thereafter."""
+        for name, ledger in self._ledgers.items():
+            for file, samples, packets in ledger.settle():
+                assert file.failed is not None
+                track, why = self._tracks.get(name), _words(file.path, file.failed)
+                if samples or packets:
+                    self._view.report(
+                        self._name, "running", f"{why}; {samples} samples may be lost", "error"
+                    )
+                self._lost_samples += samples
+                ledger.lose(samples, why)
+                if track is not None:
+                    track.lost = track.lost[0] + samples, track.lost[1] + packets
+
+    def _make_folder(self, parents: bool) -> None:
+        """Unless it is there; a power cut does not take it then."""
+        made = [f for f in (self._folder, *self._folder.parents) if not f.exists()]
+        self._folder.mkdir(parents=parents, exist_ok=True)
+        for folder in made:
+            self._syncer.add(partial(_sync_name, folder))
+
+    def _room(self) -> bool:
+        """Whether there is a folder, with room; told when that changes."""
+        state, why = "on", ""
+        try:
+            # Deleted, perhaps; a parent that is gone, too, may be the place of a medium that is.
+            self._make_folder(parents=False)
             free = shutil.disk_usage(self._folder).free / MB
         except OSError as error:
-            raise RecordingError(f"{self._folder}: {error.strerror or error}") from None
-        full = free < self._config.min_free_mb
-        if full != self._full:
-            self._full = full
-            if full:
-                self._view.report(
-                    self._name, "disk full", f"{self._folder}: {free:.0f} MB free, less than "
-                    f"min_free_mb = {self._config.min_free_mb:g}: not recording", "warning",
-                )  # fmt: skip
+            state, why = "no folder", _words(self._folder, error)
+        else:
+            if free < self._config.min_free_mb:
+                state = "disk full"
+                why = (
+                    f"{self._folder}: {free:.0f} MB free, less than "
+                    f"min_free_mb = {self._config.min_free_mb:g}"
+                )
+        if state != self._state:
+            if why:
+                self._view.report(self._name, state, f"{why}: not recording", "warning")
             else:
                 self._view.report(self._name, "running", f"{free:.0f} MB free: recording again")
-        return not full
+        self._state, self._why = state, why
+        return not why
 
     def _no_room(self, track: _Track, error: OSError) -> None:
         """The file cannot be written: it is left as it is, and tried anew at the next look."""
-        path = track.file.path if track.file is not None else self._folder
-        self._view.report(
-            self._name, "running", f"{path}: {error.strerror or error}; `tactile-rt recover` keeps "
-            "what is in it", "error",
-        )  # fmt: skip
-        if track.file is not None:
-            self._count_lost(track, *track.file.unsafe())
-            self._finish_file(track, told=True)
+        file = track.file
+        why = _words(file.path if file is not None else self._folder, error)
+        if file is not None or why != track.trouble:
+            self._view.report(
+                self._name, "running", f"{why}; `tactile-rt recover` keeps what is in it"
+                if file is not None else f"{why}: not recording", "error",
+            )  # fmt: skip
+        track.trouble = why
+        if file is not None:
+            kept = file.flushed if file.failed is None else file.synced
+            self._count_lost(track, *file.disown(kept), why)
+            self._finish_file(track, finish=file.failed is None, told=True)
+
+
+def _sync_name(folder: Path) -> None:
+    with suppress(OSError):  # what is wrong with the disk, its files will tell
+        sync_folder(folder.parent)
+
+
+def _words(path: Path, error: OSError) -> str:
+    return f"{path}: {error.strerror or error}"

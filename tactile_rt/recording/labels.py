@@ -20,7 +20,7 @@ from pathlib import Path
 
 import msgspec
 
-from tactile_rt.files import write_whole
+from tactile_rt.files import sync_folder, write_whole
 from tactile_rt.settings import check_columns, convert, nearest, read_csv, refusal
 from tactile_rt.stream import ConfigError
 
@@ -160,11 +160,7 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> None
         file.flush()
         os.fsync(file.fileno())
     if new:
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)  # the name, too
-        finally:
-            os.close(folder)
+        sync_folder(path.parent)  # the name, too
 
 
 def drop_torn_label(path: Path) -> bool:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO, TypeVar
 
 import msgspec
 
+from tactile_rt.files import open_regular
 from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
 from tactile_rt.recording.layout import (
     DECISIONS,
@@ -164,7 +165,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
     """A recording that has been written to its end."""
     need_mcap()
     try:
-        file = path.open("rb")
+        file = open_regular(path)
     except FileNotFoundError:
         raise ConfigError(f"no recording {path}") from None
     except OSError as error:
@@ -184,7 +185,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 def is_finished(path: Path) -> bool:
     """Whether the file has the end that is written last; nothing else of it is looked at."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return _has_end(file)
     except OSError:
         return False

@@ -5,6 +5,7 @@ source --> push ----+
 device --> tap -----+                                (or one after another)
 """
 
+import errno
 import threading
 import time
 from collections.abc import Iterator, Mapping
@@ -25,12 +26,14 @@ from tactile_rt.recording.layout import (
     need_mcap,
 )
 from tactile_rt.recording.rotation import Rotation
+from tactile_rt.recording.syncing import Syncer
 from tactile_rt.recording.writer import RecordingWriter, WriterStats
 from tactile_rt.stream import Chunk, ConfigError, RecordingError, Source
 
 __all__ = ["StreamWriter"]
 
 WAKE_S = 0.05  # how often the thread looks: what a recording is late by, at most
+SYNC_S = 1.0
 FLUSH_S = 0.5  # with the wake and a slow write still well under the second that may be lost
 QUEUE_BYTES = 64 << 20
 ITEM_BYTES, FRAME_BYTES = 500, 200  # what Python needs around the bytes
@@ -42,7 +45,8 @@ class StreamWriter:
     """Record a source. Make it before the first read, and `push` every chunk that is read.
 
     A thread of its own writes, at least every half second, so that a killed process leaves a file
-    from which `recover` takes all but the last moment. What waits for a slow disk is bounded: the
+    from which `recover` takes all but the last moment; another puts the file on the medium every
+    second, for a power cut. What waits for a slow disk is bounded: the
     oldest is dropped then, and counted. Of a device, the raw packets and its health are recorded
     without further ado.
 
@@ -53,6 +57,7 @@ class StreamWriter:
         session: what else to note: who, where, why.
         force: whether to replace a file that is there.
         flush_s: between two writes to the file.
+        sync_s: between two syncs, which put the file on the medium; 0: only at its end.
         queue_bytes: that may wait for the disk.
         rotate_mb: begin a new file beyond so many MB; 0: never. Files that are rotated are named by
             their beginning, too: ``run-20261121T170512Z.mcap`` for ``run.mcap``.
@@ -76,6 +81,7 @@ class StreamWriter:
         session: Mapping[str, str] | None = None,
         force: bool = False,
         flush_s: float = FLUSH_S,
+        sync_s: float = SYNC_S,
         queue_bytes: int = QUEUE_BYTES,
         rotate_mb: float = 0.0,
         rotate_s: float = 0.0,
@@ -86,14 +92,20 @@ class StreamWriter:
         self._url, self._session = url, dict(session or {})
         rotation = Rotation(self.path.parent, self.path.stem, rotate_mb, rotate_s)
         self._rotation = rotation if rotate_mb or rotate_s else None
-        self._flush_s = flush_s
+        self._flush_s, self._sync_s, self._sync_at = flush_s, sync_s, 0.0
+        self._past: list[RecordingWriter] = []  # closed, and perhaps not on the medium yet
+        self._syncer = Syncer()
         self._queue = BoundedQueue[Entry](size=queue_bytes, measure=_measure, kinds=(SAMPLES, WIRE))
         self._stop, self._asked, self._flushed = (threading.Event() for _ in range(3))
         self._error: Exception | None = None
         self._closed = False
         self._prelude: list[tuple[Packet, int]] = []
-        with _explained(self.path):
-            self._now = (WriterStats(), self._begin(force))  # of finished files, and the open one
+        try:
+            with _explained(self.path):
+                self._now = (WriterStats(), self._begin(force))  # of finished files; the open one
+        except BaseException:
+            self._syncer.close()
+            raise
         self._thread = threading.Thread(target=self._run, name="tactile-rt-recorder", daemon=True)
         self._thread.start()
         if self._device is not None:
@@ -154,10 +166,19 @@ class StreamWriter:
         self._stop.set()
         self._thread.join()
         self._queue.close()
+        writer = self._counted()
         try:
-            self._counted().close(finish=self._error is None)
+            if self._error is None:
+                _check_there(writer)
+        except OSError as error:
+            self._error = error
+        try:
+            writer.close(finish=self._error is None)
         except OSError as error:  # also what is still buffered may find no room
             self._error = self._error or error
+        self._syncer.close()
+        for file in (*self._past, writer):
+            self._error = self._error or file.failed
         if self._error is not None:
             raise self._broken()
 
@@ -192,9 +213,14 @@ class StreamWriter:
         """Begin the first file, or the next; it is described as the source is now."""
         self.about = describe(self._source, self._url, self._session)
         if self._rotation is None:
-            writer = RecordingWriter(self.path, self._source, self.about, force=force)
+            writer = RecordingWriter(
+                self.path, self._source, self.about, force=force, syncer=self._syncer
+            )
         else:
-            writer = self._rotation.begin(self._source, self.about, prelude=self._prelude)
+            writer = self._rotation.begin(
+                self._source, self.about, prelude=self._prelude, syncer=self._syncer
+            )
+        self._sync_at = 0.0  # so a power cut hardly ever leaves a name without a description
         self.path, self.files = writer.path, self.files + 1
         return writer
 
@@ -208,9 +234,9 @@ class StreamWriter:
             try:
                 while (entry := self._queue.get(0)) is not None:
                     self._write(*entry)
-                    if time.monotonic() >= flush_at:
+                    if time.monotonic() >= flush_at or self._is_sync_due():
                         flush_at = self._flush()
-                if asked or time.monotonic() >= flush_at:
+                if asked or time.monotonic() >= flush_at or self._is_sync_due():
                     flush_at = self._flush()
                 if asked:
                     self._asked.clear()
@@ -229,12 +255,25 @@ class StreamWriter:
 
     def _flush(self) -> float:
         writer = self._counted()
-        writer.flush()
+        if self._is_sync_due():
+            self._sync_at = time.monotonic() + self._sync_s
+            writer.sync()
+        else:
+            writer.flush()
+        _check_there(writer)
+        for file in (*self._past, writer):
+            if file.failed is not None:
+                raise file.failed
+        self._past = [file for file in self._past if not file.done]
         if self._rotation is not None and self._rotation.is_due(writer):
             writer.close()
+            self._past.append(writer)
             past = self.stats
             self._now = past, self._begin(False)
         return time.monotonic() + self._flush_s
+
+    def _is_sync_due(self) -> bool:
+        return self._sync_s > 0 and time.monotonic() >= self._sync_at
 
     def _counted(self) -> RecordingWriter:
         """The open file, told what was dropped since it was begun."""
@@ -242,6 +281,11 @@ class StreamWriter:
         writer.stats.dropped_samples = dropped[SAMPLES] - past.dropped_samples
         writer.stats.dropped_packets = dropped[WIRE] - past.dropped_packets
         return writer
+
+
+def _check_there(writer: RecordingWriter) -> None:
+    if writer.whereabouts() == "deleted":
+        raise OSError(errno.ENOENT, "deleted while it was written")
 
 
 def _measure(entry: Entry) -> tuple[str, int, int]:

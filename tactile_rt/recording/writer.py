@@ -3,9 +3,10 @@
     RecordingWriter    a file in a folder, with counts, health and summary
     McapFile           the channels of a recording in whatever is written to
 
-What is killed while it writes leaves a file from which `recover` takes all that had been flushed.
-For that the file must say what it is of, which takes several steps; so it gets its name only when
-it does. Until then it is hidden in the same folder, as ``.NAME.XXXXXXXX.mcap.part``.
+What is killed while it writes leaves a file from which `recover` takes all that had been flushed,
+and a power cut one from which it takes all that had been synced. For that the file must say what it
+is of, which takes several steps; so it gets its name only when it does. Until then it is hidden in
+the same folder, as ``.NAME.XXXXXXXX.mcap.part``.
 
 When one file follows another is the matter of `tactile_rt.recording.rotation`; how a stream is
 recorded beside what else is done with it, that of `tactile_rt.recording.stream_writer` and of the
@@ -19,13 +20,15 @@ import time
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Literal
 
 import msgspec
 
 from tactile_rt.drivers.device_source import device_of
 from tactile_rt.drivers.health import Health
+from tactile_rt.files import sync_folder
 from tactile_rt.recording.description import (
     METADATA,
     SESSION,
@@ -43,6 +46,7 @@ from tactile_rt.recording.layout import (
     encode_packet,
     samples_in,
 )
+from tactile_rt.recording.syncing import Extent, Syncer
 from tactile_rt.stream import Source
 
 __all__ = ["PART", "McapFile", "RecordingWriter", "WriterStats"]
@@ -135,11 +139,15 @@ class RecordingWriter:
             understood from every file.
         dropped: samples and packets that could not be recorded before.
         force: whether to replace a file that is there.
+        syncer: what syncs the file; None: the thread that calls.
 
     Attributes:
         path: The path of the file.
         begun_ns: The host monotonic time at which the file was begun, ns.
         stats: The counts so far; `dropped_samples` and `dropped_packets` are the caller's to keep.
+        flushed: The extent that the operating system has, which a kill of the process leaves.
+        failed: The error with which a sync failed; None while none has.
+        done: Whether the file is closed, and its last sync has ended.
 
     Raises:
         FileExistsError: there is such a file.
@@ -155,12 +163,16 @@ class RecordingWriter:
         prelude: Iterable[tuple[Packet, int]] = (),
         dropped: tuple[int, int] = (0, 0),
         force: bool = False,
+        syncer: Syncer | None = None,
     ) -> None:
         self.path, self.begun_ns = path, time.monotonic_ns()
         self.stats = WriterStats(dropped_samples=dropped[0], dropped_packets=dropped[1])
         self._source, self._device = source, device_of(source)
         self._told: tuple[Any, ...] = ()  # the health that was last written
-        self._safe = (0, 0)  # samples and packets that the system has
+        self.flushed, self._synced, self._newest_ns = Extent(), Extent(), 0
+        self.failed: OSError | None = None
+        self.done = False
+        self._syncer, self._waiting, self._name_synced = syncer, False, False
         target = path.resolve() if force else path  # a link is followed, not replaced
         special = force and target.exists() and not target.is_file()  # a pipe, /dev/null
         hidden = target if special else _hidden(target, force)
@@ -179,13 +191,19 @@ class RecordingWriter:
             if not special:
                 hidden.unlink(missing_ok=True)
             raise
-        self._special = special
+        self._special, self._target = special, target
+
+    @property
+    def synced(self) -> Extent:
+        """What is on the medium, which a power cut leaves; from any thread."""
+        return min(self._synced, self.flushed)
 
     def add(self, topic: str, data: bytes, t_ns: int) -> None:
         """Add an encoded message of this host time, ns."""
         self._file.add(topic, data, t_ns)
         if topic == SAMPLES:
             self.stats.samples += samples_in(data)
+            self._newest_ns = t_ns
         elif topic == WIRE:
             self.stats.packets += 1
 
@@ -213,16 +231,38 @@ class RecordingWriter:
         """Let the system have all of it; the file's size."""
         self.tell()
         self.stats.bytes = self._file.flush()
-        self._safe = (self.stats.samples, self.stats.packets)
+        self.flushed = Extent(self.stats.samples, self.stats.packets, self._newest_ns)
         return self.stats.bytes
 
-    def unsafe(self) -> tuple[int, int]:
-        """Samples and packets that were added and may not be in the file, because writing failed;
-        they no longer count as written."""
+    def sync(self) -> None:
+        """Let the system have all of it, and the medium as soon as it can; `synced` says when it
+        has, `failed` that it could not."""
+        self.flush()
+        if not self._waiting:  # one that waits will take all that has been flushed until it begins
+            self._sync_soon()
+
+    def disown(self, since: Extent) -> tuple[int, int]:
+        """Samples and packets that were added after `since`, and are not in the file or may not be,
+        because writing failed; they no longer count as written."""
         stats = self.stats
-        samples, packets = stats.samples - self._safe[0], stats.packets - self._safe[1]
-        stats.samples, stats.packets = self._safe
+        samples, packets = stats.samples - since.samples, stats.packets - since.packets
+        stats.samples, stats.packets, self.flushed = since.samples, since.packets, since
         return samples, packets
+
+    def whereabouts(self) -> Literal["there", "moved", "deleted"]:
+        """What others did with the file: ``moved`` means that another or none has its name."""
+        if self._special:
+            return "there"
+        mine = os.fstat(self._raw.fileno())
+        if mine.st_nlink == 0:
+            return "deleted"
+        try:
+            named = os.lstat(self._target)
+        except (FileNotFoundError, NotADirectoryError):
+            return "moved"
+        except OSError:  # one may not look
+            return "there"
+        return "there" if os.path.samestat(mine, named) else "moved"
 
     def close(self, finish: bool = True) -> None:
         """Write the index and close. Also when that fails the file is closed: it can be recovered.
@@ -239,10 +279,41 @@ class RecordingWriter:
                 told = {k: str(v) for k, v in asdict(self.stats).items() if k != "bytes"}
                 self._file.note(SUMMARY, told)
                 self.stats.bytes = self._file.finish()
-                if not self._special:
-                    os.fsync(self._raw.fileno())
+                self.flushed = Extent(self.stats.samples, self.stats.packets, self._newest_ns)
         finally:
-            self._raw.close()
+            try:
+                self._sync_soon(last=True)
+            finally:
+                self._raw.close()
+        if self._syncer is None and self.failed is not None:
+            raise self.failed
+
+    def _sync_soon(self, last: bool = False) -> None:
+        job = partial(self._sync, os.dup(self._raw.fileno()), last)
+        if self._syncer is None:
+            job()
+        else:
+            self._waiting = True
+            self._syncer.add(job)
+
+    def _sync(self, handle: int, last: bool) -> None:
+        """In the syncer's thread; the handle stays open when the file is closed meanwhile."""
+        self._waiting = False
+        extent = self.flushed
+        try:
+            if not self._special:
+                os.fdatasync(handle)
+                if not self._name_synced:
+                    with suppress(FileNotFoundError, NotADirectoryError):  # see `whereabouts`
+                        sync_folder(self._target.parent)
+                    self._name_synced = True
+            self._synced = extent
+        except OSError as error:
+            # The system has given up what it could not write; a later sync would not tell.
+            self.failed = self.failed or error
+        finally:
+            os.close(handle)
+            self.done = last
 
 
 def _changing(health: Health | None) -> tuple[Any, ...]:

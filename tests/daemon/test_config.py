@@ -316,7 +316,8 @@ def tables(of=Config):
     tables = ("source", "model", "publisher", "recorder", "page", "metrics", "log", "limits", "x")
     keys = (
         "version extends name url calibration file source decisions kind options folder rotate_mb "
-        "rotate_s min_free_mb mode before_s after_s host port token control level format repeat_s "
+        "rotate_s min_free_mb sync_s mode before_s after_s host port token control level format "
+        "repeat_s "
         "queue_items queue_mb gather_ms stop_s stall_s retry_first_s samples state_s a.b 'c'"
     ).split()
     text = st.text(st.characters(blacklist_categories=("Cs",)), max_size=12).map(quoted)

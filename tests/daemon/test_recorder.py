@@ -8,68 +8,39 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.classifier import Classification
-from tactile_rt.daemon.config import RecorderConfig
-from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import (
     Closed,
     Contact,
     Control,
     Decision,
     Event,
-    Opened,
     Packet,
     SourceChunk,
 )
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.sources.opening import open_source
-from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
+from tactile_rt.testing import FakeSerial, cut
+from tests.helpers.recorder_by_hand import (
+    SPEC,
+    UTC,
+    DaemonView,
+    begun,
+    files,
+    look,
+    opened,
+    samples,
+)
 
 pytest.importorskip("mcap")
 recorder = pytest.importorskip("tactile_rt.daemon.recorder")
 
-SPEC = small_spec()
-UTC = 1_700_000_000_000_000_000
 VALUES = np.random.default_rng(0).normal(size=(90, *SPEC.shape)).astype(np.float32)
-
-
-class Daemon:
-    """What a consumer sees of it."""
-
-    def __init__(self):
-        self.told, self.open = [], {}
-
-    def snapshot(self):
-        return Snapshot("0", 1, "robot.toml", 1, UTC, 0, 0, "running")
-
-    def streams(self):
-        return self.open
-
-    def config_text(self):
-        return "version = 1\n"
-
-    def report(self, part, state, reason, level="info"):
-        self.told.append((state, reason, level))
-
-    def send(self, consumer, control):
-        return False
-
-    def utc_offset_ns(self):
-        return UTC
 
 
 @pytest.fixture
 def daemon():
-    return Daemon()
-
-
-def opened(name="whiskers", stream=None):
-    stream = stream or ArraySource(SPEC, [])
-    return Opened(name, stream.spec, f"synthetic:{name}", stream, time.monotonic_ns(), UTC)
-
-
-def samples(chunk, name="whiskers", at=None):
-    return SourceChunk(name, SPEC, chunk, at or time.monotonic_ns(), UTC)
+    return DaemonView()
 
 
 def decision(step=1):
@@ -82,22 +53,6 @@ def decision(step=1):
 
 def event(level="info", part="source.whiskers"):
     return Event(part, "waiting", "unplugged", level, time.monotonic_ns(), UTC)
-
-
-def begun(daemon, folder, **config):
-    made = recorder.Recorder("recorder", RecorderConfig(folder=str(folder), **config))
-    made.open(daemon)
-    return made
-
-
-def look(made):
-    """The next look at disk and clock comes now."""
-    made._flush_at = 0.0
-    made.handle([])
-
-
-def files(folder):
-    return sorted(folder.glob("*.mcap"))
 
 
 def same(path, chunks):

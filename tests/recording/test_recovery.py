@@ -1,5 +1,6 @@
 """Of a recording that was cut or damaged, all that is whole comes back."""
 
+import os
 import re
 
 import pytest
@@ -11,9 +12,9 @@ from tactile_rt.recording.layout import (
     encode_samples,
 )
 from tactile_rt.recording.writer import McapFile
-from tactile_rt.stream import RecordingError
+from tactile_rt.stream import ConfigError, RecordingError
 from tactile_rt.testing import cut
-from tests.helpers.recordings import SPEC, all_parts, noise, write
+from tests.helpers.recordings import SPEC, all_parts, noise, parts, write
 
 pytest.importorskip("mcap")
 
@@ -111,3 +112,91 @@ def test_a_whole_recording_needs_no_recovery(path):
     write(path, cut(noise(10), 1000.0))
     assert recover(path) == path
     assert list(path.parent.iterdir()) == [path]
+
+
+@settings(max_examples=150)
+@given(
+    kept=st.lists(st.booleans(), min_size=200, max_size=200),
+    synced=st.floats(0.1, 0.9),
+    end=st.floats(0, 1),
+    sector=st.sampled_from([512, 4096]),
+)
+def test_whichever_pages_a_power_cut_leaves_all_whole_pieces_come_back(
+    whole, tmp_path_factory, kept, synced, end, sector
+):
+    data, chunks, ends = whole
+    path = tmp_path_factory.getbasetemp() / "holes.mcap"
+    safe = int(synced * len(data))
+    left = bytearray(data[:safe]) + bytes(len(data) - safe)
+    for n, at in enumerate(range(safe // sector * sector, len(data), sector)):
+        if kept[n % 200]:
+            left[at : at + sector] = data[at : at + sector]
+    left = left[: safe + int(end * (len(data) - safe))]
+    path.write_bytes(left)
+    begins = [0, *ends]
+    there = [
+        k
+        for k, (a, b) in enumerate(zip(begins, ends, strict=False))
+        if b <= len(left) and left[a:b] == data[a:b]
+    ]
+    expected = [parts(c) for k in there for c in chunks[3 * k : 3 * k + 3]]
+    out = recover(path, path.with_name("mended.mcap"), force=True)
+    back = all_parts(Recording(out))
+    assert set(expected) <= set(back)  # a hole may also lie between two pieces
+    order = [all_parts(chunks).index(p) for p in back]
+    assert order == sorted(order)
+    assert_others_read_it(out)
+
+
+def assert_others_read_it(path):
+    from mcap.reader import make_reader
+
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        counted = reader.get_summary().statistics.message_count
+        assert sum(1 for _ in reader.iter_messages()) == counted
+
+
+def test_what_only_has_the_mark_of_a_piece_is_passed_over(whole, tmp_path):
+    data, chunks, ends = whole
+    path = tmp_path / "marks.mcap"
+    mark = b"\x06" + bytes(36) + b"\x04\0\0\0zstd"
+    path.write_bytes(data[: ends[2]] + mark * 50 + data[ends[2] : ends[4]])
+    assert all_parts(Recording(recover(path))) == all_parts(chunks[:15])
+
+
+@pytest.mark.parametrize("left", [b"", bytes(5000)])
+def test_a_name_without_anything_is_told_in_one_line(left, tmp_path):
+    path = tmp_path / "empty.mcap"
+    path.write_bytes(left)
+    with pytest.raises(RecordingError, match=re.escape(str(path))):
+        recover(path)
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("use", [recover, Recording])
+def test_what_is_no_file_is_refused_and_not_waited_for(use, tmp_path):
+    path = tmp_path / "a.mcap"
+    os.mkfifo(path)
+    with pytest.raises(ConfigError, match="a pipe, socket or device, no file"):
+        use(path)
+    with pytest.raises(ConfigError, match="cannot be read: Is a directory"):
+        use(tmp_path)
+
+
+def test_what_is_recovered_is_on_the_medium_before_it_is_told(whole, tmp_path, monkeypatch):
+    data, _, ends = whole
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(data[: ends[3]])
+    synced = []
+    real = os.fsync
+
+    def note(handle):
+        real(handle)
+        synced.append(os.readlink(f"/proc/self/fd/{handle}"))
+
+    monkeypatch.setattr(os, "fsync", note)
+    made = recover(path)
+    assert len(synced) == 2
+    assert synced[0].startswith(str(tmp_path / f".{made.name}."))  # before it has its name
+    assert synced[1] == str(tmp_path)  # and then the name

@@ -1,6 +1,7 @@
 """A stream is recorded while it runs, whatever disk and process do."""
 
 import errno
+import os
 import subprocess
 import sys
 import threading
@@ -21,7 +22,7 @@ from tests.helpers.recordings import (
     record_device,
     write,
 )
-from tests.helpers.waiting import PATIENCE_S
+from tests.helpers.waiting import PATIENCE_S, until
 
 pytest.importorskip("mcap")
 
@@ -160,6 +161,53 @@ def test_what_is_flushed_is_there_whatever_happens_next(path, tmp_path, disk, no
     with pytest.raises(RecordingError, match="No space left"):
         recorder.flush()
     with pytest.raises(RecordingError):
+        recorder.close()
+
+
+def test_what_is_recorded_is_on_the_medium_soon_and_a_slow_one_is_not_waited_for(
+    path, monkeypatch, no_thread_left
+):
+    shut, begun, real = threading.Event(), threading.Event(), os.fdatasync
+    synced = []
+
+    def slow(handle):
+        begun.set()
+        assert shut.wait(PATIENCE_S)
+        real(handle)
+        synced.append(os.fstat(handle).st_size)
+
+    monkeypatch.setattr(os, "fdatasync", slow)
+    chunks = cut(noise(300), 1000.0, samples=10)
+    with StreamWriter(path, ArraySource(SPEC, chunks, live=True), sync_s=0.01) as recorder:
+        for chunk in chunks[:20]:
+            recorder.push(chunk)
+        assert begun.wait(PATIENCE_S)
+        recorder.flush()  # which the system takes meanwhile
+        assert recorder.stats.samples == 200
+        shut.set()
+        until(lambda: len(synced) > 1)
+        for chunk in chunks[20:]:
+            recorder.push(chunk)
+    assert synced[-1] == path.stat().st_size
+    assert all_parts(Recording(path)) == all_parts(chunks)
+
+
+def test_a_medium_that_fails_is_told_at_the_end_too(path, monkeypatch, no_thread_left):
+    def fail(handle):
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(os, "fdatasync", fail)
+    recorder = StreamWriter(path, ArraySource(SPEC, []), sync_s=0)
+    with pytest.raises(RecordingError, match="Input/output error"):
+        recorder.close()
+
+
+def test_a_file_that_is_deleted_is_told(path, no_thread_left):
+    recorder = StreamWriter(path, ArraySource(SPEC, []))
+    path.unlink()
+    with pytest.raises(RecordingError, match="deleted while it was written"):
+        recorder.flush()
+    with pytest.raises(RecordingError, match="deleted"):
         recorder.close()
 
 

@@ -374,7 +374,7 @@ function recording(recorder) {
   const d = recorder.details;
   const on = recorder.part.state === "running" && d.recording > 0 && !recorder.trouble;
   $("recorder-chip").textContent = on ? "recording" : d.state === "on" ? "recorder waits" : `recorder ${d.state || recorder.part.state}`;
-  $("recorder-chip").className = "chip " + (on ? "bad" : d.state === "disk full" ? "warn" : "");
+  $("recorder-chip").className = "chip " + (on ? "bad" : ["disk full", "no folder"].includes(d.state) ? "warn" : "");
   $("recording-state").textContent = `${on ? "Recording" : "Not recording"} (mode ${d.mode}), ${d.megabytes} MB in ${d.files} ${d.files === 1 ? "file" : "files"}, ${d.lost_samples} samples lost. ${d.newest ? "Newest: " + d.newest : ""}`;
   $("recording-buttons").hidden = !control;
 }

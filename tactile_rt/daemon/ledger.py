@@ -1,0 +1,83 @@
+"""What became of a source's samples: which are recorded, which a power cut would take, which are
+lost, over all files and as often as the source comes and goes."""
+
+import time
+from dataclasses import dataclass
+
+from tactile_rt.recording.writer import RecordingWriter
+
+__all__ = ["Ledger", "OnDisk"]
+
+Sums = tuple[int, int, int]  # samples, written_ns, synced_ns
+
+
+@dataclass(frozen=True)
+class OnDisk:
+    """What of a source is on the disk.
+
+    Attributes:
+        written_ns: The host monotonic time of the newest sample that the operating system has, so
+            that it outlives the process, ns; 0 if there is none.
+        synced_ns: The host monotonic time of the newest sample that is on the medium, so that it
+            outlives a power cut, ns; 0 if there is none.
+        samples: The number of samples that are recorded.
+        lost_samples: The number of samples that should have been recorded and are not; those that
+            did not reach the recorder are counted in its queue.
+        lost_ns: The host monotonic time at which samples were lost last, ns; 0 if none were.
+        lost_why: The reason for which samples were lost last; empty if none were.
+        open: Whether a file of the source is open.
+        meant: Whether the source is to be recorded now: the source is open, nobody has stopped the
+            recorder, and in the mode ``trigger`` there is a trigger.
+    """
+
+    written_ns: int = 0
+    synced_ns: int = 0
+    samples: int = 0
+    lost_samples: int = 0
+    lost_ns: int = 0
+    lost_why: str = ""
+    open: bool = False
+    meant: bool = False
+
+
+class Ledger:
+    """Keeps the account of a source; written by the recorder's thread, read by any."""
+
+    def __init__(self) -> None:
+        self._now: tuple[Sums, tuple[RecordingWriter, ...]] = (0, 0, 0), ()  # done; the others
+        self._lost = (0, 0, "")
+
+    def begin(self, file: RecordingWriter) -> None:
+        """Another file is open."""
+        past, files = self._now
+        self._now = past, (*files, file)
+
+    def lose(self, samples: int, why: str) -> None:
+        """So many samples are not recorded."""
+        if samples:
+            self._lost = self._lost[0] + samples, time.monotonic_ns(), why
+
+    def settle(self) -> list[tuple[RecordingWriter, int, int]]:
+        """Files that are done and whose last sync failed, with the samples and packets that it
+        lost; these are counted by who calls."""
+        past, files = self._now
+        done = tuple(file for file in files if file.done)
+        failed = [(f, *f.disown(f.synced)) for f in done if f.failed is not None]
+        if done:
+            self._now = _sum(past, done), tuple(file for file in files if file not in done)
+        return failed
+
+    def on_disk(self, open: bool, meant: bool) -> OnDisk:
+        """All of it; from any thread."""
+        samples, written_ns, synced_ns = _sum(*self._now)
+        return OnDisk(written_ns, synced_ns, samples, *self._lost, open, meant)
+
+
+def _sum(past: Sums, files: tuple[RecordingWriter, ...]) -> Sums:
+    """Of these files, too."""
+    samples, written_ns, synced_ns = past
+    return (
+        samples + sum(file.stats.samples for file in files),
+        max([written_ns, *(file.flushed.newest_ns for file in files)]),
+        max([synced_ns, *(file.synced.newest_ns for file in files)]),
+    )
