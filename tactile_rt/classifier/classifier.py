@@ -14,7 +14,7 @@ skipped, see `tactile_rt.classifier.skips`.
 """
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -223,21 +223,24 @@ class Classifier:
 
     def push(self, chunk: Chunk) -> list[Classification]:
         """Take samples as they come from the array, return the decisions that they complete."""
+        return list(self.decide(chunk))
+
+    def decide(self, chunk: Chunk) -> Iterator[Classification]:
+        """As `push`, but each decision as soon as it is there: the samples are taken as the
+        iterator is, which must come to its end."""
         # What no sensor measures is not taken for a measurement: no number, infinite, or absurd.
         chunk, bad = without_bad_samples(chunk)
         self.stats.bad_samples += bad
         resampled = self._resampler.push(chunk)
         if resampled is None:
-            return []
-        decisions = []
+            return
         for i in range(len(resampled)):
             if resampled.seq[i] != self._next_seq:
                 self._onset_ns = None  # what is touched now need not be what was touched before
             self._next_seq = int(resampled.seq[i]) + 1
             decision = self._sample(int(resampled.t_ns[i]), resampled.values[i], resampled.valid[i])
             if decision is not None:
-                decisions.append(decision)
-        return decisions
+                yield decision
 
     def _sample(
         self, t_ns: int, sample: NDArray[np.float32], valid: NDArray[np.bool_]

@@ -180,11 +180,11 @@ def _sources(now: "Snapshot", before: "Snapshot | None") -> Table:
             state = Text(str(s.device.state), style=COLOURS.get(str(s.device.state), ""))
         shape = f"{len(s.elements)} x {len(s.channels)} {s.array}" if s.elements else ""
         why = s.part.reason or (s.device.reason if s.device is not None else "")
+        age = f"{(now.t_ns - s.newest_ns) / 1e6:.0f}" if s.newest_ns else ""
         table.add_row(
             _name(s.part), state, rate, f"{s.rate_hz:g}" if s.rate_hz else "", f"{s.samples}",
             _bad(s.stats.missing), _bad(s.stats.corrupt), _bad(s.stats.dropped),
-            f"{s.stats.duplicates}", _bad(s.losses.minute), f"{(now.t_ns - s.newest_ns) / 1e6:.0f}" if s.newest_ns else "",
-            _line(why, "red") if why else _line(shape),
+            f"{s.stats.duplicates}", _bad(s.losses.minute), age, _line(why, "red") if why else _line(shape),
         )  # fmt: skip
     return table
 

@@ -193,7 +193,7 @@ class ModelState:
 
 @dataclass(frozen=True)
 class OnDisk:
-    """What is on the disk of a source.
+    """What of a source is on the disk.
 
     Attributes:
         written_ns: The host monotonic time of the newest sample that the operating system has, so
@@ -205,8 +205,8 @@ class OnDisk:
             did not reach the recorder are counted in its queue.
         lost_ns: The host monotonic time at which samples were lost last, ns; 0 if none were.
         lost_why: The reason for which samples were lost last; empty if none were.
-        open: Whether a file is open for it.
-        meant: Whether samples are to be recorded now: the source is open, nobody has stopped the
+        open: Whether a file of the source is open.
+        meant: Whether the source is to be recorded now: the source is open, nobody has stopped the
             recorder, and in the mode ``trigger`` there is a trigger.
     """
 

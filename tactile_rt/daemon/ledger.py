@@ -2,42 +2,13 @@
 lost, over all files and as often as the source comes and goes."""
 
 import time
-from dataclasses import dataclass
 
+from tactile_rt.daemon.health import OnDisk
 from tactile_rt.recording.writer import RecordingWriter
 
-__all__ = ["Ledger", "OnDisk"]
+__all__ = ["Ledger"]
 
 Sums = tuple[int, int, int]  # samples, written_ns, synced_ns
-
-
-@dataclass(frozen=True)
-class OnDisk:
-    """What of a source is on the disk.
-
-    Attributes:
-        written_ns: The host monotonic time of the newest sample that the operating system has, so
-            that it outlives the process, ns; 0 if there is none.
-        synced_ns: The host monotonic time of the newest sample that is on the medium, so that it
-            outlives a power cut, ns; 0 if there is none.
-        samples: The number of samples that are recorded.
-        lost_samples: The number of samples that should have been recorded and are not; those that
-            did not reach the recorder are counted in its queue.
-        lost_ns: The host monotonic time at which samples were lost last, ns; 0 if none were.
-        lost_why: The reason for which samples were lost last; empty if none were.
-        open: Whether a file of the source is open.
-        meant: Whether the source is to be recorded now: the source is open, nobody has stopped the
-            recorder, and in the mode ``trigger`` there is a trigger.
-    """
-
-    written_ns: int = 0
-    synced_ns: int = 0
-    samples: int = 0
-    lost_samples: int = 0
-    lost_ns: int = 0
-    lost_why: str = ""
-    open: bool = False
-    meant: bool = False
 
 
 class Ledger:

@@ -183,28 +183,13 @@ class ModelPart(Part):
         arrived, newest = run[-1].arrived_ns, int(chunk.t_ns[-1])
         self._ahead_ns = 0 if keeps_host_time(opened.stream) else arrived - newest
         lost = self._lost(classifier, int(chunk.t_ns[0]))
-        decisions = classifier.push(chunk)
+        offset = run[-1].utc_offset_ns
+        frame = opened.spec.frame
+        for decision in classifier.decide(chunk):
+            self._tell(decision, run, opened, offset)
         self._last_ns = newest
         self._late += classifier.stats.late - before.late
         self._bad_samples += classifier.stats.bad_samples - before.bad_samples
-        offset = run[-1].utc_offset_ns
-        frame = opened.spec.frame
-        for d in decisions:
-            made = time.monotonic_ns()
-            sample = self._completed(d, run, opened.stream)
-            self._newest = d
-            self._decisions += 1
-            self._final += d.final
-            self._age_s = (made - sample) / 1e9
-            self._latency.add(self._age_s)
-            self._step.add(d.latency_s)
-            if d.final or self.config.decisions == "every_step":
-                self._hub.post(
-                    Decision(
-                        self.config.source, self.config.name, frame, d, sample, made, offset,
-                        self._deadline_ns if opened.stream.live else 0,
-                    )
-                )  # fmt: skip
         self._skips += len(classifier.skips.found)
         for skip in classifier.skips.found:
             self._hub.post(
@@ -219,6 +204,23 @@ class ModelPart(Part):
         if not opened.stream.live:
             for box in self._hub.wanted(Decision):
                 box.wait_for_room(1.0)
+
+    def _tell(self, d: Classification, run: list[SourceChunk], opened: Opened, offset: int) -> None:
+        """Publish a decision, at once: what else is in the chunk may take its time."""
+        made = time.monotonic_ns()
+        sample = self._completed(d, run, opened.stream)
+        self._newest = d
+        self._decisions += 1
+        self._final += d.final
+        self._age_s = (made - sample) / 1e9
+        self._latency.add(self._age_s)
+        self._step.add(d.latency_s)
+        if d.final or self.config.decisions == "every_step":
+            config, frame = self.config, opened.spec.frame
+            deadline_ns = self._deadline_ns if opened.stream.live else 0
+            self._hub.post(
+                Decision(config.source, config.name, frame, d, sample, made, offset, deadline_ns)
+            )
 
     def _lost(self, classifier: Classifier, t_ns: int) -> int:
         """How many samples the mailbox dropped before this one: a stream with a hole, which no

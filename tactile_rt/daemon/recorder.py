@@ -19,6 +19,7 @@ from pathlib import Path
 
 from tactile_rt.daemon.config import RecorderConfig
 from tactile_rt.daemon.consumer import Consumer, View
+from tactile_rt.daemon.health import OnDisk
 from tactile_rt.daemon.items import (
     Closed,
     Contact,
@@ -31,7 +32,7 @@ from tactile_rt.daemon.items import (
     Skipped,
     SourceChunk,
 )
-from tactile_rt.daemon.ledger import Ledger, OnDisk
+from tactile_rt.daemon.ledger import Ledger
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.files import sync_folder
 from tactile_rt.recording.description import describe
@@ -56,6 +57,7 @@ __all__ = ["Recorder"]
 
 FLUSH_S = 0.4  # with the gathering still well under the second that may be lost
 LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
+SLOW_S = 2.0  # beyond two syncs: a medium that is slow, and not just busy for a moment
 STALE_S = 3600.0  # a file that is begun has its name long before
 RING_BYTES = 64 << 20  # of each source, before a trigger
 MB, NS = 1e6, 1e9
@@ -200,6 +202,21 @@ class Recorder(Consumer):
             "lost_samples": self._lost_samples,
             "newest": self._newest,
         }
+
+    def trouble(self) -> str:
+        if self._why and self._state == "disk full":
+            return f"less than min_free_mb = {self._config.min_free_mb:g} MB free: {self._folder}"
+        if self._why or not self._on:
+            return self._why
+        sync_s = self._config.sync_s
+        slow_ns = (2 * sync_s + SLOW_S) * NS
+        for name, track in list(self._tracks.items()):
+            disk = self._on_disk(name, track.ledger)
+            if track.trouble and disk.meant:
+                return track.trouble
+            if sync_s and disk.meant and disk.written_ns - disk.synced_ns > slow_ns:
+                return f"a power cut would take more than {slow_ns / NS:g} s of {name}: a slow disk"
+        return ""
 
     def _take(self, item: Item) -> None:
         if isinstance(item, Opened):

@@ -16,8 +16,6 @@ pytest.importorskip("onnx")
 
 from bench.daemon.process import DaemonProcess, free_port
 from tactile_rt.recording.reader import Recording
-from tactile_rt.testing import small_spec
-from tests.helpers.tiny_model import write_model
 
 CONFIGURATION = """version = 1
 [[source]]
