@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -161,18 +162,19 @@ def _measure(
     )  # fmt: skip
     records = []
     for source in models:
-        age = np.array([a for s, a, _ in heard if s == source])
-        if not len(age):
-            age = np.array([np.inf])
-        p50, p99, most = np.percentile(age, (50, 99, 100), method="lower").tolist()
-        records.append(
-            Record(
-                f"daemon.overload.{name}_{source}_age_p99", p99, "ms", f"<= {STATED_MS:g}",
-                f"p50 {p50:.1f}, worst {most:.1f} of {len(age)} decisions",
-                f"in the hand of zmq's peer; {how}",
-            )
-        )  # fmt: skip
-    unmarked = sum(age > STATED_MS and not late for _, age, late in heard)
+        mine = [h for h in heard if h.source == source]
+        for where, ages in (
+            ("published", [h.published_ms for h in mine]), ("heard", [h.age_ms for h in mine])
+        ):  # fmt: skip
+            p50, p99, most = np.percentile(ages or [np.inf], (50, 99, 100), method="lower").tolist()
+            records.append(
+                Record(
+                    f"daemon.overload.{name}_{source}_{where}_age_p99", p99, "ms",
+                    f"<= {STATED_MS:g}" if where == "published" else "",
+                    f"p50 {p50:.1f}, worst {most:.1f} of {len(mine)} decisions", how,
+                )
+            )  # fmt: skip
+    unmarked = sum(h.age_ms > STATED_MS and not h.late for h in heard)
     return [
         *records,
         Record(f"daemon.overload.{name}_not_marked", unmarked, "decisions", "== 0", "", "old ones"),
@@ -181,18 +183,35 @@ def _measure(
     ]  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Heard:
+    """A decision in a peer's hand.
+
+    Attributes:
+        source: Name of its source.
+        age_ms: Age of its newest sample then, ms; the peer had to wait for its turn, too.
+        published_ms: Age of its newest sample when the message was written, ms.
+        late: Whether it was marked as late.
+    """
+
+    source: str
+    age_ms: float
+    published_ms: float
+    late: bool
+
+
 class _Peer:
     """Hears decisions, and how old each one's newest sample is then."""
 
     def __init__(self, port: int, half_ns: int) -> None:
         self._port, self._half_ns = port, half_ns
-        self._heard: list[tuple[str, float, bool]] = []
+        self._heard: list[Heard] = []
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
 
-    def stop(self) -> list[tuple[str, float, bool]]:
-        """(source, age in ms, whether it was marked as late) of each decision."""
+    def stop(self) -> list[Heard]:
+        """All that was heard."""
         self._over.set()
         self._thread.join(10)
         return self._heard
@@ -215,7 +234,9 @@ class _Peer:
                 if topic.endswith(b"decision"):
                     message = msgspec.json.decode(line)
                     age = (now - message["t_ns"] - self._half_ns) / 1e6
-                    self._heard.append((message["source"], age, message["late"]))
+                    self._heard.append(
+                        Heard(message["source"], age, message["age_ms"], message["late"])
+                    )
 
 
 def main() -> None:

@@ -22,9 +22,11 @@ __all__ = ["CatchUp", "Skip", "Skips"]
 CatchUp = Literal["newest", "all"]
 
 SMOOTHING = 0.2  # of the time that a step is expected to take
-# A step that is expected to take even longer than may pass is tried all the same if it begins so
-# soon: else one that was slow once would be the last.
-LARGEST_SHARE = 0.9
+# Shares of the greatest age. A step whose samples are this young is tried whatever it is expected
+# to take: else one that was slow once would be the last.
+FRESH = 0.1
+# Another one should be done by here: the rest is for its publication, on a machine that is busy.
+DONE = 0.8
 
 
 @dataclass(frozen=True)
@@ -80,8 +82,11 @@ class Skips:
         with all that was taken up to now."""
         if self._age is None:
             return False
-        expected = min(self._expected_s, LARGEST_SHARE * self._most_s)
-        return self._judge(t_ns, self._age(t_ns), expected)
+        age_s = self._age(t_ns)
+        if age_s <= FRESH * self._most_s or age_s + self._expected_s <= DONE * self._most_s:
+            return False
+        self._skip(t_ns, age_s)
+        return True
 
     def after_step(self, t_ns: int, took_s: float) -> bool:
         """Whether a step has come too late; if so it is as if it had been skipped.
@@ -91,10 +96,11 @@ class Skips:
             took_s: how long it took, s.
         """
         self._expected_s += SMOOTHING * (took_s - self._expected_s)
-        return self._age is not None and self._judge(t_ns, self._age(t_ns), 0.0)
-
-    def _judge(self, t_ns: int, age_s: float, expected_s: float) -> bool:
-        if age_s + expected_s <= self._most_s:
+        age_s = 0.0 if self._age is None else self._age(t_ns)
+        if age_s <= self._most_s:
             return False
-        self.add(t_ns, t_ns + max(1, round(1e9 * age_s)))
+        self._skip(t_ns, age_s)
         return True
+
+    def _skip(self, t_ns: int, age_s: float) -> None:
+        self.add(t_ns, t_ns + max(1, round(1e9 * age_s)))

@@ -184,7 +184,8 @@ def _sources(now: "Snapshot", before: "Snapshot | None") -> Table:
         table.add_row(
             _name(s.part), state, rate, f"{s.rate_hz:g}" if s.rate_hz else "", f"{s.samples}",
             _bad(s.stats.missing), _bad(s.stats.corrupt), _bad(s.stats.dropped),
-            f"{s.stats.duplicates}", _bad(s.losses.minute), age, _line(why, "red") if why else _line(shape),
+            f"{s.stats.duplicates}", _bad(s.losses.minute), age,
+            _line(why, "red") if why else _line(shape),
         )  # fmt: skip
     return table
 

@@ -47,7 +47,9 @@ class Ages:
 @settings(max_examples=60, deadline=None)
 @given(
     ages=st.lists(
-        st.sampled_from([0.0, 0.0, 0.0, 0.01, 0.14, 0.151, 0.3, 1.0, 2.5]), min_size=3, max_size=40
+        st.sampled_from([0.0, 0.0, 0.0, 0.01, 0.1, 0.14, 0.151, 0.3, 1.0, 2.5]),
+        min_size=3,
+        max_size=40,
     ),
     mode=st.sampled_from(["episode", "sliding"]),
     samples=st.integers(1, 40),
@@ -72,7 +74,7 @@ def test_what_was_skipped_live_and_is_skipped_again_gives_the_same_decisions(
 
 
 def test_who_is_never_behind_decides_as_if_nobody_looked(model: Path) -> None:
-    watched = Classifier(model, SAME_RATE, age=lambda t_ns: 0.149, catch_up="newest")
+    watched = Classifier(model, SAME_RATE, age=lambda t_ns: 0.119, catch_up="newest")
     plain = Classifier(model, SAME_RATE)
     decisions = push_all(plain, stream(VALUES))
     assert same(push_all(watched, stream(VALUES)), decisions) and watched.stats.skips == 0
@@ -119,7 +121,7 @@ def test_a_step_that_would_be_late_is_not_begun() -> None:
     skips = Skips(most_s=0.15, age=lambda t_ns: 0.1)
     assert not skips.before_step(10)  # what a step takes is not known yet
     for _ in range(50):
-        assert not skips.after_step(10, 0.06)
+        assert not skips.after_step(10, 0.021)  # and then a fifth is left to publish it
     assert skips.before_step(20) and skips.found == [Skip(20, 20 + 100_000_000)]
     assert skips.covers(20) and skips.covers(100_000_019) and not skips.covers(100_000_020)
 

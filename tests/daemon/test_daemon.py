@@ -109,11 +109,13 @@ def robot(tmp_path, spy):
 
 
 def configured(folder, text, checked=True, stop_s=60):
-    """Loaded; calls may take as long as a busy machine makes them."""
+    """Loaded; calls may take as long as a busy machine makes them, and no model skips for that."""
     file = folder / "robot.toml"
+    text = text.replace("[[model]]\n", '[[model]]\ncatch_up = "all"\n')
     file.write_text(
         'version = 1\n[[publisher]]\nkind = "spy"\n[limits]\nretry_first_s = 0.02\n'
-        f'retry_last_s = 0.1\nstall_s = 600\nstop_s = {stop_s}\n[log]\nfile = "log"\n{text}'
+        "retry_last_s = 0.1\nstall_s = 600\nbehind_s = 600\nsample_age_s = 600\n"
+        f'stop_s = {stop_s}\n[log]\nfile = "log"\n{text}'
     )
     loaded = load_config(file)
     if checked:
