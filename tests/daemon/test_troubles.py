@@ -1,0 +1,295 @@
+"""What is told as degraded: facts at the end of each promise, and nothing else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tactile_rt.daemon import troubles as module
+from tactile_rt.daemon.config import LimitsConfig
+from tactile_rt.daemon.frozen import FrozenJudge, frozen_after
+from tactile_rt.daemon.health import (
+    ConsumerState,
+    Losses,
+    ModelState,
+    OnDisk,
+    PartState,
+    SourceState,
+)
+from tactile_rt.daemon.troubles import LossWindow, troubles
+from tactile_rt.drivers.health import Health, State
+from tactile_rt.sensor_spec import ChannelSpec, SensorSpec
+from tactile_rt.testing import cut, small_spec
+
+NOW = 1_000_000_000_000
+S = 1_000_000_000
+LIMITS = LimitsConfig(sample_age_s=0.5, behind_s=0.75, record_age_s=1.0)
+
+
+def part(name, state="running", reason="", failures=0, since_ns=1):
+    return PartState(name, state, reason, since_ns, 1, failures)
+
+
+SOURCE = SourceState(
+    part("source.a"), "serial:x", rate_hz=1000.0, device=Health(State.STREAMING, 1), samples=5,
+    newest_ns=NOW - S // 100, read_ns=NOW - S // 100, live=True,
+)  # fmt: skip
+MODEL = ModelState(part("model.a"), "a", "m.onnx")
+DISK = OnDisk(NOW - S // 2, NOW - S, 99, open=True, meant=True)
+RECORDER = ConsumerState(part("recorder"), "recorder", on_disk={"a": DISK})
+ZMQ = ConsumerState(part("publisher.zmq"), "zmq")
+
+
+def told(sources=(SOURCE,), models=(MODEL,), consumers=(RECORDER, ZMQ), **more):
+    return [t.line for t in troubles(sources, models, consumers, LIMITS, NOW, **more)]
+
+
+def test_who_does_what_it_should_is_not_named():
+    assert told() == []
+
+
+@pytest.mark.parametrize(
+    "changes, line",
+    [
+        ({"newest_ns": NOW - S, "read_ns": NOW - S},
+         "no samples: source.a: none has come for 0.5 s"),
+        ({"newest_ns": NOW - 9 * S},
+         "late samples: source.a: when they come they are older than 0.5 s"),
+        ({"losses": Losses(1, 7)}, "lost samples: source.a: some did not come, or came damaged"),
+        ({"bad": Losses(1, 1)}, "bad samples: source.a: some values are no numbers, or absurd"),
+        ({"device": Health(State.LOST, 1, "unplugged")},
+         "no samples: source.a: the device is lost"),
+        ({"part": part("source.a", "waiting", "no such port")},
+         "no samples: source.a fails: no such port"),
+        ({"part": part("source.a", "stalled")}, "no samples: source.a stalls"),
+        ({"part": part("source.a", "failed", "another array")},
+         "no samples: source.a has failed: another array"),
+    ],
+)  # fmt: skip
+def test_a_source_is_named_by_what_came_of_its_samples(changes, line):
+    assert told([replace(SOURCE, **changes)]) == [line]
+
+
+def test_a_frozen_device_is_named():
+    (line,) = told([replace(SOURCE, frozen_s=0.4)])
+    assert line.startswith("frozen samples: source.a: the values do not change")
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"losses": Losses(0, 50_000)},  # lost within the minute, and no longer
+        {"part": part("source.a", "ended"), "newest_ns": 1, "read_ns": 1},
+        {"part": part("source.a", "stopped"), "newest_ns": 1, "read_ns": 1},
+        {"part": part("source.a", "starting")},
+        {"live": False, "newest_ns": 1, "read_ns": 1},  # a recording waits for its reader
+        {"newest_ns": 0, "read_ns": 0},  # none has come yet: the device says how it is
+        {"rate_hz": 0.5, "newest_ns": NOW - 5 * S, "read_ns": NOW - 5 * S},  # three periods are 6 s
+    ],
+)
+def test_what_is_no_fault_of_a_source_is_not_told(changes):
+    assert told([replace(SOURCE, **changes)]) == []
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"behind_s": 0.76}, "late decisions: model.a: it is more than 0.75 s behind"),
+        ({"skips": Losses(1, 1)}, "missing decisions: model.a: it cannot keep up"),
+        ({"lost": Losses(9, 9)}, "missing decisions: model.a: it was too slow"),
+        ({"part": part("model.a", "waiting", "no file")}, "no decisions: model.a fails: no file"),
+    ],
+)
+def test_a_model_is_named_by_what_it_did_not_decide(changes, words):
+    (line,) = told(models=[replace(MODEL, **changes)])
+    assert line.startswith(words) and line.endswith("; recording goes on")
+    (line,) = told(models=[replace(MODEL, **changes)], consumers=[])
+    assert line.endswith("; acquisition goes on")
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"behind_s": 0.76}, "not published: publisher.zmq: it is more than 0.75 s behind"),
+        ({"losses": Losses(1, 1)}, "not published: publisher.zmq: it was too slow"),
+        ({"trouble": "all 64 are taken"}, "not published: publisher.zmq: all 64 are taken"),
+        ({"part": part("publisher.zmq", "stalled")}, "not published: publisher.zmq stalls"),
+        ({"part": part("publisher.zmq", "starting", "no port", 3)},
+         "not published: publisher.zmq fails: no port"),
+    ],
+)  # fmt: skip
+def test_a_consumer_is_named_by_what_it_did_not_hand_on(changes, words):
+    (line,) = told(consumers=[RECORDER, replace(ZMQ, **changes)])
+    assert line.startswith(words)
+
+
+@pytest.mark.parametrize(
+    "disk, source, words",
+    [
+        (replace(DISK, written_ns=NOW - 2 * S), {}, "samples of a are not on the disk after 1 s"),
+        (replace(DISK, written_ns=0, open=False), {}, "samples of a are not on the disk after 1 s"),
+        (replace(DISK, lost_ns=NOW - S // 2, lost_why="no room"), {},
+         "samples of a are lost: no room"),
+        (replace(DISK, lost_ns=NOW - 2 * S, lost_why="no room"), {}, ""),
+        (replace(DISK, written_ns=NOW - 9 * S, meant=False), {}, ""),  # nobody asks for it now
+        # nothing came that could be written
+        (replace(DISK, written_ns=NOW - 9 * S), {"newest_ns": NOW - 9 * S, "read_ns": NOW - 9 * S},
+         ""),
+    ],
+)  # fmt: skip
+def test_the_recorder_is_named_by_what_is_not_on_the_disk(disk, source, words):
+    found = [
+        line
+        for line in told(
+            [replace(SOURCE, **source)], consumers=[replace(RECORDER, on_disk={"a": disk})]
+        )
+        if line.startswith("no recording")
+    ]
+    assert found == ([f"no recording: recorder: {words}; acquisition goes on"] if words else [])
+
+
+def test_a_process_without_a_turn_blames_none_of_its_parts():
+    stalled = [
+        [replace(SOURCE, part=part("source.a", "stalled"))],
+        [replace(MODEL, behind_s=9.0)],
+        [replace(RECORDER, part=part("recorder", "stalled")), replace(ZMQ, behind_s=9.0)],
+    ]
+    (line,) = told(*stalled, starved_s=9.0)
+    assert line.startswith("late: daemon: it had no turn")
+    assert len(told(*stalled)) == 4
+    # but what was lost meanwhile was lost
+    assert len(told([replace(SOURCE, losses=Losses(5, 5))], starved_s=9.0)) == 2
+
+
+def test_a_line_does_not_change_as_long_as_what_it_says_is_true():
+    a = told([replace(SOURCE, newest_ns=NOW - S, read_ns=NOW - S)])
+    assert a == told([replace(SOURCE, newest_ns=NOW - 7 * S, read_ns=NOW - 7 * S)])
+    assert told([replace(SOURCE, losses=Losses(1, 7))]) == told(
+        [replace(SOURCE, losses=Losses(80, 90))]
+    )
+
+
+def test_a_clock_that_was_set_is_told():
+    assert told(clock_stepped=True) == ["UTC has jumped: daemon: the wall clock was set"]
+
+
+class Hand:
+    """A clock that a test sets."""
+
+    def __init__(self):
+        self.s = 1000.0
+
+    def monotonic(self):
+        return self.s
+
+
+@given(
+    steps=st.lists(
+        st.tuples(st.floats(0.01, 20.0), st.integers(0, 100)), min_size=1, max_size=60
+    )
+)  # fmt: skip
+def test_losses_are_those_of_the_newest_second_and_minute(steps):
+    """Against a list of all that was ever lost; to a look's length, as nobody looks in between."""
+    hand = Hand()
+    before, module.time = module.time, hand
+    try:
+        window, count, all_lost = LossWindow(), 0, []
+        for after_s, lost in steps:
+            hand.s += after_s
+            count += lost
+            all_lost.append((hand.s, lost))
+            found = window.add(count)
+            for length, got in ((1.0, found.second), (60.0, found.minute)):
+                least = sum(n for t, n in all_lost if t > hand.s - length)
+                # what was lost since the look before that time may be counted too
+                earlier = [t for t, _ in all_lost if t <= hand.s - length]
+                last = earlier[-1] if earlier else 1000.0
+                most = sum(n for t, n in all_lost if t > last - module.LOOK_S)
+                assert least <= got <= max(most, least)
+    finally:
+        module.time = before
+
+
+def test_whoever_looks_often_does_not_fill_the_window():
+    window = LossWindow()
+    for n in range(2000):
+        window.add(n)
+    assert len(window._seen) < 100
+
+
+# frozen
+
+
+def chunks(values):
+    return cut(np.asarray(values, np.float32), 1000.0, 7)
+
+
+def judged(values, after_s):
+    judge = FrozenJudge()
+    judge.after_s = after_s
+    found = []
+    for chunk in chunks(values):
+        judge.add(chunk)
+        found.append(judge.seconds)
+    return found
+
+
+def test_values_that_do_not_change_are_frozen_and_one_that_does_ends_it():
+    rng = np.random.default_rng(0)
+    values = rng.normal(size=(900, 3, 2))
+    values[200:700] = values[200]
+    values[700:] += 1.0
+    found = judged(values, 0.3)
+    times = (np.arange(len(found)) * 7 + 6) / 1000.0
+    frozen = np.array(found) > 0
+    assert frozen[(times > 0.51) & (times < 0.69)].all()
+    assert not frozen[times < 0.5].any() and not frozen[times > 0.708].any()
+    assert max(found) == pytest.approx(0.5, abs=0.01)
+
+
+def test_one_value_of_many_that_changes_is_enough():
+    values = np.zeros((900, 3, 2))
+    values[:, 2, 1] = np.arange(900) % 2
+    assert not any(judged(values, 0.05))
+    values[:, 2, 1] = 0.0
+    assert any(judged(values, 0.05))
+    assert any(judged(np.full((900, 3, 2), np.nan), 0.05))  # no number is equal to itself, here
+
+
+def test_nothing_is_judged_of_a_sensor_that_nothing_is_known_of():
+    assert not any(judged(np.zeros((900, 3, 2)), float("inf")))
+
+
+def sensor(noise, resolution):
+    return SensorSpec(
+        channels=(
+            ChannelSpec(name="fy", unit="N", range=1.0, noise_density=noise, resolution=resolution),
+        )
+    )
+
+
+def test_from_when_on_equal_samples_are_impossible_follows_from_the_noise():
+    spec = small_spec(rate_hz=1000.0)
+    fine, coarse = sensor(1e-3, 1e-6), sensor(1e-6, 1e-2)
+    assert frozen_after(spec, fine) == 0.25
+    assert frozen_after(spec, coarse) == float("inf")
+    assert frozen_after(spec, sensor(0.0, 1e-3)) == float("inf")
+    assert frozen_after(spec, sensor(1e-3, 0.0)) == 0.25
+
+
+@given(ratio=st.floats(0.05, 3.0), seed=st.integers(0, 1000))
+def test_no_sensor_of_a_known_noise_is_taken_for_frozen(ratio, seed):
+    """White noise, rounded to steps of so many standard deviations: never so long the same."""
+    rate, density = 200.0, 1e-3
+    sigma = density * np.sqrt(rate / 2)
+    spec = small_spec(rate_hz=rate)
+    after_s = frozen_after(spec, sensor(density, sigma / ratio))
+    noise = np.random.default_rng(seed).normal(scale=sigma, size=(2000, 3, 1))
+    rounded = (np.round(noise / (sigma / ratio)) * (sigma / ratio)).astype(np.float32)
+    judge = FrozenJudge()
+    judge.after_s = after_s
+    for chunk in cut(rounded, rate, 7):
+        judge.add(chunk)
+        assert judge.seconds == 0.0
