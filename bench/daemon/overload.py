@@ -184,7 +184,7 @@ def _measure(
 
 
 @dataclass(frozen=True)
-class Heard:
+class HeardDecision:
     """A decision in a peer's hand.
 
     Attributes:
@@ -205,12 +205,12 @@ class _Peer:
 
     def __init__(self, port: int, half_ns: int) -> None:
         self._port, self._half_ns = port, half_ns
-        self._heard: list[Heard] = []
+        self._heard: list[HeardDecision] = []
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
 
-    def stop(self) -> list[Heard]:
+    def stop(self) -> list[HeardDecision]:
         """All that was heard."""
         self._over.set()
         self._thread.join(10)
@@ -235,7 +235,7 @@ class _Peer:
                     message = msgspec.json.decode(line)
                     age = (now - message["t_ns"] - self._half_ns) / 1e6
                     self._heard.append(
-                        Heard(message["source"], age, message["age_ms"], message["late"])
+                        HeardDecision(message["source"], age, message["age_ms"], message["late"])
                     )
 
 

@@ -78,14 +78,29 @@ def example(
     """Give a configuration to begin with, in which every key is explained."""
     from tactile_rt.daemon.config import EXAMPLE
 
+    _give(EXAMPLE, output, f"run it with: tactile-rt run {shlex.quote(str(output))}")
+
+
+@config.command()
+def alerts(
+    output: Annotated[Path | None, typer.Argument(help="Where to; default: print it.")] = None,
+) -> None:
+    """Give rules by which Prometheus tells what a daemon does not do; it needs [metrics]."""
+    from tactile_rt.daemon.metrics import ALERTS
+
+    _give(ALERTS.read_text("utf-8"), output, "name it under rule_files of prometheus.yml")
+
+
+def _give(text: str, output: Path | None, then: str) -> None:
+    """Print a text, or write it to where there is nothing yet."""
     check_output(output)
     if output is None:
-        typer.echo(EXAMPLE, nl=False)
+        typer.echo(text, nl=False)
         return
     if output.exists():
         raise ConfigError(f"{output} is there already: name another file")
-    output.write_text(EXAMPLE)
-    typer.echo(f"{output} is written; run it with: tactile-rt run {shlex.quote(str(output))}")
+    output.write_text(text)
+    typer.echo(f"{output} is written; {then}")
 
 
 @app.command("install-service")

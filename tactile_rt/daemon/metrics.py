@@ -8,6 +8,7 @@ at a time.
 import os
 import resource
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -22,7 +23,9 @@ from tactile_rt.daemon.messages import encode, state_message
 from tactile_rt.drivers.health import State
 from tactile_rt.stream import SourceError
 
-__all__ = ["Metrics", "exposition"]
+__all__ = ["ALERTS", "Metrics", "exposition"]
+
+ALERTS = Path(__file__).parents[1] / "assets" / "alerts.yml"
 
 LIMITS = HttpLimits(connections=16, head_bytes=8192, head_s=2.0, send_s=2.0)
 HEADERS = {"cache-control": "no-store", "x-content-type-options": "nosniff"}

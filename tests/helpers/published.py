@@ -9,10 +9,12 @@ from tactile_rt.daemon.health import (
     ConsumerState,
     Latency,
     ModelState,
+    OnDisk,
     PartState,
     QueueState,
     Snapshot,
     SourceState,
+    Trouble,
 )
 from tactile_rt.daemon.items import Closed, Contact, Decision, Event, Opened, SourceChunk
 from tactile_rt.drivers.health import Health, State
@@ -119,8 +121,12 @@ def busy_snapshot(seconds=0, state="degraded"):
                 part("publisher.zmq"), "zmq", queue, latency,
                 {"endpoint": "tcp://127.0.0.1:5556", "messages": 40},
             ),
-            ConsumerState(part("recorder", "waiting", "No space left on device", 9), "recorder"),
+            ConsumerState(
+                part("recorder", "waiting", "No space left on device", 9), "recorder",
+                on_disk={"whiskers": OnDisk(at - 400_000_000, at - 900_000_000, 4000, meant=True)},
+            ),
         ),
+        troubles=(Trouble("source.finger", "no samples", "the device is lost"),),
     )  # fmt: skip
 
 
