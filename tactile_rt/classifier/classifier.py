@@ -221,6 +221,16 @@ class Classifier:
         self._rated = rated_noise(self.card)
         self._promise: CandidateRule | None = None  # of the episode
 
+    @property
+    def deciding(self) -> bool:
+        """Whether something is touched, or an episode is under way."""
+        return self.detector.contact or self._onset_ns is not None
+
+    @property
+    def step_ms(self) -> float:
+        """The time of the stream that a step takes, ms."""
+        return self.card.substeps * self.card.period_ns / 1e6
+
     def push(self, chunk: Chunk) -> list[Classification]:
         """Take samples as they come from the array, return the decisions that they complete."""
         return list(self.decide(chunk))

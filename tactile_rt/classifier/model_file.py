@@ -76,13 +76,17 @@ def hash_of(model: Path) -> str:
         raise ConfigError(f"model {model} cannot be read: {error.strerror}") from None
 
 
-def read_model(path: Path) -> tuple[ModelCard, Contents, bytes]:
+def read_model(path: Path, kind: Kind | None = None) -> tuple[ModelCard, Contents, bytes]:
     """Read a model file without running it: its card, what else it holds, its bytes.
 
+    Args:
+        path: the ``.onnx`` file.
+        kind: the kind of model that is needed; None takes any.
+
     Raises:
-        ModelError: not there, too large, not ONNX, reaching outside the file or past the limits
-            of `onnx_check`, without our metadata, or with metadata that is damaged, of
-            another version, or names other inputs and outputs than the graph.
+        ModelError: not of this kind, not there, too large, not ONNX, reaching outside the file or
+            past the limits of `onnx_check`, without our metadata, or with metadata that is damaged,
+            of another version, or names other inputs and outputs than the graph.
     """
     if not path.is_file():
         raise ModelError(f"no model file {path}")
@@ -103,6 +107,8 @@ def read_model(path: Path) -> tuple[ModelCard, Contents, bytes]:
             "(export it with `tactile-rt export`)"
         )
     card = parse_card(path, text)
+    if kind is not None and card.kind != kind:
+        raise ModelError(f"{path} is a model of kind {card.kind!r}; this needs {kind!r}")
     named = {"samples", "offset", "sigma", *(s.name for s in card.state)}
     if wrong := sorted(named ^ set(contents.inputs)):
         raise _disagree(path, wrong)
@@ -137,9 +143,7 @@ def load_model(
     for provider in providers:
         if provider not in available:
             raise ConfigError(f"no {provider} in this onnxruntime: it has {', '.join(available)}")
-    card, _, data = read_model(path)
-    if kind is not None and card.kind != kind:
-        raise ModelError(f"{path} is a model of kind {card.kind!r}; this needs {kind!r}")
+    card, _, data = read_model(path, kind)
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads
     options.inter_op_num_threads = 1

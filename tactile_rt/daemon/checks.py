@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tactile_rt.classifier.model_file import fit_source, load_model, read_model, shipped_model
+from tactile_rt.classifier.model_file import fit_source, read_model, shipped_model
 from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.daemon.config import Config, ModelConfig, SourceConfig, is_loopback
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
@@ -93,7 +93,8 @@ def _check_model(
         loaded.refuse([*path, "file"], f"{model.file} is a folder")
     file = Path(model.file) if model.file else shipped_model()
     if model.file:
-        _try(loaded, [*path, "file"], load_model, file)
+        # What it does when it runs is for its trial to find out, see `admission`.
+        _try(loaded, [*path, "file"], lambda f: read_model(f, "step"), file)
     _try(loaded, [*path, "providers"], onnxruntime_names, model.providers)
     if model.every and model.mode != "sliding":
         loaded.refuse([*path, "every"], 'it is for mode = "sliding"')

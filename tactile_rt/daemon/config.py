@@ -195,6 +195,9 @@ class LimitsConfig(_Table, frozen=True, kw_only=True):
         model_queue_items: Number of chunks that may wait for one model.
         gather_ms: Time that a model waits for more samples before it looks at those that came, ms;
             less is sooner, more takes less of the processor.
+        model_mb: Memory that a model may need to load and run, beside four times its file's size,
+            MB.
+        model_s: Time that a model may need to load and warm up, s.
         stop_s: Longest time that closing may take, s.
         stall_s: Duration from which a call is told as stalled, s.
         sample_age_s: Age of a live source's newest sample from which the daemon is degraded, s;
@@ -212,6 +215,8 @@ class LimitsConfig(_Table, frozen=True, kw_only=True):
     queue_mb: Annotated[float, msgspec.Meta(ge=1, le=4096)] = 32.0
     model_queue_items: Annotated[int, msgspec.Meta(ge=2, le=100_000)] = 1024
     gather_ms: Annotated[float, msgspec.Meta(ge=0, le=100)] = 2.0
+    model_mb: Annotated[float, msgspec.Meta(ge=16, le=1_000_000)] = 256.0
+    model_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 60.0
     stop_s: Annotated[float, msgspec.Meta(ge=0.2, le=60)] = 2.0
     stall_s: Annotated[float, msgspec.Meta(ge=0.5, le=3600)] = 5.0
     sample_age_s: Annotated[float, msgspec.Meta(ge=0.05, le=3600)] = 0.5
@@ -316,6 +321,8 @@ queue_items = 4096             # what may wait for one consumer before the oldes
 queue_mb = 32
 model_queue_items = 1024       # chunks that may wait for one model
 gather_ms = 2                  # more takes less of the processor, and adds to the latency
+model_mb = 256                 # memory that a model may need, beside four times its file
+model_s = 60                   # time that it may need to load and warm up
 stop_s = 2                     # how long closing may take
 stall_s = 5                    # a call that takes longer is told as stalled
 sample_age_s = 0.5             # what is older than these makes the daemon degraded: a sample,

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from tactile_rt.daemon.admission import file_stamp, model_path
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import config_text
 from tactile_rt.daemon.consumer import ConsumerPart
@@ -16,7 +17,7 @@ from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.lock import Locks, lock_keys
 from tactile_rt.daemon.mailbox import Hub
-from tactile_rt.daemon.model_part import ModelPart, file_stamp, model_path
+from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.source_part import SourcePart
 from tactile_rt.daemon.troubles import troubles
@@ -69,6 +70,7 @@ class Daemon:
         self._reloads = self._clock_steps = 0
         self._turns: dict[str, int] = {}  # threads that are no parts: when they last turned
         self._starved = (0, 0.0)  # when that ended last, CLOCK_MONOTONIC, ns; how long it was, s
+        self._refused = ""  # why the newest configuration is not in force
         self._stepped_ns = 0  # when the wall clock last jumped, CLOCK_MONOTONIC
         self._unwatch = threading.Event()
         self._watcher = threading.Thread(target=self._watch, name="tactile-rt watch", daemon=True)
@@ -90,13 +92,16 @@ class Daemon:
         self._watcher.start()
 
     def reload(self, loaded: Loaded) -> None:
-        """Change to another configuration: what is the same in it goes on undisturbed.
+        """Change to another configuration: what is the same in it goes on undisturbed, and a model
+        goes on until the one that takes its place is admitted.
 
         Raises:
             ConfigError: a consumer cannot be made; nothing has changed.
             AlreadyRunning: another process has a device; nothing has changed.
         """
         with self._changing:
+            if self._stopping:
+                return
             wanted = {w.name: w for w in wanted_consumers(loaded)}
             new = {
                 name: w.make()
@@ -105,7 +110,7 @@ class Daemon:
             }
             if self._locks is not None:
                 self._locks.hold(_keys(loaded))
-            self._loaded = loaded
+            self._loaded, self._refused = loaded, ""
             self._reloads += 1
             gone = [n for n in self._consumers if n not in wanted or n in new]
             old = [self._consumers.pop(name)[1] for name in gone]
@@ -115,6 +120,11 @@ class Daemon:
             self._match()
         parts = ", ".join(sorted(new)) if new else "no consumer"
         self.report("daemon", "reloaded", f"{loaded.path}: {parts} new or changed")
+
+    def refuse(self, reason: str) -> None:
+        """Tell that the newest configuration is not in force, for this reason."""
+        self._refused = reason
+        self.report("daemon", "refused", f"the old configuration goes on: {reason}", "error")
 
     def stop(self) -> list[str]:
         """Close everything within `limits.stop_s`: sources, then models, then consumers, each
@@ -162,7 +172,7 @@ class Daemon:
         now = self._clock.monotonic_ns()
         found = troubles(
             sources, models, consumers, self._loaded.config.limits, now, self._starved_s(),
-            bool(self._stepped_ns) and now - self._stepped_ns < LATELY_NS,
+            bool(self._stepped_ns) and now - self._stepped_ns < LATELY_NS, self._refused,
         )  # fmt: skip
         state = "degraded" if found else "running"
         state = "stopping" if self._stopping else "starting" if self._starting else state
@@ -238,11 +248,14 @@ class Daemon:
         limits = config.limits
         models = {m.name: ((m, limits, file_stamp(model_path(m))), m) for m in config.model}
         sources = {s.name: s for s in config.source}
-        old: list[Part] = [
-            self._models.pop(name)[1]
-            for name, (key, _) in list(self._models.items())
-            if name not in models or models[name][0] != key
-        ]
+        old: list[Part] = []
+        for name, (key, running) in list(self._models.items()):
+            new = models.get(name)
+            if new is None or not (key == new[0] or running.may_exchange(new[1], limits)):
+                old.append(self._models.pop(name)[1])
+            elif key != new[0]:
+                self._models[name] = (new[0], running)
+                running.exchange(new[1])
         old += [
             self._sources.pop(name)
             for name, part in list(self._sources.items())
@@ -274,11 +287,9 @@ class Daemon:
         until = time.monotonic() + self._loaded.config.limits.stop_s
         for part in parts:
             while not part.join(min(until, time.monotonic() + WATCH_S)):
-                if "main" in self._turns:
-                    self.turned("main")  # it waits, but not for ever
-                if time.monotonic() >= until:
+                if self._stopping or time.monotonic() >= until:
                     break
-            if not part.join(0.0):
+            if not part.join(0.0) and not self._stopping:
                 self.report(part.name, "abandoned", "it did not end in time", "error")
 
     def _watch(self) -> None:

@@ -166,6 +166,8 @@ class ModelState:
         skipped: The number of times that it skipped to the newest sample.
         skips: The number of times that it did so lately.
         lost: The number of samples that were dropped from its mailbox lately.
+        refused: The reason for which the model that was to take the place of this one does not;
+            empty if none was refused since this one was admitted.
         bad_samples: The number of samples that held what is no number, and were left out.
     """
 
@@ -189,6 +191,7 @@ class ModelState:
     skipped: int = 0
     skips: Losses = field(default_factory=Losses)
     lost: Losses = field(default_factory=Losses)
+    refused: str = ""
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,17 @@
 """A classifier in a thread of its own, fed from a mailbox."""
 
 import time
+from collections import deque
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
 from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.classifier.model_card import sensor_of
-from tactile_rt.classifier.model_file import hash_of, shipped_model
+from tactile_rt.classifier.model_file import hash_of
+from tactile_rt.classifier.trial import Trial
+from tactile_rt.daemon.admission import Admission, file_stamp, model_path
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.health import LatencyMeter, ModelState
@@ -28,9 +30,11 @@ from tactile_rt.stream import (
     concatenate,
 )
 
-__all__ = ["ModelPart", "file_stamp", "model_path"]
+__all__ = ["ModelPart"]
 
 MODEL_BYTES = 64 << 20
+WAKE_S, LOOK_S = 0.25, 0.02
+LONGEST_S = 10.0  # a touch that lasts longer does not keep a new model waiting
 BEGINNING_NS = 60 * NS_PER_S  # more than waits for a model that is still being loaded
 
 
@@ -51,14 +55,19 @@ class ModelPart(Part):
         self._opened: Opened | None = None
         self._classifier: Classifier | None = None
         self._refused: tuple[object, TactileError] | None = None
+        self._trial: tuple[tuple[int, ...], Trial | None] = (), None  # of which file
+        self._wanted: deque[ModelConfig] = deque()  # what is to take the place of this one
+        self._next: Admission | None = None
+        self._ready_at = 0.0
+        self.refused = ""  # why the newest one that was to do so did not
         self._half_ns = 0  # half the resampler's kernel
         self._deadline_ns = 0
         self._ahead_ns = 0  # host time less stream time
         self._last_ns: int | None = None  # stream time of the newest sample that was taken
         self._dropped = self._hole = 0  # samples that the mailbox has dropped; since that one
         self._sha256 = ""
-        self._hashed: tuple[int, ...] = ()
-        self._hash()  # a recording tells it from its first byte
+        with suppress(ConfigError):  # loading tells if it is none
+            self._sha256 = hash_of(self.file)  # a recording tells it from its first byte
         self._labels: tuple[str, ...] = ()
         self.sensor: SensorSpec | None = None  # what the model was made for, if it tells
         self._decisions = self._final = self._late = self._bad_samples = 0
@@ -80,23 +89,35 @@ class ModelPart(Part):
             self._latency.state, self._step.state, self._late, self._bad_samples,
             1e3 * self._age_s, max(queue.oldest_s, self.silent_s), self._skips,
             self._skipped.add(self._skips), self._losses.add(queue.dropped["samples"]),
+            self.refused,
         )  # fmt: skip
 
     def stop(self) -> None:
         super().stop()
         self.box.close()
 
+    def may_exchange(self, config: ModelConfig, limits: LimitsConfig) -> bool:
+        """Whether another model can take the place of this one while it decides."""
+        running = self.state.state == "running"
+        return running and config.source == self.config.source and limits == self.limits
+
+    def exchange(self, config: ModelConfig) -> None:
+        """Let another model, or the same one decided by otherwise, take the place of this one as
+        soon as it is admitted; from any thread. Asked again before that, the newest counts."""
+        self._wanted.append(config)
+
     def _work(self) -> None:
         self._load()
         self.box.taking = True
         self._up()
         while True:
-            items = self.box.take()
+            items = self.box.take(WAKE_S)
             if not items and self.box.closed:
                 return
             self._busy_ns = time.monotonic_ns()
             try:
                 self._take(items)
+                self._look_after(bool(items))
             finally:
                 self._busy_ns = 0
 
@@ -112,51 +133,114 @@ class ModelPart(Part):
         return self._refused is None or tried not in (None, self._refused[0])
 
     def _load(self) -> None:
-        """Make the classifier; without a source, at least see whether there is a model."""
-        self._opened = self._hub.streams().get(self.config.source)
-        if self._opened is not None:
-            self._make(self._opened)
-        elif not self.file.is_file():
-            raise ConfigError(f"no model file {self.file}")
+        """Make the classifier; without a source, at least see whether the model is admitted."""
+        self._opened = opened = self._hub.streams().get(self.config.source)
+        if opened is not None:
+            self._make(opened)
+        else:
+            self._admitted(None)
 
     def _make(self, opened: Opened) -> None:
         # Anew for every stream: what was touched before need not be what is touched now.
         self._classifier = None
+        if self._next is not None and self._next.finished.is_set() and self._next.error is None:
+            self.config, self.file = self._next.config, self._next.file
+            self._next = None
         tried = (opened.spec, file_stamp(self.file))
         if self._refused is not None and self._refused[0] == tried:
             raise self._refused[1]  # as long as nothing has changed, loading it again is in vain
         self._refused = None
         try:
-            config = self.config
-            self._classifier = Classifier(
-                self.file, opened.spec, mode=config.mode, every=config.every or None,
-                sure=config.sure or None, in_a_row=config.in_a_row,
-                deadline_s=config.deadline_ms / 1e3 or None, late=config.late,
-                providers=config.providers, age=self._age if opened.stream.live else None,
-                catch_up=config.catch_up, behind_s=config.behind_ms / 1e3 or None,
-            )  # fmt: skip
+            admission = self._admitted(opened)
         except SpecMismatch as error:
             self._refused = (tried, SpecMismatch(f"source {opened.source}: {error}"))
             raise self._refused[1] from None
         except TactileError as error:
             self._refused = (tried, error)
             raise
+        if admission is not None:
+            self._install(opened, admission)
+
+    def _admitted(self, opened: Opened | None) -> Admission | None:
+        """The model, once it is there; None: the part is to end.
+
+        Raises:
+            TactileError: It is refused.
+        """
+        admission = self._admit(self.config, opened)
+        while not admission.finished.wait(LOOK_S):
+            if self._stop.is_set():
+                admission.give_up()
+                return None
+        if admission.error is not None:
+            raise admission.error
+        self._trial = admission.stamp, admission.trial
+        return admission
+
+    def _admit(self, config: ModelConfig, opened: Opened | None) -> Admission:
+        known, trial = self._trial
+        same = known == file_stamp(model_path(config)) and config.mode == self.config.mode
+        return Admission(config, self.limits, opened, self._age, trial if same else None)
+
+    def _install(self, opened: Opened, admission: Admission) -> None:
+        """From now on this one decides."""
+        assert admission.classifier is not None and admission.trial is not None
+        self._classifier = admission.classifier
+        self.config, self.file = admission.config, admission.file
+        self._sha256, self.refused = admission.trial.sha256, ""
         self._opened = opened
         self._labels = self._classifier.card.labels
         self.sensor = sensor_of(self._classifier.card)
-        self._hash()
         card = self._classifier.card
         self._half_ns = max(card.period_ns, round(NS_PER_S / opened.spec.rate_hz))
         step_ns = card.substeps * card.period_ns
         self._deadline_ns = round(1e6 * self.config.deadline_ms) or step_ns
         self._last_ns = None
 
-    def _hash(self) -> None:
-        """Note the file's hash, anew only if it is another file; loading tells if it is none."""
-        stamp = file_stamp(self.file)
-        if stamp != self._hashed:
-            with suppress(ConfigError):
-                self._sha256, self._hashed = hash_of(self.file), stamp
+    def _look_after(self, came: bool) -> None:
+        """See to it that a model that is to take the place of this one does."""
+        if self._wanted:
+            if self._next is not None:
+                self._next.give_up()
+            self._next = self._admit(self._wanted[-1], self._opened)
+            self._wanted.clear()
+        new = self._next
+        if new is None or not new.finished.is_set():
+            return
+        if new.error is not None:
+            self._next, self.refused = None, str(new.error)
+            self._report(self.name, "refused", f"the one before goes on: {new.error}", "error")
+            return
+        self._trial = new.stamp, new.trial
+        waited = self._ready_s()
+        if new.classifier is None:  # there is no stream: it is loaded when there is one
+            self.config, self.file, self.refused = new.config, new.file, ""
+            assert new.trial is not None
+            self._sha256 = new.trial.sha256
+        elif self._opened is None or not self._settled(new.classifier, came, waited):
+            return
+        else:
+            self._install(self._opened, new)
+        self._next, self._ready_at = None, 0.0
+        late = (
+            f"; in the middle of a touch that did not end for {waited:.0f} s"
+            if waited > LONGEST_S
+            else ""
+        )
+        self._report(self.name, "admitted", f"{new.words}{late}")
+
+    def _ready_s(self) -> float:
+        """How long the next model has been ready, s."""
+        self._ready_at = self._ready_at or time.monotonic()
+        return time.monotonic() - self._ready_at
+
+    def _settled(self, new: Classifier, came: bool, waited: float) -> bool:
+        """Whether a new model may take over: it knows the baseline, and nothing is under way."""
+        if self._classifier is None or waited > LONGEST_S:
+            return True
+        if self._classifier.deciding:
+            return False
+        return not came or (new.detector.ready and not new.deciding)
 
     def _take(self, items: list[Item]) -> None:
         run: list[SourceChunk] = []
@@ -187,6 +271,9 @@ class ModelPart(Part):
         frame = opened.spec.frame
         for decision in classifier.decide(chunk):
             self._tell(decision, run, opened, offset)
+        if self._next is not None and self._next.classifier is not None:
+            self._next.classifier.push(chunk)  # it finds its baseline, and is asked nothing
+            self._next.classifier.skips.found.clear()
         self._last_ns = newest
         self._late += classifier.stats.late - before.late
         self._bad_samples += classifier.stats.bad_samples - before.bad_samples
@@ -257,17 +344,3 @@ class ModelPart(Part):
         if not frame and self._opened is not None:
             frame, offset = self._opened.spec.frame, self._clock.utc_offset_ns()
         self._hub.post(Contact(self.config.source, self.config.name, frame, touching, t_ns, offset))
-
-
-def model_path(config: ModelConfig) -> Path:
-    """The model's file; that of the package if the configuration names none."""
-    return Path(config.file) if config.file else shipped_model()
-
-
-def file_stamp(file: Path) -> tuple[int, ...]:
-    """Changes when a file is replaced, written, or taken away."""
-    try:
-        found = file.stat()
-    except (OSError, ValueError):
-        return ()
-    return (found.st_mtime_ns, found.st_size, found.st_ino)

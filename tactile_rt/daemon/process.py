@@ -8,6 +8,7 @@ what was noted before it starts anything. That is why this module imports next t
 import os
 import signal
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from enum import IntEnum
@@ -108,13 +109,18 @@ def _asked_to_end(calls: Calls) -> bool:
 def _serve(
     daemon: "Daemon", path: Path, sets: Sequence[str], calls: Calls, seconds: float | None
 ) -> None:
-    from tactile_rt.daemon.checks import check_config
-    from tactile_rt.daemon.loading import load_config
-    from tactile_rt.stream import TactileError
-
     end = None if seconds is None else time.monotonic() + seconds
+    reloading: threading.Thread | None = None
+    asked = False
     while True:
         daemon.turned("main")
+        if asked and (reloading is None or not reloading.is_alive()):
+            asked = False
+            daemon.report("daemon", "reloading", "")
+            reloading = threading.Thread(
+                target=_reload, args=(daemon, path, sets), name="tactile-rt reload", daemon=True
+            )
+            reloading.start()
         left = TURN_S if end is None else min(TURN_S, end - time.monotonic())
         if left < 0:
             return
@@ -124,13 +130,23 @@ def _serve(
             continue
         if number != signal.SIGHUP:
             return
-        daemon.report("daemon", "reloading", "")
-        try:
-            loaded = load_config(path, sets)
-            check_config(loaded)
-            daemon.reload(loaded)
-        except TactileError as error:
-            daemon.report("daemon", "refused", f"the old configuration goes on: {error}", "error")
+        asked = True
+
+
+def _reload(daemon: "Daemon", path: Path, sets: Sequence[str]) -> None:
+    """In a thread of its own: whatever it takes, signals are obeyed meanwhile."""
+    from tactile_rt.daemon.checks import check_config
+    from tactile_rt.daemon.loading import load_config
+    from tactile_rt.stream import TactileError
+
+    try:
+        loaded = load_config(path, sets)
+        check_config(loaded)
+        daemon.reload(loaded)
+    except TactileError as error:
+        daemon.refuse(str(error))
+    except Exception as error:  # else nobody would know that it was not done
+        daemon.refuse(f"{type(error).__name__}: {error}")
 
 
 def leave(code: ExitCode) -> None:

@@ -69,6 +69,7 @@ def troubles(
     now_ns: int,
     starved_s: float = 0.0,
     clock_stepped: bool = False,
+    refused: str = "",
 ) -> tuple[Trouble, ...]:
     """All that do not do what they promise, in the order of the stream.
 
@@ -78,6 +79,7 @@ def troubles(
         now_ns: when all this is true, host CLOCK_MONOTONIC, ns.
         starved_s: how long the whole process had no turn, within the newest second, s.
         clock_stepped: whether the wall clock jumped within the newest second.
+        refused: why the newest configuration is not in force; empty: it is.
     """
     found = []
     if starved_s:
@@ -85,12 +87,15 @@ def troubles(
         found.append(Trouble("daemon", "late", why))
     if clock_stepped:
         found.append(Trouble("daemon", "UTC has jumped", "the wall clock was set"))
+    if refused:
+        why = f"the new one is refused: {refused}"
+        found.append(Trouble("daemon", "old configuration", why, "the one before is in force"))
     for source in sources:
         found += _of_source(source, limits, now_ns, bool(starved_s))
     recording = any(c.kind == "recorder" and c.part.state == "running" for c in consumers)
     on = "recording goes on" if recording else "acquisition goes on"
     for model in models:
-        found += _of_model(model, limits, on, bool(starved_s))
+        found += _of_model(model, limits, now_ns, on, bool(starved_s))
     for consumer in consumers:
         found += _of_consumer(consumer, sources, limits, now_ns, bool(starved_s))
     return tuple(found)
@@ -128,12 +133,16 @@ def _of_source(
     return found
 
 
-def _of_model(model: ModelState, limits: LimitsConfig, still: str, starved: bool) -> list[Trouble]:
+def _of_model(
+    model: ModelState, limits: LimitsConfig, now_ns: int, still: str, starved: bool
+) -> list[Trouble]:
     part = model.part
     if _broken(part):
         if starved and part.state == "stalled":
             return []
         return [Trouble(part.name, "no decisions", _why(part), still)]
+    if part.state == "starting" and now_ns - part.since_ns > limits.behind_s * NS:
+        return [Trouble(part.name, "no decisions", "it is still being tried and loaded", still)]
     if part.state != "running":
         return []
     if model.behind_s > limits.behind_s and not starved:
@@ -147,6 +156,9 @@ def _of_model(model: ModelState, limits: LimitsConfig, still: str, starved: bool
         return [Trouble(part.name, "missing decisions", why, still)]
     if model.lost.second:
         return [Trouble(part.name, "missing decisions", "it was too slow for its samples", still)]
+    if model.refused:
+        why = f"the new one is refused: {model.refused}"
+        return [Trouble(part.name, "old model", why, "the one before decides")]
     return []
 
 

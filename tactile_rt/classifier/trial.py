@@ -1,0 +1,217 @@
+"""A model file on trial: loaded, warmed and stepped in a process of its own, within limits.
+
+`onnx_check` refuses what a file says that it is; what it does when it runs only running it shows.
+Shapes that are computed can ask for any memory, and a graph of a few kilobytes for hours. So before
+a daemon, which has samples to lose, loads a file, a child process does: with a limit on its memory,
+on its processor time and on the clock. It dies with whoever started it.
+
+    try_model(path, Limits) -> Trial        in the process that asks
+    python -m tactile_rt.classifier.trial   the child: settings as JSON in, result as JSON out
+"""
+
+import ctypes
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+
+from tactile_rt.stream import ModelError
+
+__all__ = ["Trial", "TrialLimits", "try_model"]
+
+MB = 1_000_000
+LOOK_S = 0.02  # how soon it is seen that the child has ended, or that nobody waits for it
+CPU_S = 2  # beyond the limit on the clock: threads of onnxruntime may share the work
+STEPS = 5  # timed, after the warm-up
+PR_SET_PDEATHSIG = 1
+WANTED_MEMORY = ("bad_alloc", "Failed to allocate", "BFCArena", "bad allocation")
+MESSAGE = 400  # characters
+
+
+class TrialLimits(msgspec.Struct, frozen=True):
+    """What a model may need.
+
+    Attributes:
+        memory_mb: The memory beside four times the file's size, in MB.
+        seconds: The time to load and to warm up, s.
+    """
+
+    memory_mb: float = 256.0
+    seconds: float = 60.0
+
+
+class Trial(msgspec.Struct, frozen=True):
+    """What a model needed.
+
+    Attributes:
+        sha256: The hash of the bytes that were tried, hexadecimal.
+        load_s: The time that it took to load and to warm up, s.
+        step_s: The median time of a step, s.
+        memory_mb: The memory that it took, in MB.
+    """
+
+    sha256: str
+    load_s: float
+    step_s: float
+    memory_mb: float
+
+
+class _Task(msgspec.Struct, frozen=True):
+    path: str
+    every: int  # of windows that slide; 0: none does
+    limits: TrialLimits
+
+
+class _Refusal(msgspec.Struct, frozen=True):
+    refused: str
+
+
+def try_model(
+    path: Path,
+    limits: TrialLimits | None = None,
+    every: int = 0,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Trial:
+    """Load a file, warm it up and take steps, in a child process.
+
+    Args:
+        path: of the ``.onnx`` file, of kind ``step``.
+        limits: what it may need; None: the usual ones.
+        every: steps between windows that slide, for as many lanes; 0: one lane.
+        stopped: whether nobody wants to know any more; asked again and again.
+
+    Raises:
+        ModelError: one line: what is wrong with the file, or which limit it broke.
+    """
+    limits = limits or TrialLimits()
+    task = _Task(str(path), every, limits)
+    child = subprocess.Popen(
+        [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL, close_fds=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+    )  # fmt: skip
+    assert child.stdin is not None and child.stdout is not None
+    try:
+        child.stdin.write(msgspec.json.encode(task))
+        child.stdin.close()
+        until = time.monotonic() + limits.seconds
+        while child.poll() is None:
+            if stopped():
+                raise ModelError(f"{path}: nobody waits for its trial any more")
+            if time.monotonic() > until:
+                raise ModelError(
+                    f"{path} is refused: more than limits.model_s = {limits.seconds:g} s to load "
+                    "and warm up"
+                )
+            time.sleep(LOOK_S)
+        return _result(path, limits, child.returncode, child.stdout.read())
+    except BrokenPipeError:
+        raise ModelError(f"{path} is refused: its trial could not begin") from None
+    finally:
+        child.kill()
+        child.wait()
+        child.stdout.close()
+
+
+def _result(path: Path, limits: TrialLimits, code: int, said: bytes) -> Trial:
+    try:
+        found = msgspec.json.decode(said, type=dict)
+    except msgspec.MsgspecError:
+        found = {}
+    if "refused" in found:
+        raise ModelError(found["refused"])
+    if code == 0 and found:
+        return msgspec.convert(found, Trial)
+    if -code == signal.SIGXCPU:
+        why = f"more than limits.model_s = {limits.seconds:g} s of the processor"
+    elif code < 0 or code == MEMORY:
+        why = _too_large(limits)
+    else:
+        why = f"its trial ended with exit code {code}"
+    raise ModelError(f"{path} is refused: {why}")
+
+
+def _too_large(limits: TrialLimits) -> str:
+    return (
+        f"it needs more memory than limits.model_mb = {limits.memory_mb:g} MB and four times its "
+        "size, or breaks onnxruntime"
+    )
+
+
+# the child
+
+MEMORY = 77  # its exit code when there was not enough
+
+
+def _run(task: _Task) -> Trial:
+    import numpy as np
+
+    from tactile_rt.classifier.exits import Lanes
+    from tactile_rt.classifier.model_file import hash_of, load_model
+    from tactile_rt.classifier.stepper import Stepper
+
+    path, limits = Path(task.path), task.limits
+    before = _data_bytes()
+    size = path.stat().st_size if path.is_file() else 0
+    most = before + round(limits.memory_mb * MB) + 4 * size
+    resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+    cpu = round(limits.seconds) + CPU_S
+    resource.setrlimit(resource.RLIMIT_CPU, (cpu, cpu + 1))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    sha256 = hash_of(path)
+    began = time.monotonic()
+    session, card = load_model(path)
+    every = min(task.every, card.steps) or card.steps
+    stepper = Stepper(session, card, Lanes(card.steps, every).count)
+    load_s = time.monotonic() - began
+    took = []
+    for _ in range(STEPS):
+        began = time.monotonic()
+        stepper.run()
+        took.append(time.monotonic() - began)
+    return Trial(sha256, load_s, float(np.median(took)), (_data_bytes() - before) / MB)
+
+
+def _data_bytes() -> int:
+    """What counts against RLIMIT_DATA."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmData:"):
+            return 1024 * int(line.split()[1])
+    return 0
+
+
+def _main() -> int:
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # as of who presses Ctrl-C: the parent decides
+    task = msgspec.json.decode(sys.stdin.buffer.read(), type=_Task)
+    os.nice(5)  # what is under way comes first
+    try:
+        result: Trial | _Refusal = _run(task)
+    except ModelError as error:
+        result = _Refusal(_within(str(error), task))
+    except MemoryError:
+        return MEMORY
+    except Exception as error:  # onnxruntime raises a dozen unrelated types
+        text = " ".join(str(error).split())
+        result = _Refusal(_within(f"{task.path} is refused: it cannot be run: {text}", task))
+    sys.stdout.buffer.write(msgspec.json.encode(result))
+    sys.stdout.flush()
+    os._exit(0)  # onnxruntime may yet want memory to put its things away
+
+
+def _within(text: str, task: _Task) -> str:
+    """What onnxruntime says of memory, in our words."""
+    if any(word in text for word in WANTED_MEMORY):
+        return f"{task.path} is refused: {_too_large(task.limits)}"
+    return text[:MESSAGE]
+
+
+if __name__ == "__main__":
+    sys.exit(_main())

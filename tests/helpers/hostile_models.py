@@ -1,0 +1,195 @@
+"""Model files that are whole and say what a model says, and ask for more than a robot has."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+from tests.helpers.tiny_model import write_model
+
+__all__ = ["BURNERS", "GREEDY", "UNSOUND", "write_burdened"]
+
+Burden = Callable[[list[onnx.NodeProto], list[onnx.TensorProto]], str]
+
+
+def write_burdened(path: Path, burden: Burden) -> Path:
+    """The tiny model with a burden: the scalar that it makes, times zero, is added to logits."""
+    write_model(path)
+    model = onnx.load(path)
+    graph = model.graph
+    for node in graph.node:
+        for i, name in enumerate(node.output):
+            if name == "logits":
+                node.output[i] = "logits_before"
+    nodes: list[onnx.NodeProto] = []
+    tensors = [numpy_helper.from_array(np.zeros((), np.float32), "nothing")]
+    # of an input, so that onnxruntime computes nothing beforehand
+    nodes.append(helper.make_node("ReduceMax", ["sigma"], ["live"], keepdims=0))
+    scalar = burden(nodes, tensors)
+    nodes.append(helper.make_node("Mul", [scalar, "nothing"], ["burden"]))
+    nodes.append(helper.make_node("Add", ["logits_before", "burden"], ["logits"]))
+    graph.node.extend(nodes)
+    graph.initializer.extend(tensors)
+    onnx.save(model, path)
+    return path
+
+
+def _most(nodes: list[onnx.NodeProto], name: str) -> str:
+    nodes.append(helper.make_node("ReduceMax", [name], [f"{name}_most"], keepdims=0))
+    return f"{name}_most"
+
+
+def _size(nodes: list[onnx.NodeProto], tensors: list[onnx.TensorProto], *sizes: int) -> str:
+    """A shape that is computed of an input, and so unknown until the graph runs."""
+    tensors.append(numpy_helper.from_array(np.array(sizes, np.float32), "sizes"))
+    nodes.append(helper.make_node("Mul", ["live", "nothing"], ["live_nothing"]))
+    nodes.append(helper.make_node("Add", ["sizes", "live_nothing"], ["sizes_live"]))
+    nodes.append(helper.make_node("Cast", ["sizes_live"], ["shape"], to=TensorProto.INT64))
+    return "shape"
+
+
+def _outer_product(size: int) -> Burden:
+    def burden(nodes, tensors):  # type: ignore[no-untyped-def]
+        tensors.append(numpy_helper.from_array(np.ones((size, 1), np.float32), "tall"))
+        tensors.append(numpy_helper.from_array(np.ones((1, size), np.float32), "flat"))
+        nodes.append(helper.make_node("Mul", ["tall", "live"], ["tall_live"]))
+        nodes.append(helper.make_node("MatMul", ["tall_live", "flat"], ["product"]))
+        return _most(nodes, "product")
+
+    return burden
+
+
+def _constant_of_shape(nodes, tensors):  # type: ignore[no-untyped-def]
+    nodes.append(
+        helper.make_node("ConstantOfShape", [_size(nodes, tensors, 200_000, 200_000)], ["filled"])
+    )
+    return _most(nodes, "filled")
+
+
+def _expand(nodes, tensors):  # type: ignore[no-untyped-def]
+    nodes.append(
+        helper.make_node("Expand", ["live", _size(nodes, tensors, 200_000, 200_000)], ["wide"])
+    )
+    return _most(nodes, "wide")
+
+
+def _tile(nodes, tensors):  # type: ignore[no-untyped-def]
+    tensors.append(numpy_helper.from_array(np.array([1, 1], np.int64), "square"))
+    nodes.append(helper.make_node("Reshape", ["live", "square"], ["cell"]))
+    nodes.append(
+        helper.make_node("Tile", ["cell", _size(nodes, tensors, 200_000, 200_000)], ["tiled"])
+    )
+    return _most(nodes, "tiled")
+
+
+def _range(nodes, tensors):  # type: ignore[no-untyped-def]
+    tensors.append(numpy_helper.from_array(np.array(1e10, np.float64), "end"))
+    tensors.append(numpy_helper.from_array(np.array(0, np.int64), "start"))
+    tensors.append(numpy_helper.from_array(np.array(1, np.int64), "by"))
+    nodes.append(helper.make_node("Cast", ["live"], ["live_64"], to=TensorProto.DOUBLE))
+    nodes.append(helper.make_node("Add", ["end", "live_64"], ["end_live"]))
+    nodes.append(helper.make_node("Cast", ["end_live"], ["last"], to=TensorProto.INT64))
+    nodes.append(helper.make_node("Range", ["start", "last", "by"], ["long"]))
+    nodes.append(helper.make_node("Cast", ["long"], ["long_32"], to=TensorProto.FLOAT))
+    return _most(nodes, "long_32")
+
+
+def _doubling(nodes, tensors):  # type: ignore[no-untyped-def]
+    """Forty times twice as long."""
+    tensors.append(numpy_helper.from_array(np.array([1], np.int64), "single"))
+    nodes.append(helper.make_node("Reshape", ["live", "single"], ["twice_0"]))
+    for n in range(40):
+        nodes.append(helper.make_node("Concat", [f"twice_{n}"] * 2, [f"twice_{n + 1}"], axis=0))
+    return _most(nodes, "twice_40")
+
+
+def _kept(nodes, tensors):  # type: ignore[no-untyped-def]
+    """Five hundred tensors of 4 MB that are all needed until the end."""
+    tensors.append(numpy_helper.from_array(np.ones((1000, 1), np.float32), "tall"))
+    tensors.append(numpy_helper.from_array(np.ones((1, 1000), np.float32), "flat"))
+    names = []
+    for n in range(500):
+        tensors.append(numpy_helper.from_array(np.array(n, np.float32), f"n{n}"))
+        nodes.append(helper.make_node("Add", ["live", f"n{n}"], [f"live_{n}"]))
+        nodes.append(helper.make_node("Mul", ["tall", f"live_{n}"], [f"tall_{n}"]))
+        nodes.append(helper.make_node("MatMul", [f"tall_{n}", "flat"], [f"kept_{n}"]))
+        names.append(f"kept_{n}")
+    nodes.append(helper.make_node("Max", names, ["all"]))
+    return _most(nodes, "all")
+
+
+def _products(count: int, wide: int, live: bool) -> Burden:
+    def burden(nodes, tensors):  # type: ignore[no-untyped-def]
+        matrix = np.eye(wide, dtype=np.float32)
+        tensors.append(numpy_helper.from_array(matrix, "matrix"))
+        if live:
+            nodes.append(helper.make_node("Mul", ["matrix", "live"], ["product_0"]))
+        else:  # all of it is known beforehand: to load it is to compute it
+            nodes.append(helper.make_node("Identity", ["matrix"], ["product_0"]))
+        for n in range(count):
+            nodes.append(
+                helper.make_node("MatMul", [f"product_{n}", "matrix"], [f"product_{n + 1}"])
+            )
+        return _most(nodes, f"product_{count}")
+
+    return burden
+
+
+# They ask for more memory than they may.
+GREEDY: dict[str, Burden] = {
+    "outer_product_40_GB": _outer_product(100_000),
+    "outer_product_1.3_GB": _outer_product(18_000),
+    "constant_of_shape_160_GB": _constant_of_shape,
+    "expand_160_GB": _expand,
+    "tile_160_GB": _tile,
+    "range_80_GB": _range,
+    "doubling": _doubling,
+    "kept_2_GB": _kept,
+}
+# They take longer than they may.
+BURNERS: dict[str, Burden] = {
+    "chained_products": _products(4000, 900, live=True),
+    "products_at_load": _products(4000, 900, live=False),
+}
+
+
+def _truncated(path: Path) -> None:
+    data = write_model(path).read_bytes()
+    path.write_bytes(data[: len(data) // 2])
+
+
+def _loop(path: Path) -> None:
+    """A loop without end."""
+    write_model(path)
+    model = onnx.load(path)
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["go_on"], ["go_on_next"])], "body",
+        [helper.make_tensor_value_info("i", TensorProto.INT64, []),
+         helper.make_tensor_value_info("go_on", TensorProto.BOOL, [])],
+        [helper.make_tensor_value_info("go_on_next", TensorProto.BOOL, [])],
+    )  # fmt: skip
+    model.graph.initializer.append(numpy_helper.from_array(np.array(True), "true"))
+    model.graph.node.append(helper.make_node("Loop", ["", "true"], [], body=body))
+    onnx.save(model, path)
+
+
+def _elsewhere(path: Path) -> None:
+    """Weights that are to be read from another file."""
+    write_model(path)
+    model = onnx.load(path)
+    tensor = TensorProto(name="outside", data_type=TensorProto.FLOAT, dims=[1])
+    tensor.data_location = TensorProto.EXTERNAL
+    entry = tensor.external_data.add()
+    entry.key, entry.value = "location", "/dev/zero"
+    model.graph.initializer.append(tensor)
+    onnx.save(model, path)
+
+
+# What is seen without running them.
+UNSOUND: dict[str, Callable[[Path], None]] = {
+    "truncated": _truncated,
+    "endless_loop": _loop,
+    "external_weights": _elsewhere,
+}
