@@ -1,5 +1,6 @@
 """A classifier in a thread of its own, fed from a mailbox."""
 
+import math
 import time
 from collections import deque
 from contextlib import suppress
@@ -65,6 +66,7 @@ class ModelPart(Part):
         self._ahead_ns = 0  # host time less stream time
         self._last_ns: int | None = None  # stream time of the newest sample that was taken
         self._dropped = self._hole = 0  # samples that the mailbox has dropped; since that one
+        self._missed = 0  # events that it has dropped
         self._sha256 = ""
         with suppress(ConfigError):  # loading tells if it is none
             self._sha256 = hash_of(self.file)  # a recording tells it from its first byte
@@ -107,8 +109,8 @@ class ModelPart(Part):
         self._wanted.append(config)
 
     def _work(self) -> None:
+        self.box.taking = True  # a source that waits for its reader waits for the trial, too
         self._load()
-        self.box.taking = True
         self._up()
         while True:
             items = self.box.take(WAKE_S)
@@ -168,8 +170,11 @@ class ModelPart(Part):
             TactileError: It is refused.
         """
         admission = self._admit(self.config, opened)
+        until = math.inf
         while not admission.finished.wait(LOOK_S):
-            if self._stop.is_set():
+            if self._stop.is_set():  # what waits is still to be decided about, if there is time
+                until = min(until, time.monotonic() + self.limits.stop_s / 4)
+            if time.monotonic() > until:
                 admission.give_up()
                 return None
         if admission.error is not None:
@@ -244,8 +249,12 @@ class ModelPart(Part):
 
     def _take(self, items: list[Item]) -> None:
         run: list[SourceChunk] = []
-        dropped = self.box.dropped["samples"]  # the oldest: they came before all these
-        self._hole, self._dropped = dropped - self._dropped, dropped
+        dropped = self.box.dropped  # the oldest: they came before all these
+        self._hole, self._dropped = dropped["samples"] - self._dropped, dropped["samples"]
+        opened = self._hub.streams().get(self.config.source)
+        if dropped["events"] > self._missed and opened is not None:
+            items = [opened, *items]  # it may have been that one
+        self._missed = dropped["events"]
         for item in items:
             if isinstance(item, SourceChunk):
                 run.append(item)

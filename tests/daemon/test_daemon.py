@@ -300,7 +300,7 @@ def test_a_source_that_breaks_is_opened_again_and_its_counts_add_up(robot, monke
     assert "no samples: source.a fails: no such port" in daemon.snapshot().degraded
 
 
-def test_without_a_model_all_else_goes_on_and_it_comes_back(robot, tmp_path):
+def test_a_model_that_is_refused_does_not_take_the_place_of_one_that_decides(robot, tmp_path):
     model = write_model(tmp_path / "m.onnx")
     good = model.read_bytes()
     with FakeSerial(touching(60_000), spec=SPEC) as device:
@@ -313,19 +313,22 @@ def test_without_a_model_all_else_goes_on_and_it_comes_back(robot, tmp_path):
         until(lambda: daemon.snapshot().models[0].decisions > 6)
         with pytest.raises(ConfigError, match=r"model\[0\].file: .* is not a readable ONNX model"):
             configured(tmp_path, loaded)
-        # Taken all the same, it is the model alone that fails.
+        # Taken all the same, it is tried, and the one before goes on.
         daemon.reload(configured(tmp_path, loaded, checked=False))
-        until(lambda: state_of(daemon, "model.a").failures > 2)
-        assert any(
-            line.startswith("no decisions: model.a fails:") and "acquisition goes on" in line
-            for line in daemon.snapshot().degraded
+        until(lambda: spy.told("model.a", "refused"))
+        (line,) = [x for x in daemon.snapshot().degraded if "model.a" in x]
+        assert line.startswith("old model: model.a: the new one is refused: ") and (
+            line.endswith("; the one before decides")
         )
-        before = len(seqs(spy, "a"))
-        until(lambda: len(seqs(spy, "a")) > before + 200)
+        count = daemon.snapshot().models[0].decisions
+        until(lambda: daemon.snapshot().models[0].decisions > count + 4)
         model.write_bytes(good)
-        until(lambda: state_of(daemon, "model.a").state == "running")
+        daemon.reload(configured(tmp_path, loaded))
+        until(lambda: spy.told("model.a", "admitted"))
+        assert not any("model.a" in x for x in daemon.snapshot().degraded)
         count = daemon.snapshot().models[0].decisions
         until(lambda: daemon.snapshot().models[0].decisions > count)
+        assert state_of(daemon, "model.a").starts == 1
         kept = seqs(spy, "a")
         assert np.array_equal(kept, kept[0] + np.arange(len(kept)))
 

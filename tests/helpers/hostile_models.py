@@ -14,10 +14,10 @@ __all__ = ["BURNERS", "GREEDY", "UNSOUND", "write_burdened"]
 Burden = Callable[[list[onnx.NodeProto], list[onnx.TensorProto]], str]
 
 
-def write_burdened(path: Path, burden: Burden) -> Path:
-    """The tiny model with a burden: the scalar that it makes, times zero, is added to logits."""
-    write_model(path)
-    model = onnx.load(path)
+def write_burdened(path: Path, burden: Burden, base: Path | None = None) -> Path:
+    """A model, by default the tiny one, with a burden: the scalar that it makes, times zero, is
+    added to the logits."""
+    model = onnx.load(base or write_model(path))
     graph = model.graph
     for node in graph.node:
         for i, name in enumerate(node.output):
@@ -79,19 +79,19 @@ def _tile(nodes, tensors):  # type: ignore[no-untyped-def]
     tensors.append(numpy_helper.from_array(np.array([1, 1], np.int64), "square"))
     nodes.append(helper.make_node("Reshape", ["live", "square"], ["cell"]))
     nodes.append(
-        helper.make_node("Tile", ["cell", _size(nodes, tensors, 200_000, 200_000)], ["tiled"])
+        helper.make_node("Tile", ["cell", _size(nodes, tensors, 30_000, 30_000)], ["tiled"])
     )
     return _most(nodes, "tiled")
 
 
 def _range(nodes, tensors):  # type: ignore[no-untyped-def]
-    tensors.append(numpy_helper.from_array(np.array(1e10, np.float64), "end"))
+    tensors.append(numpy_helper.from_array(np.array(1e10, np.float64), "far"))
     tensors.append(numpy_helper.from_array(np.array(0, np.int64), "start"))
     tensors.append(numpy_helper.from_array(np.array(1, np.int64), "by"))
     nodes.append(helper.make_node("Cast", ["live"], ["live_64"], to=TensorProto.DOUBLE))
-    nodes.append(helper.make_node("Add", ["end", "live_64"], ["end_live"]))
-    nodes.append(helper.make_node("Cast", ["end_live"], ["last"], to=TensorProto.INT64))
-    nodes.append(helper.make_node("Range", ["start", "last", "by"], ["long"]))
+    nodes.append(helper.make_node("Add", ["far", "live_64"], ["far_live"]))
+    nodes.append(helper.make_node("Cast", ["far_live"], ["stop"], to=TensorProto.INT64))
+    nodes.append(helper.make_node("Range", ["start", "stop", "by"], ["long"]))
     nodes.append(helper.make_node("Cast", ["long"], ["long_32"], to=TensorProto.FLOAT))
     return _most(nodes, "long_32")
 
@@ -143,7 +143,7 @@ GREEDY: dict[str, Burden] = {
     "outer_product_1.3_GB": _outer_product(18_000),
     "constant_of_shape_160_GB": _constant_of_shape,
     "expand_160_GB": _expand,
-    "tile_160_GB": _tile,
+    "tile_3.6_GB": _tile,
     "range_80_GB": _range,
     "doubling": _doubling,
     "kept_2_GB": _kept,

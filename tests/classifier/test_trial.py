@@ -1,0 +1,112 @@
+"""Models on trial: what they need is known before they are let in, and hostile ones are not."""
+
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("onnx")
+
+from tactile_rt.classifier.model_file import hash_of, shipped_model
+from tactile_rt.classifier.trial import TrialLimits, try_model
+from tactile_rt.stream import ModelError
+from tests.helpers.hostile_models import BURNERS, GREEDY, UNSOUND, write_burdened
+from tests.helpers.tiny_model import write_model
+from tests.helpers.waiting import until
+
+LARGEST_CHILD = 400_000_000  # bytes: onnxruntime, Python, and what a trial may take
+PROMPT_S = 20.0  # on a busy machine; alone 0.3
+
+
+def used_by_children() -> float:
+    """Processor time, s."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def test_the_shipped_model_says_what_it_needs() -> None:
+    found = try_model(shipped_model())
+    assert found.sha256 == hash_of(shipped_model())
+    assert 0 < found.step_s < 0.045 and 0 < found.load_s < PROMPT_S and 0 < found.memory_mb < 256
+
+
+def test_lanes_of_windows_that_slide_are_tried_together() -> None:
+    one, six = try_model(shipped_model()), try_model(shipped_model(), every=4)
+    assert six.memory_mb >= one.memory_mb and six.sha256 == one.sha256
+
+
+@pytest.mark.parametrize("name", GREEDY)
+def test_one_that_wants_more_memory_than_it_may_is_refused(name: str, tmp_path: Path) -> None:
+    file = write_burdened(tmp_path / "m.onnx", GREEDY[name])
+    began = used_by_children()
+    with pytest.raises(ModelError) as refused:
+        try_model(file)
+    assert "\n" not in str(refused.value) and str(file) in str(refused.value)
+    assert "limits.model_mb = 256 MB" in str(refused.value)
+    assert used_by_children() - began < 2.0
+    assert 1024 * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < LARGEST_CHILD
+
+
+@pytest.mark.parametrize("name", BURNERS)
+def test_one_that_takes_longer_than_it_may_is_refused_when_its_time_is_over(
+    name: str, tmp_path: Path
+) -> None:
+    file = write_burdened(tmp_path / "m.onnx", BURNERS[name])
+    began = time.monotonic()
+    with pytest.raises(ModelError, match=r"limits\.model_(s = 2 s|mb)"):
+        try_model(file, TrialLimits(seconds=2.0))
+    assert time.monotonic() - began < 2.0 + PROMPT_S
+
+
+@pytest.mark.parametrize("name", UNSOUND)
+def test_one_that_is_not_sound_is_refused_for_what_it_is(name: str, tmp_path: Path) -> None:
+    UNSOUND[name](tmp_path / "m.onnx")
+    with pytest.raises(ModelError, match="is not a readable ONNX model"):
+        try_model(tmp_path / "m.onnx")
+
+
+def test_a_large_file_may_take_more(tmp_path: Path) -> None:
+    """Four times its size is allowed beside what all may have."""
+    limits = TrialLimits(memory_mb=16.0)
+    with pytest.raises(ModelError, match=r"limits\.model_mb = 16 MB"):
+        try_model(write_burdened(tmp_path / "m.onnx", GREEDY["kept_2_GB"]), limits)
+    assert try_model(write_model(tmp_path / "tiny.onnx"), limits).memory_mb < 16
+
+
+def test_nobody_waits_for_a_trial_that_nobody_wants(tmp_path: Path) -> None:
+    file = write_burdened(tmp_path / "m.onnx", BURNERS["chained_products"])
+    began = time.monotonic()
+    with pytest.raises(ModelError, match="nobody waits"):
+        try_model(file, stopped=lambda: time.monotonic() - began > 0.3)
+    assert time.monotonic() - began < PROMPT_S
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="prctl is Linux's")
+def test_a_trial_dies_with_whoever_started_it(tmp_path: Path) -> None:
+    file = write_burdened(tmp_path / "m.onnx", BURNERS["chained_products"])
+    code = (
+        "from pathlib import Path; from tactile_rt.classifier.trial import try_model; "
+        f"try_model(Path({str(file)!r}))"
+    )
+    parent = subprocess.Popen(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+    )
+
+    def children() -> list[int]:
+        found = Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text().split()
+        return [int(pid) for pid in found]
+
+    until(lambda: children() != [])
+    (child,) = children()
+    until(lambda: b"trial" in Path(f"/proc/{child}/cmdline").read_bytes())
+    # by then it has said whom it dies with
+    until(lambda: b"onnxruntime" in Path(f"/proc/{child}/maps").read_bytes())
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    until(lambda: not Path(f"/proc/{child}").exists())

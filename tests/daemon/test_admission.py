@@ -1,0 +1,163 @@
+"""A daemon whose model is replaced: nothing waits for the new one, and nothing is lost for it."""
+
+import json
+import signal
+import time
+
+import pytest
+
+pytest.importorskip("mcap")
+pytest.importorskip("onnx")
+
+from bench.daemon.process import DaemonProcess, free_port
+from tactile_rt.classifier.model_file import shipped_model
+from tests.helpers.hostile_models import BURNERS, GREEDY, write_burdened
+from tests.helpers.waiting import until
+
+CONFIGURATION = """version = 1
+[[source]]
+name = "a"
+url = "synthetic:mouse"
+[[model]]
+file = "model.onnx"
+catch_up = "all"
+[[publisher]]
+kind = "jsonl"
+options = {{ file = "said.jsonl" }}
+[metrics]
+port = {port}
+[limits]
+model_s = 20
+"""
+TERM_S = 10.0  # on a busy machine; alone 0.3
+
+
+@pytest.fixture
+def daemon(tmp_path):
+    (tmp_path / "model.onnx").write_bytes(shipped_model().read_bytes())
+    port = free_port()
+    with DaemonProcess(tmp_path, CONFIGURATION.format(port=port), port) as process:
+        process.await_state(lambda s: sum(m["decisions"] for m in s["models"]) > 5)
+        yield process
+
+
+def hostile(folder, burden):
+    """The bytes of the shipped model with a burden."""
+    return write_burdened(folder / "hostile.onnx", burden, shipped_model()).read_bytes()
+
+
+def said(folder, kind):
+    lines = (folder / "said.jsonl").read_text().splitlines()
+    return [m for m in map(json.loads, lines) if m["type"] == kind]
+
+
+def events(folder, state):
+    return [m for m in said(folder, "health") if m["state"] == state and "model" in m["part"]]
+
+
+def put(folder, data):
+    """A file takes the place of the model's, whole."""
+    (folder / "new.onnx").write_bytes(data)
+    (folder / "new.onnx").replace(folder / "model.onnx")
+
+
+def steps_of(decisions):
+    """The steps that were decided on, by onset."""
+    found = {}
+    for d in decisions:
+        found.setdefault(d["onset_ns"], []).append(d["step"])
+    return list(found.values())
+
+
+def test_a_good_model_takes_over_without_a_step_being_lost(daemon, tmp_path):
+    good = shipped_model().read_bytes()
+    for n in range(1, 5):
+        put(tmp_path, good)  # another file, though it says the same
+        daemon.reload()
+        until(lambda n=n: len(events(tmp_path, "admitted")) == n)
+    before = daemon.state()["models"][0]["decisions"]
+    daemon.await_state(lambda s: s["models"][0]["decisions"] > before + 60)
+    daemon.stop()
+    touches = steps_of(said(tmp_path, "decision"))
+    assert len(touches) > 3
+    # but the last one, which the end cut short, each was decided on at every step, once
+    assert all(steps == list(range(1, len(steps) + 1)) for steps in touches)
+    assert {len(steps) for steps in touches[:-1]} == {max(map(len, touches))}
+    assert not said(tmp_path, "skip")
+
+
+@pytest.mark.parametrize("burden", [*GREEDY.values(), BURNERS["chained_products"]][::3])
+def test_a_hostile_model_is_refused_and_the_one_before_goes_on(daemon, tmp_path, burden):
+    resident = daemon.usage
+    resident.look()
+    before = daemon.state()
+    put(tmp_path, hostile(tmp_path, burden))
+    daemon.reload()
+    found = daemon.await_state(lambda s: s["state"] == "degraded", every_s=0.02)
+    assert [t["what"] for t in found["troubles"]] == ["old model"]
+    daemon.await_state(
+        lambda s: s["models"][0]["decisions"] > before["models"][0]["decisions"] + 30
+    )
+    resident.look()
+    assert resident.resident[-1] - resident.resident[0] < 50e6
+    state = daemon.state()
+    assert state["sources"][0]["stats"]["dropped"] == 0
+    assert state["models"][0]["queue"]["dropped"]["samples"] == 0
+    put(tmp_path, shipped_model().read_bytes())
+    daemon.reload()
+    daemon.await_state(lambda s: s["state"] == "running")
+
+
+def test_a_signal_is_obeyed_while_a_model_is_on_trial(tmp_path):
+    """One that takes as long as it may, at the start and at a reload."""
+    port = free_port()
+    put(tmp_path, hostile(tmp_path, BURNERS["chained_products"]))
+    text = CONFIGURATION.format(port=port)
+    with DaemonProcess(tmp_path, text, port) as process:
+        state = process.await_state(lambda s: any(x["samples"] > 100 for x in s["sources"]))
+        assert state["models"][0]["part"]["state"] == "starting"
+        # samples come, and what is missing is told
+        degraded = process.await_state(lambda s: s["troubles"])
+        assert degraded["troubles"][0]["what"] == "no decisions"
+        code, took = process.stop()
+        assert code == 0 and took < TERM_S
+
+
+def test_a_signal_is_obeyed_while_a_reload_tries_a_model(daemon, tmp_path):
+    put(tmp_path, hostile(tmp_path, BURNERS["chained_products"]))
+    daemon.reload()
+    daemon.reload()
+    time.sleep(0.5)  # in the middle of it, or before
+    code, took = daemon.stop()
+    assert code == 0 and took < TERM_S
+
+
+def test_the_newest_of_several_wins(daemon, tmp_path):
+    """A slow one that is being tried keeps nobody waiting: the file after it is admitted."""
+    put(tmp_path, hostile(tmp_path, BURNERS["chained_products"]))
+    daemon.reload()
+    time.sleep(0.3)
+    put(tmp_path, shipped_model().read_bytes())
+    daemon.reload()
+    until(lambda: events(tmp_path, "admitted"))
+    assert daemon.await_state(lambda s: s["state"] == "running")["models"][0]["refused"] == ""
+    assert daemon.process.poll() is None and not events(tmp_path, "refused")
+    daemon.process.send_signal(signal.SIGTERM)
+    assert daemon.process.wait(60) == 0
+
+
+def test_another_way_to_decide_takes_over_as_another_model_does(daemon, tmp_path):
+    text = daemon.path.read_text()
+    daemon.path.write_text(
+        text.replace('catch_up = "all"', 'catch_up = "all"\ndecisions = "final"')
+    )
+    daemon.reload()
+    until(lambda: events(tmp_path, "admitted"))
+    count = len(said(tmp_path, "decision"))
+    until(lambda: len(said(tmp_path, "decision")) > count + 1)
+    assert all(d["final"] for d in said(tmp_path, "decision")[count + 1 :])
+
+
+def test_the_helpers_make_what_they_say(tmp_path):
+    write_model(tmp_path / "m.onnx")
+    assert STEPS * SUBSTEPS * PERIOD_NS > 0
