@@ -49,7 +49,7 @@ def _replace_model(scene: DisturbedDaemon, n: int) -> float:
     new.replace(scene.model)
     back = time.monotonic_ns()
     scene.daemon.reload()
-    told = scene.await_told(since, "model.whiskers", "running")
+    told = scene.await_told(since, "model.whiskers", "admitted")
     return (told.t_ns - back) / NS_PER_S
 
 
@@ -128,10 +128,9 @@ KINDS: dict[str, tuple[Callable[[DisturbedDaemon, int], float], Expected, float,
             ("daemon", "reloading"): (2, 2),
             ("daemon", "refused"): ONCE,
             ("daemon", "reloaded"): ONCE,
-            ("model.whiskers", "stopped"): ONCE,
-            ("model.whiskers", "running"): ONCE,
+            ("model.whiskers", "admitted"): ONCE,
         },
-        2.0, "SIGHUP with the good file to the model running",
+        2.0, "SIGHUP with the good file to the model deciding",
     ),
     "peer_stalled": (
         _stop_reading,

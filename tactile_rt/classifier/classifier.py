@@ -207,6 +207,7 @@ class Classifier:
         most_s = max(BEHIND_S, BEHIND_STEPS * step_s) if behind_s is None else behind_s
         self.skips = Skips(skips, most_s, age if catch_up == "newest" else None)
         self._stepper = Stepper(session, self.card, self._lanes.count)
+        self._rate_hz = spec.rate_hz
         self._resampler = Resampler(self.card.period_ns, spec.rate_hz)
         self._order = order  # where the array has the model's elements
         # Of the episode; the detector does not change them, it makes new ones.
@@ -230,6 +231,23 @@ class Classifier:
     def step_ms(self) -> float:
         """The time of the stream that a step takes, ms."""
         return self.card.substeps * self.card.period_ns / 1e6
+
+    def go_on_from(self, other: "Classifier") -> bool:
+        """Take over where another classifier of the same stream is, with its baseline, as long as
+        nothing is under way; whether that can be: both must resample and hear alike."""
+        if self.card.period_ns != other.card.period_ns or self.card.floor != other.card.floor:
+            return False
+        self._resampler, self.detector = other._resampler, other.detector
+        self._offset, self._sigma = self.detector.offset, self.detector.sigma
+        self._next_seq = other._next_seq
+        return True
+
+    def forget(self) -> None:
+        """Be as if no sample had come: find the baseline anew."""
+        shape, floor = self.detector.offset.shape, self.detector.floor
+        self.detector = ContactDetector((shape[0], shape[1]), floor)
+        self._resampler = Resampler(self.card.period_ns, self._rate_hz)
+        self._onset_ns, self._next_seq = None, 0
 
     def push(self, chunk: Chunk) -> list[Classification]:
         """Take samples as they come from the array, return the decisions that they complete."""

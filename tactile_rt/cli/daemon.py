@@ -43,13 +43,17 @@ def serve(file: Path, sets: list[str], seconds: float | None) -> None:
 
 @config.command()
 def check(file: File, sets: Settings = None) -> None:
-    """Say whether a configuration can work; nothing is opened."""
+    """Say whether a configuration can work; no device is opened. Models are tried."""
+    from tactile_rt.classifier.trial import TrialLimits, try_model
+    from tactile_rt.daemon.admission import model_path
     from tactile_rt.daemon.checks import check_config
     from tactile_rt.daemon.loading import load_config
 
     loaded = load_config(file, sets or [])
     check_config(loaded)
     found = loaded.config
+    for model in dict.fromkeys(model_path(m) for m in found.model):
+        try_model(model, TrialLimits(found.limits.model_mb, found.limits.model_s))
     tables = [t for t in ("recorder", "page", "metrics") if getattr(found, t) is not None]
     counts = [
         f"{len(items)} {what}{'' if len(items) == 1 else 's'}"

@@ -82,17 +82,25 @@ def show(file: File) -> None:
 def verify(file: File) -> None:
     """Whether a file is whole, and computes here what it did where it was made.
 
-    Reads it within bounds, checks its metadata against its graph, runs an
-    episode of built-in input, and compares the logits with those in the file.
+    Reads it within bounds, checks its metadata against its graph, tries it in a
+    process of its own as the daemon does, runs an episode of built-in input, and
+    compares the logits with those in the file.
     """
     import hashlib
 
     from tactile_rt.classifier.model_file import load_model, read_model
     from tactile_rt.classifier.model_runs import verify_model
+    from tactile_rt.classifier.trial import try_model
 
     _, contents, data = read_model(file)
     typer.echo(f"sha256 {hashlib.sha256(data).hexdigest()}")
     typer.echo(f"structure: {sum(contents.operators.values())} operators, nothing outside the file")
+    if read_model(file)[0].kind == "step":
+        found = try_model(file)
+        typer.echo(
+            f"trial: warm after {found.load_s:.2f} s, {found.memory_mb:.0f} MB, "
+            f"{1e3 * found.step_s:.2f} ms a step"
+        )
     _, card = load_model(file, kind=None)
     typer.echo(f"metadata: version {card.version}, agrees with the graph")
     for line in verify_model(file):

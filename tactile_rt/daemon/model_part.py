@@ -24,6 +24,7 @@ from tactile_rt.daemon.troubles import LossWindow
 from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.stream import (
     NS_PER_S,
+    Chunk,
     ConfigError,
     Source,
     SpecMismatch,
@@ -169,6 +170,8 @@ class ModelPart(Part):
         Raises:
             TactileError: It is refused.
         """
+        if self._stop.is_set():
+            return None
         admission = self._admit(self.config, opened)
         until = math.inf
         while not admission.finished.wait(LOOK_S):
@@ -240,12 +243,21 @@ class ModelPart(Part):
         return time.monotonic() - self._ready_at
 
     def _settled(self, new: Classifier, came: bool, waited: float) -> bool:
-        """Whether a new model may take over: it knows the baseline, and nothing is under way."""
-        if self._classifier is None or waited > LONGEST_S:
+        """Whether a new model may take over: nothing is under way, and it knows the baseline."""
+        old = self._classifier
+        if old is None:
             return True
-        if self._classifier.deciding:
+        if old.deciding and waited <= LONGEST_S:
             return False
-        return not came or (new.detector.ready and not new.deciding)
+        return new.go_on_from(old) or not came or new.detector.ready or waited > LONGEST_S
+
+    def _prepare(self, new: Classifier, old: Classifier, chunk: Chunk) -> None:
+        """Let a new model that hears otherwise find its baseline, while nothing is touched."""
+        if old.deciding:
+            new.forget()
+        else:
+            new.push(chunk)
+            new.skips.found.clear()
 
     def _take(self, items: list[Item]) -> None:
         run: list[SourceChunk] = []
@@ -281,8 +293,7 @@ class ModelPart(Part):
         for decision in classifier.decide(chunk):
             self._tell(decision, run, opened, offset)
         if self._next is not None and self._next.classifier is not None:
-            self._next.classifier.push(chunk)  # it finds its baseline, and is asked nothing
-            self._next.classifier.skips.found.clear()
+            self._prepare(self._next.classifier, classifier, chunk)
         self._last_ns = newest
         self._late += classifier.stats.late - before.late
         self._bad_samples += classifier.stats.bad_samples - before.bad_samples

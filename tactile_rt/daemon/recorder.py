@@ -244,6 +244,8 @@ class Recorder(Consumer):
         message = message_of(item)
         if message is None:
             return
+        if isinstance(item, Event) and item.state == "admitted":
+            self._exchanged(item.part)
         topic = DECISIONS if isinstance(item, Decision) else EVENTS
         at = item.made_ns if isinstance(item, Decision) else item.t_ns
         told = Raw(topic, at, encode(message))
@@ -255,6 +257,12 @@ class Recorder(Consumer):
             self._add(track, told)
             if happened and getattr(item, "part", "") != self._name:
                 self._trigger(track)
+
+    def _exchanged(self, model: str) -> None:
+        """Another model decides from here on: a file says of which model its decisions are."""
+        for state in self._view.snapshot().models:
+            if state.part.name == model and state.source in self._tracks:
+                self._rotate(self._tracks[state.source])
 
     def _add(self, track: _Track, message: Raw) -> None:
         if track.file is None and self._config.mode == "trigger":

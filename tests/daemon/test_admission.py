@@ -148,16 +148,14 @@ def test_the_newest_of_several_wins(daemon, tmp_path):
 
 def test_another_way_to_decide_takes_over_as_another_model_does(daemon, tmp_path):
     text = daemon.path.read_text()
-    daemon.path.write_text(
-        text.replace('catch_up = "all"', 'catch_up = "all"\ndecisions = "final"')
-    )
+    sure = 'catch_up = "all"\nsure = 0.01\nin_a_row = 1'
+    daemon.path.write_text(text.replace('catch_up = "all"', sure))
     daemon.reload()
     until(lambda: events(tmp_path, "admitted"))
-    count = len(said(tmp_path, "decision"))
-    until(lambda: len(said(tmp_path, "decision")) > count + 1)
-    assert all(d["final"] for d in said(tmp_path, "decision")[count + 1 :])
+    (event,) = events(tmp_path, "admitted")
 
+    def after():
+        return [d for d in said(tmp_path, "decision") if d["onset_ns"] > event["t_ns"]]
 
-def test_the_helpers_make_what_they_say(tmp_path):
-    write_model(tmp_path / "m.onnx")
-    assert STEPS * SUBSTEPS * PERIOD_NS > 0
+    until(lambda: len(after()) > 2)
+    assert all(d["final"] and d["step"] == 1 for d in after())
