@@ -15,7 +15,7 @@ from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.daemon.config import Config, ModelConfig, SourceConfig, is_loopback
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.loading import Loaded
-from tactile_rt.daemon.lock import lock_keys
+from tactile_rt.daemon.lock import device_keys
 from tactile_rt.daemon.service_folders import MADE
 from tactile_rt.settings import no_such
 from tactile_rt.sources.opening import check_source
@@ -116,7 +116,7 @@ def _check_devices(loaded: Loaded, config: Config) -> None:
     """Two sources cannot share a device."""
     taken: dict[str, str] = {}
     for i, source in enumerate(config.source):
-        for key in lock_keys(loaded.path, [source.url])[1:]:
+        for key in device_keys([source.url]):
             if key in taken:
                 loaded.refuse(["source", i, "url"], f"source {taken[key]!r} has that {key}")
             taken[key] = source.name
