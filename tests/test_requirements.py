@@ -32,20 +32,20 @@ def asked_for(*extras: str) -> list[Requirement]:
 def pins(name: str) -> list[Requirement]:
     """The releases of a file; a line that goes on is one line."""
     text = (FOLDER / name).read_text("utf-8").replace("\\\n", "")
-    lines = [
-        line.partition(" --hash")[0] for line in text.splitlines() if line[:1] not in ("", "#")
-    ]
-    return [Requirement(line) for line in lines if not line.isspace() and line[0] != " "]
+    lines = [line for line in text.splitlines() if line and line[0] not in " #"]
+    return [Requirement(line.partition(" --hash")[0]) for line in lines]
 
 
 def pinned(found: list[Requirement], name: str, python: str) -> Version:
     """The one release of a package for a Python on Linux."""
-    here = {"python_version": python, "python_full_version": f"{python}.0", "sys_platform": "linux",
-            "implementation_name": "cpython", "platform_python_implementation": "CPython"}  # fmt: skip
+    here = {
+        "python_version": python, "python_full_version": f"{python}.0", "sys_platform": "linux",
+        "implementation_name": "cpython", "platform_python_implementation": "CPython",
+    }  # fmt: skip
+    name = canonicalize_name(name)
     (pin,) = [
         r for r in found
-        if canonicalize_name(r.name) == canonicalize_name(name)
-        and (r.marker is None or r.marker.evaluate(here))
+        if canonicalize_name(r.name) == name and (r.marker is None or r.marker.evaluate(here))
     ]  # fmt: skip
     (only,) = pin.specifier
     assert only.operator == "=="
