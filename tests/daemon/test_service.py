@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.cli import main
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
@@ -248,7 +249,13 @@ REFUSED = [
     (recorder("/srv/no/rec"), "", "there is no folder /srv/no to make it in"),
     (recorder("/srv/../srv/rec"), "", "it is /srv/rec in truth: name that"),
     (
-        recorder(sys.prefix), "", f"folder {sys.prefix}: the service would own",
+        recorder(sys.prefix), "", f"folder {sys.prefix}: the service ",  # wherever it lies
+    ),
+    (
+        '[[source]]\nname = "b"\nurl = "synthetic:mouse"\n'
+        '[[model]]\nsource = "b"\nfile = "/srv/models/m.onnx"\n' + recorder("/srv/models"),
+        f"mkdir /srv/models; cp {shlex.quote(str(shipped_model()))} /srv/models/m.onnx",
+        "folder /srv/models: the service would own /srv/models/m.onnx, which it reads",
     ),
     (
         recorder("/srv/bobs"), OTHERS,
