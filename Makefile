@@ -2,6 +2,9 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# The exact releases that the tests run with.
+PINS := requirements/constraints.txt
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint $(PINS)
 # As many processes as cores, each taking the next file: what a file's tests share is made once.
 # `pytest` alone runs the same tests in one process.
 PYTEST := $(BIN)/python -m pytest
@@ -40,12 +43,12 @@ format: $(VENV)/.dev
 clean:
 	rm -rf $(VENV) dist
 
-$(VENV)/.sim: pyproject.toml
+$(VENV)/.sim: pyproject.toml $(PINS)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[sim]'
+	$(INSTALL) --editable '.[sim]'
 	touch $@
 
-$(VENV)/.dev: pyproject.toml
+$(VENV)/.dev: pyproject.toml $(PINS)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[sim,train,view,dbc,record,publish,ui,test,dev]'
+	$(INSTALL) --editable '.[sim,train,view,dbc,record,publish,ui,test,dev]'
 	touch $@ $(VENV)/.sim

@@ -11,10 +11,14 @@ What is imported from here is loaded when it is first used, so that a program pa
 takes: the sources need no ONNX Runtime, and reading a recording needs no serial port.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from tactile_rt.version import VERSION as __version__
+
+# From 1.29 on ONNX Runtime reports what runs to its maker unless told not to before it loads.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.classifier import Classification, Classifier, fuse

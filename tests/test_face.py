@@ -1,5 +1,6 @@
 """What `from tactile_rt import ...` gives, and what it costs."""
 
+import os
 import re
 import subprocess
 import sys
@@ -43,6 +44,16 @@ def test_names_are_loaded_when_they_are_used() -> None:
         for _ in range(3)
     ]
     assert min(spent) <= IMPORT_CPU_S
+
+
+def test_nothing_is_told_to_the_maker_of_the_runtime(tmp_path: Path) -> None:
+    """Its reports begin with an identity and a store of what is to be sent, in the user's cache."""
+    code = "import tactile_rt; tactile_rt.load_model(tactile_rt.shipped_model())"
+    left_out = ("CI", "ORT_DISABLE_TELEMETRY", "XDG_CACHE_HOME")
+    environment = {k: v for k, v in os.environ.items() if k not in left_out}
+    environment |= {"HOME": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.skipif(not README.exists(), reason="a source archive, without README")

@@ -70,7 +70,7 @@ class DaemonProcess:
     """`tactile-rt run` on a configuration; a context manager.
 
     Args:
-        folder: where its files are, and its locks.
+        folder: where its files are.
         configuration: TOML; it must have ``[metrics]``.
         port: of its metrics.
         stdout: descriptor.
@@ -97,8 +97,7 @@ class DaemonProcess:
             self.process = subprocess.Popen(
                 [sys.executable, "-c", main, "run", str(self.path)],
                 stdout=stdout, stderr=log, preexec_fn=before,
-                env={**os.environ, "PYTHONPATH": paths, "XDG_RUNTIME_DIR": str(folder),
-                     **(environment or {})},
+                env={**os.environ, "PYTHONPATH": paths, **(environment or {})},
             )  # fmt: skip
         self.usage = Usage(self.process.pid)
 

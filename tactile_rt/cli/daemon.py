@@ -121,18 +121,21 @@ def install_service(
     """
     from tactile_rt.daemon.checks import check_config
     from tactile_rt.daemon.loading import load_config
-    from tactile_rt.daemon.systemd import install_script, unit_text
+    from tactile_rt.daemon.service import install_script, unit_text
+    from tactile_rt.daemon.service_folders import check_folders
     from tactile_rt.drivers.discovery import serial_ports, udev_rules
 
     loaded = load_config(file.absolute())
     check_config(loaded)
     if not USER.fullmatch(user):
         raise ConfigError(f"--user {user!r} is not a name that a user can have")
+    check_folders(loaded, user)
     if to.exists() and (not to.is_dir() or any(to.iterdir())):
         raise ConfigError(f"{to} is there already: name a new folder with --to")
     program, path = _program(), str(file.absolute())
     unit = unit_text([*program, "run", path], loaded.config, user)
-    script = install_script(UNIT, [*program, "config", "check", path], loaded.config, user)
+    again = [*program, "install-service", path, "--user", user]
+    script = install_script(UNIT, again, loaded.config, user)
     to.mkdir(parents=True, exist_ok=True)
     (to / UNIT).write_text(unit)
     (to / "99-tactile.rules").write_text(udev_rules(serial_ports()))

@@ -15,7 +15,8 @@ from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.daemon.config import Config, ModelConfig, SourceConfig, is_loopback
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.loading import Loaded
-from tactile_rt.daemon.lock import lock_keys
+from tactile_rt.daemon.lock import device_keys
+from tactile_rt.daemon.service_folders import MADE
 from tactile_rt.settings import no_such
 from tactile_rt.sources.opening import check_source
 from tactile_rt.stream import ArraySpec, SpecMismatch, TactileError
@@ -116,7 +117,7 @@ def _check_devices(loaded: Loaded, config: Config) -> None:
     """Two sources cannot share a device."""
     taken: dict[str, str] = {}
     for i, source in enumerate(config.source):
-        for key in lock_keys(loaded.path, [source.url])[1:]:
+        for key in device_keys([source.url]):
             if key in taken:
                 loaded.refuse(["source", i, "url"], f"source {taken[key]!r} has that {key}")
             taken[key] = source.name
@@ -199,7 +200,8 @@ def _check_outputs(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
             continue
         if "\0" in file:
             loaded.refuse(path, "no file's name has a zero byte")
-        if file and not os.path.isdir(Path(file).parent):
+        made = Path(file).parent in MADE.values()
+        if file and not made and not os.path.isdir(Path(file).parent):
             loaded.refuse(path, f"no folder {Path(file).parent}")
         if file and os.path.isdir(file):
             loaded.refuse(path, f"{file} is a folder")

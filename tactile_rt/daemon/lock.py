@@ -1,18 +1,28 @@
-"""One daemon per configuration and per device: a second one is refused, by the first one's pid."""
+"""One daemon per configuration and per device: a second one is refused, by the first one's pid.
 
-import fcntl
+A lock is a name in the kernel's abstract namespace of Unix sockets (unix(7)), which ends with the
+process that has it. No file is written, so that neither the environment, nor a read-only system,
+nor what another user left behind decides who is alone.
+"""
+
+import errno
 import hashlib
 import os
-import stat
-import tempfile
+import socket
+import struct
+import time
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from tactile_rt.stream import TactileError
 
-__all__ = ["AlreadyRunning", "Locks", "lock_keys"]
+__all__ = ["AlreadyRunning", "Locks", "device_keys", "lock_keys"]
 
 DEVICES = ("serial", "can")
+TRIES = 20  # at a name whose holder does not answer: it has just begun, or has just ended
+PAUSE_S = 0.01
+CREDENTIALS = struct.Struct("3i")  # pid, uid, gid
+WAITING = 4096  # who has asked for the pid stays in a queue that nobody empties
 
 
 class AlreadyRunning(TactileError):
@@ -21,85 +31,93 @@ class AlreadyRunning(TactileError):
 
 def lock_keys(config: Path, urls: list[str]) -> list[str]:
     """What a daemon must have to itself: its configuration, and every device."""
-    keys = [f"configuration {os.path.realpath(config)}"]
+    # As it is named, too: a link may lead to another file by the time a second one starts.
+    paths = [os.path.realpath(config), os.path.abspath(config)]
+    return list(dict.fromkeys([*(f"configuration {p}" for p in paths), *device_keys(urls)]))
+
+
+def device_keys(urls: list[str]) -> list[str]:
+    """The devices of some sources; two names of one port are one device."""
+    keys = []
     for url in urls:
         parts = urlsplit(url, allow_fragments=False)
         if parts.scheme not in DEVICES:
             continue
         target = unquote(parts.netloc + parts.path)
         port = target.removeprefix("slcan:") if target.startswith("slcan:") else target
-        # Two names of one port are one port.
         keys.append(f"device {os.path.realpath(port) if port.startswith('/') else target}")
     return list(dict.fromkeys(keys))
 
 
 class Locks:
-    """Locks that the process holds until it ends, however it ends.
+    """Locks that the process holds until it ends, however it ends."""
 
-    Args:
-        folder: where the files are; None: see `lock_folder`.
-    """
-
-    def __init__(self, folder: Path | None = None) -> None:
-        self._folder = folder or lock_folder()
-        self._held: dict[str, int] = {}
+    def __init__(self) -> None:
+        self._held: dict[str, socket.socket] = {}
 
     def hold(self, keys: list[str]) -> None:
         """Hold exactly these: get what is missing, then let go of the others.
 
         Raises:
             AlreadyRunning: another process has one; what was held is still held.
+        TactileError: the kernel gives none, which is so where Unix sockets are forbidden.
         """
-        got: dict[str, int] = {}
+        got: dict[str, socket.socket] = {}
         try:
             for key in keys:
                 if key not in self._held:
-                    got[key] = self._lock(key)
+                    got[key] = _lock(key)
         except BaseException:
             for handle in got.values():
-                os.close(handle)
+                handle.close()
             raise
         for key in [k for k in self._held if k not in keys]:
-            os.close(self._held.pop(key))
+            self._held.pop(key).close()
         self._held.update(got)
 
     def close(self) -> None:
         """Let go of all."""
         self.hold([])
 
-    def _lock(self, key: str) -> int:
-        path = self._folder / f"{hashlib.sha256(key.encode()).hexdigest()[:16]}.lock"
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            pid = os.pread(handle, 20, 0).decode(errors="replace").strip()
-            os.close(handle)
-            raise AlreadyRunning(
-                f"{key} is in use by process {pid or 'unknown'} (lock {path})"
-            ) from None
-        # The file stays for ever: to remove it would let two processes lock two files of one name.
-        os.ftruncate(handle, 0)
-        os.pwrite(handle, f"{os.getpid()}\n".encode(), 0)
-        return handle
 
-
-def lock_folder() -> Path:
-    """``$XDG_RUNTIME_DIR/tactile-rt``, else ``/run/tactile-rt`` if it can be made, else one of the
-    user's own in the folder for temporary files."""
-    places = []
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    if runtime:
-        places.append(Path(runtime) / "tactile-rt")
-    places += [Path("/run/tactile-rt"), Path(tempfile.gettempdir()) / f"tactile-rt-{os.getuid()}"]
-    for place in places:
+def _lock(key: str) -> socket.socket:
+    name = _name(key)
+    for _ in range(TRIES):
+        handle = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            place.mkdir(mode=0o700, exist_ok=True)
-            found = place.lstat()
-        except OSError:
+            handle.bind(name)
+            handle.listen(WAITING)
+            return handle
+        except OSError as error:
+            handle.close()
+            if error.errno != errno.EADDRINUSE:
+                raise TactileError(f"no lock for {key}: {error.strerror}") from None
+        try:
+            who = _holder(name)
+        except ConnectionRefusedError:
+            time.sleep(PAUSE_S)
             continue
-        # Else another user could hold our locks, or have us write where a link of theirs points.
-        ours = found.st_uid == os.getuid() and stat.S_ISDIR(found.st_mode)
-        if ours and os.access(place, os.W_OK):
-            return place
-    raise TactileError(f"no folder for the lock: tried {', '.join(map(str, places))}")
+        raise AlreadyRunning(f"{key} is in use by {who}")
+    raise AlreadyRunning(f"{key} is in use by a process that does not tell who it is")
+
+
+def _name(key: str) -> bytes:
+    """The same wherever it is asked for, but in a container: its paths are others."""
+    root = os.stat("/")
+    told = f"{root.st_dev} {root.st_ino} {key}"
+    return b"\0tactile-rt/" + hashlib.sha256(os.fsencode(told)).hexdigest()[:32].encode()
+
+
+def _holder(name: bytes) -> str:
+    """Who listens at a name; the kernel says so, nobody can say it of another."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
+        asking.setblocking(False)
+        try:
+            asking.connect(name)
+        except BlockingIOError:  # very many have asked
+            return "another process"
+        found = asking.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size)
+    pid, uid, _ = CREDENTIALS.unpack(found)
+    if pid == 0:
+        return "a process that cannot be seen from this container"
+    return f"process {pid}" + (f" of user {uid}" if uid != os.getuid() else "")

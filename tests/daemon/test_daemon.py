@@ -509,14 +509,12 @@ def test_a_source_that_is_still_being_opened_disturbs_no_other_after_a_reload(ro
 
 
 def test_a_reload_that_needs_a_device_of_another_process_changes_nothing(robot, tmp_path):
-    folder = tmp_path / "locks"
-    folder.mkdir()
-    base = source("a", "synthetic:")
-    daemon, _ = robot(base, locks=Locks(folder))
-    other = Locks(folder)
-    other.hold(["device /dev/null"])
+    base, port = source("a", "synthetic:"), tmp_path / "tty"
+    daemon, _ = robot(base, locks=Locks())
+    other = Locks()
+    other.hold([f"device {port}"])
     with pytest.raises(AlreadyRunning):
-        daemon.reload(configured(tmp_path, base + source("b", "serial:/dev/null?codec=bota")))
+        daemon.reload(configured(tmp_path, base + source("b", f"serial:{port}?codec=bota")))
     assert [s.part.name for s in daemon.snapshot().sources] == ["source.a"]
     with pytest.raises(AlreadyRunning, match="configuration"):
         other.hold([f"configuration {tmp_path}/robot.toml"])

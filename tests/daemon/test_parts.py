@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 import subprocess
 import sys
 import threading
@@ -25,7 +26,7 @@ from tactile_rt.daemon.items import (
     Packet,
     SourceChunk,
 )
-from tactile_rt.daemon.lock import AlreadyRunning, Locks, lock_keys
+from tactile_rt.daemon.lock import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.daemon.log import Log
 from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.messages import encode, message_of, topic_of
@@ -300,36 +301,82 @@ def test_the_level_is_the_least_that_is_written(tmp_path):
 # locks
 
 
-def test_a_second_process_is_refused_by_the_pid_of_the_first(tmp_path):
-    keys = lock_keys(tmp_path / "robot.toml", ["serial:///dev/null?codec=native", "synthetic:"])
-    assert keys == [f"configuration {tmp_path}/robot.toml", "device /dev/null"]
+def test_a_lock_ends_with_its_process_and_is_anothers_until_then(tmp_path):
+    device = f"device {tmp_path}/tty"
+    keys = [f"configuration {tmp_path}/robot.toml", device]
     code = (
-        "import sys, pathlib; from tactile_rt.daemon.lock import Locks; "
-        "held = Locks(pathlib.Path(sys.argv[1])); held.hold(['device /dev/null']); "
-        "print('held', flush=True); sys.stdin.read()"
+        "import sys; from tactile_rt.daemon.lock import Locks; held = Locks(); "
+        "held.hold([sys.argv[1]]); print('held', flush=True); sys.stdin.read()"
     )
     with subprocess.Popen(
-        [sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        [sys.executable, "-c", code, device], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as other:
         assert other.stdout.readline() == b"held\n"
-        mine = Locks(tmp_path)
-        with pytest.raises(AlreadyRunning, match=f"/dev/null is in use by process {other.pid} "):
-            mine.hold(keys)
+        mine = Locks()
+        for _ in range(3):  # whoever asks takes nothing from who asks next
+            with pytest.raises(AlreadyRunning, match=f"/tty is in use by process {other.pid}$"):
+                mine.hold(keys)
         mine.hold(keys[:1])
         other.kill()
-    mine.hold(keys)  # a process that is killed holds nothing
+    mine.hold(keys)
     with pytest.raises(AlreadyRunning):
-        Locks(tmp_path).hold(keys[:1])
+        Locks().hold(keys[:1])
     mine.hold(keys[1:])
-    Locks(tmp_path).hold(keys[:1])
+    second = Locks()
+    second.hold(keys[:1])
+    second.close()
     mine.close()
 
 
-def test_two_names_of_a_port_are_one_device(tmp_path):
-    link = tmp_path / "whiskers"
+def test_many_start_at_once_and_one_of_them_is_alone(tmp_path):
+    """Also while the name is bound and not yet listened at."""
+    key, won, lost = f"device {tmp_path}/tty", [], []
+    together = threading.Barrier(8)
+
+    def start():
+        locks = Locks()
+        together.wait()
+        try:
+            locks.hold([key])
+            won.append(locks)
+        except AlreadyRunning:
+            lost.append(locks)
+
+    threads = [threading.Thread(target=start) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert (len(won), len(lost)) == (1, 7)
+    won[0].close()
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user")
+def test_a_lock_of_another_user_is_a_lock_and_names_the_user(tmp_path):
+    key = f"device {tmp_path}/tty"
+    code = (
+        "import os, sys; from tactile_rt.daemon.lock import Locks; os.setuid(65534); "
+        "held = Locks(); held.hold([sys.argv[1]]); print('held', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, key], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as other:
+        assert other.stdout.readline() == b"held\n"
+        with pytest.raises(AlreadyRunning, match=f"process {other.pid} of user 65534"):
+            Locks().hold([key])
+        other.kill()
+
+
+def test_two_names_of_a_configuration_or_a_port_are_one(tmp_path):
+    link, file = tmp_path / "whiskers", tmp_path / "robot.toml"
     link.symlink_to("/dev/null")
     urls = ["serial:///dev/null?codec=bota", f"serial:{link}?codec=native", "can:slcan:/dev/null"]
-    assert lock_keys(tmp_path / "x", urls)[1:] == ["device /dev/null"]
+    assert device_keys([*urls, "synthetic:"]) == ["device /dev/null"]
+    assert lock_keys(file, urls) == [f"configuration {file}", "device /dev/null"]
+    # A link may lead elsewhere by the time a second one starts, so its own name is held, too.
+    named = tmp_path / "named.toml"
+    named.symlink_to(file)
+    assert lock_keys(named, []) == [f"configuration {file}", f"configuration {named}"]
 
 
 # supervision

@@ -47,8 +47,7 @@ options = { file = "out.jsonl" }
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+def folder(tmp_path):
     (tmp_path / "robot.toml").write_text(SMALL)
     return tmp_path
 
@@ -113,7 +112,7 @@ def test_signals_reload_and_stop_and_a_second_one_is_refused(folder, started, mo
     first = started()
     code, out, err = call(monkeypatch, capsys, "run", folder / "robot.toml")
     assert code == 3 and out == ""
-    assert f"robot.toml is in use by process {first.pid} " in err
+    assert f"robot.toml is in use by process {first.pid}\n" in err
     (folder / "robot.toml").write_text(SMALL.replace("2x2", "2by2"))
     first.send_signal(signal.SIGHUP)
     await_told(folder, "daemon", "refused")
@@ -130,6 +129,58 @@ def test_signals_reload_and_stop_and_a_second_one_is_refused(folder, started, mo
     assert states.count(("source.a", "running")) == 1  # it went on undisturbed
     assert ("source.b", "stopped") in states
     assert "Traceback" not in log and "daemon stopping" in log
+
+
+def second(folder, file="robot.toml", *arguments, **environment):
+    """(exit code, errors) of a daemon that is started beside the first one."""
+    paths = os.pathsep.join(sys.path)
+    done = subprocess.run(
+        [*RUN, "run", str(folder / file), "--seconds", "0.1", *arguments],
+        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
+        env={**os.environ, "PYTHONPATH": paths, **environment},
+    )  # fmt: skip
+    return done.returncode, done.stderr
+
+
+def test_a_second_one_is_refused_whatever_its_environment(folder, started):
+    """Also under another name, and with another output: the rest of it would be written twice."""
+    first = started()
+    (folder / "link.toml").symlink_to("robot.toml")
+    other = folder / "other"
+    other.mkdir()
+    places = dict.fromkeys(("XDG_RUNTIME_DIR", "TMPDIR", "HOME"), str(other))
+    for file in ("robot.toml", "link.toml"):
+        code, said = second(
+            folder, file, "--set", f"publisher.jsonl.options.file={folder}/x", **places
+        )
+        assert (code, said.count("\n")) == (3, 1) and f"in use by process {first.pid}\n" in said
+    assert list(other.iterdir()) == []  # and nothing is written to find that out
+    first.kill()
+    first.wait(PATIENCE_S)
+    assert second(folder)[0] == 0  # what was killed keeps nobody away
+
+
+def test_a_configuration_that_is_replaced_is_the_same_one(folder, started):
+    first = started()
+    (folder / "new.toml").write_text(SMALL)
+    os.replace(folder / "new.toml", folder / "robot.toml")
+    assert second(folder) == (3, f"tactile-rt: configuration {folder}/robot.toml is in use by "
+                              f"process {first.pid}\n")  # fmt: skip
+    first.send_signal(signal.SIGHUP)
+    await_told(folder, "daemon", "reloaded")
+    assert second(folder)[0] == 3
+
+
+def test_a_link_that_is_set_elsewhere_is_the_same_configuration(folder, started):
+    (folder / "robot.toml").rename(folder / "one.toml")
+    (folder / "two.toml").write_text(SMALL)
+    (folder / "robot.toml").symlink_to("one.toml")
+    first = started()
+    (folder / "next").symlink_to("two.toml")
+    os.replace(folder / "next", folder / "robot.toml")
+    for file in ("robot.toml", "one.toml"):
+        code, said = second(folder, file)
+        assert code == 3 and f"process {first.pid}" in said
 
 
 def signalled(folder, at, number, seconds):

@@ -1,11 +1,8 @@
-"""What systemd is told, at a notify socket of the test; the unit file; the install script."""
+"""What systemd is told, at a notify socket of the test."""
 
 import contextlib
 import os
-import shutil
 import socket
-import subprocess
-import sys
 import threading
 import time
 from queue import SimpleQueue
@@ -13,20 +10,12 @@ from typing import ClassVar
 
 import pytest
 
-from tactile_rt.cli import main
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.process import _serve
-from tactile_rt.daemon.systemd import (
-    Systemd,
-    hanging,
-    install_script,
-    status_of,
-    unit_text,
-    written_folders,
-)
+from tactile_rt.daemon.systemd import Systemd, hanging, status_of
 from tactile_rt.stream import ConfigError, Source
 from tactile_rt.testing import small_spec
 from tests.helpers.published import View, busy_snapshot, event, running
@@ -288,86 +277,3 @@ def test_a_device_that_is_not_there_or_silent_does_not(watched, tmp_path):
     assert daemon.stop() == [] and not lines_of(log, "source.", "stalled")
     for handle in (master, slave):
         os.close(handle)  # and with it the wait
-
-
-def configured(tmp_path, text=""):
-    file = tmp_path / "robot.toml"
-    file.write_text(SMALL + text)
-    return file, load_config(file).config
-
-
-def test_the_unit_opens_what_the_configuration_writes_and_nothing_else(tmp_path):
-    file, config = configured(
-        tmp_path,
-        '[recorder]\nfolder = "my recordings"\n[log]\nfile = "logs/d.log"\n'
-        '[[publisher]]\nkind = "jsonl"\noptions = { file = "out/a.jsonl" }\n',
-    )
-    folders = [tmp_path / "logs", tmp_path / "my recordings", tmp_path / "out"]
-    assert written_folders(config) == folders
-    unit = unit_text([sys.executable, "run", str(file)], config, "tactile")
-    lines = unit.splitlines()
-    assert f'ReadWritePaths="{tmp_path}/my recordings"' in lines
-    assert [x for x in lines if x.startswith("ReadWritePaths")] == [
-        f"ReadWritePaths={tmp_path}/logs", f'ReadWritePaths="{tmp_path}/my recordings"',
-        f"ReadWritePaths={tmp_path}/out",
-    ]  # fmt: skip
-    for line in (
-        "Type=notify", "NoNewPrivileges=yes", "ProtectSystem=strict", "DevicePolicy=closed",
-        "DeviceAllow=char-ttyACM rw", "WatchdogSec=15", "RestartPreventExitStatus=2 3",
-        "User=tactile", "CapabilityBoundingSet=",
-    ):  # fmt: skip
-        assert line in lines
-    script = install_script(
-        "tactile-rt.service", ["/opt/t r/tactile-rt", "config", "check", "x"], config, "tactile"
-    )
-    assert "\n'/opt/t r/tactile-rt' config check x\n" in script
-    assert f"install -d -o tactile -g tactile '{tmp_path}/my recordings'" in script
-    assert subprocess.run(["sh", "-n"], input=script, text=True, check=False).returncode == 0
-
-
-def test_what_means_something_in_a_unit_is_kept_from_it(tmp_path):
-    _, config = configured(tmp_path)
-    unit = unit_text(["/bin/a b", "100%", "$HOME", 'q"'], config, "u")
-    assert r'ExecStart="/bin/a b" 100%% $$HOME "q\""' in unit.splitlines()
-    with pytest.raises(ConfigError, match="unit file"):
-        unit_text(["/bin/a\nExecStart=/bin/evil"], config, "u")
-
-
-@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="no systemd here")
-def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path):
-    file, config = configured(tmp_path, '[recorder]\nfolder = "my recordings"\n')
-    unit = tmp_path / "tactile-rt.service"
-    unit.write_text(unit_text([sys.executable, "run", str(file)], config, "root"))
-    command = ["systemd-analyze", "verify", "--man=no"]
-    done = subprocess.run([*command, str(unit)], capture_output=True, text=True, check=False)
-    ours = [x for x in (done.stdout + done.stderr).splitlines() if "tactile-rt.service" in x]
-    assert ours == []
-    # And it does look: a wrong line is found.
-    unit.write_text(unit.read_text().replace("ProtectSystem=strict", "ProtectSystem=strictly"))
-    done = subprocess.run([*command, str(unit)], capture_output=True, text=True, check=False)
-    assert "strictly" in done.stdout + done.stderr
-
-
-def test_install_service_writes_all_three_and_touches_nothing_else(tmp_path, monkeypatch, capsys):
-    file, _ = configured(tmp_path)
-
-    def call(*arguments):
-        monkeypatch.setattr(sys, "argv", ["tactile-rt", "install-service", *map(str, arguments)])
-        with pytest.raises(SystemExit) as left:
-            main()
-        return left.value.code or 0, *capsys.readouterr()
-
-    code, out, err = call(file, "--to", tmp_path / "to")
-    assert code == 0, err
-    assert "sudo sh" in out
-    written = {p.name for p in (tmp_path / "to").iterdir()}
-    assert written == {"tactile-rt.service", "99-tactile.rules", "install.sh"}
-    assert f"{file}" in (tmp_path / "to" / "tactile-rt.service").read_text()
-    assert "latency_timer" in (tmp_path / "to" / "99-tactile.rules").read_text()
-    code, _, err = call(file, "--to", tmp_path / "to")
-    assert code == 2 and "is there already" in err
-    code, _, err = call(file, "--to", tmp_path / "new", "--user", "a; rm -rf /")
-    assert code == 2 and "--user" in err and not (tmp_path / "new").exists()
-    file.write_text("version = 2\n")
-    code, _, err = call(file, "--to", tmp_path / "new")
-    assert code == 2 and "robot.toml:1" in err and not (tmp_path / "new").exists()

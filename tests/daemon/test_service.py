@@ -1,0 +1,326 @@
+"""The service's unit, and the script that installs it, run by root on a copy of the system."""
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.cli import main
+from tactile_rt.daemon.checks import check_config
+from tactile_rt.daemon.loading import load_config
+from tactile_rt.daemon.service import install_script, unit_text
+from tactile_rt.daemon.service_folders import written_folders
+from tactile_rt.stream import ConfigError
+from tests.helpers.overlay import changes
+
+SMALL = 'version = 1\n[[source]]\nname = "a"\nurl = "synthetic:2x2"\n'
+
+
+def configured(tmp_path, text=""):
+    file = tmp_path / "robot.toml"
+    file.write_text(SMALL + text)
+    return file, load_config(file).config
+
+
+def test_the_unit_opens_what_the_configuration_writes_and_nothing_else(tmp_path):
+    file, config = configured(
+        tmp_path,
+        '[recorder]\nfolder = "my recordings"\n[log]\nfile = "logs/d.log"\n'
+        '[[publisher]]\nkind = "jsonl"\noptions = { file = "out/a.jsonl" }\n',
+    )
+    folders = [tmp_path / "logs", tmp_path / "my recordings", tmp_path / "out"]
+    assert written_folders(config) == folders
+    unit = unit_text([sys.executable, "run", str(file)], config, "tactile")
+    lines = unit.splitlines()
+    assert f'ReadWritePaths="{tmp_path}/my recordings"' in lines
+    assert [x for x in lines if x.startswith("ReadWritePaths")] == [
+        f"ReadWritePaths={tmp_path}/logs", f'ReadWritePaths="{tmp_path}/my recordings"',
+        f"ReadWritePaths={tmp_path}/out",
+    ]  # fmt: skip
+    for line in (
+        "Type=notify", "NoNewPrivileges=yes", "ProtectSystem=strict", "DevicePolicy=closed",
+        "DeviceAllow=char-ttyACM rw", "WatchdogSec=15", "RestartPreventExitStatus=2 3",
+        "User=tactile", "CapabilityBoundingSet=",
+    ):  # fmt: skip
+        assert line in lines
+
+
+def test_systemd_makes_the_folders_that_are_the_services_own(tmp_path):
+    """And only what such a folder does not cover is opened besides."""
+    file, config = configured(
+        tmp_path,
+        recorder("/var/lib/tactile-rt/rec")
+        + log("/var/log/tactile-rt/d.log")
+        + '[[publisher]]\nkind = "jsonl"\noptions = { file = "out/a" }\n',
+    )
+    (tmp_path / "out").mkdir()
+    check_config(load_config(file))  # a folder that systemd will make need not be there
+    unit = unit_text(["/opt/x", "run", str(file)], config, "tactile").splitlines()
+    assert "StateDirectory=tactile-rt" in unit and "LogsDirectory=tactile-rt" in unit
+    assert [x for x in unit if x.startswith("ReadWritePaths")] == [f"ReadWritePaths={tmp_path}/out"]
+    assert not any(x.startswith("RuntimeDirectory") for x in unit)
+    script = install_script("u.service", ["/opt/x"], config, "tactile")
+    assert f"mkdir -m 0750 -- {tmp_path}/out" in script and "/rec" not in script
+
+
+def test_what_means_something_in_a_unit_is_kept_from_it(tmp_path):
+    _, config = configured(tmp_path)
+    unit = unit_text(["/bin/a b", "100%", "$HOME", 'q"'], config, "u")
+    assert r'ExecStart="/bin/a b" 100%% $$HOME "q\""' in unit.splitlines()
+    _, config = configured(tmp_path, '[recorder]\nfolder = "/srv/it\'s 100% \\"x\\""\n')
+    unit = unit_text(["/bin/a"], config, "u")
+    assert r'''ReadWritePaths="/srv/it's 100%% \"x\""''' in unit.splitlines()
+    with pytest.raises(ConfigError, match="unit file"):
+        unit_text(["/bin/a\nExecStart=/bin/evil"], config, "u")
+
+
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="no systemd here")
+def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path):
+    file, config = configured(tmp_path, '[recorder]\nfolder = "my recordings"\n')
+    unit = tmp_path / "tactile-rt.service"
+    unit.write_text(unit_text([sys.executable, "run", str(file)], config, "root"))
+    command = ["systemd-analyze", "verify", "--man=no"]
+    done = subprocess.run([*command, str(unit)], capture_output=True, text=True, check=False)
+    ours = [x for x in (done.stdout + done.stderr).splitlines() if "tactile-rt.service" in x]
+    assert ours == []
+    # And it does look: a wrong line is found.
+    unit.write_text(unit.read_text().replace("ProtectSystem=strict", "ProtectSystem=strictly"))
+    done = subprocess.run([*command, str(unit)], capture_output=True, text=True, check=False)
+    assert "strictly" in done.stdout + done.stderr
+
+
+def test_install_service_writes_all_three_and_touches_nothing_else(tmp_path, monkeypatch, capsys):
+    file, _ = configured(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["tactile-rt", "install-service", *map(str, arguments)])
+        with pytest.raises(SystemExit) as left:
+            main()
+        return left.value.code or 0, *capsys.readouterr()
+
+    code, out, err = call(file, "--to", tmp_path / "to")
+    assert code == 0, err
+    assert "sudo sh" in out
+    written = {p.name for p in (tmp_path / "to").iterdir()}
+    assert written == {"tactile-rt.service", "99-tactile.rules", "install.sh"}
+    assert f"{file}" in (tmp_path / "to" / "tactile-rt.service").read_text()
+    assert "latency_timer" in (tmp_path / "to" / "99-tactile.rules").read_text()
+    code, _, err = call(file, "--to", tmp_path / "to")
+    assert code == 2 and "is there already" in err
+    code, _, err = call(file, "--to", tmp_path / "new", "--user", "a; rm -rf /")
+    assert code == 2 and "--user" in err and not (tmp_path / "new").exists()
+    file.write_text("version = 2\n")
+    code, _, err = call(file, "--to", tmp_path / "new")
+    assert code == 2 and "robot.toml:1" in err and not (tmp_path / "new").exists()
+
+
+# The script, as root, on a copy of the whole file system
+
+CONFIG = "/etc/tactile/robot.toml"
+TOOL = [sys.executable, "-B", "-c", "from tactile_rt.cli import main; main()"]
+WRITE = shlex.join([*TOOL, "install-service", CONFIG, "--to"])
+STUBS = "/opt/stubs"  # of what needs a running systemd; users and groups are real
+RUN = f"PATH={STUBS}:$PATH sh /root/service/install.sh"
+PREPARE = f"""
+mkdir -p {STUBS} /etc/tactile /etc/udev/rules.d /etc/systemd/system
+for tool in systemctl udevadm; do
+    printf '#!/bin/sh\\necho {STUBS}/%s "$@"\\n' "$tool" > {STUBS}/$tool
+    chmod 755 {STUBS}/$tool
+done
+"""
+USER = "useradd --system --no-create-home --shell /usr/sbin/nologin --user-group tactile\n"
+ACCOUNTS = {
+    f"/etc/{name}{old}" for name in ("passwd", "shadow", "group", "gshadow") for old in ("", "-")
+}
+ACCOUNTS |= {"/etc/.pwd.lock", "/etc/subuid", "/etc/subuid-", "/etc/subgid", "/etc/subgid-"}
+INSTALLED = {"/etc/systemd/system/tactile-rt.service", "/etc/udev/rules.d/99-tactile.rules"}
+
+
+@pytest.fixture(scope="module")
+def on_a_copy():
+    """`changes`, where the system lets root have copies of itself."""
+    if os.geteuid() != 0 or not shutil.which("unshare"):
+        pytest.skip("needs root and unshare")
+    try:
+        tried = changes("true", shlex.join([*TOOL[:-1], "import tactile_rt"]))
+    except OSError as error:
+        pytest.skip(f"no overlay here: {error}")
+    if tried.code:
+        pytest.skip("this Python lies on another file system than /")
+    assert tried.before == {}
+    return changes
+
+
+def recorder(folder):
+    return f"[recorder]\nfolder = {json.dumps(folder)}\n"
+
+
+def log(file):
+    return f"[log]\nfile = {json.dumps(file)}\n"
+
+
+def prepared(config="", before="", after=""):
+    """Shell: the stubs, what `before` makes, the configuration, the service, what `after` makes."""
+    write = f"printf %s {shlex.quote(SMALL + config)} > {CONFIG}\n"
+    return f"{PREPARE}\n{before}\n{write}{WRITE} /root/service\n{after}"
+
+
+def check_installed(changed, made=()):
+    assert changed.code == 0, changed.said
+    expected = INSTALLED | set(made)
+    assert expected <= set(changed.after) <= expected | ACCOUNTS
+    for path in ACCOUNTS & set(changed.after):
+        (was, now) = changed.before[path], changed.after[path]
+        if was is None or now is None or path == "/etc/.pwd.lock":
+            continue
+        assert was[:3] == now[:3], path  # kind and mode, owner, group
+        if not path.endswith("-"):
+            lines = set(was[3].splitlines()) ^ set(now[3].splitlines())
+            assert all("tactile" in x or x.startswith("dialout:") for x in lines), (path, lines)
+    for path in INSTALLED:
+        assert changed.after[path][:3] == ["-rw-r--r--", 0, 0]
+
+
+def test_installing_changes_accounts_unit_and_rules_and_nothing_else(on_a_copy):
+    changed = on_a_copy(prepared(), RUN)
+    check_installed(changed)
+    assert "\ntactile:" in changed.after["/etc/passwd"][3]
+    assert f"{STUBS}/systemctl restart tactile-rt.service" in changed.said
+
+
+def test_installing_again_changes_nothing(on_a_copy):
+    keeps = recorder("/srv/recordings")
+    changed = on_a_copy(prepared(keeps, after=RUN), RUN)
+    assert (changed.code, changed.after) == (0, {}), changed.said
+
+
+@pytest.mark.parametrize(
+    ("folder", "before"),
+    [
+        ("/srv/recordings", ""),
+        ("""/srv/it's my "rec" 100% $HOME `id`""", ""),
+        ("/srv/deep/er/recordings", "mkdir -p /srv/deep/er"),
+    ],
+)
+def test_a_new_folder_is_made_and_none_above_it(on_a_copy, folder, before):
+    changed = on_a_copy(prepared(recorder(folder), before), RUN)
+    check_installed(changed, {folder})
+    (entry,) = [x for x in changed.after["/etc/passwd"][3].splitlines() if x.startswith("tactile:")]
+    owner, group = map(int, entry.split(":")[2:4])
+    assert changed.before[folder] is None and changed.after[folder] == [
+        "drwxr-x---",
+        owner,
+        group,
+        "",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("folder", "before"),
+    [
+        ("/srv/rec", "mkdir -m 0777 /srv/rec; chown tactile: /srv/rec; echo x > /srv/rec/file"),
+        ("/var/lib/tactile-rt/rec", "install -d -m 0700 -o tactile /var/lib/tactile-rt"),
+        (
+            "/home/bob/rec",
+            "install -d -m 0711 -o bob /home/bob; install -d -o tactile /home/bob/rec",
+        ),
+    ],
+)
+def test_a_folder_of_the_services_own_is_left_as_it_is(on_a_copy, folder, before):
+    users = f"{USER}useradd bob\n"
+    changed = on_a_copy(prepared(recorder(folder), users + before), RUN)
+    check_installed(changed)
+
+
+OTHERS = "useradd bob; mkdir -m 0750 /srv/bobs; chown bob: /srv/bobs\n"
+REFUSED = [
+    (log("/tmp/d.log"), "", "log.file: folder /tmp: the service has a /tmp of its own"),
+    (log("/var/log/d.log"), "", "log.file: folder /var/log: it is not for one service"),
+    (log("d.log"), "", f"log.file: folder /etc/tactile: the service would own {CONFIG}"),
+    (log("/d.log"), "", "log.file: folder /: the service would own"),
+    (recorder("/home/bob"), "", "folder /home/bob: it is not for one service"),
+    (recorder("/etc"), "", f"folder /etc: the service would own {CONFIG}"),
+    (recorder("/run/rec"), "", "folder /run/rec: /run is empty after each boot"),
+    (recorder("/srv/no/rec"), "", "there is no folder /srv/no to make it in"),
+    (recorder("/srv/../srv/rec"), "", "it is /srv/rec in truth: name that"),
+    (
+        recorder(sys.prefix), "", f"folder {sys.prefix}: the service ",  # wherever it lies
+    ),
+    (
+        '[[source]]\nname = "b"\nurl = "synthetic:mouse"\n'
+        '[[model]]\nsource = "b"\nfile = "/srv/models/m.onnx"\n' + recorder("/srv/models"),
+        f"mkdir /srv/models; cp {shlex.quote(str(shipped_model()))} /srv/models/m.onnx",
+        "folder /srv/models: the service would own /srv/models/m.onnx, which it reads",
+    ),
+    (
+        recorder("/srv/bobs"), OTHERS,
+        "/srv/bobs belongs to bob (drwxr-x---), and tactile must own it",
+    ),
+    (
+        recorder("/srv/bobs/rec"), OTHERS,
+        "others than root can write in /srv/bobs: make it yourself: sudo useradd --system",
+    ),
+    (
+        recorder("/srv/open/rec"), "mkdir -m 1777 /srv/open",
+        "others than root can write in /srv/open",
+    ),
+    (
+        recorder("/srv/link"), f"{OTHERS}ln -s bobs /srv/link",
+        "folder /srv/link: it is /srv/bobs in truth: name that",
+    ),
+    (
+        recorder("/srv/ro"), f"{USER}mkdir -m 0500 /srv/ro; chown tactile: /srv/ro",
+        "/srv/ro belongs to tactile (dr-x------), and tactile must own it and write in it",
+    ),
+    (
+        '[[publisher]]\nkind = "jsonl"\noptions = { file = "/srv/bobs/out" }\n', OTHERS,
+        "publisher[0].options.file: folder /srv/bobs: /srv/bobs belongs to bob",
+    ),
+    (
+        recorder("/var/lib/tactile-rt/rec"), f"{OTHERS}mv /srv/bobs /var/lib/tactile-rt",
+        "/var/lib/tactile-rt belongs to bob",
+    ),
+    (
+        "", f"{OTHERS}mv /srv/bobs /var/lib/tactile-rt",
+        "folder /var/lib/tactile-rt: /var/lib/tactile-rt belongs to bob",
+    ),
+]  # fmt: skip
+
+
+def test_a_folder_that_is_not_the_services_is_refused_before_anything_is_written(on_a_copy):
+    """All in one copy: each is written, refused in one line, and nothing is left of it."""
+    for config, before, said in REFUSED:
+        write = f"printf %s {shlex.quote(SMALL + config)} > {CONFIG}\n"
+        changed = on_a_copy(f"{PREPARE}\n{before}\n{write}", f"{WRITE} /root/service")
+        assert changed.code == 2 and changed.said.count("\n") == 1, (config, changed.said)
+        assert said in changed.said and changed.after == {}, (config, changed)
+
+
+@pytest.mark.parametrize(
+    ("meanwhile", "said"),
+    [
+        (f"{OTHERS}mv /srv/bobs /srv/rec", "/srv/rec belongs to bob"),
+        (f"{OTHERS}ln -s bobs /srv/rec", "/srv/rec: it is /srv/bobs in truth"),
+        ("chmod 1777 /srv", "others than root can write in /srv"),
+        (f"sed -i s:/srv/rec:/srv/rec2: {CONFIG}", "now gives another tactile-rt.service"),
+        (f"echo nonsense >> {CONFIG}", "the configuration cannot be installed"),
+        ("groupdel dialout", "there is no group dialout"),
+        ("rm -r /etc/udev/rules.d", "there is no folder /etc/udev/rules.d"),
+        (f"rm {STUBS}/udevadm; ! command -v udevadm", "there is no udevadm here"),
+    ],
+)
+def test_what_has_changed_since_is_seen_before_anything_is_changed(on_a_copy, meanwhile, said):
+    changed = on_a_copy(prepared(recorder("/srv/rec"), after=meanwhile), RUN)
+    assert (changed.code, changed.after) == (1, {}), changed.said
+    assert said in changed.said and "nothing has been changed\n" in changed.said
+
+
+def test_without_root_nothing_is_tried(on_a_copy):
+    run = f"chmod 755 /root; exec setpriv --reuid 65534 --clear-groups sh -c {shlex.quote(RUN)}"
+    changed = on_a_copy(prepared(after="chmod 755 /root"), run)
+    assert changed.code == 1 and "run it as root" in changed.said and changed.after == {}
