@@ -7,15 +7,20 @@ from typing import TYPE_CHECKING, BinaryIO
 
 from tactile_rt.files import write_whole
 from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
-from tactile_rt.recording.layout import CHANNELS, need_mcap
-from tactile_rt.recording.reader import MAGIC, Recording
+from tactile_rt.recording.layout import CHANNELS, is_message, need_mcap
+from tactile_rt.recording.reader import Recording
+from tactile_rt.recording.records import MAGIC, read_whole_records
 from tactile_rt.recording.writer import McapFile
 from tactile_rt.stream import ConfigError, RecordingError
 
 if TYPE_CHECKING:
-    from mcap.records import McapRecord, Message
+    from mcap.records import Message
+
+    from tactile_rt.recording.records import Record
 
 __all__ = ["recover"]
+
+MOST_NONE = 1000  # messages that are none, after which the file is no damaged recording
 
 
 def recover(path: str | Path, output: str | Path | None = None, force: bool = False) -> Path:
@@ -48,8 +53,8 @@ def recover(path: str | Path, output: str | Path | None = None, force: bool = Fa
         if file.read(len(MAGIC)) != MAGIC:
             raise RecordingError(f"{path} is not an MCAP file, or was cut before it began")
         file.seek(0)
-        about, records = _begun(path, _whole_records(file))
-        write_whole(output, lambda new: _copy(records, new, about))
+        about, records = _begun(path, _bounded(path, file))
+        write_whole(output, lambda new: _copy(path, records, new, about))
     return output
 
 
@@ -62,9 +67,14 @@ def _is_whole(path: Path) -> bool:
     return True
 
 
-def _begun(
-    path: Path, records: "Iterator[McapRecord]"
-) -> "tuple[Description, Iterator[McapRecord]]":
+def _bounded(path: Path, file: BinaryIO) -> "Iterator[Record]":
+    try:
+        yield from read_whole_records(file)
+    except ValueError as error:
+        raise RecordingError(f"{path} is no recording: {error}") from None
+
+
+def _begun(path: Path, records: "Iterator[Record]") -> "tuple[Description, Iterator[Record]]":
     """What the recording is of, and what follows."""
     from mcap.records import Metadata
 
@@ -83,30 +93,7 @@ def _begun(
     )
 
 
-def _whole_records(file: BinaryIO) -> "Iterator[McapRecord]":
-    """Records outside chunks and within, until one is cut; damaged chunks are left out."""
-    from mcap.records import Chunk, DataEnd
-    from mcap.stream_reader import StreamReader, breakup_chunk
-
-    records = StreamReader(file, emit_chunks=True, record_size_limit=1 << 30).records
-    while True:
-        try:
-            record = next(records, None)
-        except Exception:  # cut off here; a damaged length reads as anything
-            return
-        if record is None or isinstance(record, DataEnd):
-            return
-        if not isinstance(record, Chunk):
-            yield record
-            continue
-        try:
-            inside = breakup_chunk(record, validate_crc=True)
-        except Exception:  # damaged: what follows may be whole
-            continue
-        yield from inside
-
-
-def _copy(records: "Iterator[McapRecord]", new: BinaryIO, about: Description) -> None:
+def _copy(path: Path, records: "Iterator[Record]", new: BinaryIO, about: Description) -> None:
     from mcap.records import Channel, Message
 
     file = McapFile(new, about)
@@ -114,11 +101,21 @@ def _copy(records: "Iterator[McapRecord]", new: BinaryIO, about: Description) ->
     # A damaged first chunk takes the names of the channels with it, but we number them alike.
     numbered = (topic for topic, wire in CHANNELS if wire in ("", about.wire))
     names = dict(enumerate(numbered, 1))
+    whole = none = 0
     for record in records:
         if isinstance(record, Channel):
             names[record.id] = record.topic
         elif isinstance(record, Message) and record.channel_id in names:
-            file.add(names[record.channel_id], record.data, _host_ns(record, about))
+            topic = names[record.channel_id]
+            if is_message(topic, record.data, about.spec.shape):
+                file.add(topic, record.data, _host_ns(record, about))
+                whole += 1
+            else:
+                none += 1
+        if none > MOST_NONE:
+            raise RecordingError(f"{path} is no recording: more than {MOST_NONE} messages are none")
+    if not whole:
+        raise RecordingError(f"{path}: nothing in it is whole")
     file.finish()
 
 
