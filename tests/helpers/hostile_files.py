@@ -96,7 +96,50 @@ MCAPS: dict[str, Callable[[], bytes]] = {
     ),
     "cut in a bomb": lambda: _recording(_chunk(b"zstd", _zstd(GIB), GIB))[:20_000],
 }
-DBCS: dict[str, Callable[[], bytes]] = {}
+
+# DBC: what a sensor's bus looks like, and then what no bus has
+
+
+def _dbc(text: str, length: str = "8") -> bytes:
+    return f'VERSION ""\nBU_: A\nBO_ 1 M: {length} A\n{text}\n'.encode("cp1252")
+
+
+def _signals(number: int) -> str:
+    return "\n".join(f' SG_ S{i} : {i % 64}|1@1+ (1,0) [0|1] "" A' for i in range(number))
+
+
+def _message_per_line(number: int) -> str:
+    return "\n".join(f"BO_ {i + (1 << 31)} M{i}: 64 A" for i in range(number))
+
+
+def _nested(depth: int) -> str:
+    head = ' SG_ S0 M : 0|8@1+ (1,0) [0|1] "" A\n'
+    lines = (f' SG_ S{i} m0M : {i % 56}|8@1+ (1,0) [0|1] "" A' for i in range(1, depth))
+    ranges = (f"SG_MUL_VAL_ 1 S{i} S{i - 1} 0-0;" for i in range(1, depth))
+    return head + "\n".join([*lines, "", *ranges])
+
+
+MUX = ' SG_ X M : 0|8@1+ (1,0) [0|1] "" A\n SG_ S m0 : 8|8@1+ (1,0) [0|1] "" A\n'
+DBCS: dict[str, Callable[[], bytes]] = {
+    "a message of 100,000 bytes": lambda: _dbc(_signals(1), "100000"),
+    "a length of 10,000 digits": lambda: _dbc(_signals(1), "9" * 10_000),
+    "100 MB": lambda: _dbc(_signals(1)) + b" " * 100_000_000,
+    "a million signals": lambda: _dbc(_signals(1_000_000)),
+    "a signal of 10^9 bits": lambda: _dbc(' SG_ S : 0|1000000000@1+ (1,0) [0|1] "" A'),
+    "a signal at bit 10^9": lambda: _dbc(' SG_ S : 1000000000|8@1+ (1,0) [0|1] "" A'),
+    "a multiplexer of 10^9 values": lambda: _dbc(MUX + "SG_MUL_VAL_ 1 S X 0-1000000000;"),
+    "a thousand multiplexers deep": lambda: _dbc(_nested(1000)),
+    "multiplexers in a circle": lambda: _dbc(
+        ' SG_ S m0M : 0|8@1+ (1,0) [0|1] "" A\n SG_ T m0M : 8|8@1+ (1,0) [0|1] "" A\n'
+        "SG_MUL_VAL_ 1 S T 0-0;\nSG_MUL_VAL_ 1 T S 0-0;"
+    ),
+    "a string without end": lambda: _dbc(_signals(1) + '\nCM_ "' + '\\"' * 400_000),
+    "a million quotes": lambda: _dbc(_signals(1) + "\nCM_ " + '"a"\\' * 200_000),
+    "no end of names": lambda: _dbc(" SG_ " + "a " * 500_000),
+    "zeroes": lambda: bytes(1 << 20),
+    "25,000 messages": lambda: _dbc(_message_per_line(25_000)),
+    "a name of 1 MB": lambda: _dbc(f' SG_ {"a" * 1_000_000} : 0|8@1+ (1,0) [0|1] "" A'),
+}
 MESHES: dict[str, Callable[[], tuple[str, bytes]]] = {}
 
 
