@@ -1,11 +1,12 @@
 """Files that are made to hang or exhaust who reads them; each is small, or made in a moment."""
 
+import base64
 import io
+import json
 import struct
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable
-from pathlib import Path
 
 __all__ = ["DBCS", "MCAPS", "MESHES"]
 
@@ -140,17 +141,12 @@ DBCS: dict[str, Callable[[], bytes]] = {
     "25,000 messages": lambda: _dbc(_message_per_line(25_000)),
     "a name of 1 MB": lambda: _dbc(f' SG_ {"a" * 1_000_000} : 0|8@1+ (1,0) [0|1] "" A'),
 }
-MESHES: dict[str, Callable[[], tuple[str, bytes]]] = {}
 
 
-def written(folder: Path, name: str, data: bytes) -> Path:
-    """The file in the folder."""
-    path = folder / name
-    path.write_bytes(data)
-    return path
+# Meshes: a name with its ending, and what is in the file
 
 
-def zipped(members: Iterable[tuple[str, Iterable[bytes]]]) -> bytes:
+def _zipped(members: Iterable[tuple[str, Iterable[bytes]]]) -> bytes:
     """A ZIP archive, deflated."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
@@ -159,3 +155,159 @@ def zipped(members: Iterable[tuple[str, Iterable[bytes]]]) -> bytes:
                 for part in parts:
                     member.write(part)
     return packed.getvalue()
+
+
+def _ply(kind: str, vertices: int, faces: int, body: bytes, list_of: str = "uchar") -> bytes:
+    head = (
+        f"ply\nformat {kind} 1.0\nelement vertex {vertices}\n"
+        "property float x\nproperty float y\nproperty float z\n"
+        f"element face {faces}\nproperty list {list_of} int vertex_indices\nend_header\n"
+    )
+    return head.encode() + body
+
+
+def _3mf(model: str) -> bytes:
+    head = (
+        '<?xml version="1.0" encoding="UTF-8"?>'
+        '<model unit="millimeter" '
+        'xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02">'
+    )
+    return _zipped([("3D/3dmodel.model", [(head + model + "</model>").encode()])])
+
+
+def _3mf_instances(depth: int, each: int) -> str:
+    """Each object holds the one before several times: each^depth tetrahedra."""
+    mesh = (
+        '<object id="1" type="model"><mesh><vertices><vertex x="0" y="0" z="0"/>'
+        '<vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/><vertex x="0" y="0" z="1"/>'
+        '</vertices><triangles><triangle v1="0" v2="2" v3="1"/><triangle v1="0" v2="1" v3="3"/>'
+        '<triangle v1="1" v2="2" v3="3"/><triangle v1="2" v2="0" v3="3"/></triangles></mesh>'
+        "</object>"
+    )
+    shift = "1 0 0 0 1 0 0 0 1 {} 0 0"
+    for i in range(2, depth + 2):
+        held = "".join(
+            f'<component objectid="{i - 1}" transform="{shift.format(2 * k)}"/>'
+            for k in range(each)
+        )
+        mesh += f'<object id="{i}" type="model"><components>{held}</components></object>'
+    return f'<resources>{mesh}</resources><build><item objectid="{depth + 1}"/></build>'
+
+
+def _dae(doctype: str, text: str) -> bytes:
+    return (
+        f'<?xml version="1.0"?>{doctype}'
+        '<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">'
+        f"{text}</COLLADA>"
+    ).encode()
+
+
+def _laughs() -> bytes:
+    entities = ['<!ENTITY a0 "ha ha ha ha ha">']
+    entities += [f'<!ENTITY a{i} "{f"&a{i - 1};" * 10}">' for i in range(1, 12)]
+    title = "<asset><title>&a11;</title></asset>"
+    return _dae(f"<!DOCTYPE COLLADA [{''.join(entities)}]>", title)
+
+
+def _dae_nodes(depth: int) -> bytes:
+    """Nodes that hold the one before twice: 2^depth."""
+    nodes = '<node id="n0"/>' + "".join(
+        f'<node id="n{i}">{f"""<instance_node url="#n{i - 1}"/>""" * 2}</node>'
+        for i in range(1, depth)
+    )
+    scene = f'<visual_scene id="s"><node id="r"><instance_node url="#n{depth - 1}"/></node>'
+    return _dae(
+        "",
+        "<asset><unit meter='1'/></asset>"
+        f"<library_nodes>{nodes}</library_nodes>"
+        f"<library_visual_scenes>{scene}</visual_scene></library_visual_scenes>"
+        '<scene><instance_visual_scene url="#s"/></scene>',
+    )
+
+
+def _gltf(**parts: object) -> bytes:
+    whole = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], **parts}
+    return json.dumps(whole).encode()
+
+
+def _gltf_of(count: int, buffer: dict[str, object], **accessor: object) -> dict[str, object]:
+    data = {"componentType": 5126, "type": "VEC3", "count": count, "bufferView": 0, **accessor}
+    return {
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "accessors": [{k: v for k, v in data.items() if v is not None}],
+        "bufferViews": [{"buffer": 0, "byteLength": 12 * count}],
+        "buffers": [buffer],
+    }
+
+
+def _data_uri(data: bytes) -> str:
+    return "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+
+
+def _gltf_instances(nodes: int, triangles: int) -> bytes:
+    """A mesh of so many triangles, by so many nodes."""
+    corners = b"".join(struct.pack("<3f", i % 7, i % 11, i % 13) for i in range(3 * triangles))
+    made = _gltf_of(3 * triangles, {"byteLength": len(corners), "uri": _data_uri(corners)})
+    made["nodes"] = [{"mesh": 0}] * nodes
+    return _gltf(**made, scenes=[{"nodes": list(range(nodes))}])
+
+
+def _draco(points: int) -> dict[str, object]:
+    # header of a mesh, sequential: this many faces and points, and no data
+    data = b"DRACO" + bytes([2, 2, 1, 0, 0, 0]) + b"\xff\xff\xff\xff\x0f" * 2
+    made = _gltf_of(points, {"byteLength": len(data), "uri": _data_uri(data)}, bufferView=None)
+    extension = {"bufferView": 0, "attributes": {"POSITION": 0}}
+    primitive = {"attributes": {"POSITION": 0}}
+    primitive["extensions"] = {"KHR_draco_mesh_compression": extension}
+    made["meshes"] = [{"primitives": [primitive]}]
+    made["bufferViews"] = [{"buffer": 0, "byteLength": len(data)}]
+    made["extensionsUsed"] = made["extensionsRequired"] = ["KHR_draco_mesh_compression"]
+    return made
+
+
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+MESHES: dict[str, Callable[[], tuple[str, bytes]]] = {
+    "STL of 4e9 faces": lambda: (".stl", bytes(80) + struct.pack("<I", 4_000_000_000) + bytes(500)),
+    "PLY of 10^9 vertices": lambda: (".ply", _ply("binary_little_endian", 10**9, 1, bytes(100))),
+    "text PLY of 10^9 faces": lambda: (".ply", _ply("ascii", 3, 10**9, b"0 0 0\n" * 3)),
+    "PLY list of 2^31": lambda: (
+        ".ply",
+        _ply("binary_little_endian", 3, 9, bytes(36) + b"\xff\xff\xff\x7f" + bytes(99), "uint"),
+    ),
+    "OBJ of index 2^31": lambda: (".obj", (TETRAHEDRON + "f 1 2 2147483647\n").encode()),
+    "OBJ of index -2^62": lambda: (".obj", (TETRAHEDRON + f"f 1 2 {-(1 << 62)}\n").encode()),
+    "OBJ of a face of 10^6": lambda: (".obj", ("v 0 0 0\nf" + " 1" * 1_000_000).encode()),
+    "OFF of 10^9 vertices": lambda: (".off", b"OFF\n1000000000 1000000000 0\n0 0 0\n"),
+    "ZIP of 1 GiB": lambda: (".3mf", _zipped([("3D/3dmodel.model", _zeros(GIB))])),
+    "3MF of 8^12 instances": lambda: (".3mf", _3mf(_3mf_instances(12, 8))),
+    "3MF in a circle": lambda: (
+        ".3mf",
+        _3mf(
+            '<resources><object id="1"><components><component objectid="1"/></components>'
+            '</object></resources><build><item objectid="1"/></build>'
+        ),
+    ),
+    "a billion laughs": lambda: (".dae", _laughs()),
+    "COLLADA of 2^40 nodes": lambda: (".dae", _dae_nodes(40)),
+    "XML a million deep": lambda: (".dae", _dae("", "<node>" * 1_000_000)),
+    "glTF buffer of 10^12": lambda: (
+        ".gltf",
+        _gltf(**_gltf_of(10**11, {"byteLength": 12 * 10**11, "uri": _data_uri(bytes(36))})),
+    ),
+    "glTF accessor of nothing": lambda: (
+        ".gltf",
+        _gltf(**_gltf_of(10**9, {"byteLength": 36, "uri": _data_uri(bytes(36))}, bufferView=None)),
+    ),
+    "glTF of 2e9 instances": lambda: (".gltf", _gltf_instances(20_000, 10_000)),
+    "glTF a million nodes deep": lambda: (
+        ".gltf",
+        _gltf(nodes=[{"children": [i + 1]} for i in range(200_000)] + [{}]),
+    ),
+    "glTF of Draco's 10^9": lambda: (".gltf", _gltf(**_draco(10**9))),
+    "GLB of 4 GB": lambda: (
+        ".glb",
+        b"glTF" + struct.pack("<III", 2, 0xFFFFFFFF, 0xFFFFFFF0) + b"JSON" + b"{" * 100,
+    ),
+    "JSON a million deep": lambda: (".gltf", b'{"asset":' + b"[" * 1_000_000),
+}

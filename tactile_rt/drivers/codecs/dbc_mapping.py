@@ -208,7 +208,7 @@ class _Reader:
             raise ConfigError(f"{path}, dbc: {self.dbc}: {error.strerror or error}") from None
         if len(content) > MOST_BYTES:
             raise ConfigError(
-                f"{self.dbc}: is larger than {MOST_BYTES >> 20} MiB; keep the messages of the sensor"
+                f"{self.dbc}: larger than {MOST_BYTES >> 20} MiB; keep the messages of the sensor"
             )
         try:
             text = content.decode("cp1252")  # as cantools takes them to be
@@ -300,7 +300,7 @@ class _Reader:
                 f"{where}: no signal {signal_name!r} in message {of} of {self.dbc}{hint}"
             )
         signal = known[signal_name]
-        chain = []
+        chain: list[tuple[str, frozenset[int]]] = []
         outer = signal
         while outer.multiplexer_signal:
             if len(chain) == DEEPEST:
