@@ -2,7 +2,8 @@
 
     FOLDER/whiskers-20261121T170512Z.mcap
 
-A file holds samples, raw packets, decisions, health and events of one source, and in its metadata
+A file is begun with a source's first sample or packet: one that fails again and again leaves none.
+It holds samples, raw packets, decisions, health and events of one source, and in its metadata
 the configuration in force and the hash of every model. Whatever ends the process, `tactile-rt
 recover` gets back all but the last moment; files that were left so are named when the recorder
 begins.
@@ -52,6 +53,7 @@ FLUSH_S = 0.4  # with the gathering still well under the second that may be lost
 LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
 STALE_S = 3600.0  # a file that is begun has its name long before
 RING_BYTES = 64 << 20  # of each source, before a trigger
+EVER_NS = 1 << 62
 MB, NS = 1e6, 1e9
 
 
@@ -63,6 +65,7 @@ class _Track:
         self.wire = describe(opened.stream).wire
         self.prelude_ns = opened.prelude[-1][1] if opened.prelude else -1
         self.file: RecordingWriter | None = None
+        self.came = False  # a sample, or a packet: before, there is nothing to record
         self.ring: deque[Raw] = deque()
         self.ring_bytes = 0
         self.until_ns = 0  # of a trigger; 0: none
@@ -202,9 +205,14 @@ class Recorder(Consumer):
                 self._trigger(track)
 
     def _add(self, track: _Track, message: Raw) -> None:
-        if track.file is None and self._config.mode == "trigger":
+        always = self._config.mode == "always"
+        if not track.came and message.topic in (SAMPLES, WIRE):
+            track.came = True
+            if self._on and (always or track.until_ns > time.monotonic_ns()):
+                self._start_file(track)
+        if track.file is None and not (always and track.came):
             if self._on:
-                track.keep(message, round(self._config.before_s * NS))
+                track.keep(message, EVER_NS if always else round(self._config.before_s * NS))
             return
         if track.file is None:
             if self._on:
@@ -255,9 +263,7 @@ class Recorder(Consumer):
         self._end(opened.source)
         config = self._config
         rotation = Rotation(self._folder, opened.source, config.rotate_mb, config.rotate_s)
-        track = self._tracks[opened.source] = _Track(opened, rotation)
-        if self._config.mode == "always" and self._on:
-            self._start_file(track)
+        self._tracks[opened.source] = _Track(opened, rotation)
 
     def _end(self, source: str) -> None:
         track = self._tracks.pop(source, None)
@@ -265,7 +271,7 @@ class Recorder(Consumer):
             self._finish_file(track)
 
     def _start_file(self, track: _Track) -> None:
-        if track.file is not None or track.closed_ns or not self._room():
+        if track.file is not None or not track.came or track.closed_ns or not self._room():
             return
         opened, snapshot = track.opened, self._view.snapshot()
         session = {

@@ -21,9 +21,9 @@ from typing import Final
 
 __all__ = ["ConnectionLimit"]
 
-LOOK_S: Final = 0.05  # on loopback, a thousand may come meanwhile
+LOOK_S: Final = 0.1  # on loopback, some thousand may come meanwhile
 AGAIN_S: Final = 0.002  # while they come
-CALM: Final = 40  # looks without anyone to shut down, after which they have gone
+CALM: Final = 20  # looks without anyone to shut down, after which they have gone
 Key = tuple[int, int]  # descriptor and inode: a socket, as long as it is open
 
 
