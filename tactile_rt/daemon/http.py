@@ -44,7 +44,7 @@ class HttpLimits:
     Attributes:
         connections: The number of connections at a time; one more is dropped at once, before a file
             descriptor is missed elsewhere.
-        head_bytes: The largest head of a request, in bytes.
+        head_bytes: The largest head of a request with the empty line that ends it, in bytes.
         head_s: The time from the connection to the end of the head, however it drips in, s.
         send_s: The time that a peer may leave what is sent to it untaken, s.
     """
@@ -303,9 +303,9 @@ class HttpServer:
         try:
             async with asyncio.timeout(self._limits.head_s):
                 while b"\r\n\r\n" not in data:
-                    if len(data) > most:
+                    if len(data) == most:
                         raise Refused(431, f"more than {most} bytes of headers")
-                    more = await reader.read(most + 1 - len(data))
+                    more = await reader.read(most - len(data))
                     if not more:
                         raise Refused(400, "the request breaks off")
                     data += more

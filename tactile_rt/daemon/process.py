@@ -6,11 +6,13 @@ what was noted before it starts anything. That is why this module imports next t
 """
 
 import os
+import resource
 import signal
 import sys
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from enum import IntEnum
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -82,6 +84,7 @@ def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = Non
         if _asked_to_end(calls):
             return ExitCode.STOPPED
         sys.setswitchinterval(SWITCH_S)
+        _want_descriptors()
         daemon = Daemon(loaded, locks=Locks(), freeze=True, on_over=lambda: calls.put(OVER))
         try:
             daemon.start()
@@ -93,6 +96,14 @@ def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = Non
         for number, handler in zip(SIGNALS, before, strict=True):
             signal.signal(number, handler)
     return ExitCode.ABANDONED if late else ExitCode.STOPPED
+
+
+def _want_descriptors() -> None:
+    """Let the process open as much as it may: when a thousand connect at once, what it opens
+    itself finds a descriptor until they are shut down."""
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    with suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def _asked_to_end(calls: Calls) -> bool:

@@ -2,7 +2,8 @@
 
     FOLDER/whiskers-20261121T170512Z.mcap
 
-A file holds samples, raw packets, decisions, health and events of one source, and in its metadata
+A file is begun with a source's first sample or packet: one that fails again and again leaves none.
+It holds samples, raw packets, decisions, health and events of one source, and in its metadata
 the configuration in force and the hash of every model. Whatever ends the process, `tactile-rt
 recover` gets back all but the last moment, and after a power cut all but the last second or so;
 files that were left so are named when the recorder begins.
@@ -60,6 +61,7 @@ LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
 SLOW_S = 2.0  # beyond two syncs: a medium that is slow, and not just busy for a moment
 STALE_S = 3600.0  # a file that is begun has its name long before
 RING_BYTES = 64 << 20  # of each source, before a trigger
+EVER_NS = 1 << 62
 MB, NS = 1e6, 1e9
 
 
@@ -71,6 +73,7 @@ class _Track:
         self.wire = describe(opened.stream).wire
         self.prelude_ns = opened.prelude[-1][1] if opened.prelude else -1
         self.file: RecordingWriter | None = None
+        self.came = False  # a sample, or a packet: before, there is nothing to record
         self.ring: deque[Raw] = deque()
         self.ring_bytes = 0
         self.until_ns = 0  # of a trigger; 0: none
@@ -265,10 +268,16 @@ class Recorder(Consumer):
                 self._rotate(self._tracks[state.source])
 
     def _add(self, track: _Track, message: Raw) -> None:
-        if track.file is None and self._config.mode == "trigger":
+        always = self._config.mode == "always"
+        if not track.came and message.topic in (SAMPLES, WIRE):
+            track.came = True
+            if self._on and (always or track.until_ns > time.monotonic_ns()):
+                self._start_file(track)
+        if track.file is None and not (always and track.came):
             if self._on:
-                gone = track.keep(message, round(self._config.before_s * NS))
-                if track.until_ns:  # there is a trigger, and no file can be begun
+                before_ns = EVER_NS if always else round(self._config.before_s * NS)
+                gone = track.keep(message, before_ns)
+                if track.until_ns and track.came:  # there is a trigger, and no file can be begun
                     self._lose(track, *gone)
             return
         if track.file is None:
@@ -323,9 +332,7 @@ class Recorder(Consumer):
         config = self._config
         rotation = Rotation(self._folder, opened.source, config.rotate_mb, config.rotate_s)
         ledger = self._ledgers.setdefault(opened.source, Ledger())
-        track = self._tracks[opened.source] = _Track(opened, rotation, ledger)
-        if self._config.mode == "always" and self._on:
-            self._start_file(track)
+        self._tracks[opened.source] = _Track(opened, rotation, ledger)
 
     def _end(self, source: str) -> None:
         track = self._tracks.pop(source, None)
@@ -333,7 +340,7 @@ class Recorder(Consumer):
             self._finish_file(track)
 
     def _start_file(self, track: _Track) -> None:
-        if track.file is not None or track.closed_ns or not self._room():
+        if track.file is not None or not track.came or track.closed_ns or not self._room():
             return
         opened, snapshot = track.opened, self._view.snapshot()
         session = {

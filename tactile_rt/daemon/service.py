@@ -37,7 +37,7 @@ KillMode=mixed
 # Acquisition before all else that is not as urgent.
 Nice=-5
 OOMScoreAdjust=-500
-LimitNOFILE=4096
+LimitNOFILE=65536
 MemoryMax=2G
 TasksMax=256
 UMask=0027

@@ -9,12 +9,15 @@ over restarts of the device, and has a gap exactly where the stream has one.
 
 The plan. A device's counter is narrow, may begin anywhere and begins anew with the device. So only
 its steps count, modulo its width:
+- a sample with the counter and the very content of one that came lately is a copy of it;
 - a step of one is the next sample; a step of g + 1 is a gap of g. If d damaged frames came within
   the gap, min(d, g) of it count as corrupt and the rest as missing: noise looks like damage, too;
-- a step of zero, or back, is a copy if a sample with this counter and this very content came
-  lately; else the counter has begun anew;
-- a step forward though the device's clock hardly moved is a restart as well, not a gap of
-  thousands. What was lost around a restart nobody knows, so nothing is counted.
+- a step back means that the counter has begun anew, and so does one far ahead while the device's
+  clock hardly moved or went back. What was lost around a restart nobody knows, so nothing is
+  counted. Several samples may share one reading of the clock, as those of one packet do: a clock
+  that stands still between two samples is no sign of a restart;
+- where the clock tells how many samples passed, it tells gaps beyond the counter's width, too, and
+  a gap of more than half of it from a step back.
 
 A device without a counter can show damage only.
 """
@@ -27,7 +30,10 @@ from tactile_rt.stream import SourceStats
 
 __all__ = ["Sequencer"]
 
-REMEMBERED = 64  # samples back that a repeated one is looked for
+REMEMBERED = 1024  # samples back that a repeated one is looked for
+HARDLY = 0.25  # of the time that a step of the counter takes: nominal rates are off by less
+RATE_TOLERANCE = 0.02  # of the nominal rate, when the clock is to tell how many samples passed
+LEAST_TURN = 10_000  # samples: a clock that wraps sooner cannot show that it went back
 
 
 class Sequencer:
@@ -57,8 +63,13 @@ class Sequencer:
         self._period_ticks, self._tick_wrap = period_ticks, 1 << tick_bits
         self._count: int | None = None  # of the newest sample
         self._tick = 0
+        self._run = self._longest_run = 0  # steps of the counter within one reading of the clock
+        self._damaged = 0  # frames since the newest sample
         self._next = 0
-        self._seen: dict[int, int] = {}  # of the last samples: what was in it, by its counter
+        self._seen: dict[int, None] = {}  # of the last samples, oldest first: what was in it
+        # Without a clock, a sample of an earlier turn can look like this one.
+        turn = REMEMBERED if bits is None or period_ticks is not None else 1 << bits
+        self._remembered = min(REMEMBERED, turn)
 
     def number(self, samples: Samples) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
         """((n,) sequence numbers, (n,) which samples to keep); the others came before.
@@ -74,25 +85,30 @@ class Sequencer:
         seq, keep = [0] * n, [True] * n
         ticks = [0] * n if samples.ticks is None else samples.ticks.tolist()
         for i, count in enumerate(samples.count.tolist()):
-            content = hash((ticks[i], samples.values[i].tobytes()))
+            content = hash((count, ticks[i], samples.values[i].tobytes()))
+            self._damaged += damaged[i]
             gap = self._gap(count, ticks[i])
-            if gap < 0 and self._seen.get(count) == content:
+            # While the clock stands still, the same content may be a sample of a later turn.
+            if content in self._seen and (gap < 0 or ticks[i] != self._tick):
                 keep[i], seq[i] = False, self._next
                 self._stats.duplicates += 1
                 continue
             if gap < 0:
                 self.resets += 1
                 self._seen.clear()
-                gap = 0
+                self._run = gap = 0
+            elif self._count is not None:
+                self._run = self._run + gap + 1 if ticks[i] == self._tick else 0
+                self._longest_run = max(self._longest_run, self._run)
             if gap:
-                corrupt = min(damaged[i], gap)
+                corrupt = min(self._damaged, gap)
                 self._stats.corrupt += corrupt
                 self._stats.missing += gap - corrupt
             seq[i] = self._next + gap
             self._next = seq[i] + 1
-            self._count, self._tick = count, ticks[i]
-            self._seen[count] = content
-            if len(self._seen) > REMEMBERED:
+            self._count, self._tick, self._damaged = count, ticks[i], 0
+            self._seen[content] = None
+            if len(self._seen) > self._remembered:
                 del self._seen[next(iter(self._seen))]
         return np.array(seq, np.int64), np.array(keep, np.bool_)
 
@@ -102,11 +118,20 @@ class Sequencer:
         if self._count is None:
             return 0
         ahead = (count - self._count) % self._wrap
-        if not 0 < ahead <= self._wrap // 2:
+        if ahead == 1:
+            return 0
+        forward = 0 < ahead <= self._wrap // 2
+        period = self._period_ticks
+        if period is None or ahead * period >= self._tick_wrap / 2:  # the clock tells nothing
+            return ahead - 1 if forward else -1
+        passed = (tick - self._tick) % self._tick_wrap
+        if passed > self._tick_wrap // 2 and self._tick_wrap >= LEAST_TURN * period:
             return -1
-        if self._period_ticks is not None and ahead > 1:
-            passed = (tick - self._tick) % self._tick_wrap
-            expected = ahead * self._period_ticks
-            if expected < self._tick_wrap / 2 and passed < expected / 2:
-                return -1
-        return ahead - 1
+        steps = ahead or self._wrap
+        expected = passed / period
+        steps += self._wrap * max(0, round((expected - steps) / self._wrap))
+        margin = 1 + self._longest_run + RATE_TOLERANCE * expected
+        if margin < self._wrap / 2 and abs(steps - expected) <= margin:
+            return steps - 1
+        hardly = 0 < passed < HARDLY * ahead * period
+        return ahead - 1 if forward and not hardly else -1

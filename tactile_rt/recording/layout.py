@@ -30,6 +30,7 @@ __all__ = [
     "decode_samples",
     "encode_packet",
     "encode_samples",
+    "is_message",
     "need_mcap",
     "samples_in",
 ]
@@ -223,6 +224,24 @@ def encode_packet(packet: Packet, wire: str) -> bytes:
             frame.data,
         ]
     return b"".join(parts)
+
+
+def is_message(topic: str, data: bytes, shape: tuple[int, int]) -> bool:
+    """Whether data can be a message of this channel, as far as its length and beginning tell.
+
+    Args:
+        topic: the name of the channel.
+        data: the message.
+        shape: (element, channel) of the array.
+    """
+    if topic == WIRE:
+        return len(data) >= 12 and data[:4] == _CDR
+    if topic != SAMPLES:
+        return topic not in (HEALTH, DECISIONS, EVENTS) or data[:1] == b"{"
+    if len(data) < 8 or data[:4] != _CDR:
+        return False
+    n, (elements, channels) = samples_in(data), shape
+    return n > 0 and len(data) == 36 + n * (16 + elements * (4 * channels + 1))
 
 
 def decode_packet(data: bytes, wire: str) -> Packet:

@@ -19,16 +19,17 @@ from tactile_rt.recording.layout import (
     Raw,
     decode_packet,
     decode_samples,
+    is_message,
     need_mcap,
 )
+from tactile_rt.recording.records import MAGIC, read_records
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError, RecordingError, TactileError
 
 if TYPE_CHECKING:
-    from mcap.records import McapRecord
+    from tactile_rt.recording.records import Record
 
-__all__ = ["MAGIC", "Recording", "is_finished"]
+__all__ = ["Recording", "is_finished"]
 
-MAGIC = b"\x89MCAP0\r\n"
 FOOTER = b"\x02" + (20).to_bytes(8, "little")  # its opcode and length
 FOOTER_BYTES = len(FOOTER) + 20 + len(MAGIC)
 
@@ -60,7 +61,7 @@ class Recording:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         with _opened(self.path) as file:
-            self.description = _described(self.path, _records(file))[0]
+            self.description = _described(self.path, read_records(file))[0]
 
     @property
     def spec(self) -> ArraySpec:
@@ -101,14 +102,16 @@ class Recording:
 
         path = self.path
         with _opened(path) as file, _naming(path):
-            records = _records(file)
+            records = read_records(file)
             about, record = _described(path, records)
             names: dict[int, str] = {}
             due: dict[int, int] = {}
             while record is not None:
                 if isinstance(record, Channel):
-                    names[record.id] = record.topic
+                    names[record.id] = " ".join(record.topic.split())
                 elif isinstance(record, Message):
+                    if record.channel_id not in names:
+                        raise ValueError(f"a message of no known channel, {record.channel_id}")
                     name = names[record.channel_id]
                     expected = due.get(record.channel_id, 0)
                     if record.sequence != expected:
@@ -117,6 +120,8 @@ class Recording:
                             "`tactile-rt recover` keeps what is whole"
                         )
                     due[record.channel_id] = (expected + 1) % (1 << 32)
+                    if not is_message(name, record.data, about.spec.shape):
+                        raise ValueError(f"message {expected} of {name} is none")
                     if name in topics:
                         t_ns = record.log_time - about.utc_offset_ns
                         yield Raw(name, t_ns, record.data)
@@ -133,24 +138,15 @@ def _fields(raw: Raw) -> dict[str, Any]:
     return msgspec.json.decode(raw.data, type=dict[str, Any])
 
 
-def _records(file: BinaryIO) -> "Iterator[McapRecord]":
-    from mcap.stream_reader import StreamReader
-
-    return iter(StreamReader(file, validate_crcs=True, record_size_limit=1 << 30).records)
-
-
-def _described(
-    path: Path, records: "Iterator[McapRecord]"
-) -> "tuple[Description, McapRecord | None]":
+def _described(path: Path, records: "Iterator[Record]") -> "tuple[Description, Record | None]":
     """What the recording is of, and the record after that."""
-    from mcap.records import Header, Metadata
+    from mcap.records import Metadata
 
     found: dict[str, dict[str, str]] = {}
     with _naming(path):
         record = next(records, None)
-        while isinstance(record, Header | Metadata):
-            if isinstance(record, Metadata):
-                found.setdefault(record.name, record.metadata)
+        while isinstance(record, Metadata):
+            found.setdefault(record.name, record.metadata)
             record = next(records, None)
     if METADATA not in found:
         raise RecordingError(f"{path} is an MCAP file, but no recording of tactile-rt")

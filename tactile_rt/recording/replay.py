@@ -24,7 +24,8 @@ from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples
 from tactile_rt.drivers.opening import Prepared, make_codec
 from tactile_rt.recording.layout import SAMPLES, WIRE, Packet
-from tactile_rt.recording.reader import MAGIC, Recording
+from tactile_rt.recording.reader import Recording
+from tactile_rt.recording.records import MAGIC
 from tactile_rt.settings import take_options
 from tactile_rt.stream import (
     NS_PER_S,

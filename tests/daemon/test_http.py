@@ -195,6 +195,18 @@ def test_a_body_may_come_in_pieces_and_must_come_whole(serve):
             assert line.recv(100).startswith(b"HTTP/1.1 200 " if end else b"HTTP/1.1 400 ")
 
 
+@pytest.mark.parametrize("more, status", [(-1, 200), (0, 200), (1, 431), (2, 431), (50_000, 431)])
+@pytest.mark.parametrize("body", [b"", b"12345"])
+def test_a_head_is_as_long_as_it_may_be_and_no_byte_longer(serve, more, status, body):
+    _, _, port = serve()
+    begin = b"POST /body HTTP/1.1\r\nContent-Length: %d\r\nX: " % len(body)
+    head = begin + b"a" * (LIMITS.head_bytes + more - len(begin) - 4) + b"\r\n\r\n"
+    assert len(head) == LIMITS.head_bytes + more
+    with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as line:
+        line.sendall(head + body)
+        assert line.recv(100).startswith(b"HTTP/1.1 %d " % status)
+
+
 def test_a_body_that_takes_too_long_is_refused():
     async def ask():
         request = Request("POST", "/", "", "HTTP/1.1", {"content-length": "2"}, begun=b"1")

@@ -237,3 +237,39 @@ def test_what_one_left_who_was_killed_as_it_began_a_file_is_cleared_away(daemon,
     begun(daemon, tmp_path, min_free_mb=0).close()
     assert sorted(tmp_path.iterdir()) == [new, other]
     assert daemon.told == []
+
+
+@pytest.mark.parametrize("mode", ["always", "trigger"])
+def test_a_source_that_fails_before_its_first_sample_leaves_no_file(daemon, tmp_path, mode):
+    made = begun(daemon, tmp_path, mode=mode)
+    for _ in range(3):
+        made.handle([opened()])
+        made.handle([event("error"), Closed("whiskers", "failed", time.monotonic_ns())])
+        look(made)
+    assert not list(tmp_path.iterdir())
+    assert (made.details()["files"], made.details()["lost_samples"]) == (0, 0)
+    made.close()
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("mode", ["always", "trigger"])
+def test_what_was_told_before_the_first_sample_is_in_the_file(daemon, tmp_path, mode):
+    made = begun(daemon, tmp_path, mode=mode)
+    made.handle([opened(), event("warning"), event("error")])
+    look(made)
+    assert not list(tmp_path.iterdir())
+    (chunk,) = cut(VALUES[:9], 1000.0)
+    made.handle([samples(chunk)])
+    made.close()
+    (path,) = files(tmp_path)
+    same(path, [chunk])
+    assert [e["level"] for e in Recording(path).events()] == ["warning", "error"]
+
+
+def test_a_device_that_sends_packets_and_no_sample_is_recorded(daemon, tmp_path):
+    with FakeSerial(np.zeros((600, 2, 6))) as fake, open_source(fake.url) as source:
+        made = begun(daemon, tmp_path)
+        made.handle([opened(stream=source), Packet("whiskers", b"noise", time.monotonic_ns())])
+        made.close()
+    (path,) = files(tmp_path)
+    assert [p for p, _ in Recording(path).packets()] == [b"noise"]

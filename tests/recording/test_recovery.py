@@ -2,6 +2,7 @@
 
 import os
 import re
+from contextlib import suppress
 
 import pytest
 from hypothesis import given, settings
@@ -140,6 +141,10 @@ def test_whichever_pages_a_power_cut_leaves_all_whole_pieces_come_back(
         if b <= len(left) and left[a:b] == data[a:b]
     ]
     expected = [parts(c) for k in there for c in chunks[3 * k : 3 * k + 3]]
+    if not expected:
+        with suppress(RecordingError):  # nothing in it is whole
+            recover(path, path.with_name("mended.mcap"), force=True)
+        return
     out = recover(path, path.with_name("mended.mcap"), force=True)
     back = all_parts(Recording(out))
     assert set(expected) <= set(back)  # a hole may also lie between two pieces

@@ -36,8 +36,9 @@ from tactile_rt.daemon.messages import (
     shortest,
     topic_of,
 )
+from tactile_rt.daemon.publishers.connections import ConnectionLimit
 from tactile_rt.daemon.publishers.scene import Scene
-from tactile_rt.daemon.publishers.sending import Prefix, Repeated, tell_exposed
+from tactile_rt.daemon.publishers.sending import Connections, Prefix, Repeated, tell_exposed
 from tactile_rt.stream import ArraySpec, SourceError
 
 __all__ = ["FoxgloveOptions", "FoxglovePublisher", "schema_of"]
@@ -55,6 +56,7 @@ class FoxgloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
         prefix: The beginning of all topics.
         rate_hz: The largest number of pictures and values a second, Hz.
         m_per_n: The length of the arrow of a force of 1 N, m; 0: chosen after the largest force.
+        connections: The number of connections at a time; more are shut down.
     """
 
     host: Annotated[str, msgspec.Meta(min_length=1, max_length=255)] = "127.0.0.1"
@@ -62,6 +64,7 @@ class FoxgloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     prefix: Prefix = "tactile"
     rate_hz: Annotated[float, msgspec.Meta(ge=0.1, le=200)] = 25.0
     m_per_n: Annotated[float, msgspec.Meta(ge=0, le=1e6)] = 0.0
+    connections: Connections = 32
 
 
 class FoxglovePublisher(Consumer):
@@ -75,6 +78,7 @@ class FoxglovePublisher(Consumer):
         self.name, self._options = name, options
         self.gather_s = 1 / options.rate_hz
         self._server: WebSocketServer | None = None
+        self._limit: ConnectionLimit | None = None
         self._context = Context()
         self._channels: dict[str, Any] = {}
         self._log: LogChannel | None = None
@@ -98,6 +102,8 @@ class FoxglovePublisher(Consumer):
             why = str(error).removeprefix("FoxgloveError: ").partition(" (os error")[0]
             raise SourceError(f"cannot listen at {host}:{port}: {why}") from None
         self._port = self._server.port
+        name, most = f"{self.name} limit", self._options.connections
+        self._limit = ConnectionLimit(name, {self._port}, most)
         tell_exposed(view, self.name, host)
         # The app's message paths begin with a slash.
         self._log = LogChannel(f"/{self._options.prefix}/log", context=self._context)
@@ -126,6 +132,9 @@ class FoxglovePublisher(Consumer):
 
     def close(self) -> None:
         server, self._server = self._server, None
+        limit, self._limit = self._limit, None
+        if limit is not None:
+            limit.close()
         channels, self._channels = self._channels, {}
         self._scenes.clear()
         for channel in channels.values():

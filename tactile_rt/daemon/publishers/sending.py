@@ -10,8 +10,17 @@ from tactile_rt.daemon.config import is_loopback
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Skipped, SourceChunk
 from tactile_rt.daemon.messages import Message, message_of, state_message
+from tactile_rt.daemon.publishers.connections import ConnectionLimit
 
-__all__ = ["Repeated", "Sender", "SenderOptions", "is_port", "tell_exposed"]
+__all__ = [
+    "Connections",
+    "Prefix",
+    "Repeated",
+    "Sender",
+    "SenderOptions",
+    "is_port",
+    "tell_exposed",
+]
 
 Prefix = Annotated[
     str,
@@ -20,6 +29,7 @@ Prefix = Annotated[
         description="prefix: one to eight words of letters, digits, ., - and _, with / between",
     ),
 ]
+Connections = Annotated[int, msgspec.Meta(ge=1, le=1000)]
 StateSeconds = Annotated[float, msgspec.Meta(ge=0, le=86400)]
 
 
@@ -31,11 +41,13 @@ class SenderOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         samples: Whether samples are published, too.
         state_s: The time after which ``state`` and all ``array`` messages are repeated, for those
             that come late, s; 0: never.
+        connections: The number of connections at a time; more are shut down.
     """
 
     prefix: Prefix = "tactile"
     samples: bool = False
     state_s: StateSeconds = 1.0
+    connections: Connections = 32
 
 
 class Repeated:
@@ -74,6 +86,7 @@ class Sender(Consumer):
         self._repeated = Repeated(options.state_s)
         self._view: View | None = None
         self._messages = self._bytes = 0
+        self._limit: ConnectionLimit | None = None
 
     def open(self, view: View) -> None:
         self._view = view

@@ -11,6 +11,7 @@ import zenoh
 
 from tactile_rt.daemon.consumer import View
 from tactile_rt.daemon.messages import Message, encode, topic_of
+from tactile_rt.daemon.publishers.connections import ConnectionLimit
 from tactile_rt.daemon.publishers.sending import (
     Sender,
     SenderOptions,
@@ -46,7 +47,7 @@ class ZenohOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_on
             protocol, slash, address = endpoint.partition("/")
             if not (protocol.isalnum() and slash and address):
                 raise ValueError(f"an endpoint is like tcp/127.0.0.1:7447, not {endpoint}")
-            port = re.split("[?#]", address)[0].rpartition(":")[2]
+            port = _port_text(address)
             if protocol in ON_PORTS and port != "0" and not is_port(port):
                 raise ValueError(f"{endpoint}: a port is a number from 0 to 65535, not {port}")
         if not (self.listen or self.connect or self.scouting or self.config_file):
@@ -69,6 +70,10 @@ class ZenohPublisher(Sender):
             self._session = zenoh.open(self._config())
         except zenoh.ZError as error:
             raise SourceError(f"zenoh: {_short(error)}") from None
+        ports = {port for endpoint in self._options.listen if (port := _port(endpoint))}
+        if ports:
+            name, most = f"{self.name} limit", self._options.connections
+            self._limit = ConnectionLimit(name, set(ports), most)
         for endpoint in self._options.listen:
             address = endpoint.partition("/")[2].partition("?")[0].partition("#")[0]
             tell_exposed(view, self.name, address.rpartition(":")[0])
@@ -86,6 +91,9 @@ class ZenohPublisher(Sender):
 
     def close(self) -> None:
         session, self._session = self._session, None
+        limit, self._limit = self._limit, None
+        if limit is not None:
+            limit.close()
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
 
@@ -123,6 +131,16 @@ class ZenohPublisher(Sender):
         except (zenoh.ZError, OSError) as error:
             raise ConfigError(f"zenoh: {_short(error)}") from None
         return config
+
+
+def _port_text(address: str) -> str:
+    return re.split("[?#]", address)[0].rpartition(":")[2]
+
+
+def _port(endpoint: str) -> int:
+    """The TCP port of an endpoint; 0: none, or a free one, which Zenoh does not tell."""
+    protocol, _, address = endpoint.partition("/")
+    return int(_port_text(address)) if protocol in ("tcp", "tls", "ws") else 0
 
 
 def _short(error: BaseException) -> str:

@@ -9,6 +9,7 @@ import zmq
 
 from tactile_rt.daemon.consumer import View
 from tactile_rt.daemon.messages import Message, encode, topic_of
+from tactile_rt.daemon.publishers.connections import ConnectionLimit
 from tactile_rt.daemon.publishers.sending import (
     Sender,
     SenderOptions,
@@ -73,6 +74,9 @@ class ZmqPublisher(Sender):
         except zmq.ZMQError as error:
             raise SourceError(f"cannot listen at {bind}: {error.strerror}") from None
         self._endpoint = socket.getsockopt(zmq.LAST_ENDPOINT).decode().rstrip("\0")  # type: ignore[union-attr]
+        address = self._endpoint.partition("://")[2]
+        local = int(address.rpartition(":")[2]) if bind.startswith("tcp:") else address
+        self._limit = ConnectionLimit(f"{self.name} limit", {local}, self._options.connections)
         if bind.startswith("tcp:"):
             # An interface's name cannot be told from a host's: it counts as open to others.
             tell_exposed(view, self.name, urlsplit(self._endpoint).hostname or "")
@@ -94,6 +98,9 @@ class ZmqPublisher(Sender):
     def close(self) -> None:
         socket, self._socket = self._socket, None
         context, self._context = self._context, None
+        limit, self._limit = self._limit, None
+        if limit is not None:
+            limit.close()
         if socket is not None:
             socket.close()
         if context is not None:

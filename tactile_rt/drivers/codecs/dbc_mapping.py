@@ -20,6 +20,7 @@ from cantools.database.errors import Error as DatabaseError
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import CanFrame
+from tactile_rt.drivers.codecs.dbc_limits import DEEPEST, MOST_BYTES, check_dbc
 from tactile_rt.settings import convert, read_toml
 from tactile_rt.stream import ArraySpec, ConfigError
 
@@ -193,7 +194,7 @@ def read_mapping(path: Path) -> DbcMapping:
 
 def _near(name: str, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(name, list(known), 1)
-    return f" (did you mean {near[0]}?)" if near else ""
+    return f" (did you mean {near[0][:100]}?)" if near else ""
 
 
 class _Reader:
@@ -201,11 +202,21 @@ class _Reader:
         self.path, self.file = path, file
         self.dbc = path.parent / file.dbc
         try:
-            database: Any = cantools.database.load_file(self.dbc, "dbc")
+            with self.dbc.open("rb") as dbc:
+                content = dbc.read(MOST_BYTES + 1)
         except OSError as error:
             raise ConfigError(f"{path}, dbc: {self.dbc}: {error.strerror or error}") from None
-        except (DatabaseError, UnicodeDecodeError, ValueError) as error:
-            why = " ".join(str(error).split())
+        if len(content) > MOST_BYTES:
+            raise ConfigError(
+                f"{self.dbc}: larger than {MOST_BYTES >> 20} MiB; keep the messages of the sensor"
+            )
+        try:
+            text = content.decode("cp1252")  # as cantools takes them to be
+            check_dbc(str(self.dbc), text)
+            database: Any = cantools.database.load_string(text, "dbc")
+        except (DatabaseError, ValueError, LookupError, TypeError, RecursionError) as error:
+            why = "".join(c if c.isprintable() else " " for c in str(error)[:1000])
+            why = " ".join(why.split())[:200]
             raise ConfigError(f"{self.dbc}: is not a DBC file that cantools reads: {why}") from None
         self.messages: dict[str, Any] = {m.name: m for m in database.messages}
         # (message, multiplexers' values) of each signal that is used
@@ -284,14 +295,16 @@ class _Reader:
         message = self._message(where, of)
         known = {s.name: s for s in message.signals}
         if signal_name not in known:
-            hint = _near(signal_name, known) or f"; it has {', '.join(known)}"
+            hint = _near(signal_name, known) or f"; it has {', '.join(known)[:500]}"
             raise ConfigError(
                 f"{where}: no signal {signal_name!r} in message {of} of {self.dbc}{hint}"
             )
         signal = known[signal_name]
-        chain = []
+        chain: list[tuple[str, frozenset[int]]] = []
         outer = signal
         while outer.multiplexer_signal:
+            if len(chain) == DEEPEST:
+                raise ConfigError(f"{self.dbc}: {name} is within {DEEPEST} multiplexers, or itself")
             chain.append((outer.multiplexer_signal, frozenset(outer.multiplexer_ids)))
             outer = known[outer.multiplexer_signal]
         self.used[of, signal_name] = tuple(chain)

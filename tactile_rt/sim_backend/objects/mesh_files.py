@@ -10,6 +10,7 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 
+from tactile_rt.sim_backend.objects.mesh_limits import check_mesh_content
 from tactile_rt.stream import ConfigError
 
 __all__ = ["MESH_SUFFIXES", "check_mesh_file", "mesh_content", "read_parts", "read_triangles"]
@@ -41,9 +42,14 @@ def check_mesh_file(path: Path) -> None:
 
 
 def mesh_content(path: Path) -> bytes:
-    """What a mesh file holds, with the files of numbers that one in glTF's text form names."""
-    content = path.read_bytes()
-    if path.suffix.lower() == ".gltf":
+    """What a mesh file holds, with the files of numbers that one in glTF's text form names.
+
+    Raises:
+        ConfigError: it unpacks to more than it can be expected to hold.
+    """
+    content, suffix = path.read_bytes(), path.suffix.lower()
+    check_mesh_content(str(path), suffix, content)
+    if suffix == ".gltf":
         with suppress(ValueError, KeyError, TypeError, AttributeError, OSError):
             for buffer in json.loads(content)["buffers"]:
                 if not buffer["uri"].startswith("data:"):
@@ -88,14 +94,10 @@ def read_parts(paths: Sequence[Path], up: str = "") -> trimesh.Trimesh:
 def _part(path: Path, up: str) -> trimesh.Trimesh:
     check_mesh_file(path)
     suffix = path.suffix.lower()
+    check_mesh_content(str(path), suffix, path.read_bytes())
     meshes = _parsed(path, suffix)
-    faces = sum(len(m.faces) for m in meshes)
-    if faces == 0:
+    if not any(len(m.faces) for m in meshes):
         raise ConfigError(f"{path}: holds no triangles; export a surface mesh, not points or lines")
-    if faces > MAX_FACES:
-        raise ConfigError(
-            f"{path}: has {faces} triangles, more than {MAX_FACES}; simplify it in a mesh tool"
-        )
     # joined by hand: what colours and textures the bodies have is dropped
     joined = trimesh.util.append_faces([m.vertices for m in meshes], [m.faces for m in meshes])
     mesh = trimesh.Trimesh(*joined, process=False)
@@ -114,7 +116,15 @@ def _parsed(path: Path, suffix: str) -> list[trimesh.Trimesh]:
         kinds = (".obj", ".ply")
         materials: dict[str, Any] = {"skip_materials": True} if suffix in kinds else {}
         scene = trimesh.load_scene(path, process=False, **materials)
+        names = [scene.graph[node][1] for node in scene.graph.nodes_geometry]
+        faces = sum(len(getattr(scene.geometry[name], "faces", ())) for name in names)
+        if faces > MAX_FACES:  # told before a mesh that is used a thousand times is copied
+            raise ConfigError(
+                f"{path}: has {faces} triangles, more than {MAX_FACES}; simplify it in a mesh tool"
+            )
         return [m for m in scene.dump() if isinstance(m, trimesh.Trimesh)]
+    except ConfigError:
+        raise
     except Exception as error:  # the parsers raise whatever their format trips over
         reason = " ".join(str(error).split()) or type(error).__name__
         if isinstance(error, ImportError):  # what guesses at encodings is not installed

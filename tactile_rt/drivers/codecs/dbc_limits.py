@@ -1,0 +1,67 @@
+"""A DBC file held against what CAN can do, before cantools reads it.
+
+A file may come from elsewhere. cantools lays out every bit of every message and every value of a
+multiplexer's range in memory: a message of 100,000 bytes takes it minutes. So sizes are checked in
+the text. It is not parsed: what looks like a size in a comment counts as one.
+"""
+
+import re
+from typing import Final
+
+from tactile_rt.stream import ConfigError
+
+__all__ = ["DEEPEST", "MOST_BYTES", "check_dbc"]
+
+MOST_BYTES: Final = 1 << 20  # of the file; 20,000 signals, a second
+MOST_FRAME: Final = 64  # bytes of a CAN FD frame
+MOST_SIGNALS: Final = 20_000
+MOST_MULTIPLEXED: Final = 1 << 16  # values of all multiplexers' ranges together
+DEEPEST: Final = 16  # multiplexers within each other
+
+_MESSAGE = re.compile(r"\bBO_\s+\d+\s+(\w+)\s*:\s*(\d+)")
+_SIGNAL = re.compile(r"\bSG_\s+(\w+)(?:\s+\w+)?\s*:\s*(\d+)\s*\|\s*(\d+)")
+_RANGES = re.compile(r"\bSG_MUL_VAL_\b([^;]*)")
+_RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
+
+
+def check_dbc(file: str, text: str) -> None:
+    """Refuse what no CAN bus can carry, and more than a sensor has.
+
+    Args:
+        file: the file, for the message.
+        text: what is in it.
+
+    Raises:
+        ConfigError: one line with the file and the message or signal.
+    """
+    for found in _MESSAGE.finditer(text):
+        if _number(found[2]) > MOST_FRAME:
+            raise ConfigError(
+                f"{file}: message {found[1][:50]} of {found[2][:20]} bytes; "
+                f"a CAN frame has {MOST_FRAME} at most"
+            )
+    signals = 0
+    for found in _SIGNAL.finditer(text):
+        signals += 1
+        start, length = _number(found[2]), _number(found[3])
+        if not (start < 8 * MOST_FRAME and 0 < length <= 8 * MOST_FRAME):
+            raise ConfigError(
+                f"{file}: signal {found[1][:50]} of {found[3][:20]} bits at bit {found[2][:20]}; "
+                f"a CAN frame has {8 * MOST_FRAME} bits at most"
+            )
+    if signals > MOST_SIGNALS:
+        raise ConfigError(
+            f"{file}: {signals} signals, more than {MOST_SIGNALS}; keep the messages of the sensor"
+        )
+    values = 0
+    for ranges in _RANGES.finditer(text):
+        for low, high in _RANGE.findall(ranges[1]):
+            values += max(0, _number(high) - _number(low))
+    if values > MOST_MULTIPLEXED:
+        raise ConfigError(
+            f"{file}: multiplexers of more than {MOST_MULTIPLEXED} values; keep those in use"
+        )
+
+
+def _number(digits: str) -> int:
+    return int(digits[:20])
