@@ -101,7 +101,7 @@ def test_it_decides_as_the_daemon_did_at_every_speed(call, live, tmp_path):
     path, _ = live
     recorded = [d for d in Recording(path).decisions() if d["model"] == "left"]
     assert len(recorded) >= 8
-    timing = {"model_ms", "latency_ms", "late", "utc_ns"}
+    timing = {"model_ms", "latency_ms", "age_ms", "late", "utc_ns"}
     printed = set()
     for speed in ("max", "max", "4"):
         code, out, err = call("replay", path, "--name", "left", "--speed", speed)
