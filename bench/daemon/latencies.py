@@ -1,5 +1,6 @@
 """From the array's write of the sample that completes a step to the decision in a peer's hand."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ __all__ = ["Latencies", "latencies"]
 BEFORE_S, AFTER_S = 0.1, 1.0  # a fault counts for what is decided so long around it
 BEGIN_S = 3.0  # until all have begun
 PROMPT_MS = 2.0  # of a ping
-QUIET = ""
+QUIET, APART = "", "apart"
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ def latencies(
     t_ns: NDArray[np.int64],
     at_ns: NDArray[np.int64],
     ping: Ping | None = None,
+    apart: Sequence[tuple[float, float]] = (),
 ) -> Latencies:
     """Of one array's decisions.
 
@@ -55,6 +57,8 @@ def latencies(
         t_ns: (n,) stream time of each decision's last sample.
         at_ns: (n,) host time at which the peer had it.
         ping: what the machine added; None: it is not known.
+        apart: (from, to) in s of CLOCK_MONOTONIC, in which decisions count for nothing here: the
+            machine had more to do than it can.
     """
     order = np.argsort(recorded.t_ns, kind="stable")
     ends = np.searchsorted(recorded.t_ns[order], t_ns + half_ns)
@@ -68,7 +72,10 @@ def latencies(
             first = begun + round((at_s - BEFORE_S) * NS_PER_S)
             last = begun + round((at_s + duration_s + AFTER_S) * NS_PER_S)
             cause[(when > first) & (when < last)] = kind
-    settled = (wrote > 0) & (when > played[name].at_ns[0] + BEGIN_S * NS_PER_S)
+    for begin, end in apart:
+        first, last = round(begin * NS_PER_S), round((end + AFTER_S) * NS_PER_S)
+        cause[(when > first) & (when < last)] = APART
+    settled = (cause != APART) & (wrote > 0) & (when > played[name].at_ns[0] + BEGIN_S * NS_PER_S)
     quiet = (cause == QUIET) & settled
     return Latencies(
         took[quiet], took[(cause != QUIET) & settled],

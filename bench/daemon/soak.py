@@ -24,8 +24,10 @@ from tactile_rt.stream import NS_PER_S
 
 __all__ = ["soak_records"]
 
-WARM_SHARE, WARM_MOST_S = 0.25, 300.0
-STEADY_S = 240.0  # a shorter run cannot tell a leak from warming up
+WARM_S = 300.0  # from then on nothing is excused
+WARM_SHARE = 0.15  # of a shorter run
+STEADY_S = 600.0  # a shorter run cannot tell a leak from warming up
+GROWTH = 10.0  # %
 TOOK = "array's write of the sample that completes a step to the decision in zmq's peer's hand"
 
 
@@ -109,7 +111,7 @@ def _latency(result: Soak) -> list[Record]:
         half_ns = max(card.period_ns, round(NS_PER_S / spec.rate_hz))
         found = latencies(
             half_ns, result.recorded[name], result.played, name, heard.t_ns[mine],
-            heard.at_ns[mine], result.ping,
+            heard.at_ns[mine], result.ping, [(a, b) for _, a, b in result.disturbed],
         )  # fmt: skip
         worst = "worst: " + ", ".join(
             f"{fault} {ms.max():.0f}" for fault, ms in found.kinds.items() if len(ms)
@@ -137,17 +139,23 @@ def _latency(result: Soak) -> list[Record]:
 def _memory(result: Soak) -> list[Record]:
     at, resident = np.array(result.usage.at), np.array(result.usage.resident, float)
     at -= at[0]
-    warm = min(WARM_SHARE * result.seconds, WARM_MOST_S)
-    tenth = max(3.0, 0.1 * (result.seconds - warm))
+    warm = WARM_S if result.seconds >= 2 * WARM_S else WARM_SHARE * result.seconds
+    tenth = max(3.0, min(60.0, 0.1 * (result.seconds - warm)))
     early = np.median(resident[(at >= warm) & (at < warm + tenth)])
     late = np.median(resident[(at >= result.seconds - tenth) & (at <= result.seconds)])
     most = ", ".join(f"{n} {a}, {b}" for n, (a, b) in result.waiting.items() if a or b)
     steady = result.seconds >= STEADY_S
+    first = result.usage.at[0]
+    between = ", ".join(
+        f"{what} from {a - first:.0f} to {b - first:.0f} s" for what, a, b in result.disturbed
+    )
     return [
         Record(
-            "daemon.soak.memory_growth", 100 * (late / early - 1), "%", "<= 1" if steady else "",
-            f"{early / 1e6:.1f} MB after {warm:.0f} s, {late / 1e6:.1f} MB at the end",
-            "resident, medians of a tenth of the time each",
+            "daemon.soak.memory_growth", 100 * (late / early - 1), "%",
+            f"<= {GROWTH:g}" if steady else "",
+            f"{early / 1e6:.1f} MB after {warm:.0f} s, {late / 1e6:.1f} MB at the end, at most "
+            f"{resident.max() / 1e6:.1f} MB",
+            f"resident; in between: {between or 'nothing but faults of the arrays'}",
         ),
         Record(
             "daemon.soak.waiting_most", max(map(max, result.waiting.values()), default=0) / 1e3,

@@ -6,6 +6,9 @@ recorder, three publishers with their peers, the page with somebody who looks at
 
 import http.client
 import os
+import socket
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -27,6 +30,9 @@ __all__ = ["EVERY_S", "QUICK_S", "WHOLE_S", "WIRES", "Soak", "configuration", "s
 QUICK_S, WHOLE_S = 20.0, 600.0
 FIRST_FAULT_S, EVERY_S, APART_S = 4.0, 3.0, 0.4  # the two arrays' faults do not fall together
 LOOK_S, ASK_S = 1.0, 10.0
+DISTURBED_S = 600.0  # a soak of this length is flooded and overloaded, too
+FLOOD, FLOODED_S = 1000, 5.0  # connections to each port, and how long they are held
+HOGS_PER_CORE, OVERLOADED_S = 3, 60.0
 GRACE_S, SILENT_S = 5.0, 240.0  # beyond the arrays' streams: to end them, to give up
 WIRES = {"whiskers": "serial", "finger": "slcan"}
 
@@ -44,6 +50,8 @@ class Soak:
         heard: What each peer heard, by the peer's name.
         ping: The delay that the machine itself added meanwhile.
         usage: Processor time and memory of the daemon's process.
+    disturbed: What was done to the daemon beside the arrays' faults: (what, from, to), in s of
+        CLOCK_MONOTONIC.
         waiting: Most bytes seen waiting in each mailbox: (first half, second half).
         code: The daemon's exit code.
         stop_s: Time that the daemon took to stop, s.
@@ -58,6 +66,7 @@ class Soak:
     heard: dict[str, Heard]
     ping: Ping
     usage: Usage
+    disturbed: list[tuple[str, float, float]]
     waiting: dict[str, tuple[int, int]]
     code: int
     stop_s: float
@@ -133,6 +142,11 @@ def soak(
             DaemonProcess(folder, configuration(urls, ports), ports["metrics"], stdout)
         )
         peers.hear()
+        disturbed: list[tuple[str, float, float]] = []
+        if seconds >= DISTURBED_S:
+            threading.Thread(
+                target=_disturb, args=(seconds, ports, disturbed, daemon.process), daemon=True
+            ).start()
         seconds, waiting = _watch(daemon, arrays, seconds, enough or threading.Event())
         state = daemon.await_state(lambda s: not any(_queued(s).values()))
         code, stop_s = daemon.stop()
@@ -142,8 +156,50 @@ def soak(
         found = {name: recorded(files, name) for name in specs}
         return Soak(
             seconds, played, state, found, sum(not is_finished(f) for f in files), heard,
-            ping, daemon.usage, waiting, code, stop_s, daemon.log(),
+            ping, daemon.usage, disturbed, waiting, code, stop_s, daemon.log(),
         )  # fmt: skip
+
+
+def _disturb(
+    seconds: float,
+    ports: dict[str, int],
+    done: list[tuple[str, float, float]],
+    process: "subprocess.Popen[bytes]",
+) -> None:
+    """A flood of connections, and then more to do than the machine can, in the second quarter."""
+    began = time.monotonic()
+    for share, what, act in ((0.25, "flood", _flood), (0.4, "overload", _overload)):
+        time.sleep(max(0.0, share * seconds - (time.monotonic() - began)))
+        if process.poll() is not None:
+            return
+        begin = time.monotonic()
+        act(ports)
+        done.append((what, begin, time.monotonic()))
+
+
+def _flood(ports: dict[str, int]) -> None:
+    """So many connections to whatever listens, held for a while."""
+    for port in ports.values():
+        with ExitStack() as stack:
+            for _ in range(FLOOD):
+                line = socket.socket()
+                stack.callback(line.close)
+                line.setblocking(False)
+                line.connect_ex(("127.0.0.1", port))
+            time.sleep(FLOODED_S)
+
+
+def _overload(ports: dict[str, int]) -> None:
+    hogs = [
+        subprocess.Popen([sys.executable, "-c", "while True: pass"])
+        for _ in range(HOGS_PER_CORE * (os.cpu_count() or 1))
+    ]
+    try:
+        time.sleep(OVERLOADED_S)
+    finally:
+        for hog in hogs:
+            hog.kill()
+            hog.wait()
 
 
 def _watch(
