@@ -34,6 +34,7 @@ __all__ = [
 # What a device's own buffer loses beside a restart of its counter nobody could count: while a busy
 # machine keeps the host waiting, nothing shall be lost here.
 FIFO_BYTES = 64 << 20
+GAP = 20  # samples from one that is missing, or damaged, to the next, in such a mood
 LOOP_S = 6.0  # of bumps, that come again and again: four of them
 PIECE_S = 0.064
 # Each strikes within a moment, so that what is undisturbed is known; none beside another.
@@ -162,15 +163,17 @@ class LoopedSource(Source):
 
 
 class _Bytes(bytes):
-    """A sample's packet that knows which one it is."""
+    """A sample's packet that knows which one it is, and whether the line swallows it."""
 
     nth: int
+    swallowed: bool
 
 
 class _Frames(list[Any]):
     """The same on CAN."""
 
     nth: int
+    swallowed: bool
 
 
 class _Timed:
@@ -179,6 +182,8 @@ class _Timed:
     at_ns: "array[int]"
 
     def send(self, packet: Any, answer: bool = False) -> bool:
+        if getattr(packet, "swallowed", False):
+            return True
         nth = getattr(packet, "nth", -1)  # what was damaged has lost it
         if nth >= 0 and not self.at_ns[nth]:
             self.at_ns[nth] = time.monotonic_ns()
@@ -200,6 +205,11 @@ class EmulatedArray(EmulatedDevice):
     Args:
         script: What the array is and what happens to it.
         signal: (n, element, channel) SI, in place of the script's signal.
+
+    Attributes:
+        mood: What the array does from now on: ``well``; ``silent``: nothing comes; ``frozen``: the
+            same values again and again; ``no_number``: NaN; ``gaps``, ``corrupt``: every twentieth
+            sample is missing, or damaged.
     """
 
     def __init__(self, script: ArrayScript, signal: NDArray[np.float32] | None = None) -> None:
@@ -211,6 +221,7 @@ class EmulatedArray(EmulatedDevice):
         )
         self._endpoint.at_ns = array("q", bytes(8 * script.samples))
         felt = SIGNALS[script.signal](script) if signal is None else signal
+        self._last = felt[0]
         self._source = LoopedSource(script.spec, felt, script.samples)
         faults = FaultSchedule(script.faults, script.seed) if script.faults else None
         super().__init__(
@@ -219,15 +230,33 @@ class EmulatedArray(EmulatedDevice):
         )  # fmt: skip
         encode, counter = self.codec.encode, itertools.count()
 
+        self.mood = "well"
+
         def numbered(chunk: Chunk) -> list[Any]:
             packets = []
-            for packet in encode(chunk):
+            for packet in encode(self._felt(chunk)):
                 known = (_Bytes if isinstance(packet, bytes) else _Frames)(packet)
-                known.nth = next(counter)
+                nth = known.nth = next(counter)
+                known.swallowed = self.mood == "silent" or (
+                    self.mood == "gaps" and nth % GAP == 0
+                )
+                if self.mood == "corrupt" and nth % GAP == 0 and isinstance(packet, bytes):
+                    known = _Bytes(packet[:-3] + bytes(b ^ 0xFF for b in packet[-3:]))
+                    known.nth, known.swallowed = nth, False
                 packets.append(known)
             return packets
 
         self.codec.encode = numbered  # type: ignore[method-assign]
+
+    def _felt(self, chunk: Chunk) -> Chunk:
+        """What the array's mood makes of what it feels."""
+        values = chunk.values
+        if self.mood == "frozen":
+            values = np.broadcast_to(self._last, values.shape).copy()
+        elif self.mood == "no_number":
+            values = np.full_like(values, np.nan)
+        self._last = values[-1]
+        return Chunk(chunk.seq, chunk.t_ns, values, chunk.valid)
 
     def end(self) -> None:
         """Measure nothing more; what is measured still goes out."""
@@ -254,7 +283,7 @@ class EmulatedArray(EmulatedDevice):
 def play(pipe: Connection, script: ArrayScript) -> None:
     """Be an array in a process of its own, for `Helper`: say the URL, then obey until it hangs up.
 
-    The words: ``unplug`` (say when it began), ``replug`` (say when it was done), ``end`` (of what
+    The words: ``mood NAME`` (say when), ``unplug`` (say when it began), ``replug`` (say when it was done), ``end`` (of what
     is measured; say when), ``done`` (say whether), ``where`` (in words), ``played`` (a `Played`).
     """
     with EmulatedArray(script) as device:
@@ -266,7 +295,9 @@ def play(pipe: Connection, script: ArrayScript) -> None:
                 return
             began = time.monotonic_ns()
             answer: Any = began
-            if word == "unplug":
+            if word.startswith("mood "):
+                device.mood = word.removeprefix("mood ")
+            elif word == "unplug":
                 device.unplug()
             elif word == "replug":
                 device.replug()

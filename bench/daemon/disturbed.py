@@ -72,6 +72,7 @@ class DisturbedDaemon:
     Args:
         before: called in the daemon's process before it becomes the daemon.
         prepare: called with the path of the model of ``whiskers`` before the daemon is started.
+        configuration: TOML, with the URLs and ports in braces.
 
     Attributes:
         folder: The folder of the daemon's files.
@@ -83,9 +84,12 @@ class DisturbedDaemon:
     """
 
     def __init__(
-        self, before: Any = None, prepare: Callable[[Path], None] = lambda path: None
+        self,
+        before: Any = None,
+        prepare: Callable[[Path], None] = lambda path: None,
+        configuration: str = CONFIGURATION,
     ) -> None:
-        self._before, self._prepare = before, prepare
+        self._before, self._prepare, self._text = before, prepare, configuration
         self._stack = ExitStack()
         self._told: list[DaemonEvent] = []
         self._over = threading.Event()
@@ -113,6 +117,7 @@ class DisturbedDaemon:
         }  # fmt: skip
         urls = {name: helper.hear() for name, helper in self.arrays.items()}
         self.ports = {kind: free_port() for kind in ("zmq", "page", "metrics")}
+        self.configuration = self._text.format(**urls, **self.ports)
         self.clock = WallClock(self.folder / "clock")
         self.pipe, out = os.pipe()
         for work in (self._listen, self._drain):
@@ -123,7 +128,7 @@ class DisturbedDaemon:
         self._reading.set()
         self.daemon = stack.enter_context(
             DaemonProcess(
-                self.folder, CONFIGURATION.format(**urls, **self.ports), self.ports["metrics"],
+                self.folder, self.configuration, self.ports["metrics"],
                 out, {PATH: str(self.folder / "clock")}, self._before, MAIN,
             )
         )  # fmt: skip

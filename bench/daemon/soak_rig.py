@@ -50,8 +50,8 @@ class Soak:
         heard: What each peer heard, by the peer's name.
         ping: The delay that the machine itself added meanwhile.
         usage: Processor time and memory of the daemon's process.
-    disturbed: What was done to the daemon beside the arrays' faults: (what, from, to), in s of
-        CLOCK_MONOTONIC.
+        disturbed: What was done to the daemon beside the arrays' faults: (what, from, to), in s of
+            CLOCK_MONOTONIC.
         waiting: Most bytes seen waiting in each mailbox: (first half, second half).
         code: The daemon's exit code.
         stop_s: Time that the daemon took to stop, s.
