@@ -237,9 +237,7 @@ class EmulatedArray(EmulatedDevice):
             for packet in encode(self._felt(chunk)):
                 known = (_Bytes if isinstance(packet, bytes) else _Frames)(packet)
                 nth = known.nth = next(counter)
-                known.swallowed = self.mood == "silent" or (
-                    self.mood == "gaps" and nth % GAP == 0
-                )
+                known.swallowed = self.mood == "silent" or (self.mood == "gaps" and nth % GAP == 0)
                 if self.mood == "corrupt" and nth % GAP == 0 and isinstance(packet, bytes):
                     known = _Bytes(packet[:-3] + bytes(b ^ 0xFF for b in packet[-3:]))
                     known.nth, known.swallowed = nth, False
@@ -283,8 +281,9 @@ class EmulatedArray(EmulatedDevice):
 def play(pipe: Connection, script: ArrayScript) -> None:
     """Be an array in a process of its own, for `Helper`: say the URL, then obey until it hangs up.
 
-    The words: ``mood NAME`` (say when), ``unplug`` (say when it began), ``replug`` (say when it was done), ``end`` (of what
-    is measured; say when), ``done`` (say whether), ``where`` (in words), ``played`` (a `Played`).
+    The words: ``mood NAME`` (say when), ``unplug`` (say when it began), ``replug`` (say when it was
+    done), ``end`` (of what is measured; say when), ``done`` (say whether), ``where`` (in words),
+    ``played`` (a `Played`).
     """
     with EmulatedArray(script) as device:
         pipe.send(device.url)

@@ -5,6 +5,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 from tactile_rt.daemon.admission import file_stamp, model_path
@@ -15,7 +16,7 @@ from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
-from tactile_rt.daemon.lock import Locks, lock_keys
+from tactile_rt.daemon.lock import AlreadyRunning, Locks, lock_keys
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
@@ -296,6 +297,7 @@ class Daemon:
         self.turned("watch")
         while not self._unwatch.wait(WATCH_S):
             self._notice_starving()
+            self._hold_devices()
             self.turned("watch")
             for name, source in self._sources.copy().items():
                 on_it = (p for _, p in self._models.copy().values() if p.config.source == name)
@@ -323,6 +325,13 @@ class Daemon:
                 done, self._on_over = self._on_over, None
                 if done is not None:
                     done()
+
+    def _hold_devices(self) -> None:
+        """A link to a device that was plugged in again leads to another one: that is held now, and
+        the one before is free for others."""
+        if self._locks is not None:
+            with suppress(AlreadyRunning):  # then opening it fails, and says so
+                self._locks.hold(_keys(self._loaded))
 
     def _notice_starving(self) -> None:
         now = time.monotonic_ns()

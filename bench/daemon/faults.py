@@ -1,0 +1,241 @@
+"""Is every fault told, rightly, soon, and no longer than it lasts; and nothing else?
+
+python -m bench.daemon.faults [--times 40] [--only NAME ...] [--resume faults.json]
+
+Each fault is caused by real means in a daemon under way with two arrays. Another thread asks
+`/health` and `/metrics` all the while. Of each repetition it is measured when the right trouble was
+told, what else was, and when nothing was told any more.
+"""
+
+import argparse
+import http.client
+import json
+import re
+import threading
+import time
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from rich.console import Console
+
+from bench.daemon.fault_kinds import KINDS, FaultKind, FaultScene, Named, may_mount
+from tactile_rt.evidence.records import Record, show, write
+
+__all__ = ["faults", "one_of_each"]
+
+ASK_S = 0.02
+SEEN_S, GONE_S = 1.0, 2.0  # stated
+HOLD_S = 1.2  # that a fault lasts after it is seen, for what else might be told
+PATIENCE_S = 12.0
+BUSY_S = 0.25  # two looks further apart: the machine kept the rig itself waiting
+RETRIES = 3
+DEGRADED = re.compile(rb"^tactile_degraded_parts (\d+)", re.M)
+NEED_A_DISK = ("little_room", "no_room", "two_at_once")
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """One fault, once.
+
+    Attributes:
+        seen_s: Time from the effect until the fault was told, s; infinite: never.
+        gone_s: Time from the end of the fault until nothing was told any more, s.
+        wrong: What was told and is not true: ``part: what``.
+        disagreed: Number of looks at which the metric was another than what health told.
+        retried: Number of times that it was repeated as the machine was too busy to look.
+    """
+
+    seen_s: float
+    gone_s: float
+    wrong: tuple[str, ...]
+    disagreed: int
+    retried: int = 0
+
+
+@dataclass(frozen=True)
+class _Look:
+    at: float
+    troubles: frozenset[Named]
+    lines: tuple[str, ...]
+
+
+class _Watcher:
+    """Asks again and again; a context manager."""
+
+    def __init__(self, port: int) -> None:
+        self._port = port
+        self.looks: list[_Look] = []
+        self.disagreed = 0
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join(15)
+
+    def since(self, at: float) -> list[_Look]:
+        """Looks from then on."""
+        return [look for look in self.looks[-2000:] if look.at >= at]
+
+    def wait(self, true: Any, after: float, seconds: float) -> float:
+        """When a look after this time was so; infinite: none within so many seconds."""
+        end = time.monotonic() + seconds
+        while True:
+            for look in self.since(after):
+                if true(look):
+                    return look.at
+            if time.monotonic() > end:
+                return np.inf
+            time.sleep(ASK_S / 2)
+
+    def _run(self) -> None:
+        while not self._over.is_set():
+            began = time.monotonic()
+            try:
+                health = json.loads(self._ask("/health"))
+                found = DEGRADED.search(self._ask("/metrics"))
+            except (OSError, http.client.HTTPException, ValueError):
+                time.sleep(ASK_S)
+                continue
+            named = frozenset((t["part"], t["what"]) for t in health["troubles"])
+            at = time.monotonic()
+            self.looks.append(_Look(at, named, tuple(health["degraded"])))
+            again = json.loads(self._ask("/health"))["troubles"] if found else []
+            if found and int(found[1]) not in (len(health["troubles"]), len(again)):
+                self.disagreed += 1
+            time.sleep(max(0.0, ASK_S - (time.monotonic() - began)))
+
+    def _ask(self, path: str) -> bytes:
+        line = http.client.HTTPConnection("127.0.0.1", self._port, timeout=10)
+        try:
+            line.request("GET", path)
+            return line.getresponse().read()
+        finally:
+            line.close()
+
+
+def repeat(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> Repetition:
+    """Cause a fault once, and see what is told of it."""
+    retried = 0
+    while True:
+        made, busy = _once(scene, watcher, kind)
+        if not busy or retried == RETRIES:
+            return Repetition(**{**asdict(made), "retried": retried})
+        retried += 1
+
+
+def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repetition, bool]:
+    named, allowed = frozenset(kind.named), frozenset(kind.named + kind.also)
+    began, disagreed = time.monotonic(), watcher.disagreed
+    with contextmanager(kind.cause)(scene) as effect:  # type: ignore[arg-type]
+        if named:
+            seen = watcher.wait(lambda look: named <= look.troubles, began, PATIENCE_S)
+        else:
+            seen = effect
+        if kind.lasts:
+            time.sleep(HOLD_S)
+    ended = time.monotonic() if kind.lasts else (seen if np.isfinite(seen) else effect)
+    gone = watcher.wait(lambda look: not look.troubles, max(ended, effect), PATIENCE_S)
+    time.sleep(0.3)
+    looks = watcher.since(began)
+    wrong = sorted({f"{p}: {w}" for look in looks for p, w in look.troubles - allowed})
+    gaps = np.diff([look.at for look in looks]) if len(looks) > 1 else np.zeros(1)
+    # while a process is stopped nobody answers
+    busy = bool(gaps.max() > BUSY_S) and kind.cause.__name__ != "_stopped"
+    scene.tidy()
+    return Repetition(
+        max(0.0, seen - effect), max(0.0, gone - ended), tuple(wrong), watcher.disagreed - disagreed
+    ), busy  # fmt: skip
+
+
+def faults(times: int, only: tuple[str, ...] = (), resume: Path | None = None) -> list[Record]:
+    """Every fault so many times; what a file holds of them already is not repeated.
+
+    Args:
+        times: how often each.
+        only: names of faults; none: all.
+        resume: file that keeps the repetitions.
+    """
+    done: dict[str, list[dict[str, Any]]] = {}
+    if resume is not None and resume.exists():
+        done = json.loads(resume.read_text())
+    names = [n for n in (only or tuple(KINDS)) if may_mount() or n not in NEED_A_DISK]
+    while open_names := [n for n in names if len(done.get(n, ())) < times]:
+        with FaultScene() as scene, _Watcher(scene.ports["metrics"]) as watcher:
+            time.sleep(0.5)
+            for name in open_names:
+                for _ in range(min(BATCH, times - len(done.get(name, ())))):
+                    done.setdefault(name, []).append(asdict(repeat(scene, watcher, KINDS[name])))
+                if resume is not None:
+                    resume.write_text(json.dumps(done))
+    return [r for n in names for r in _records(n, [Repetition(**d) for d in done[n]])]
+
+
+BATCH = 8  # of each fault, in one daemon
+
+
+def _records(name: str, found: list[Repetition]) -> list[Record]:
+    kind = KINDS[name]
+    seen, gone = np.array([r.seen_s for r in found]), np.array([r.gone_s for r in found])
+    n = len(found)
+    told = ", ".join(f"{part}: {what}" for part, what in kind.named) or "nothing"
+    how = f"{n} times; {sum(r.retried for r in found)} repeated as the machine was too busy"
+    wrong = [w for r in found for w in r.wrong]
+    records = []
+    if kind.named:
+        records.append(
+            Record(
+                f"daemon.faults.{name}_seen", float(seen.max()), "s", f"<= {SEEN_S:g}",
+                f"{told}; median {np.median(seen):.2f}; named rightly "
+                f"{int(np.isfinite(seen).sum())} of {n}", how,
+            )
+        )  # fmt: skip
+        records.append(
+            Record(
+                f"daemon.faults.{name}_gone", float(gone.max()), "s", f"<= {GONE_S:g}",
+                f"median {np.median(gone):.2f}",
+            )
+        )  # fmt: skip
+    records.append(
+        Record(
+            f"daemon.faults.{name}_told_wrongly", len(wrong), "times", "== 0",
+            ", ".join(sorted(set(wrong))) or f"but {told}", "" if kind.named else how,
+        )
+    )  # fmt: skip
+    records.append(
+        Record(
+            f"daemon.faults.{name}_disagreed", sum(r.disagreed for r in found), "looks", "== 0",
+            "tactile_degraded_parts is another number than /health tells",
+        )
+    )  # fmt: skip
+    return records
+
+
+def one_of_each() -> list[Record]:
+    """Every fault once."""
+    return faults(1)
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--times", type=int, default=40)
+    parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--resume", type=Path)
+    parser.add_argument("--json", type=Path)
+    given = parser.parse_args()
+    records = faults(given.times, tuple(given.only), given.resume)
+    show(records, Console())
+    if given.json:
+        write(records, given.json)
+
+
+if __name__ == "__main__":
+    main()
