@@ -325,8 +325,14 @@ GHOST = '[[source]]\nname = "ghost"\nurl = "serial:///dev/not_there?codec=native
 FULL = '[[publisher]]\nkind = "jsonl"\nname = "full"\noptions = { file = "/dev/full" }\n'
 KINDS: dict[str, FaultKind] = {
     "nothing_at_all": FaultKind(_nothing),
-    "serial_cable_pulled": FaultKind(_unplugged("whiskers"), (("source.whiskers", "no samples"),)),
-    "can_cable_pulled": FaultKind(_unplugged("finger"), (("source.finger", "no samples"),)),
+    "serial_cable_pulled": FaultKind(
+        _unplugged("whiskers"), (("source.whiskers", "no samples"),),
+        (("source.whiskers", "lost samples"),),
+    ),
+    "can_cable_pulled": FaultKind(
+        _unplugged("finger"), (("source.finger", "no samples"),),
+        (("source.finger", "lost samples"),),
+    ),
     "serial_device_silent": FaultKind(
         _mood("whiskers", "silent"), (("source.whiskers", "no samples"),),
         (("source.whiskers", "lost samples"),),
@@ -360,7 +366,9 @@ KINDS: dict[str, FaultKind] = {
         _reader_stalls, (("publisher.jsonl", "not published"),)
     ),
     "page_flooded": FaultKind(_page_flooded, (("page", "no page"),)),
-    "publisher_flooded": FaultKind(_publisher_flooded),
+    "publisher_flooded": FaultKind(
+        _publisher_flooded, (("publisher.zmq", "not published"),)
+    ),
     "peer_never_reads": FaultKind(_peer_that_never_reads),
     "wall_clock_set": FaultKind(_clock_set, (("daemon", "UTC has jumped"),), lasts=False),
     "process_stopped": FaultKind(
@@ -385,5 +393,8 @@ KINDS: dict[str, FaultKind] = {
         _slow_model, (("model.whiskers", "missing decisions"),),
         (("model.whiskers", "late decisions"),),
     ),
-    "two_at_once": FaultKind(_two_at_once, (RECORDER, ("source.finger", "no samples"))),
+    "two_at_once": FaultKind(
+        _two_at_once, (RECORDER, ("source.finger", "no samples")),
+        (("source.finger", "lost samples"),),
+    ),
 }  # fmt: skip

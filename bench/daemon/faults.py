@@ -43,7 +43,7 @@ class Repetition:
     Attributes:
         seen_s: Time from the effect until the fault was told, s; infinite: never.
         gone_s: Time from the end of the fault until nothing was told any more, s.
-        wrong: What was told and is not true: ``part: what``.
+        wrong: What was told and is not true: ``part: what: why``.
         disagreed: Number of looks at which the metric was another than what health told.
         retried: Number of times that it was repeated as the machine was too busy to look.
     """
@@ -58,7 +58,7 @@ class Repetition:
 @dataclass(frozen=True)
 class _Look:
     at: float
-    troubles: frozenset[Named]
+    troubles: dict[Named, str]
     lines: tuple[str, ...]
 
 
@@ -104,7 +104,7 @@ class _Watcher:
             except (OSError, http.client.HTTPException, ValueError):
                 time.sleep(ASK_S)
                 continue
-            named = frozenset((t["part"], t["what"]) for t in health["troubles"])
+            named = {(t["part"], t["what"]): t["why"] for t in health["troubles"]}
             at = time.monotonic()
             self.looks.append(_Look(at, named, tuple(health["degraded"])))
             again = json.loads(self._ask("/health"))["troubles"] if found else []
@@ -136,7 +136,7 @@ def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repeti
     began, disagreed = time.monotonic(), watcher.disagreed
     with contextmanager(kind.cause)(scene) as effect:  # type: ignore[arg-type]
         if named:
-            seen = watcher.wait(lambda look: named <= look.troubles, began, PATIENCE_S)
+            seen = watcher.wait(lambda look: named <= look.troubles.keys(), began, PATIENCE_S)
         else:
             seen = effect
         if kind.lasts:
@@ -145,7 +145,14 @@ def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repeti
     gone = watcher.wait(lambda look: not look.troubles, max(ended, effect), PATIENCE_S)
     time.sleep(0.3)
     looks = watcher.since(began)
-    wrong = sorted({f"{p}: {w}" for look in looks for p, w in look.troubles - allowed})
+    wrong = sorted(
+        {
+            f"{part}: {what}: {why}"
+            for look in looks
+            for (part, what), why in look.troubles.items()
+            if (part, what) not in allowed
+        }
+    )
     gaps = np.diff([look.at for look in looks]) if len(looks) > 1 else np.zeros(1)
     # while a process is stopped nobody answers
     busy = bool(gaps.max() > BUSY_S) and kind.cause.__name__ != "_stopped"

@@ -24,6 +24,8 @@ from tactile_rt.daemon.troubles import LossWindow
 
 __all__ = ["Consumer", "ConsumerPart", "View"]
 
+TAKEN = "all its connections are taken, and others are turned away"
+
 
 class View(Protocol):
     """The daemon as a consumer sees it; every method from any thread, at once."""

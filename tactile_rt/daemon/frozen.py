@@ -35,17 +35,19 @@ class FrozenJudge:
         self.seconds = 0.0
 
     def add(self, chunk: Chunk) -> None:
-        """Take the next samples of the stream."""
+        """Take the next samples of the stream; of one without any valid element nothing is
+        judged."""
         if math.isinf(self.after_s):
             self._last, self.seconds = None, 0.0
             return
         values = chunk.values.view(np.uint32)  # bits: what is no number is equal to itself, too
         last, self._last = self._last, values[-1]
-        changed = (values[1:] != values[:-1]).any(axis=(1, 2))
+        useless = np.asarray(~chunk.valid.any(axis=1))
+        changed = useless[1:] | (values[1:] != values[:-1]).any(axis=(1, 2))
         first = last is None or last.shape != values[0].shape or bool((values[0] != last).any())
         if changed.any():
             self._since_ns = int(chunk.t_ns[1 + int(np.flatnonzero(changed)[-1])])
-        elif first:
+        elif first or useless[0]:
             self._since_ns = int(chunk.t_ns[0])
         same_s = (int(chunk.t_ns[-1]) - self._since_ns) / NS_PER_S
         self.seconds = same_s if same_s > self.after_s else 0.0

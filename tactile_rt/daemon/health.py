@@ -112,6 +112,8 @@ class SourceState:
         newest_ns: The time at which the newest sample was taken, host CLOCK_MONOTONIC, ns; of a
             device whose own clock is kept that at which it came; 0: there is none yet.
         read_ns: The time at which the newest sample was read, host CLOCK_MONOTONIC, ns.
+        flowing_ns: The time since which samples have come without a pause, host CLOCK_MONOTONIC,
+            ns.
         live: Whether samples come whether or not anyone reads them, so that they can be too old.
         losses: The number of samples that were corrupt, missing or dropped lately.
         bad_samples: The number of samples of one element that held no number, or an absurd one,
@@ -134,6 +136,7 @@ class SourceState:
     samples: int = 0
     newest_ns: int = 0
     read_ns: int = 0
+    flowing_ns: int = 0
     live: bool = False
     losses: Losses = field(default_factory=Losses)
     bad_samples: int = 0
@@ -209,8 +212,10 @@ class OnDisk:
         lost_ns: The host monotonic time at which samples were lost last, ns; 0 if none were.
         lost_why: The reason for which samples were lost last; empty if none were.
         open: Whether a file of the source is open.
-        meant: Whether the source is to be recorded now: the source is open, nobody has stopped the
-            recorder, and in the mode ``trigger`` there is a trigger.
+        meant_ns: The host monotonic time since which the source is to be recorded, ns; 0: it is not
+            now, as it is closed, somebody has stopped the recorder, or it waits for a trigger.
+        waits_ns: The host monotonic time since which something that the operating system has waits
+            for the medium, ns; 0: nothing does.
     """
 
     written_ns: int = 0
@@ -220,7 +225,8 @@ class OnDisk:
     lost_ns: int = 0
     lost_why: str = ""
     open: bool = False
-    meant: bool = False
+    meant_ns: int = 0
+    waits_ns: int = 0
 
 
 @dataclass(frozen=True)

@@ -189,6 +189,11 @@ class HttpServer:
         """How many there are now; from any thread."""
         return len(self._tasks)
 
+    @property
+    def full(self) -> bool:
+        """Whether whoever comes now is turned away; from any thread."""
+        return self.connections >= self._limits.connections
+
     def call(self, function: Callable[..., object], *arguments: Any) -> None:
         """Call something in the thread of the server, soon.
 

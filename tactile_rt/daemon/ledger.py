@@ -38,10 +38,12 @@ class Ledger:
             self._now = _sum(past, done), tuple(file for file in files if file not in done)
         return failed
 
-    def on_disk(self, open: bool, meant: bool) -> OnDisk:
+    def on_disk(self, open: bool, meant_ns: int) -> OnDisk:
         """All of it; from any thread."""
-        samples, written_ns, synced_ns = _sum(*self._now)
-        return OnDisk(written_ns, synced_ns, samples, *self._lost, open, meant)
+        past, files = self._now
+        samples, written_ns, synced_ns = _sum(past, files)
+        waits_ns = min((ns for file in files if (ns := file.unsynced_ns)), default=0)
+        return OnDisk(written_ns, synced_ns, samples, *self._lost, open, meant_ns, waits_ns)
 
 
 def _sum(past: Sums, files: tuple[RecordingWriter, ...]) -> Sums:

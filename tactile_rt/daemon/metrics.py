@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from tactile_rt.daemon.config import MetricsConfig, is_loopback
-from tactile_rt.daemon.consumer import Consumer, View
+from tactile_rt.daemon.consumer import TAKEN, Consumer, View
 from tactile_rt.daemon.health import Latency, PartState, QueueState, Snapshot
 from tactile_rt.daemon.http import HttpLimits, HttpServer, Refused, Request, Response, listen
 from tactile_rt.daemon.items import Item
@@ -72,6 +72,10 @@ class Metrics(Consumer):
     def close(self) -> None:
         if self._server is not None:
             self._server.close()
+
+    def trouble(self) -> str:
+        server = self._server
+        return TAKEN if server is not None and server.full else ""
 
     def details(self) -> dict[str, str | int | float]:
         server = self._server
@@ -336,12 +340,12 @@ def _recorded(out: _Text, s: Snapshot) -> None:
     out.add(
         "recorder_written_sample_age_seconds", "gauge",
         "Since the newest sample that the system has of the recording, while it is recorded.",
-        [(n, (s.t_ns - d.written_ns) / 1e9) for n, d in disks if d.meant and d.written_ns],
+        [(n, (s.t_ns - d.written_ns) / 1e9) for n, d in disks if d.meant_ns and d.written_ns],
     )  # fmt: skip
     out.add(
         "recorder_synced_sample_age_seconds", "gauge",
         "Since the newest sample of the recording that is on the medium, while it is recorded.",
-        [(n, (s.t_ns - d.synced_ns) / 1e9) for n, d in disks if d.meant and d.synced_ns],
+        [(n, (s.t_ns - d.synced_ns) / 1e9) for n, d in disks if d.meant_ns and d.synced_ns],
     )  # fmt: skip
 
 

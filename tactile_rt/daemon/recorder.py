@@ -76,6 +76,7 @@ class _Track:
         self.came = False  # a sample, or a packet: before, there is nothing to record
         self.ring: deque[Raw] = deque()
         self.ring_bytes = 0
+        self.since_ns = time.monotonic_ns()  # it was opened, recording was started, or a trigger
         self.until_ns = 0  # of a trigger; 0: none
         self.closed_ns = 0  # when its source ended; 0: it has not
         self.lost = (0, 0)  # samples and packets since the last file was begun
@@ -186,11 +187,10 @@ class Recorder(Consumer):
     def _on_disk(self, name: str, ledger: Ledger) -> OnDisk:
         track = self._tracks.get(name)
         if track is None:
-            return ledger.on_disk(open=False, meant=False)
+            return ledger.on_disk(open=False, meant_ns=0)
         wanted = self._config.mode == "always" or track.until_ns > 0
-        return ledger.on_disk(
-            open=track.file is not None, meant=self._on and wanted and not track.closed_ns
-        )
+        meant = self._on and wanted and not track.closed_ns
+        return ledger.on_disk(open=track.file is not None, meant_ns=track.since_ns if meant else 0)
 
     def details(self) -> dict[str, str | int | float]:
         tracks = list(self._tracks.values())
@@ -211,14 +211,14 @@ class Recorder(Consumer):
             return f"less than min_free_mb = {self._config.min_free_mb:g} MB free: {self._folder}"
         if self._why or not self._on:
             return self._why
-        sync_s = self._config.sync_s
-        slow_ns = (2 * sync_s + SLOW_S) * NS
+        slow_s = 2 * self._config.sync_s + SLOW_S
+        now = time.monotonic_ns()
         for name, track in list(self._tracks.items()):
             disk = self._on_disk(name, track.ledger)
-            if track.trouble and disk.meant:
+            if track.trouble and disk.meant_ns:
                 return track.trouble
-            if sync_s and disk.meant and disk.written_ns - disk.synced_ns > slow_ns:
-                return f"a power cut would take more than {slow_ns / NS:g} s of {name}: a slow disk"
+            if self._config.sync_s and disk.waits_ns and now - disk.waits_ns > slow_s * NS:
+                return f"a power cut would take more than {slow_s:g} s of {name}: a slow disk"
         return ""
 
     def _take(self, item: Item) -> None:
@@ -304,7 +304,9 @@ class Recorder(Consumer):
     def _trigger(self, track: _Track) -> None:
         if self._config.mode != "trigger" or not self._on:
             return
-        track.until_ns = time.monotonic_ns() + round(self._config.after_s * NS)
+        now = time.monotonic_ns()
+        track.since_ns = track.since_ns if track.until_ns else now
+        track.until_ns = now + round(self._config.after_s * NS)
         if track.file is None:
             self._start_file(track)
 
@@ -313,6 +315,7 @@ class Recorder(Consumer):
             self._on = True
             if self._config.mode == "always":
                 for track in self._tracks.values():
+                    track.since_ns = time.monotonic_ns()
                     self._start_file(track)
         elif control.action == "stop":
             self._on = False

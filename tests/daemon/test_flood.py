@@ -145,7 +145,8 @@ def test_the_first_connections_stay_and_the_rest_are_shut_down(tmp_path, unix):
         until(lambda: limit.connections == 2)
         rest = [connect() for _ in range(3)]
         assert [line.recv(1) for line in rest] == [b""] * 3
-        assert limit.dropped == 3
+        until(lambda: limit.dropped == 3)
+        assert limit.full
         for line, end in zip(first, accepted, strict=False):
             end.sendall(b"x")
             assert line.recv(1) == b"x"
@@ -153,6 +154,7 @@ def test_the_first_connections_stay_and_the_rest_are_shut_down(tmp_path, unix):
         assert others[1].recv(1) == b"z"
         accepted[0].close()  # makes room
         until(lambda: limit.connections == 1)
+        assert not limit.full
         line = connect()
         accepted[-1].sendall(b"y")
         assert line.recv(1) == b"y"

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_rt.daemon import recorder
 from tactile_rt.daemon.items import Closed, Contact, Control
 from tactile_rt.recording import Recording, recover
 from tactile_rt.testing import cut
@@ -101,9 +102,9 @@ def test_what_is_synced_outlives_a_power_cut_and_is_told(daemon, tmp_path):
     until(lambda: on_disk(made).synced_ns == at)
     now = on_disk(made)
     assert (now.samples, now.written_ns, now.lost_samples) == (10, at, 0)
-    assert (now.open, now.meant) == (True, True)
+    assert (now.open, now.meant_ns > 0) == (True, True)
     made.handle([Closed("whiskers", "over", 0)])
-    assert not on_disk(made).meant
+    assert not on_disk(made).meant_ns
     made.close()
     assert (on_disk(made).samples, on_disk(made).open, on_disk(made).synced_ns) == (10, False, at)
 
@@ -130,6 +131,27 @@ def test_a_medium_that_is_slow_holds_up_nothing(daemon, tmp_path, medium):
     made.close()
     assert medium.most == 1  # never two at a time
     assert seqs(tmp_path) == list(range(400))
+
+
+def test_a_medium_that_hangs_is_told_from_when_something_waits_for_it(
+    daemon, tmp_path, medium, monkeypatch
+):
+    monkeypatch.setattr(recorder, "SLOW_S", 0.05)
+    made = begun(daemon, tmp_path, min_free_mb=0, sync_s=1e-6)
+    made.handle([opened(), samples(CHUNKS[0], at=time.monotonic_ns() - 60 * 10**9)])
+    until(lambda: on_disk(made).synced_ns)
+    monkeypatch.setattr(recorder, "SLOW_S", 60.0)
+    medium.open.clear()
+    made.handle([samples(CHUNKS[1])])  # a minute after the last one
+    look(made)
+    until(lambda: medium.together == 1)
+    assert on_disk(made).waits_ns and made.trouble() == ""
+    monkeypatch.setattr(recorder, "SLOW_S", 0.05)
+    until(lambda: "a slow disk" in made.trouble())
+    medium.open.set()
+    until(lambda: (look(made), made.trouble() == "")[1])
+    made.close()
+    assert on_disk(made).waits_ns == 0
 
 
 def test_without_syncs_the_file_is_synced_at_its_end_alone(daemon, tmp_path, medium):
@@ -194,7 +216,7 @@ def test_below_min_free_mb_what_is_not_recorded_is_counted(daemon, tmp_path):
     made = begun(daemon, tmp_path, min_free_mb=1e7)
     made.handle([opened(), samples(CHUNKS[0])])
     now = on_disk(made)
-    assert (now.samples, now.lost_samples, now.open, now.meant) == (0, 10, False, True)
+    assert (now.samples, now.lost_samples, now.open, now.meant_ns > 0) == (0, 10, False, True)
     assert "min_free_mb" in now.lost_why
     assert made.details()["state"] == "disk full"
     made.close()
@@ -203,11 +225,11 @@ def test_below_min_free_mb_what_is_not_recorded_is_counted(daemon, tmp_path):
 def test_who_is_stopped_or_waits_for_a_trigger_is_not_meant_to_record(daemon, tmp_path):
     made = begun(daemon, tmp_path, min_free_mb=0, mode="trigger")
     made.handle([opened(), samples(CHUNKS[0])])
-    assert not on_disk(made).meant
+    assert not on_disk(made).meant_ns
     made.handle([Control("trigger")])
-    assert (on_disk(made).meant, on_disk(made).open) == (True, True)
+    assert (on_disk(made).meant_ns > 0, on_disk(made).open) == (True, True)
     made.handle([Control("stop"), samples(CHUNKS[1])])
-    assert (on_disk(made).meant, on_disk(made).lost_samples) == (False, 0)
+    assert (on_disk(made).meant_ns > 0, on_disk(made).lost_samples) == (False, 0)
     made.close()
 
 
@@ -223,10 +245,10 @@ def test_a_trigger_outlives_the_next_file_and_the_want_of_one(daemon, tmp_path):
     (tmp_path / "a").write_text("in the way")
     made.handle([Control("trigger"), samples(CHUNKS[2])])
     look(made)
-    assert (on_disk(made).open, on_disk(made).meant) == (False, True)
+    assert (on_disk(made).open, on_disk(made).meant_ns > 0) == (False, True)
     made._tracks["whiskers"].until_ns = 1
     look(made)
-    assert (on_disk(made).lost_samples, on_disk(made).meant) == (10, False)
+    assert (on_disk(made).lost_samples, on_disk(made).meant_ns > 0) == (10, False)
     made.close()
 
 
@@ -286,7 +308,7 @@ def test_a_folder_that_may_not_be_written_is_told_once_counted_and_tried_again(
         made.handle([samples(chunk)])
         look(made)
     now = on_disk(made)
-    assert (now.samples, now.lost_samples, now.open, now.meant) == (10, 30, False, True)
+    assert (now.samples, now.lost_samples, now.open, now.meant_ns > 0) == (10, 30, False, True)
     assert "Permission denied" in now.lost_why
     assert len(daemon.told) == 1
     folder.chmod(0o700)

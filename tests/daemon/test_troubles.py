@@ -37,7 +37,7 @@ SOURCE = SourceState(
     newest_ns=NOW - S // 100, read_ns=NOW - S // 100, live=True,
 )  # fmt: skip
 MODEL = ModelState(part("model.a"), "a", "m.onnx")
-DISK = OnDisk(NOW - S // 2, NOW - S, 99, open=True, meant=True)
+DISK = OnDisk(NOW - S // 2, NOW - S, 99, open=True, meant_ns=1)
 RECORDER = ConsumerState(part("recorder"), "recorder", on_disk={"a": DISK})
 ZMQ = ConsumerState(part("publisher.zmq"), "zmq")
 
@@ -58,7 +58,8 @@ def test_who_does_what_it_should_is_not_named():
         ({"newest_ns": NOW - 9 * S},
          "late samples: source.a: when they come they are older than 0.5 s"),
         ({"losses": Losses(1, 7)}, "lost samples: source.a: some did not come, or came damaged"),
-        ({"bad": Losses(1, 1)}, "bad samples: source.a: some values are no numbers, or absurd"),
+        ({"bad": Losses(1, 1)},
+         "bad samples: source.a: some values are no numbers, or absurd, or none is valid"),
         ({"device": Health(State.LOST, 1, "unplugged")},
          "no samples: source.a: the device is lost"),
         ({"part": part("source.a", "waiting", "no such port")},
@@ -133,7 +134,13 @@ def test_a_consumer_is_named_by_what_it_did_not_hand_on(changes, words):
         (replace(DISK, lost_ns=NOW - S // 2, lost_why="no room"), {},
          "samples of a are lost: no room"),
         (replace(DISK, lost_ns=NOW - 2 * S, lost_why="no room"), {}, ""),
-        (replace(DISK, written_ns=NOW - 9 * S, meant=False), {}, ""),  # nobody asks for it now
+        (replace(DISK, written_ns=NOW - 9 * S, meant_ns=0), {}, ""),  # nobody asks for it now
+        # somebody asks for it only now, or they come again only now
+        (replace(DISK, written_ns=NOW - 9 * S, meant_ns=NOW - S // 2), {}, ""),
+        (replace(DISK, written_ns=NOW - 9 * S), {"flowing_ns": NOW - S // 2}, ""),
+        (replace(DISK, written_ns=NOW - 2 * S), {"flowing_ns": NOW - 2 * S},
+         "samples of a are not on the disk after 1 s"),
+        (replace(DISK, written_ns=NOW - 2 * S), {"rate_hz": 1.0}, ""),
         # nothing came that could be written
         (replace(DISK, written_ns=NOW - 9 * S), {"newest_ns": NOW - 9 * S, "read_ns": NOW - 9 * S},
          ""),
@@ -256,6 +263,14 @@ def test_one_value_of_many_that_changes_is_enough():
     values[:, 2, 1] = 0.0
     assert any(judged(values, 0.05))
     assert any(judged(np.full((900, 3, 2), np.nan), 0.05))  # no number is equal to itself, here
+
+
+def test_a_sample_without_any_valid_element_says_nothing_of_freezing():
+    judge = FrozenJudge()
+    judge.after_s = 0.05
+    for chunk in chunks(np.zeros((900, 3, 2))):
+        judge.add(replace(chunk, valid=np.zeros_like(chunk.valid)))
+        assert not judge.seconds
 
 
 def test_nothing_is_judged_of_a_sensor_that_nothing_is_known_of():

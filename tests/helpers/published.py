@@ -123,7 +123,7 @@ def busy_snapshot(seconds=0, state="degraded"):
             ),
             ConsumerState(
                 part("recorder", "waiting", "No space left on device", 9), "recorder",
-                on_disk={"whiskers": OnDisk(at - 400_000_000, at - 900_000_000, 4000, meant=True)},
+                on_disk={"whiskers": OnDisk(at - 400_000_000, at - 900_000_000, 4000, meant_ns=at)},
             ),
         ),
         troubles=(Trouble("source.finger", "no samples", "the device is lost"),),

@@ -9,7 +9,7 @@ import time
 import msgspec
 
 from tactile_rt.daemon.config import PageConfig, is_loopback
-from tactile_rt.daemon.consumer import Consumer, View
+from tactile_rt.daemon.consumer import TAKEN, Consumer, View
 from tactile_rt.daemon.http import HttpServer, listen
 from tactile_rt.daemon.items import Contact, Control, Decision, Event, Item, Opened, SourceChunk
 from tactile_rt.daemon.messages import encode, state_message
@@ -97,6 +97,10 @@ class Page(Consumer):
         """End all streams and stop listening."""
         if self._server is not None:
             self._server.close()
+
+    def trouble(self) -> str:
+        server = self._server
+        return TAKEN if server is not None and server.full else ""
 
     def details(self) -> dict[str, str | int | float]:
         options, answers, server = self._options, self._routes, self._server

@@ -55,6 +55,11 @@ class ConnectionLimit:
         """How many there were at the last look."""
         return len(self._kept)
 
+    @property
+    def full(self) -> bool:
+        """Whether whoever comes now is shut down."""
+        return len(self._kept) >= self._most
+
     def close(self) -> None:
         """Look no more."""
         self._over.set()

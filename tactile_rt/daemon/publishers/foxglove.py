@@ -16,7 +16,7 @@ from foxglove.channels import LogChannel, SceneUpdateChannel
 from foxglove.messages import Log, LogLevel, Timestamp
 from foxglove.websocket import WebSocketServer
 
-from tactile_rt.daemon.consumer import Consumer, View
+from tactile_rt.daemon.consumer import TAKEN, Consumer, View
 from tactile_rt.daemon.items import (
     Closed,
     Contact,
@@ -141,6 +141,10 @@ class FoxglovePublisher(Consumer):
             channel.close()
         if server is not None:
             server.stop()
+
+    def trouble(self) -> str:
+        limit = self._limit
+        return TAKEN if limit is not None and limit.full else ""
 
     def details(self) -> dict[str, str | int | float]:
         return {

@@ -7,7 +7,7 @@ from typing import Annotated
 import msgspec
 
 from tactile_rt.daemon.config import is_loopback
-from tactile_rt.daemon.consumer import Consumer, View
+from tactile_rt.daemon.consumer import TAKEN, Consumer, View
 from tactile_rt.daemon.items import Contact, Decision, Event, Item, Opened, Skipped, SourceChunk
 from tactile_rt.daemon.messages import Message, message_of, state_message
 from tactile_rt.daemon.publishers.connections import ConnectionLimit
@@ -99,6 +99,10 @@ class Sender(Consumer):
         for message in messages:
             self._bytes += self._send(message)
             self._messages += 1
+
+    def trouble(self) -> str:
+        limit = self._limit
+        return TAKEN if limit is not None and limit.full else ""
 
     @abc.abstractmethod
     def _connect(self, view: View) -> None:
