@@ -98,7 +98,14 @@ class DisturbedDaemon:
         self._connected = False
 
     def __enter__(self) -> Self:
-        stack = self._stack
+        try:
+            self._begin(self._stack)
+        except BaseException:
+            self._stack.close()
+            raise
+        return self
+
+    def _begin(self, stack: ExitStack) -> None:
         self.folder = Path(
             stack.enter_context(tempfile.TemporaryDirectory(prefix="tactile-chaos-"))
         )
@@ -139,7 +146,6 @@ class DisturbedDaemon:
         while count < len(self._told) and time.monotonic() < end:
             count = len(self._told)
             time.sleep(SETTLED_S)
-        return self
 
     def __exit__(
         self,

@@ -9,7 +9,7 @@ import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,8 @@ __all__ = ["CONFIGURATION", "KINDS", "FaultKind", "FaultScene", "may_mount"]
 FROZEN_S = 0.3
 DISK_MB, SPARE_MB = 96, 24  # of the recordings' file system; that must be free
 STEP_S = 3600.0
-STOPPED_S = 3.0
+STOPPED_S, STARVED_S = 3.0, 10.0
+SLOW_MS = 300.0  # of a step that may take 45
 FLOOD = 200
 CONFIGURATION = f"""version = 1
 [[source]]
@@ -74,11 +75,12 @@ class FaultScene(DisturbedDaemon):
         self.disk = model.parent / "disk"
         self.disk.mkdir()
         if may_mount():
-            size = f"size={DISK_MB}m"
-            subprocess.run(
-                ["mount", "-t", "tmpfs", "-o", size, "tmpfs", str(self.disk)], check=True
-            )
-            self._stack.callback(subprocess.run, ["umount", "-l", str(self.disk)], check=False)
+            image = model.parent / "image"
+            with image.open("wb") as file:
+                file.truncate(DISK_MB * 1_000_000)
+            _do("mkfs.ext4", "-q", "-m", "0", image)
+            _do("mount", "-o", "loop", image, self.disk)
+            self._stack.callback(_do, "umount", "-l", self.disk)
         self.good_model = model.read_bytes()
 
     def configure(
@@ -109,8 +111,13 @@ class FaultScene(DisturbedDaemon):
 
 
 def may_mount() -> bool:
-    """Whether a file system can be mounted here."""
-    return os.geteuid() == 0 and shutil.which("mount") is not None
+    """Whether a file system can be mounted here, and processes be kept short."""
+    tools = ("mount", "mkfs.ext4", "chattr", "fsfreeze", "mkswap", "swapon", "swapoff")
+    return os.geteuid() == 0 and all(map(shutil.which, tools))
+
+
+def _do(*command: object) -> None:
+    subprocess.run([str(word) for word in command], check=True)
 
 
 @dataclass(frozen=True)
@@ -123,12 +130,16 @@ class FaultKind:
         named: What must be told: part and what is missing; nothing: it is no fault.
         also: What may be told besides, as it is true as well.
         lasts: Whether the fault lasts until it is ended; else it is over in a moment.
+        root: Whether only the superuser can cause it.
+        blind: Whether nobody answers while it lasts.
     """
 
     cause: "Callable[[FaultScene], Iterator[float]]"
     named: tuple[Named, ...] = ()
     also: tuple[Named, ...] = ()
     lasts: bool = True
+    root: bool = False
+    blind: bool = False
 
 
 def _mood(array: str, mood: str, effect_s: float = 0.0) -> Callable[[FaultScene], Iterator[float]]:
@@ -166,8 +177,10 @@ def _folder_is_a_file(scene: FaultScene) -> Iterator[float]:
 def _filled(scene: FaultScene, left_mb: float) -> Iterator[float]:
     filler = scene.disk / "filler"
     free = shutil.disk_usage(scene.disk).free
-    with filler.open("wb") as file:
-        os.posix_fallocate(file.fileno(), 0, max(1, free - round(1e6 * left_mb)))
+    with filler.open("wb", buffering=0) as file, suppress(OSError):
+        os.posix_fallocate(file.fileno(), 0, max(1, free - round(1e6 * max(1.0, left_mb))))
+        while not left_mb:
+            file.write(bytes(1 << 16))  # until there is no room
     yield time.monotonic()
     filler.unlink()
 
@@ -190,6 +203,22 @@ def _no_growth(scene: FaultScene) -> Iterator[float]:
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (1 << 16, before[1]))
     yield time.monotonic()
     resource.prlimit(pid, resource.RLIMIT_FSIZE, (most, before[1]))
+
+
+def _disk_hangs(scene: FaultScene) -> Iterator[float]:
+    _do("fsfreeze", "-f", scene.disk)
+    yield time.monotonic()
+    _do("fsfreeze", "-u", scene.disk)
+
+
+def _folder_read_only(scene: FaultScene) -> Iterator[float]:
+    """No file can be begun or taken away, and the one that was written is gone."""
+    folder = scene.disk / "recordings"
+    for file in folder.glob("*.mcap"):
+        file.unlink()
+    _do("chattr", "+i", folder)
+    yield time.monotonic()
+    _do("chattr", "-i", folder)
 
 
 def _reader_stalls(scene: FaultScene) -> Iterator[float]:
@@ -244,6 +273,53 @@ def _stopped(scene: FaultScene) -> Iterator[float]:
     yield time.monotonic()
 
 
+@contextmanager
+def _kept_short(scene: FaultScene, what: str, old: str, new: str) -> Iterator[Callable[[str], int]]:
+    """A control group of the daemon's process, version 1 or 2; what sets its limit."""
+    root = Path("/sys/fs/cgroup")
+    unified = (root / "cgroup.controllers").exists()
+    group = (root if unified else root / what) / f"tactile-faults-{os.getpid()}"
+    group.mkdir(exist_ok=True)
+    pid, limit = str(scene.daemon.process.pid), group / (new if unified else old)
+    (group / "cgroup.procs").write_text(pid)
+    try:
+        yield limit.write_text
+    finally:
+        (group.parent / "cgroup.procs").write_text(pid)
+        group.rmdir()
+
+
+def _starved(scene: FaultScene) -> Iterator[float]:
+    """A hundredth of a processor for all of its threads."""
+    unified = Path("/sys/fs/cgroup/cgroup.controllers").exists()
+    with _kept_short(scene, "cpu", "cpu.cfs_quota_us", "cpu.max") as limit:
+        limit("1000 100000" if unified else "1000")
+        time.sleep(STARVED_S)
+        limit("max" if unified else "-1")
+        yield time.monotonic()
+
+
+def _swapped_out(scene: FaultScene) -> Iterator[float]:
+    """Half of its memory, again and again."""
+    swap = scene.folder / "swap"
+    if not swap.exists():
+        swap.touch(0o600)
+        with swap.open("r+b") as file:
+            os.posix_fallocate(file.fileno(), 0, 1 << 29)
+        _do("mkswap", "-q", swap)
+    unified = Path("/sys/fs/cgroup/cgroup.controllers").exists()
+    status = Path(f"/proc/{scene.daemon.process.pid}/status").read_text()
+    resident = 1024 * int(status.partition("VmRSS:")[2].split()[0])
+    _do("swapon", swap)
+    try:
+        with _kept_short(scene, "memory", "memory.limit_in_bytes", "memory.high") as limit:
+            limit(str(resident // 2))
+            yield time.monotonic()
+            limit("max" if unified else "-1")
+    finally:
+        _do("swapoff", swap)
+
+
 def _reloaded(further: str) -> Callable[[FaultScene], Iterator[float]]:
     """A part that cannot work is configured, and taken out again."""
 
@@ -294,7 +370,7 @@ def _slow_model(scene: FaultScene) -> Iterator[float]:
     slow = scene.folder / "slow.onnx"
     if not slow.exists():
         slow.write_bytes(scene.good_model)
-        slow_down(slow, 135.0)
+        slow_down(slow, SLOW_MS)
     since = scene.mark()
     scene.put_model(slow.read_bytes())
     # what it does not decide is seen when something is touched
@@ -320,6 +396,11 @@ def _nothing(scene: FaultScene) -> Iterator[float]:
     yield time.monotonic()
 
 
+LATE_TOO = (
+    ("source.whiskers", "lost samples"), ("source.finger", "lost samples"),
+    ("source.whiskers", "late samples"), ("source.finger", "late samples"),
+    ("model.whiskers", "missing decisions"), ("model.finger", "missing decisions"),
+)  # fmt: skip
 RECORDER = ("recorder", "no recording")
 GHOST = '[[source]]\nname = "ghost"\nurl = "serial:///dev/not_there?codec=native"\n'
 FULL = '[[publisher]]\nkind = "jsonl"\nname = "full"\noptions = { file = "/dev/full" }\n'
@@ -359,8 +440,10 @@ KINDS: dict[str, FaultKind] = {
     ),
     "recordings_deleted": FaultKind(_folder_deleted, (RECORDER,), lasts=False),
     "folder_is_a_file": FaultKind(_folder_is_a_file, (RECORDER,)),
-    "little_room": FaultKind(_little_room, (RECORDER,)),
-    "no_room": FaultKind(_no_room, (RECORDER,)),
+    "folder_read_only": FaultKind(_folder_read_only, (RECORDER,), root=True),
+    "disk_hangs": FaultKind(_disk_hangs, (RECORDER,), root=True),
+    "little_room": FaultKind(_little_room, (RECORDER,), root=True),
+    "no_room": FaultKind(_no_room, (RECORDER,), root=True),
     "files_may_not_grow": FaultKind(_no_growth, (RECORDER,)),
     "reader_of_a_pipe_stalls": FaultKind(
         _reader_stalls, (("publisher.jsonl", "not published"),)
@@ -372,12 +455,12 @@ KINDS: dict[str, FaultKind] = {
     "peer_never_reads": FaultKind(_peer_that_never_reads),
     "wall_clock_set": FaultKind(_clock_set, (("daemon", "UTC has jumped"),), lasts=False),
     "process_stopped": FaultKind(
-        _stopped, (("daemon", "late"),),
-        (("source.whiskers", "lost samples"), ("source.finger", "lost samples"),
-         ("source.whiskers", "late samples"), ("source.finger", "late samples"),
-         ("model.whiskers", "missing decisions"), ("model.finger", "missing decisions")),
-        lasts=False,
+        _stopped, (("daemon", "late"),), LATE_TOO, lasts=False, blind=True
     ),
+    "processor_starved": FaultKind(
+        _starved, (("daemon", "late"),), LATE_TOO, lasts=False, root=True, blind=True
+    ),
+    "memory_swapped_out": FaultKind(_swapped_out, (), (("daemon", "late"), *LATE_TOO), root=True),
     "port_taken": FaultKind(_port_taken, (("publisher.second", "not published"),)),
     "device_not_there": FaultKind(_reloaded(GHOST), (("source.ghost", "no samples"),)),
     "file_cannot_be_written": FaultKind(
@@ -395,6 +478,6 @@ KINDS: dict[str, FaultKind] = {
     ),
     "two_at_once": FaultKind(
         _two_at_once, (RECORDER, ("source.finger", "no samples")),
-        (("source.finger", "lost samples"),),
+        (("source.finger", "lost samples"),), root=True,
     ),
 }  # fmt: skip

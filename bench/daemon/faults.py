@@ -33,7 +33,7 @@ PATIENCE_S = 12.0
 BUSY_S = 0.25  # two looks further apart: the machine kept the rig itself waiting
 RETRIES = 3
 DEGRADED = re.compile(rb"^tactile_degraded_parts (\d+)", re.M)
-NEED_A_DISK = ("little_room", "no_room", "two_at_once")
+BATCH = 8  # of each fault, in one daemon
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,8 @@ def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repeti
             seen = effect
         if kind.lasts:
             time.sleep(HOLD_S)
-    ended = time.monotonic() if kind.lasts else (seen if np.isfinite(seen) else effect)
+    moment = max(effect, seen) if np.isfinite(seen) else effect
+    ended = time.monotonic() if kind.lasts else moment
     gone = watcher.wait(lambda look: not look.troubles, max(ended, effect), PATIENCE_S)
     time.sleep(0.3)
     looks = watcher.since(began)
@@ -155,7 +156,7 @@ def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repeti
     )
     gaps = np.diff([look.at for look in looks]) if len(looks) > 1 else np.zeros(1)
     # while a process is stopped nobody answers
-    busy = bool(gaps.max() > BUSY_S) and kind.cause.__name__ != "_stopped"
+    busy = bool(gaps.max() > BUSY_S) and not kind.blind
     scene.tidy()
     return Repetition(
         max(0.0, seen - effect), max(0.0, gone - ended), tuple(wrong), watcher.disagreed - disagreed
@@ -173,7 +174,7 @@ def faults(times: int, only: tuple[str, ...] = (), resume: Path | None = None) -
     done: dict[str, list[dict[str, Any]]] = {}
     if resume is not None and resume.exists():
         done = json.loads(resume.read_text())
-    names = [n for n in (only or tuple(KINDS)) if may_mount() or n not in NEED_A_DISK]
+    names = [n for n in (only or tuple(KINDS)) if may_mount() or not KINDS[n].root]
     while open_names := [n for n in names if len(done.get(n, ())) < times]:
         with FaultScene() as scene, _Watcher(scene.ports["metrics"]) as watcher:
             time.sleep(0.5)
@@ -185,44 +186,27 @@ def faults(times: int, only: tuple[str, ...] = (), resume: Path | None = None) -
     return [r for n in names for r in _records(n, [Repetition(**d) for d in done[n]])]
 
 
-BATCH = 8  # of each fault, in one daemon
-
-
 def _records(name: str, found: list[Repetition]) -> list[Record]:
-    kind = KINDS[name]
+    kind, n = KINDS[name], len(found)
+    told = ", ".join(f"{part}: {what}" for part, what in kind.named) or "nothing is told"
     seen, gone = np.array([r.seen_s for r in found]), np.array([r.gone_s for r in found])
-    n = len(found)
-    told = ", ".join(f"{part}: {what}" for part, what in kind.named) or "nothing"
-    how = f"{n} times; {sum(r.retried for r in found)} repeated as the machine was too busy"
-    wrong = [w for r in found for w in r.wrong]
-    records = []
-    if kind.named:
-        records.append(
-            Record(
-                f"daemon.faults.{name}_seen", float(seen.max()), "s", f"<= {SEEN_S:g}",
-                f"{told}; median {np.median(seen):.2f}; named rightly "
-                f"{int(np.isfinite(seen).sum())} of {n}", how,
-            )
-        )  # fmt: skip
-        records.append(
-            Record(
-                f"daemon.faults.{name}_gone", float(gone.max()), "s", f"<= {GONE_S:g}",
-                f"median {np.median(gone):.2f}",
-            )
-        )  # fmt: skip
-    records.append(
-        Record(
-            f"daemon.faults.{name}_told_wrongly", len(wrong), "times", "== 0",
-            ", ".join(sorted(set(wrong))) or f"but {told}", "" if kind.named else how,
-        )
-    )  # fmt: skip
-    records.append(
-        Record(
-            f"daemon.faults.{name}_disagreed", sum(r.disagreed for r in found), "looks", "== 0",
-            "tactile_degraded_parts is another number than /health tells",
-        )
-    )  # fmt: skip
-    return records
+    times = [
+        f"{what} after {np.median(of_all):.2f}, at most {of_all.max():.2f} s"
+        for what, of_all in (("told", seen), ("gone", gone))
+    ]
+    notes = [told, *(times if kind.named else ())]
+    if wrong := sorted({w for r in found for w in r.wrong}):
+        notes.append(f"told wrongly: {', '.join(wrong)}")
+    if disagreed := sum(r.disagreed for r in found):
+        notes.append(f"{disagreed} times tactile_degraded_parts was another number")
+    if retried := sum(r.retried for r in found):
+        notes.append(f"{retried} repeated: the machine kept the rig itself waiting")
+    right = sum(_right(r) for r in found)
+    return [Record(f"daemon.faults.{name}", right, f"of {n}", f"== {n}", "; ".join(notes))]
+
+
+def _right(one: Repetition) -> bool:
+    return one.seen_s <= SEEN_S and one.gone_s <= GONE_S and not one.wrong and not one.disagreed
 
 
 def one_of_each() -> list[Record]:

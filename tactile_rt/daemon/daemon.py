@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 from tactile_rt.daemon.admission import file_stamp, model_path
@@ -21,7 +22,7 @@ from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.source_part import SourcePart
-from tactile_rt.daemon.troubles import troubles
+from tactile_rt.daemon.troubles import LossWindow, troubles
 from tactile_rt.version import VERSION
 
 __all__ = ["Daemon"]
@@ -29,6 +30,7 @@ __all__ = ["Daemon"]
 WATCH_S = 0.25
 STARTED_S = 5.0  # what has not started by then is told as degraded instead
 STARVED_S = 1.0  # a watch that has no turn for so long: neither has anybody else
+WAITED_S = 0.25  # for a processor, of the newest second: others take it, or a quota
 LATELY_NS = 1_000_000_000  # how long it is told that it was so, and that the wall clock has jumped
 
 
@@ -71,6 +73,7 @@ class Daemon:
         self._reloads = self._clock_steps = 0
         self._turns: dict[str, int] = {}  # threads that are no parts: when they last turned
         self._starved = (0, 0.0)  # when that ended last, CLOCK_MONOTONIC, ns; how long it was, s
+        self._waits = LossWindow()  # of the watch, for a processor, ns
         self._refused = ""  # why the newest configuration is not in force
         self._stepped_ns = 0  # when the wall clock last jumped, CLOCK_MONOTONIC
         self._unwatch = threading.Event()
@@ -217,7 +220,18 @@ class Daemon:
         ended_ns, lasted_s = self._starved
         if waiting > STARVED_S:
             return waiting
+        if not self._stopping and (waited_s := self._waited_s()) > WAITED_S:
+            return waited_s
         return lasted_s if ended_ns and now - ended_ns < LATELY_NS else 0.0
+
+    def _waited_s(self) -> float:
+        """How long the watch, which wants few and short turns, has waited for a processor within
+        the newest second, s; 0 where the system does not tell."""
+        try:
+            told = Path(f"/proc/self/task/{self._watcher.native_id}/schedstat").read_text()
+            return self._waits.add(int(told.split()[1])).second / 1e9
+        except (OSError, IndexError, ValueError):
+            return 0.0
 
     def turned(self, name: str) -> None:
         """A thread that must go on, and is no part, tells that it does."""
@@ -340,6 +354,7 @@ class Daemon:
             self._starved = now, lasted_s
             why = f"it had no turn for {lasted_s:.1f} s: it was stopped, or the processor was taken"
             self.report("daemon", "starved", why, "warning")
+        self._waited_s()  # so that what it waits from now on is known
 
     def _parts(self) -> list[Part]:
         return [

@@ -216,6 +216,7 @@ class OnDisk:
             now, as it is closed, somebody has stopped the recorder, or it waits for a trigger.
         waits_ns: The host monotonic time since which something that the operating system has waits
             for the medium, ns; 0: nothing does.
+        slow_s: The time for which that may wait, s; 0: for ever.
     """
 
     written_ns: int = 0
@@ -227,6 +228,7 @@ class OnDisk:
     open: bool = False
     meant_ns: int = 0
     waits_ns: int = 0
+    slow_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -38,12 +38,12 @@ class Ledger:
             self._now = _sum(past, done), tuple(file for file in files if file not in done)
         return failed
 
-    def on_disk(self, open: bool, meant_ns: int) -> OnDisk:
+    def on_disk(self, open: bool, meant_ns: int, slow_s: float) -> OnDisk:
         """All of it; from any thread."""
         past, files = self._now
         samples, written_ns, synced_ns = _sum(past, files)
         waits_ns = min((ns for file in files if (ns := file.unsynced_ns)), default=0)
-        return OnDisk(written_ns, synced_ns, samples, *self._lost, open, meant_ns, waits_ns)
+        return OnDisk(written_ns, synced_ns, samples, *self._lost, open, meant_ns, waits_ns, slow_s)
 
 
 def _sum(past: Sums, files: tuple[RecordingWriter, ...]) -> Sums:

@@ -185,12 +185,13 @@ class Recorder(Consumer):
         return {name: self._on_disk(name, ledger) for name, ledger in list(self._ledgers.items())}
 
     def _on_disk(self, name: str, ledger: Ledger) -> OnDisk:
-        track = self._tracks.get(name)
+        track, sync_s = self._tracks.get(name), self._config.sync_s
+        slow_s = 2 * sync_s + SLOW_S if sync_s else 0.0
         if track is None:
-            return ledger.on_disk(open=False, meant_ns=0)
+            return ledger.on_disk(open=False, meant_ns=0, slow_s=slow_s)
         wanted = self._config.mode == "always" or track.until_ns > 0
-        meant = self._on and wanted and not track.closed_ns
-        return ledger.on_disk(open=track.file is not None, meant_ns=track.since_ns if meant else 0)
+        meant_ns = track.since_ns if self._on and wanted and not track.closed_ns else 0
+        return ledger.on_disk(track.file is not None, meant_ns, slow_s)
 
     def details(self) -> dict[str, str | int | float]:
         tracks = list(self._tracks.values())
@@ -211,14 +212,10 @@ class Recorder(Consumer):
             return f"less than min_free_mb = {self._config.min_free_mb:g} MB free: {self._folder}"
         if self._why or not self._on:
             return self._why
-        slow_s = 2 * self._config.sync_s + SLOW_S
-        now = time.monotonic_ns()
         for name, track in list(self._tracks.items()):
             disk = self._on_disk(name, track.ledger)
             if track.trouble and disk.meant_ns:
                 return track.trouble
-            if self._config.sync_s and disk.waits_ns and now - disk.waits_ns > slow_s * NS:
-                return f"a power cut would take more than {slow_s:g} s of {name}: a slow disk"
         return ""
 
     def _take(self, item: Item) -> None:

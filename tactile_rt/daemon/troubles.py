@@ -11,10 +11,13 @@ A trouble is one line that stays the same as long as what it says is true: it ho
 counts on. The numbers are in the snapshot.
 """
 
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Sequence
+
+from msgspec import structs
 
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.health import (
@@ -90,6 +93,8 @@ def troubles(
     if starved_s:
         why = "it had no turn: it was stopped, or another program took the processor"
         found.append(Trouble("daemon", "late", why))
+        # none of its parts is to blame for what came late meanwhile; but what is lost is lost
+        limits = structs.replace(limits, sample_age_s=math.inf, behind_s=math.inf)
     if clock_stepped:
         found.append(Trouble("daemon", "UTC has jumped", "the wall clock was set"))
     if refused:
@@ -111,13 +116,12 @@ def _of_source(
 ) -> list[Trouble]:
     part, device = source.part, source.device
     name = part.name
-    if _broken(part):
-        return (
-            [] if starved and part.state == "stalled" else [Trouble(name, "no samples", _why(part))]
-        )
+    if _broken(part, starved):
+        return [Trouble(name, "no samples", _why(part))]
     if part.state != "running":
         return []
-    if device is not None and device.state in (State.STALE, State.LOST):
+    away = (State.LOST,) if starved else (State.STALE, State.LOST)
+    if device is not None and device.state in away:
         return [Trouble(name, "no samples", f"the device is {device.state}")]
     found = []
     if source.live and source.newest_ns:
@@ -143,15 +147,13 @@ def _of_model(
     model: ModelState, limits: LimitsConfig, now_ns: int, still: str, starved: bool
 ) -> list[Trouble]:
     part = model.part
-    if _broken(part):
-        if starved and part.state == "stalled":
-            return []
+    if _broken(part, starved):
         return [Trouble(part.name, "no decisions", _why(part), still)]
     if part.state == "starting" and now_ns - part.since_ns > limits.behind_s * NS:
         return [Trouble(part.name, "no decisions", "it is still being tried and loaded", still)]
     if part.state != "running":
         return []
-    if model.behind_s > limits.behind_s and not starved:
+    if model.behind_s > limits.behind_s:
         return [
             Trouble(
                 part.name, "late decisions", f"it is more than {limits.behind_s:g} s behind", still
@@ -179,13 +181,11 @@ def _of_consumer(
     missing = "not published"
     if not part.name.startswith("publisher."):
         missing = "no recording" if consumer.kind == "recorder" else f"no {consumer.kind}"
-    if _broken(part):
-        if starved and part.state == "stalled":
-            return []
+    if _broken(part, starved):
         return [Trouble(part.name, missing, _why(part), still)]
     if part.state not in ("running", "starting"):
         return []
-    if consumer.behind_s > limits.behind_s and not starved:
+    if consumer.behind_s > limits.behind_s:
         why = f"it is more than {limits.behind_s:g} s behind"
     elif consumer.trouble:
         why = consumer.trouble
@@ -205,6 +205,8 @@ def _unrecorded(
         disk = consumer.on_disk.get(name)
         if disk is None:
             continue
+        if disk.slow_s and disk.waits_ns and now_ns - disk.waits_ns > disk.slow_s * NS:
+            return f"a power cut would take more than {disk.slow_s:g} s of {name}: a slow disk"
         if disk.lost_ns and now_ns - disk.lost_ns < SECOND_S * NS:
             return f"samples of {name} are lost: {disk.lost_why}"
         if not disk.meant_ns or not source.live or not source.read_ns:
@@ -216,9 +218,11 @@ def _unrecorded(
     return ""
 
 
-def _broken(part: PartState) -> bool:
+def _broken(part: PartState, starved: bool) -> bool:
+    if part.state == "stalled":
+        return not starved
     # While it is tried again it is not well yet.
-    broken = part.state in ("waiting", "stalled", "failed")
+    broken = part.state in ("waiting", "failed")
     return broken or (part.state == "starting" and part.failures > 0)
 
 

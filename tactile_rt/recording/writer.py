@@ -292,8 +292,10 @@ class RecordingWriter:
             raise self.failed
 
     def _flushed(self) -> None:
-        self.flushed = Extent(self.stats.samples, self.stats.packets, self._newest_ns)
-        self.unsynced_ns = self.unsynced_ns or time.monotonic_ns()
+        extent = Extent(self.stats.samples, self.stats.packets, self._newest_ns)
+        if extent != self.flushed and not self.unsynced_ns:
+            self.unsynced_ns = time.monotonic_ns()
+        self.flushed = extent
 
     def _sync_soon(self, last: bool = False) -> None:
         job = partial(self._sync, os.dup(self._raw.fileno()), last)

@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_rt.daemon import recorder
 from tactile_rt.daemon.items import Closed, Contact, Control
 from tactile_rt.recording import Recording, recover
 from tactile_rt.testing import cut
@@ -133,23 +132,19 @@ def test_a_medium_that_is_slow_holds_up_nothing(daemon, tmp_path, medium):
     assert seqs(tmp_path) == list(range(400))
 
 
-def test_a_medium_that_hangs_is_told_from_when_something_waits_for_it(
-    daemon, tmp_path, medium, monkeypatch
-):
-    monkeypatch.setattr(recorder, "SLOW_S", 0.05)
+def test_since_when_something_waits_for_the_medium_is_known(daemon, tmp_path, medium):
     made = begun(daemon, tmp_path, min_free_mb=0, sync_s=1e-6)
     made.handle([opened(), samples(CHUNKS[0], at=time.monotonic_ns() - 60 * 10**9)])
-    until(lambda: on_disk(made).synced_ns)
-    monkeypatch.setattr(recorder, "SLOW_S", 60.0)
+    until(lambda: (look(made), on_disk(made).waits_ns == 0)[1])
     medium.open.clear()
+    at = time.monotonic_ns()
     made.handle([samples(CHUNKS[1])])  # a minute after the last one
     look(made)
     until(lambda: medium.together == 1)
-    assert on_disk(made).waits_ns and made.trouble() == ""
-    monkeypatch.setattr(recorder, "SLOW_S", 0.05)
-    until(lambda: "a slow disk" in made.trouble())
+    assert at < on_disk(made).waits_ns < time.monotonic_ns()
+    assert on_disk(made).slow_s == pytest.approx(2.0, abs=0.01)
     medium.open.set()
-    until(lambda: (look(made), made.trouble() == "")[1])
+    until(lambda: (look(made), on_disk(made).waits_ns == 0)[1])
     made.close()
     assert on_disk(made).waits_ns == 0
 

@@ -141,6 +141,9 @@ def test_a_consumer_is_named_by_what_it_did_not_hand_on(changes, words):
         (replace(DISK, written_ns=NOW - 2 * S), {"flowing_ns": NOW - 2 * S},
          "samples of a are not on the disk after 1 s"),
         (replace(DISK, written_ns=NOW - 2 * S), {"rate_hz": 1.0}, ""),
+        (replace(DISK, waits_ns=NOW - 5 * S, slow_s=4.0), {},
+         "a power cut would take more than 4 s of a: a slow disk"),
+        (replace(DISK, waits_ns=NOW - 3 * S, slow_s=4.0), {}, ""),
         # nothing came that could be written
         (replace(DISK, written_ns=NOW - 9 * S), {"newest_ns": NOW - 9 * S, "read_ns": NOW - 9 * S},
          ""),
