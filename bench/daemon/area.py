@@ -2,6 +2,7 @@
 
 from bench.daemon.chaos import chaos
 from bench.daemon.kills import kill_nine
+from bench.daemon.overload import overload
 from bench.daemon.power import power_cuts
 from bench.daemon.soak import soak_records
 from bench.daemon.soak_rig import QUICK_S, WHOLE_S, soak
@@ -13,4 +14,5 @@ __all__ = ["run"]
 def run(quick: bool) -> list[Record]:
     """Measure; quick: two minutes, else half an hour."""
     records = soak_records(soak(QUICK_S if quick else WHOLE_S))
-    return [*records, *chaos(quick), *kill_nine(quick), *power_cuts(quick)]
+    records += [*chaos(quick), *kill_nine(quick), *power_cuts(quick), *overload(quick)]
+    return records

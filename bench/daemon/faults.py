@@ -1,5 +1,6 @@
 """Is every fault told, rightly, soon, and no longer than it lasts; and nothing else?
 
+tactile-rt bench daemon --faults [--resume faults.json]
 python -m bench.daemon.faults [--times 40] [--only NAME ...] [--resume faults.json]
 
 Each fault is caused by real means in a daemon under way with two arrays. Another thread asks
@@ -24,8 +25,9 @@ from rich.console import Console
 from bench.daemon.fault_kinds import KINDS, FaultKind, FaultScene, Named, may_mount
 from tactile_rt.evidence.records import Record, show, write
 
-__all__ = ["faults", "one_of_each"]
+__all__ = ["TIMES", "faults"]
 
+TIMES = 40
 ASK_S = 0.02
 SEEN_S, GONE_S = 1.0, 2.0  # stated
 HOLD_S = 1.2  # that a fault lasts after it is seen, for what else might be told
@@ -209,15 +211,10 @@ def _right(one: Repetition) -> bool:
     return one.seen_s <= SEEN_S and one.gone_s <= GONE_S and not one.wrong and not one.disagreed
 
 
-def one_of_each() -> list[Record]:
-    """Every fault once."""
-    return faults(1)
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--times", type=int, default=40)
+    parser.add_argument("--times", type=int, default=TIMES)
     parser.add_argument("--only", nargs="*", default=[])
     parser.add_argument("--resume", type=Path)
     parser.add_argument("--json", type=Path)

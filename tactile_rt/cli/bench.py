@@ -34,18 +34,32 @@ def bench(
         bool, typer.Option("--quick", help="Fewer repetitions: a look, not a figure.")
     ] = False,
     json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
+    faults: Annotated[
+        bool, typer.Option("--faults", help="Of daemon: cause each fault of its world 40 times.")
+    ] = False,
+    resume: Annotated[
+        Path | None, typer.Option(help="With --faults: keep each here, and go on from there.")
+    ] = None,
 ) -> None:
     """Measure speed and accuracy, each figure beside its bar and what it is compared to."""
     from tactile_rt.evidence.records import show, write
 
     if area is not None and area not in AREAS:
         raise ConfigError(f"no benchmark area {area!r}: there are {', '.join(AREAS)}")
+    if faults and area != "daemon":
+        raise ConfigError("--faults are those of the daemon: tactile-rt bench daemon --faults")
+    if resume is not None and not faults:
+        raise ConfigError("--resume goes with --faults")
     check_output(json)
     progress, records = Console(stderr=True), []
     for name in [area] if area else AREAS:
         with progress.status(f"measuring {name}"):
             try:
-                records += _rig(name).run(quick)
+                if faults:
+                    rig = _rig(name, "faults")
+                    records += rig.faults(2 if quick else rig.TIMES, resume=resume)
+                else:
+                    records += _rig(name).run(quick)
             except ModuleNotFoundError as error:
                 raise needs(AREAS[name], error) from None
     show(records, Console())
@@ -55,8 +69,8 @@ def bench(
         write(records, json)
 
 
-def _rig(area: str) -> Any:
-    """The module that measures an area.
+def _rig(area: str, module: str = "area") -> Any:
+    """The module that measures an area, or some of it.
 
     Raises:
         ConfigError: This install has none: it is no checkout.
@@ -68,4 +82,4 @@ def _rig(area: str) -> Any:
         )
     if sys.path[0] != str(CHECKOUT):
         sys.path.insert(0, str(CHECKOUT))  # first, lest that `bench` be imported
-    return import_module(f"bench.{area}.area")
+    return import_module(f"bench.{area}.{module}")
