@@ -165,3 +165,17 @@ def test_many_writers_and_a_reader_lose_nothing_that_is_not_counted():
     reader.join()
     assert 2 * len(found) == made.state.taken["a"]
     assert made.state.taken["a"] + made.dropped["a"] == 4000
+
+
+@pytest.mark.parametrize("way", ["got", "dropped"])
+def test_an_urgent_one_that_is_gone_lets_others_come_together_again(way):
+    made, items = queue(items=9, size=100, urgent=("b",), gather_s=PATIENCE_S), []
+    made.put(("b", 1, 60))
+    if way == "got":
+        made.get(0)
+    made.put(("a", 1, 60))  # there is no room for both
+    reader = started(lambda: items.extend(made.take(PATIENCE_S)))
+    until(lambda: made._waiting or items)
+    made.put(("b", 1, 20))
+    reader.join(PATIENCE_S)
+    assert items == [("a", 1, 60), ("b", 1, 20)]

@@ -311,3 +311,13 @@ def test_no_sensor_of_a_known_noise_is_taken_for_frozen(ratio, seed):
     for chunk in cut(rounded, rate, 7):
         judge.add(chunk)
         assert judge.seconds == 0.0
+
+
+@pytest.mark.parametrize("resolution", [0.25, 0.5, 1.0])  # standard deviations of the noise
+def test_the_chance_of_equal_readings_is_that_of_noise_that_is_rounded(resolution):
+    spec = small_spec(elements=2, rate_hz=2.0)
+    drawn = np.round(np.random.default_rng(0).normal(size=2_000_000) / resolution)
+    chance = float((drawn[1:] == drawn[:-1]).mean()) ** 2  # both elements
+    pairs = frozen_after(spec, sensor(1.0, resolution)) * spec.rate_hz
+    assert chance**pairs <= 1e-12 * 1.2
+    assert chance ** (pairs - 1) >= 1e-12 / 1.2
