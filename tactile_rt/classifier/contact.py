@@ -148,6 +148,8 @@ class ContactDetector:
         return excess
 
     def _wait(self, sample: NDArray[np.float32], valid: NDArray[np.bool_]) -> None:
+        if not valid.any():  # it says nothing, and takes no place in the baseline of one that did
+            return
         quiet = np.where(valid[:, None], sample, 0.0).astype(np.float64)
         self._pending.append((quiet, valid.copy()))
 

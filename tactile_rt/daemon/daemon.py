@@ -17,7 +17,7 @@ from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
-from tactile_rt.daemon.lock import AlreadyRunning, Locks, lock_keys
+from tactile_rt.daemon.lock import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
@@ -61,6 +61,7 @@ class Daemon:
     ) -> None:
         self._on_over = on_over
         self._loaded, self._clock, self._locks = loaded, clock or Clock(), locks
+        self._configured: list[str] = []  # the names of its file that are held
         self._freeze = freeze
         self._hub = Hub()
         self._sources: dict[str, SourcePart] = {}
@@ -84,8 +85,7 @@ class Daemon:
 
     def start(self) -> None:
         """Start all parts; returns at once."""
-        if self._locks is not None:
-            self._locks.hold(_keys(self._loaded))
+        self._hold(self._loaded, lock_keys(self._loaded.path, []))
         # Consumers first: they are to hear of everything.
         ready, self._ready = self._ready, []
         with self._changing:
@@ -112,8 +112,7 @@ class Daemon:
                 for name, w in wanted.items()
                 if name not in self._consumers or self._consumers[name][0] != w.key
             }
-            if self._locks is not None:
-                self._locks.hold(_keys(loaded))
+            self._hold(loaded, lock_keys(loaded.path, []))
             self._loaded, self._refused = loaded, ""
             self._reloads += 1
             gone = [n for n in self._consumers if n not in wanted or n in new]
@@ -343,9 +342,18 @@ class Daemon:
     def _hold_devices(self) -> None:
         """A link to a device that was plugged in again leads to another one: that is held now, and
         the one before is free for others."""
-        if self._locks is not None:
-            with suppress(AlreadyRunning):  # then opening it fails, and says so
-                self._locks.hold(_keys(self._loaded))
+        if self._changing.acquire(blocking=False):
+            try:
+                with suppress(AlreadyRunning):  # then opening it fails, and says so
+                    self._hold(self._loaded, self._configured)
+            finally:
+                self._changing.release()
+
+    def _hold(self, loaded: Loaded, configured: list[str]) -> None:
+        """Have the devices of a configuration, and its file under these names, to ourselves."""
+        if self._locks is not None and not self._stopping:
+            self._locks.hold([*configured, *device_keys([s.url for s in loaded.config.source])])
+            self._configured = configured
 
     def _notice_starving(self) -> None:
         now = time.monotonic_ns()
@@ -376,7 +384,3 @@ class Daemon:
         if self._degraded and not lines:
             self.report("daemon", "running", "all parts work again")
         self._degraded = lines
-
-
-def _keys(loaded: Loaded) -> list[str]:
-    return lock_keys(loaded.path, [s.url for s in loaded.config.source])

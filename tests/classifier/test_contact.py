@@ -333,3 +333,12 @@ def test_a_constant_that_is_exact_in_binary_has_no_noise() -> None:
     assert feed(detector, samples) == []
     assert (detector.offset == np.float32(0.125)).all()
     assert (detector.sigma == FLOOR).all()
+
+
+def test_a_sensor_that_comes_back_in_the_middle_of_a_touch_does_not_take_it_for_its_baseline():
+    detector, touch = taught(), np.float32(1000 * RATED)
+    feed(detector, noise(300, 1), itertools.repeat(~ALL))  # longer than the baseline
+    assert feed(detector, noise(60, 2) + touch) != []
+    feed(detector, noise(60, 3))
+    assert not detector.contact
+    assert feed(detector, noise(300, 4)) == []

@@ -59,8 +59,10 @@ def live(tmp_path_factory):
     folder = tmp_path_factory.mktemp("live")
     (path,) = daemon_records(
         folder,
-        '[[model]]\nfile = "{model}"\n'
+        # A busy machine skips none.
+        '[[model]]\nfile = "{model}"\ncatch_up = "all"\n'
         '[[model]]\nname = "last"\nfile = "{model}"\ndecisions = "final"\nmode = "sliding"\n'
+        'catch_up = "all"\n'
         '[recorder]\nfolder = "rec"\nmin_free_mb = 0\n',
     )
     return path, folder / "tiny.onnx"
