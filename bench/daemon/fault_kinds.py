@@ -228,14 +228,16 @@ def _reader_stalls(scene: FaultScene) -> Iterator[float]:
     scene.read_pipe(True)
 
 
-def _page_flooded(scene: FaultScene) -> Iterator[float]:
-    with ExitStack() as stack:
-        for _ in range(FLOOD):
-            line = socket.socket()
-            stack.callback(line.close)
-            line.setblocking(False)
-            line.connect_ex(("127.0.0.1", scene.ports["page"]))
-        yield time.monotonic()
+def _flooded(port: str) -> Callable[[FaultScene], Iterator[float]]:
+    def cause(scene: FaultScene) -> Iterator[float]:
+        with ExitStack() as stack:
+            for _ in range(FLOOD):
+                line = stack.enter_context(socket.socket())
+                line.setblocking(False)
+                line.connect_ex(("127.0.0.1", scene.ports[port]))
+            yield time.monotonic()
+
+    return cause
 
 
 def _peer_that_never_reads(scene: FaultScene) -> Iterator[float]:
@@ -249,16 +251,6 @@ def _peer_that_never_reads(scene: FaultScene) -> Iterator[float]:
         peer.connect(f"tcp://127.0.0.1:{scene.ports['zmq']}")
         yield time.monotonic()
     context.destroy(0)
-
-
-def _publisher_flooded(scene: FaultScene) -> Iterator[float]:
-    with ExitStack() as stack:
-        for _ in range(FLOOD):
-            line = socket.socket()
-            stack.callback(line.close)
-            line.setblocking(False)
-            line.connect_ex(("127.0.0.1", scene.ports["zmq"]))
-        yield time.monotonic()
 
 
 def _clock_set(scene: FaultScene) -> Iterator[float]:
@@ -448,9 +440,9 @@ KINDS: dict[str, FaultKind] = {
     "reader_of_a_pipe_stalls": FaultKind(
         _reader_stalls, (("publisher.jsonl", "not published"),)
     ),
-    "page_flooded": FaultKind(_page_flooded, (("page", "no page"),)),
+    "page_flooded": FaultKind(_flooded("page"), (("page", "no page"),)),
     "publisher_flooded": FaultKind(
-        _publisher_flooded, (("publisher.zmq", "not published"),)
+        _flooded("zmq"), (("publisher.zmq", "not published"),)
     ),
     "peer_never_reads": FaultKind(_peer_that_never_reads),
     "wall_clock_set": FaultKind(_clock_set, (("daemon", "UTC has jumped"),), lasts=False),
