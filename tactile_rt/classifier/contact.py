@@ -5,6 +5,7 @@ baseline (offset and noise) that it measured while nothing was touched.
 """
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,13 @@ BASELINE_SAMPLES = 100  # the baseline is the mean of at most this many of the l
 GUARD_SAMPLES = 15
 FIRST_GUARD_SAMPLES = 5
 RELEASE_SAMPLES = 20
+# A level to which the signal returns so often within one contact is that of rest: the tare was
+# taken while something was touched.
+RETURNS = 3
+LEVELS = 8  # that are remembered
+STRETCH_SAMPLES = 20
+WILD_Z2, WILD_SAMPLES = 60.0, 2  # from the median: so many of a still stretch may be further away
+SAME_Z2 = 60.0  # of the medians of two stretches
 
 # Exponential means of rate r: the sample itself, and means over about 7 and 19 samples (2/r - 1).
 RATES = np.array([1.0, 0.25, 0.1], dtype=np.float32)
@@ -63,6 +71,11 @@ class ContactDetector:
         shape: (element, channel).
         floor: (channel,) smallest sigma assumed, SI.
 
+    A tare that was taken while something was touched, as by an array that is plugged in again in
+    the middle of a touch, would be a contact without end. So within a contact still stretches of 20
+    samples are looked for. Once the signal has come back to the level of one of them three times,
+    and was there for longer than it was ever quiet on the tare, that level is the new tare.
+
     An element that is not trusted neither touches nor tares: its baseline is that of its own
     trusted samples, and it is left out until it has enough of them.
 
@@ -97,6 +110,8 @@ class ContactDetector:
         self._suspicious_for = np.zeros(shape[0], dtype=np.int64)
         self._above: NDArray[np.bool_] = np.zeros(shape[0], dtype=np.bool_)
         self._quiet_for = 0
+        self._quiet = 0  # samples that were quiet, ever
+        self._rest = _Rest()
 
     @property
     def ready(self) -> bool:
@@ -123,6 +138,7 @@ class ContactDetector:
         if begins:
             self.contact = True
             self._quiet_for = 0
+            self._rest = _Rest()
             # What came before the onset is known to be quiet now, and need not wait.
             self._learn(max(FIRST_GUARD_SAMPLES, int(self._suspicious_for[certain].max())))
             self.doubted = len(self._pending) + 1  # and the one that was above its threshold first
@@ -131,6 +147,8 @@ class ContactDetector:
             self._quiet_for = 0 if (excess > RELEASE).any() else self._quiet_for + 1
             if self._quiet_for >= RELEASE_SAMPLES:
                 self.contact = False
+            elif self._rest.found(sample, valid & self.tared, self._pooled, self._quiet):
+                self._tare_anew()
         elif not above.any():
             self._wait(sample, valid)
             self._learn(GUARD_SAMPLES)
@@ -150,8 +168,24 @@ class ContactDetector:
     def _wait(self, sample: NDArray[np.float32], valid: NDArray[np.bool_]) -> None:
         if not valid.any():  # it says nothing, and takes no place in the baseline of one that did
             return
+        self._quiet += 1
         quiet = np.where(valid[:, None], sample, 0.0).astype(np.float64)
         self._pending.append((quiet, valid.copy()))
+
+    def _tare_anew(self) -> None:
+        """What was taken for a touch since long is rest."""
+        self.contact = False
+        self._above = np.zeros_like(self._above)
+        self._suspicious_for = np.zeros_like(self._suspicious_for)
+        self._means = np.zeros_like(self._means)
+        self._pending.clear()
+        self._baseline.clear()
+        self._quiet = 0
+        for total in (self._count, self._sum, self._sum_of_squares):
+            total[...] = 0
+        for sample, valid in self._rest.block:
+            self._wait(sample, valid)
+        self._learn(0)
 
     def _learn(self, guard: int) -> None:
         """Let all but the latest `guard` waiting samples into the baseline."""
@@ -183,3 +217,73 @@ class ContactDetector:
         # Twenty samples underestimate an element's own noise often enough to raise false onsets:
         # for detection no element counts as quieter than the typical one.
         self._pooled = np.maximum(self.sigma, np.median(self.sigma[self.tared], axis=0))
+
+
+class _Rest:
+    """The level to which a signal keeps coming back within a contact.
+
+    Attributes:
+        block: The samples of the stretch under way, with their validity.
+    """
+
+    def __init__(self) -> None:
+        self.block: list[tuple[NDArray[np.float32], NDArray[np.bool_]]] = []
+        self._levels: deque[_Level] = deque(maxlen=LEVELS)
+        self._at: _Level | None = None  # None: it moves
+
+    def found(
+        self,
+        sample: NDArray[np.float32],
+        known: NDArray[np.bool_],
+        sigma: NDArray[np.float32],
+        quiet: int,
+    ) -> bool:
+        """Take one sample; whether it completes a stretch of rest.
+
+        Args:
+            sample: (element, channel) SI.
+            known: (element,) elements to trust.
+            sigma: (element, channel) the noise per sample, SI.
+            quiet: samples that were ever quiet on the tare.
+        """
+        if len(self.block) == STRETCH_SAMPLES:
+            self.block = []
+        self.block.append((sample.copy(), known))
+        if len(self.block) < STRETCH_SAMPLES:
+            return False
+        stretch = np.array([values for values, _ in self.block])[:, known := self._known()]
+        median = np.median(stretch, axis=0)
+        away = np.square((stretch - median) / sigma[known]).sum(axis=2)  # (sample, element)
+        if not known.any() or ((away > WILD_Z2).sum(axis=0) > WILD_SAMPLES).any():
+            self._at = None
+            return False
+        level = np.full(sigma.shape, np.nan, dtype=np.float32)
+        level[known] = median
+        if self._at is None or not self._at.near(level, sigma):
+            near = (other for other in self._levels if other.near(level, sigma))
+            self._at = next(near, None) or self._new(level)
+            self._at.returns += 1
+        self._at.samples += STRETCH_SAMPLES
+        return self._at.returns >= RETURNS and self._at.samples > quiet
+
+    def _known(self) -> NDArray[np.bool_]:
+        """(element,) those that are to be trusted in all of the stretch."""
+        all_of_them: NDArray[np.bool_] = np.logical_and.reduce([known for _, known in self.block])
+        return all_of_them
+
+    def _new(self, median: NDArray[np.float32]) -> "_Level":
+        self._levels.append(level := _Level(median))
+        return level
+
+
+@dataclass
+class _Level:
+    median: NDArray[np.float32]  # (element, channel) NaN: not known
+    returns: int = 0
+    samples: int = 0
+
+    def near(self, median: NDArray[np.float32], sigma: NDArray[np.float32]) -> bool:
+        """Whether the median of another stretch is the same, but for noise."""
+        # The variance of a median is pi / 2 times that of a mean, and there are two of them.
+        z2 = np.square((median - self.median) / sigma).sum(axis=1) * STRETCH_SAMPLES / np.pi
+        return not (z2 > SAME_Z2).any()

@@ -342,3 +342,59 @@ def test_a_sensor_that_comes_back_in_the_middle_of_a_touch_does_not_take_it_for_
     feed(detector, noise(60, 3))
     assert not detector.contact
     assert feed(detector, noise(300, 4)) == []
+
+
+REST, TOUCH, MOVE = 60, 40, 10  # samples
+
+
+def touches(how_many: int, size: float = 100.0, seed: int = 0) -> np.ndarray:
+    """(n, element, channel) touches, each with a way there, a hold of its own and a way back."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for _ in range(how_many):
+        load = size * RATED * rng.normal(size=(ELEMENTS, CHANNELS))
+        way = np.linspace(0, 1, MOVE)[:, None, None]
+        hold = np.ones((TOUCH, 1, 1))
+        parts.append(np.concatenate([np.zeros((REST, 1, 1)), way, hold, way[::-1]]) * load)
+    clean = np.concatenate(parts)
+    return (clean + noise(len(clean), seed + 1)).astype(np.float32)
+
+
+def test_a_tare_that_was_taken_in_a_touch_is_found_out_wherever_it_was_taken() -> None:
+    samples = touches(7)
+    touch = REST + TOUCH + 2 * MOVE
+    for start in range(0, touch, 3):
+        detector = new()
+        contact = []
+        for sample in samples[start:]:
+            detector.update(sample, ALL)
+            contact.append(detector.contact)
+        # From the fifth touch on all is as it was never otherwise.
+        ends = np.arange(5, 8) * touch - start
+        for end in ends:
+            assert contact[end - MOVE - 5], (start, end)
+            assert not contact[end - touch + REST - 5], (start, end)
+
+
+@pytest.mark.parametrize("wild", [0, 25])
+def test_what_is_held_for_long_is_not_taken_for_rest(wild: int) -> None:
+    """Though now and then a sample is wild, and the hand moves to other places and back."""
+    detector = taught()
+    hold = touches(9, seed=3) + (1000 * RATED).astype(np.float32)
+    still = (noise(600, 5) + 1000 * RATED).astype(np.float32)
+    if wild:
+        hold[::wild], still[::wild] = 1.0, 1.0
+    # It was quiet for longer than anything is held.
+    feed(detector, noise(1000, 9))
+    assert len(feed(detector, still)) == 1
+    for sample in np.concatenate([hold, still]):
+        detector.update(sample, ALL)
+        assert detector.contact
+
+
+def test_a_hold_without_a_move_is_never_taken_for_rest() -> None:
+    detector = taught()
+    still = (noise(6000, 5) + 1000 * RATED).astype(np.float32)
+    still[::130] = 1.0  # glitches are no moves
+    feed(detector, still)
+    assert detector.contact
