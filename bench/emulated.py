@@ -5,8 +5,10 @@ costs is not on the bill of what is measured; it is told what to do through a pi
 """
 
 import itertools
+import os
 import time
 from array import array
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection
 from typing import Any
@@ -37,6 +39,7 @@ FIFO_BYTES = 64 << 20
 GAP = 20  # samples from one that is missing, or damaged, to the next, in such a mood
 LOOP_S = 6.0  # of bumps, that come again and again: four of them
 PIECE_S = 0.064
+PRIORITY = -15
 # Each strikes within a moment, so that what is undisturbed is known; none beside another.
 KINDS = (
     Fault("bit_flip", at_s=1.0, amount=3),
@@ -285,6 +288,8 @@ def play(pipe: Connection, script: ArrayScript) -> None:
     done), ``end`` (of what is measured; say when), ``done`` (say whether), ``where`` (in words),
     ``played`` (a `Played`).
     """
+    with suppress(OSError):  # a device has a processor of its own; where that is allowed
+        os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
     with EmulatedArray(script) as device:
         pipe.send(device.url)
         while True:

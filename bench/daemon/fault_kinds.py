@@ -343,7 +343,9 @@ def _garbage_configuration(scene: FaultScene) -> Iterator[float]:
 def _garbage_model(scene: FaultScene) -> Iterator[float]:
     scene.put_model(b"no model\n" * 1000)
     yield time.monotonic()
+    since = scene.mark()
     scene.put_model(scene.good_model)
+    scene.await_told(since, "model.whiskers", "admitted")  # its trial reads the file, too
 
 
 def _greedy_model(scene: FaultScene) -> Iterator[float]:

@@ -14,6 +14,7 @@ skipped, see `tactile_rt.classifier.skips`.
 """
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,6 +43,7 @@ EVERY = 4
 BEHIND_STEPS, BEHIND_S = 3, 0.15
 # Far beyond any load, and far below where squares of float32 overflow.
 ABSURD = 1e9
+TOUCHES = 256
 
 
 @dataclass(frozen=True)
@@ -150,6 +152,8 @@ class Classifier:
         detector: The contact detector, which holds the stream's contact state and tare.
         tared: (element, channel) The last resampled sample less the tare, SI; zeros before the
             tare. The next `push` overwrites it.
+        touches: When contact began (t_ns, True) or ended (t_ns, False), the newest 256; whoever
+            reads them takes them out.
         stats: The counters of steps, late steps and bad samples.
         skips: The stretches of the stream that the network skips.
         providers: Names of the execution providers in use, as onnxruntime has them.
@@ -193,6 +197,7 @@ class Classifier:
         order = fit_source(model, self.card, spec)
         self.detector = ContactDetector(spec.shape, np.array(self.card.floor, dtype=np.float32))
         self.tared = np.zeros(spec.shape, dtype=np.float32)
+        self.touches: deque[tuple[int, bool]] = deque(maxlen=TOUCHES)
         self.stats = ClassifierStats()
         self.providers: tuple[str, ...] = tuple(session.get_providers())
         self._sliding = mode == "sliding"
@@ -273,7 +278,10 @@ class Classifier:
     def _sample(
         self, t_ns: int, sample: NDArray[np.float32], valid: NDArray[np.bool_]
     ) -> Classification | None:
+        touched = self.detector.contact
         begins = self.detector.update(sample, valid)
+        if self.detector.contact != touched:
+            self.touches.append((t_ns, not touched))
         # An element without a trustworthy value, or without a tare, reads as untouched.
         untouched = ~(valid & self.detector.tared)
         np.subtract(sample, self.detector.offset, out=self.tared)

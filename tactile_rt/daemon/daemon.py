@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from tactile_rt.daemon.admission import file_stamp, model_path
@@ -22,16 +21,15 @@ from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.source_part import SourcePart
-from tactile_rt.daemon.troubles import LossWindow, troubles
+from tactile_rt.daemon.troubles import troubles
+from tactile_rt.daemon.turns import Turns
 from tactile_rt.version import VERSION
 
 __all__ = ["Daemon"]
 
 WATCH_S = 0.25
 STARTED_S = 5.0  # what has not started by then is told as degraded instead
-STARVED_S = 1.0  # a watch that has no turn for so long: neither has anybody else
-WAITED_S = 0.25  # for a processor, of the newest second: others take it, or a quota
-LATELY_NS = 1_000_000_000  # how long it is told that it was so, and that the wall clock has jumped
+LATELY_NS = 1_000_000_000  # how long it is told that the wall clock has jumped
 
 
 class Daemon:
@@ -72,9 +70,7 @@ class Daemon:
         self._starting, self._stopping = True, False
         self._degraded: tuple[str, ...] = ()
         self._reloads = self._clock_steps = 0
-        self._turns: dict[str, int] = {}  # threads that are no parts: when they last turned
-        self._starved = (0, 0.0)  # when that ended last, CLOCK_MONOTONIC, ns; how long it was, s
-        self._waits = LossWindow()  # of the watch, for a processor, ns
+        self._turns = Turns()
         self._refused = ""  # why the newest configuration is not in force
         self._stepped_ns = 0  # when the wall clock last jumped, CLOCK_MONOTONIC
         self._unwatch = threading.Event()
@@ -173,8 +169,9 @@ class Daemon:
         models = tuple(p.model_state for _, p in self._models.copy().values())
         consumers = tuple(p.consumer_state for _, p in self._consumers.copy().values())
         now = self._clock.monotonic_ns()
+        starved_s = 0.0 if self._stopping else self._turns.starved_s(self._watcher.native_id)
         found = troubles(
-            sources, models, consumers, self._loaded.config.limits, now, self._starved_s(),
+            sources, models, consumers, self._loaded.config.limits, now, starved_s,
             bool(self._stepped_ns) and now - self._stepped_ns < LATELY_NS, self._refused,
         )  # fmt: skip
         state = "degraded" if found else "running"
@@ -211,37 +208,14 @@ class Daemon:
         """UTC less monotonic time, now."""
         return self._clock.utc_offset_ns()
 
-    def _starved_s(self) -> float:
-        """How long the whole process had no turn, lately, s."""
-        now = time.monotonic_ns()
-        since = self._turns.get("watch")
-        waiting = (now - since) / 1e9 if since and not self._stopping else 0.0
-        ended_ns, lasted_s = self._starved
-        if waiting > STARVED_S:
-            return waiting
-        if not self._stopping and (waited_s := self._waited_s()) > WAITED_S:
-            return waited_s
-        return lasted_s if ended_ns and now - ended_ns < LATELY_NS else 0.0
-
-    def _waited_s(self) -> float:
-        """How long the watch, which wants few and short turns, has waited for a processor within
-        the newest second, s; 0 where the system does not tell."""
-        try:
-            told = Path(f"/proc/self/task/{self._watcher.native_id}/schedstat").read_text()
-            return self._waits.add(int(told.split()[1])).second / 1e9
-        except (OSError, IndexError, ValueError):
-            return 0.0
-
     def turned(self, name: str) -> None:
         """A thread that must go on, and is no part, tells that it does."""
-        self._turns[name] = time.monotonic_ns()
+        self._turns.take(name)
 
     def silent(self) -> Mapping[str, float]:
         """How long the current turn of each thread that must go on has taken, s."""
-        now = time.monotonic_ns()
-        turns = {} if self._stopping else self._turns.copy()
         return {
-            **{name: (now - turned) / 1e9 for name, turned in turns.items()},
+            **({} if self._stopping else self._turns.silent()),
             **{p.name: p.silent_s for p in self._sources.copy().values()},
             **{p.name: p.silent_s for _, p in self._models.copy().values()},
         }
@@ -356,13 +330,9 @@ class Daemon:
             self._configured = configured
 
     def _notice_starving(self) -> None:
-        now = time.monotonic_ns()
-        lasted_s = (now - self._turns["watch"]) / 1e9
-        if lasted_s > STARVED_S:
-            self._starved = now, lasted_s
+        if lasted_s := self._turns.watch(self._watcher.native_id):
             why = f"it had no turn for {lasted_s:.1f} s: it was stopped, or the processor was taken"
             self.report("daemon", "starved", why, "warning")
-        self._waited_s()  # so that what it waits from now on is known
 
     def _parts(self) -> list[Part]:
         return [

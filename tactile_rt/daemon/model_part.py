@@ -61,6 +61,7 @@ class ModelPart(Part):
         self._wanted: deque[ModelConfig] = deque()  # what is to take the place of this one
         self._next: Admission | None = None
         self._ready_at = 0.0
+        self._until = math.inf  # once it is to end: so long a model is waited for
         self.refused = ""  # why the newest one that was to do so did not
         self._half_ns = 0  # half the resampler's kernel
         self._deadline_ns = 0
@@ -170,14 +171,13 @@ class ModelPart(Part):
         Raises:
             TactileError: It is refused.
         """
-        if self._stop.is_set():
+        if self._stop.is_set() and (opened is None or time.monotonic() > self._until):
             return None
         admission = self._admit(self.config, opened)
-        until = math.inf
         while not admission.finished.wait(LOOK_S):
             if self._stop.is_set():  # what waits is still to be decided about, if there is time
-                until = min(until, time.monotonic() + self.limits.stop_s / 4)
-            if time.monotonic() > until:
+                self._until = min(self._until, time.monotonic() + self.limits.stop_s / 4)
+            if time.monotonic() > self._until:
                 admission.give_up()
                 return None
         if admission.error is not None:
@@ -258,6 +258,7 @@ class ModelPart(Part):
         else:
             new.push(chunk)
             new.skips.found.clear()
+            new.touches.clear()
 
     def _take(self, items: list[Item]) -> None:
         run: list[SourceChunk] = []
@@ -307,7 +308,10 @@ class ModelPart(Part):
             )  # fmt: skip
             lost = 0
         classifier.skips.found.clear()
-        self._touch(classifier.detector.contact, int(chunk.t_ns[-1]), frame, offset)
+        while classifier.touches:
+            t_ns, touching = classifier.touches.popleft()
+            self._touch(touching, t_ns, frame, offset)
+        self._touch(classifier.detector.contact, newest, frame, offset)
         if not opened.stream.live:
             for box in self._hub.wanted(Decision):
                 box.wait_for_room(1.0)

@@ -9,13 +9,9 @@ recover` gets back all but the last moment, and after a power cut all but the la
 files that were left so are named when the recorder begins.
 """
 
-import os
-import shutil
 import time
 from collections import deque
 from collections.abc import Mapping
-from contextlib import suppress
-from functools import partial
 from pathlib import Path
 
 from tactile_rt.daemon.config import RecorderConfig
@@ -35,7 +31,7 @@ from tactile_rt.daemon.items import (
 )
 from tactile_rt.daemon.ledger import Ledger
 from tactile_rt.daemon.messages import encode, message_of
-from tactile_rt.files import sync_folder
+from tactile_rt.daemon.recordings_folder import RecordingsFolder, words
 from tactile_rt.recording.description import describe
 from tactile_rt.recording.layout import (
     DECISIONS,
@@ -48,10 +44,9 @@ from tactile_rt.recording.layout import (
     need_mcap,
     samples_in,
 )
-from tactile_rt.recording.reader import is_finished
 from tactile_rt.recording.rotation import Rotation
 from tactile_rt.recording.syncing import Extent, Syncer
-from tactile_rt.recording.writer import PART, RecordingWriter
+from tactile_rt.recording.writer import RecordingWriter
 from tactile_rt.version import VERSION
 
 __all__ = ["Recorder"]
@@ -59,7 +54,6 @@ __all__ = ["Recorder"]
 FLUSH_S = 0.4  # with the gathering still well under the second that may be lost
 LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
 SLOW_S = 2.0  # beyond two syncs: a medium that is slow, and not just busy for a moment
-STALE_S = 3600.0  # a file that is begun has its name long before
 RING_BYTES = 64 << 20  # of each source, before a trigger
 EVER_NS = 1 << 62
 MB, NS = 1e6, 1e9
@@ -127,11 +121,13 @@ class Recorder(Consumer):
     def __init__(self, name: str, config: RecorderConfig) -> None:
         need_mcap()
         self._name, self._config = name, config
-        self._folder = Path(config.folder)
+        self._folder = RecordingsFolder(
+            Path(config.folder), config.min_free_mb, lambda job: self._syncer.add(job),
+            lambda state, why, level: self._view.report(self._name, state, why, level),
+        )  # fmt: skip
         self._tracks: dict[str, _Track] = {}
         self._ledgers: dict[str, Ledger] = {}
         self._on = True
-        self._state, self._why = "on", ""  # of the disk
         self._files = self._bytes = 0
         self._lost_samples = 0
         self._newest = ""
@@ -140,23 +136,12 @@ class Recorder(Consumer):
     def open(self, view: View) -> None:
         self._view = view
         self._syncer = Syncer()
-        self._make_folder(parents=True)
-        with os.scandir(self._folder) as found:  # a pipe or a dead mount is not even looked at
-            files = sorted(f.name for f in found if f.is_file(follow_symlinks=False))
-        cut = [f for f in files if f.endswith(".mcap") and not is_finished(self._folder / f)]
-        if cut:
+        if cut := self._folder.open():
             some = ", ".join(cut[:3]) + (f" and {len(cut) - 3} more" if len(cut) > 3 else "")
             view.report(
-                self._name, "running", f"{self._folder}: cut short: {some}; `tactile-rt recover` "
-                "makes whole ones of them", "warning",
+                self._name, "running", f"{self._folder.path}: cut short: {some}; "
+                "`tactile-rt recover` makes whole ones of them", "warning",
             )  # fmt: skip
-        for name in files:  # of one who was killed as it began a file
-            left = self._folder / name
-            with suppress(OSError):
-                if not (name.startswith(".") and name.endswith(PART)):
-                    continue
-                if time.time() - left.stat().st_mtime > STALE_S:  # else it is just being begun
-                    left.unlink()
         for opened in view.streams().values():
             self._begin(opened)
 
@@ -198,7 +183,7 @@ class Recorder(Consumer):
         recording = sum(track.file is not None for track in tracks)
         size = self._bytes + sum(t.file.stats.bytes for t in tracks if t.file is not None)
         return {
-            "state": self._state if self._why else ("on" if self._on else "off"),
+            "state": self._folder.state if self._folder.why else "on" if self._on else "off",
             "mode": self._config.mode,
             "recording": recording,
             "files": self._files,
@@ -208,10 +193,11 @@ class Recorder(Consumer):
         }
 
     def trouble(self) -> str:
-        if self._why and self._state == "disk full":
-            return f"less than min_free_mb = {self._config.min_free_mb:g} MB free: {self._folder}"
-        if self._why or not self._on:
-            return self._why
+        folder = self._folder
+        if folder.full:
+            return f"less than min_free_mb = {self._config.min_free_mb:g} MB free: {folder.path}"
+        if folder.why or not self._on:
+            return folder.why
         for name, track in list(self._tracks.items()):
             disk = self._on_disk(name, track.ledger)
             if track.trouble and disk.meant_ns:
@@ -290,7 +276,8 @@ class Recorder(Consumer):
     def _lose(self, track: _Track, *messages: Raw) -> None:
         self._count_lost(
             track, sum(samples_in(m.data) for m in messages if m.topic == SAMPLES),
-            sum(m.topic == WIRE for m in messages), self._why or track.trouble,
+            sum(m.topic == WIRE for m in messages),
+            self._folder.why or track.trouble,
         )  # fmt: skip
 
     def _count_lost(self, track: _Track, samples: int, packets: int, why: str) -> None:
@@ -330,7 +317,7 @@ class Recorder(Consumer):
     def _begin(self, opened: Opened) -> None:
         self._end(opened.source)
         config = self._config
-        rotation = Rotation(self._folder, opened.source, config.rotate_mb, config.rotate_s)
+        rotation = Rotation(self._folder.path, opened.source, config.rotate_mb, config.rotate_s)
         ledger = self._ledgers.setdefault(opened.source, Ledger())
         self._tracks[opened.source] = _Track(opened, rotation, ledger)
 
@@ -340,7 +327,9 @@ class Recorder(Consumer):
             self._finish_file(track)
 
     def _start_file(self, track: _Track) -> None:
-        if track.file is not None or not track.came or track.closed_ns or not self._room():
+        if track.file is not None or not track.came or track.closed_ns:
+            return
+        if not self._folder.has_room():
             return
         opened, snapshot = track.opened, self._view.snapshot()
         session = {
@@ -393,7 +382,7 @@ class Recorder(Consumer):
                     f"({error.strerror or error}); `tactile-rt recover` keeps what is in it",
                     "error",
                 )  # fmt: skip
-            self._count_lost(track, *file.disown(file.flushed), _words(file.path, error))
+            self._count_lost(track, *file.disown(file.flushed), words(file.path, error))
         self._bytes += file.stats.bytes
 
     def _rotate(self, track: _Track) -> None:
@@ -403,7 +392,7 @@ class Recorder(Consumer):
 
     def _look_after(self, sync: bool) -> None:
         """Flush, rotate, end what a trigger began or whose source ended, look at the disk."""
-        self._room()
+        self._folder.has_room()
         self._settle()
         now = time.monotonic_ns()
         closed = [
@@ -436,9 +425,7 @@ class Recorder(Consumer):
                 continue
             if not self._sync(track, sync):
                 continue
-            if self._state == "disk full" and self._why:
-                self._finish_file(track)
-            elif over:
+            if over or self._folder.full:
                 self._finish_file(track)
             elif track.rotation.is_due(file):
                 self._rotate(track)
@@ -461,7 +448,7 @@ class Recorder(Consumer):
         for name, ledger in self._ledgers.items():
             for file, samples, packets in ledger.settle():
                 assert file.failed is not None
-                track, why = self._tracks.get(name), _words(file.path, file.failed)
+                track, why = self._tracks.get(name), words(file.path, file.failed)
                 if samples or packets:
                     self._view.report(
                         self._name, "running", f"{why}; {samples} samples may be lost", "error"
@@ -471,41 +458,10 @@ class Recorder(Consumer):
                 if track is not None:
                     track.lost = track.lost[0] + samples, track.lost[1] + packets
 
-    def _make_folder(self, parents: bool) -> None:
-        """Unless it is there; a power cut does not take it then."""
-        made = [f for f in (self._folder, *self._folder.parents) if not f.exists()]
-        self._folder.mkdir(parents=parents, exist_ok=True)
-        for folder in made:
-            self._syncer.add(partial(_sync_name, folder))
-
-    def _room(self) -> bool:
-        """Whether there is a folder, with room; told when that changes."""
-        state, why = "on", ""
-        try:
-            # Deleted, perhaps; a parent that is gone, too, may be the place of a medium that is.
-            self._make_folder(parents=False)
-            free = shutil.disk_usage(self._folder).free / MB
-        except OSError as error:
-            state, why = "no folder", _words(self._folder, error)
-        else:
-            if free < self._config.min_free_mb:
-                state = "disk full"
-                why = (
-                    f"{self._folder}: {free:.0f} MB free, less than "
-                    f"min_free_mb = {self._config.min_free_mb:g}"
-                )
-        if state != self._state:
-            if why:
-                self._view.report(self._name, state, f"{why}: not recording", "warning")
-            else:
-                self._view.report(self._name, "running", f"{free:.0f} MB free: recording again")
-        self._state, self._why = state, why
-        return not why
-
     def _no_room(self, track: _Track, error: OSError) -> None:
         """The file cannot be written: it is left as it is, and tried anew at the next look."""
         file = track.file
-        why = _words(file.path if file is not None else self._folder, error)
+        why = words(file.path if file is not None else self._folder.path, error)
         if file is not None or why != track.trouble:
             self._view.report(
                 self._name, "running", f"{why}; `tactile-rt recover` keeps what is in it"
@@ -516,12 +472,3 @@ class Recorder(Consumer):
             kept = file.flushed if file.failed is None else file.synced
             self._count_lost(track, *file.disown(kept), why)
             self._finish_file(track, finish=file.failed is None, told=True)
-
-
-def _sync_name(folder: Path) -> None:
-    with suppress(OSError):  # what is wrong with the disk, its files will tell
-        sync_folder(folder.parent)
-
-
-def _words(path: Path, error: OSError) -> str:
-    return f"{path}: {error.strerror or error}"

@@ -104,6 +104,19 @@ def test_decisions_do_not_depend_on_how_the_stream_was_cut(
         assert np.array_equal(a.probabilities, b.probabilities)
 
 
+def test_both_touches_of_one_chunk_are_told_with_their_times(
+    model: Path, uncut: tuple[Chunk, list[Classification]]
+) -> None:
+    whole, decisions = uncut
+    classifier = Classifier(model, SAME_RATE)
+    classifier.push(whole)
+    assert [began for _, began in classifier.touches] == [True, False, True]
+    begun = [t_ns for t_ns, began in classifier.touches if began]
+    assert begun == sorted({d.onset_ns for d in decisions})
+    # It ends with the twentieth quiet sample.
+    assert classifier.touches[1][0] >= (180 + 20 - 1) * PERIOD_NS
+
+
 def test_without_contact_there_is_no_decision(model: Path) -> None:
     assert push_all(Classifier(model, SAME_RATE), stream(signal([], 600))) == []
 

@@ -33,7 +33,6 @@ from tests.helpers.recorder_by_hand import (
 )
 
 pytest.importorskip("mcap")
-recorder = pytest.importorskip("tactile_rt.daemon.recorder")
 
 VALUES = np.random.default_rng(0).normal(size=(90, *SPEC.shape)).astype(np.float32)
 
@@ -195,7 +194,7 @@ def test_without_room_it_says_so_counts_and_goes_on_when_there_is(daemon, tmp_pa
     made, chunks = begun(daemon, tmp_path, min_free_mb=100), cut(VALUES, 1000.0)
     free = [10e9]
     usage = type("usage", (), {"free": property(lambda _: free[0])})
-    monkeypatch.setattr(recorder.shutil, "disk_usage", lambda _: usage())
+    monkeypatch.setattr("tactile_rt.daemon.recordings_folder.shutil.disk_usage", lambda _: usage())
     made.handle([opened(), samples(chunks[0])])
     free[0] = 50e6
     look(made)
