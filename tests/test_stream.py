@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import msgspec
 import numpy as np
@@ -6,7 +6,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError, EndOfStream, TactileError, concatenate
+from tactile_rt.stream import (
+    NS_PER_S,
+    ArraySpec,
+    Chunk,
+    ConfigError,
+    EndOfStream,
+    Source,
+    SourceStats,
+    TactileError,
+    concatenate,
+)
 from tactile_rt.testing import ArraySource, cut, small_spec
 
 SPEC = small_spec()
@@ -210,3 +220,44 @@ def test_every_error_a_caller_may_handle_is_a_tactile_error() -> None:
 def test_an_array_source_refuses_chunks_of_another_shape() -> None:
     with pytest.raises(ValueError, match=r"chunk of shape \(9, 4, 2\)"):
         ArraySource(SPEC, cut(np.zeros((9, 4, 2)), 1000.0))
+
+
+def test_another_number_of_entries_is_a_difference() -> None:
+    n = len(SPEC.elements)
+    fewer = replace(
+        SPEC, elements=SPEC.elements[1:], grid=SPEC.grid[1:], positions=SPEC.positions[1:],
+        orientations=SPEC.orientations[1:],
+    )  # fmt: skip
+    assert f"elements: {n - 1} entries, not {n}" in SPEC.differences(fewer)
+
+
+class Given(Source):
+    """Gives out what it is given, then ends."""
+
+    def __init__(self, *given: Chunk | None) -> None:
+        self.spec, self._given, self.closed = SPEC, list(given), False
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        if not self._given:
+            raise EndOfStream
+        return self._given.pop(0)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_what_does_not_come_in_time_is_no_chunk_of_a_stream() -> None:
+    first, second = cut(np.zeros((4, *SPEC.shape), dtype=np.float32), 1000.0, samples=2)
+    assert list(Given(None, first, None, None, second)) == [first, second]
+
+
+def test_a_source_is_closed_where_its_context_is_left() -> None:
+    with Given() as source:
+        assert not source.closed
+    assert source.closed
+
+
+def test_nothing_is_counted_before_it_happens_and_a_second_is_a_billion_nanoseconds() -> None:
+    stats = SourceStats()
+    assert set(asdict(stats).values()) == {0}
+    assert NS_PER_S == 10**9

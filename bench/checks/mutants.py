@@ -124,12 +124,18 @@ def _changes(tree: ast.AST) -> Iterator[tuple[Any, str]]:
         elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
             yield node, f"({ast.unparse(node.operand)})"
         elif isinstance(node, ast.Constant) and isinstance(node.value, bool | int | float):
-            value = node.value
-            yield node, repr(not value if isinstance(value, bool) else value + 1)
+            yield node, repr(_another(node.value))
         elif isinstance(node, ast.Expr) and isinstance(node.value, ast.Call):
             yield node, "pass"
         if isinstance(node, ast.If | ast.While | ast.IfExp):
             yield node.test, f"(not ({ast.unparse(node.test)}))"
+
+
+def _another(value: bool | int | float) -> bool | int | float:
+    """Another constant: so far off that it matters, if anything does."""
+    if isinstance(value, bool):
+        return not value
+    return value + 1 if isinstance(value, int) and abs(value) < 100 else 2 * value or 1.0
 
 
 def _with(items: list[Any], n: int, other: Any, whole: ast.AST) -> str:

@@ -184,6 +184,7 @@ def test_at_an_onset_all_quiet_samples_but_five_are_the_baseline_and_then_it_sta
     detector = new()
     assert feed(detector, quiet) == []
     assert feed(detector, touch[:2]) == [1]
+    assert detector.doubted == 5 + 1  # those that waited, and the first one above
     # The sample that only might have been an onset is not learnt from either.
     window = quiet[: QUIET - 5][-100:].astype(np.float64)
     assert detector.offset == pytest.approx(window.mean(axis=0), rel=1e-5, abs=1e-12)
@@ -365,15 +366,31 @@ def test_a_tare_that_was_taken_in_a_touch_is_found_out_wherever_it_was_taken() -
     touch = REST + TOUCH + 2 * MOVE
     for start in range(0, touch, 3):
         detector = new()
-        contact = []
+        contact, ready = [], []
         for sample in samples[start:]:
             detector.update(sample, ALL)
             contact.append(detector.contact)
+            ready.append(detector.ready)
+        assert all(ready[25:])
         # From the fifth touch on all is as it was never otherwise.
         ends = np.arange(5, 8) * touch - start
         for end in ends:
             assert contact[end - MOVE - 5], (start, end)
             assert not contact[end - touch + REST - 5], (start, end)
+
+
+def test_it_is_found_out_with_the_third_return_and_not_before() -> None:
+    samples = touches(4)
+    touch = REST + TOUCH + 2 * MOVE
+    detector = new()
+    contact = []
+    for sample in samples[REST + MOVE :]:
+        detector.update(sample, ALL)
+        contact.append(detector.contact)
+    first = TOUCH + 2 * MOVE + 2  # where the first rest is known to be a contact
+    third = TOUCH + MOVE + 2 * touch
+    assert all(contact[first : third + 20])
+    assert not any(contact[third + 45 : third + REST])
 
 
 @pytest.mark.parametrize("wild", [0, 25])

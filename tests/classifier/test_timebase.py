@@ -338,3 +338,44 @@ def test_the_caller_s_samples_are_left_alone() -> None:
     out.values[:] = np.nan
     assert np.array_equal(chunk.values, before.values)
     assert np.array_equal(chunk.t_ns, before.t_ns)
+
+
+@pytest.mark.parametrize("start_ns", [0, 1, 4_500_000, 9_000_000, -31_000_001, 10**15 + 7])
+@pytest.mark.parametrize("rate_hz", [70.0, 1000.0])
+def test_aligned_outputs_are_at_whole_periods_of_the_clock(start_ns: int, rate_hz: float) -> None:
+    resampler = Resampler(PERIOD_NS, rate_hz, aligned=True)
+    half = resampler.half_width_ns
+    outputs = []
+    samples = regular(np.arange(400.0), rate_hz, start_ns)
+    for n in range(0, 400, 7):
+        if (out := resampler.push(part(samples, slice(n, n + 7)))) is not None:
+            outputs.append(out)
+    found = concatenate(outputs)
+    periods = range((start_ns - 10**9) // PERIOD_NS, (int(samples.t_ns[-1]) + 10**9) // PERIOD_NS)
+    filled = [
+        k for k in periods
+        if k * PERIOD_NS - half >= samples.t_ns[0] and k * PERIOD_NS + half <= samples.t_ns[-1]
+    ]  # fmt: skip
+    assert found.seq.tolist() == filled
+    assert found.t_ns.tolist() == [k * PERIOD_NS for k in filled]
+
+
+def test_no_more_is_kept_than_the_next_output_needs() -> None:
+    resampler = Resampler(PERIOD_NS, 1000.0)
+    for n in range(100):
+        resampler.push(regular(np.ones(50), start_ns=n * 50 * MS))
+        assert resampler._held is not None and len(resampler._held) <= 2 * 9 + 1
+
+
+def test_a_silence_begins_beyond_one_second_or_two_kernels() -> None:
+    for rate_hz, longest_ns in ((1000.0, NS_PER_S), (0.5, 4 * NS_PER_S)):
+        for more in (0, 1):
+            resampler = Resampler(PERIOD_NS, rate_hz)
+            resampler.push(regular(np.ones(60), rate_hz))
+            last = round(59 * NS_PER_S / rate_hz)
+            out = resampler.push(regular(np.ones(60), rate_hz, start_ns=last + longest_ns + more))
+            assert out is not None
+            unbroken = bool((np.diff(out.seq) == 1).all()) and (
+                out.t_ns[0] < last + longest_ns - resampler.half_width_ns
+            )
+            assert unbroken == (not more), (rate_hz, more)
