@@ -438,7 +438,7 @@ KINDS: dict[str, FaultKind] = {
     "disk_hangs": FaultKind(_disk_hangs, (RECORDER,), root=True),
     "little_room": FaultKind(_little_room, (RECORDER,), root=True),
     "no_room": FaultKind(_no_room, (RECORDER,), root=True),
-    "files_may_not_grow": FaultKind(_no_growth, (RECORDER,)),
+    "files_may_not_grow": FaultKind(_no_growth, (RECORDER,), (("log", "no log"),)),
     "reader_of_a_pipe_stalls": FaultKind(
         _reader_stalls, (("publisher.jsonl", "not published"),)
     ),
