@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.drivers.accounting import Sequencer
+from tactile_rt.drivers.accounting import REMEMBERED, Sequencer
 from tactile_rt.drivers.codec import Samples
 from tactile_rt.stream import SourceStats
 
@@ -94,3 +94,79 @@ def test_a_device_without_a_counter_shows_damage_only(damaged):
     seq, keep = Sequencer(None, stats).number(one)
     assert seq.tolist() == [0, 1, 2] and keep.all()
     assert stats == SourceStats(corrupt=damaged)
+
+
+def test_a_step_of_half_the_counter_is_a_gap_and_of_more_a_restart():
+    for step, missing, resets in ((128, 127, 0), (129, 0, 1)):
+        stats = SourceStats()
+        sequencer = Sequencer(8, stats)
+        sequencer.number(samples([7, 7 + step], content=[1, 2]))
+        assert (stats.missing, sequencer.resets) == (missing, resets)
+
+
+def test_a_copy_is_known_for_as_long_as_is_remembered():
+    for later, duplicates in ((REMEMBERED, 1), (REMEMBERED + 1, 0)):
+        stats = SourceStats()
+        counts = [*range(later), 0]
+        Sequencer(16, stats, period_ticks=10.0).number(
+            samples(counts, ticks=[10 * count for count in counts])
+        )
+        assert stats.duplicates == duplicates
+
+
+def test_a_constant_signal_is_no_copy_of_itself_a_turn_of_the_counter_later():
+    stats = SourceStats()
+    counts = [k % 256 for k in range(1000)]
+    _, keep = Sequencer(8, stats).number(samples(counts, content=[3.0] * 1000))
+    assert keep.all() and stats == SourceStats()
+
+
+PACKET, TICKS = 8, 1000  # samples that share a reading of the clock; its ticks to a sample
+
+
+@pytest.mark.parametrize("off, missing, resets", [(-11, 179, 0), (11, 179, 0), (12, 0, 1)])
+def test_the_clock_bears_a_gap_out_within_a_packet_and_two_percent(off, missing, resets):
+    """A step of 180 of an 8-bit counter: more than half, so that it may be a step back, too."""
+    stats = SourceStats()
+    sequencer = Sequencer(8, stats, float(TICKS))
+    first = list(range(3 * PACKET))
+    ticks = [TICKS * PACKET * (k // PACKET) for k in first]
+    passed = TICKS * (180 + off)
+    sequencer.number(samples([*first, first[-1] + 180], ticks=[*ticks, ticks[-1] + passed]))
+    # 1 + (a packet less one) + 2 % of about 190 is between 11 and 12
+    assert (stats.missing, sequencer.resets) == (missing, resets)
+
+
+@pytest.mark.parametrize(
+    "bits, tick_bits, period, ahead, passed, missing, resets",
+    [
+        # a clock that wraps sooner than 10,000 samples cannot show that it went back
+        (16, 16, 1000.0, 2, 40_000, 1, 0),
+        # one that does not can, from half of its turn on
+        (16, 16, 1.0, 25_000, 25_000, 24_999, 0),
+        (16, 16, 1.0, 2, 40_000, 0, 1),
+        # a gap of half the clock's turn, or more: it tells nothing
+        (16, 16, 1024.0, 32, 5, 31, 0),
+        (16, 16, 1024.0, 40, 5, 39, 0),
+        (16, 16, 1024.0, 31, 5, 0, 1),
+        # it hardly moved: by less than a quarter of what the counter says
+        (16, 32, 1000.0, 900, 224_999, 0, 1),
+        (16, 32, 1000.0, 900, 225_000, 899, 0),
+        (16, 32, 1000.0, 900, 300_000, 899, 0),
+        (16, 32, 1000.0, 900, 1, 0, 1),
+        (16, 32, 1000.0, 900, 0, 899, 0),
+    ],
+)
+def test_what_the_clock_says_of_a_step(bits, tick_bits, period, ahead, passed, missing, resets):
+    stats = SourceStats()
+    sequencer = Sequencer(bits, stats, period, tick_bits)
+    sequencer.number(samples([100, 100 + ahead], ticks=[7, (7 + passed) % 2**tick_bits]))
+    assert (stats.missing, sequencer.resets) == (missing, resets)
+
+
+def test_a_device_that_does_not_count_in_this_packet_is_taken_for_one_that_does_not():
+    stats = SourceStats()
+    one = samples([0, 0, 0], [0, 2, 0])
+    one = Samples(one.values, one.valid, one.arrived_ns, one.damaged)
+    seq, keep = Sequencer(16, stats).number(one)
+    assert seq.tolist() == [0, 1, 2] and keep.all() and stats == SourceStats(corrupt=2)
