@@ -12,6 +12,8 @@ import argparse
 import http.client
 import json
 import re
+import signal
+import sys
 import threading
 import time
 from contextlib import contextmanager
@@ -224,6 +226,7 @@ def main() -> None:
     parser.add_argument("--resume", type=Path)
     parser.add_argument("--json", type=Path)
     given = parser.parse_args()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # the daemon and its disk are put away
     records = faults(given.times, tuple(given.only), given.resume)
     show(records, Console())
     if given.json:
