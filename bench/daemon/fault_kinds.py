@@ -48,7 +48,7 @@ options = {{{{ bind = "tcp://127.0.0.1:{{zmq}}", state_s = 0.25 }}}}
 [recorder]
 folder = "disk/recordings"
 min_free_mb = {SPARE_MB}
-rotate_s = 10
+rotate_s = 5
 [page]
 port = {{page}}
 [metrics]

@@ -30,7 +30,7 @@ from tactile_rt.evidence.records import Record, show, write
 __all__ = ["TIMES", "faults"]
 
 TIMES = 40
-ASK_S = 0.02
+ASK_S = 0.04
 SEEN_S, GONE_S = 1.0, 2.0  # stated
 HOLD_S = 1.2  # that a fault lasts after it is seen, for what else might be told
 PATIENCE_S = 12.0
