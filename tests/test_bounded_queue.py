@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.bounded_queue import BoundedQueue
+from tactile_rt.bounded_queue import BoundedQueue, QueueState
 from tests.helpers.waiting import PATIENCE_S, until
 
 KINDS = ("a", "b")
@@ -179,3 +179,49 @@ def test_an_urgent_one_that_is_gone_lets_others_come_together_again(way):
     made.put(("b", 1, 20))
     reader.join(PATIENCE_S)
     assert items == [("a", 1, 60), ("b", 1, 20)]
+
+
+def test_half_full_is_half_full(no_thread_left):
+    """The item that makes it so wakes who gathers."""
+    made, got = queue(items=8, size=10**6, gather_s=PATIENCE_S), []
+    reader = started(lambda: got.extend(made.take(PATIENCE_S)))
+    for k in range(4):
+        made.put(("a", 1, k))
+        until(lambda k=k: made._waiting or got)
+    reader.join(PATIENCE_S / 2)
+    assert not reader.is_alive() and len(got) == 4
+
+
+def test_without_a_reason_nothing_is_gathered(monkeypatch):
+    made = BoundedQueue()
+    made.put("x")
+    monkeypatch.setattr(made, "_wait", lambda *_: pytest.fail("it waits"))
+    assert made.take() == ["x"]
+
+
+def test_plain_items_have_no_size():
+    made = BoundedQueue(size=1)
+    for k in range(5):
+        made.put(k)
+    assert made.state.waiting_bytes == 0 and made.take() == list(range(5))
+
+
+def test_of_an_empty_one_nothing_is_old():
+    state = BoundedQueue().state
+    assert (
+        (state.oldest_s, state.waiting_bytes)
+        == (0.0, 0)
+        == (QueueState().oldest_s, QueueState().waiting_bytes)
+    )
+
+
+@pytest.mark.parametrize("way", ["get", "take"])
+def test_a_writer_that_waits_for_room_is_woken_by_the_reader(way):
+    made = queue(items=2)
+    for k in range(2):
+        made.put(("a", 1, k))
+    writer = started(lambda: made.wait_for_room(2 * PATIENCE_S))
+    until(lambda: made._waiting)
+    getattr(made, way)()
+    writer.join(PATIENCE_S)
+    assert not writer.is_alive()

@@ -1,5 +1,6 @@
 """What is told as degraded: facts at the end of each promise, and nothing else."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -21,6 +22,7 @@ from tactile_rt.daemon.health import (
 from tactile_rt.daemon.troubles import LossWindow, troubles
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.sensor_spec import ChannelSpec, SensorSpec
+from tactile_rt.stream import Chunk
 from tactile_rt.testing import cut, small_spec
 
 NOW = 1_000_000_000_000
@@ -276,6 +278,53 @@ def test_a_sample_without_any_valid_element_says_nothing_of_freezing():
         assert not judge.seconds
 
 
+@given(
+    values=st.lists(st.integers(0, 1), min_size=2, max_size=40),
+    useless=st.lists(st.booleans(), min_size=40, max_size=40),
+    cuts=st.lists(st.integers(1, 39), max_size=8, unique=True).map(sorted),
+    start=st.integers(0, 9),
+    after=st.sampled_from([0, 2, 5]),
+)
+def test_how_long_nothing_changes_is_counted_sample_by_sample(values, useless, cuts, start, after):
+    """By the plainest way to count it, however the stream is cut."""
+    n, judge = len(values), FrozenJudge()
+    judge.after_s = after / 1000
+    loads = np.zeros((n, 3, 2), np.float32)
+    loads[:, 1, 1] = values
+    valid = ~np.array(useless[:n])[:, None] & np.ones((n, 3), np.bool_)
+    t_ns = 1_000_000 * (start + np.arange(n))
+    edges = [0, *(c for c in cuts if c < n), n]
+    since = 0
+    for a, b in itertools.pairwise(edges):
+        judge.add(Chunk(np.arange(a, b), t_ns[a:b], loads[a:b], valid[a:b]))
+        for k in range(a, b):
+            if k == 0 or useless[k] or values[k] != values[k - 1]:
+                since = k
+        same = b - 1 - since
+        assert judge.seconds == pytest.approx(same / 1000 if same > after else 0.0)
+
+
+def test_another_array_is_no_frozen_one():
+    judge = FrozenJudge()
+    judge.after_s = 0.005
+    for at, elements in ((0, 3), (1, 4)):
+        chunk = cut(np.zeros((9, elements, 2), np.float32), 1000.0, 9)[0]
+        judge.add(replace(chunk, t_ns=chunk.t_ns + at * 9_000_000))
+        assert judge.seconds == pytest.approx(0.008)
+
+
+def test_who_is_judged_no_more_is_not_frozen():
+    judge = FrozenJudge()
+    assert judge.seconds == 0.0
+    judge.after_s = 0.001
+    (chunk,) = cut(np.zeros((9, 3, 2), np.float32), 1000.0, 9)
+    judge.add(chunk)
+    assert judge.seconds
+    judge.after_s = float("inf")
+    judge.add(replace(chunk, t_ns=chunk.t_ns + 9_000_000))
+    assert judge.seconds == 0.0
+
+
 def test_nothing_is_judged_of_a_sensor_that_nothing_is_known_of():
     assert not any(judged(np.zeros((900, 3, 2)), float("inf")))
 
@@ -295,6 +344,16 @@ def test_from_when_on_equal_samples_are_impossible_follows_from_the_noise():
     assert frozen_after(spec, coarse) == float("inf")
     assert frozen_after(spec, sensor(0.0, 1e-3)) == float("inf")
     assert frozen_after(spec, sensor(1e-3, 0.0)) == 0.25
+
+
+def test_from_when_on_is_as_many_pairs_as_make_it_impossible():
+    """At one sample a second a pair takes a second, and 0.25 s are no matter."""
+    spec = small_spec(elements=1, rate_hz=1.0)
+    # s = 1 sqrt(1/2), p = q / (2 s sqrt(pi)) = 0.2821 for q = s: 0.2821^22 = 8e-13
+    assert frozen_after(spec, sensor(1.0, np.sqrt(0.5))) == 22.0
+    # twice the elements, half the pairs; and never fewer than three
+    assert frozen_after(small_spec(elements=2, rate_hz=1.0), sensor(1.0, np.sqrt(0.5))) == 11.0
+    assert frozen_after(spec, sensor(1.0, 1e-15)) == 3.0
 
 
 @given(ratio=st.floats(0.05, 3.0), seed=st.integers(0, 1000))
