@@ -97,6 +97,7 @@ class DeviceSource(Source):
         self._tap: Tap | None = None
         self._retry_at, self._retry_s = 0.0, FIRST_RETRY_S
         self._poll_at = 0.0
+        self._looked_ns = 0  # when nothing had come
         self._early: list[Samples] = []  # that came while the device was being started
         try:
             self._open()
@@ -150,12 +151,13 @@ class DeviceSource(Source):
 
     @property
     def health(self) -> Health:
-        """How the device is doing now; from any thread."""
+        """How the device is doing, by what was found when it was last read; from any thread."""
         stamper, link = self._stamper, self._link
         assert stamper is not None
         clock, newest, status = stamper.clock, stamper.newest_ns, stamper.status
         state, since, reason = self._state, self._since, self._reason
-        silent = time.monotonic_ns() - newest
+        # Since then nobody may have looked: what waits in the line is no silence of the device.
+        silent = self._looked_ns - newest
         if state == State.STREAMING and silent > self._stale_ns:
             state, since = State.STALE, newest + self._stale_ns
             reason = f"no sample for {silent / 1e9:.1f} s"
@@ -206,6 +208,7 @@ class DeviceSource(Source):
                 self._lose(str(error))
             return None
         if found is None:
+            self._looked_ns = time.monotonic_ns()
             return None
         packet, t_ns = found
         if self._tap is not None:

@@ -133,7 +133,8 @@ def test_without_reconnection_a_lost_line_breaks_the_source(tmp_path):
 def test_a_silent_device_is_stale_not_fresh():
     with FakeSerial(signal(300)) as fake, open_source(f"{fake.url}&stale_s=0.2") as source:
         take(source, 300)
-        until(lambda: source.health.state == State.STALE)
+        assert source.health.state == State.STREAMING  # nobody has looked
+        until(lambda: not source.read(0.0) and source.health.state == State.STALE)
         assert "no sample for" in source.health.reason
 
 
