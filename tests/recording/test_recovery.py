@@ -9,15 +9,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tactile_rt.recording import Description, Recording, recover
-from tactile_rt.recording.layout import (
-    encode_samples,
-)
+from tactile_rt.recording.description import RECOVERED
+from tactile_rt.recording.layout import encode_samples
+from tactile_rt.recording.recovery import MOST_NONE
 from tactile_rt.recording.writer import McapFile
 from tactile_rt.stream import ConfigError, RecordingError
 from tactile_rt.testing import cut
 from tests.helpers.recordings import SPEC, all_parts, noise, parts, write
 
 pytest.importorskip("mcap")
+
+from mcap.reader import NonSeekingReader
 
 
 @pytest.fixture(scope="module")
@@ -205,3 +207,69 @@ def test_what_is_recovered_is_on_the_medium_before_it_is_told(whole, tmp_path, m
     assert len(synced) == 2
     assert synced[0].startswith(str(tmp_path / f".{made.name}."))  # before it has its name
     assert synced[1] == str(tmp_path)  # and then the name
+
+
+def told(path):
+    """(topic, log time in UTC) of each message, by MCAP's own reader, and the names of metadata."""
+    from mcap.records import Metadata
+    from mcap.stream_reader import StreamReader
+
+    with path.open("rb") as file:
+        messages = [(c.topic, m.log_time) for _, c, m in NonSeekingReader(file).iter_messages()]
+        file.seek(0)
+        named = [r.name for r in StreamReader(file).records if isinstance(r, Metadata)]
+    return messages, named
+
+
+def test_what_is_recovered_says_so_and_keeps_its_times(whole, tmp_path):
+    data, _, ends = whole
+    original, cut_off = tmp_path / "original.mcap", tmp_path / "cut.mcap"
+    original.write_bytes(data)
+    cut_off.write_bytes(data[: ends[4] + 9])
+    back = recover(cut_off)
+    assert back == tmp_path / "cut.recovered.mcap"
+    messages, named = told(back)
+    assert messages == told(original)[0][: len(messages)] and len(messages) == 15
+    assert RECOVERED in named and RECOVERED not in told(original)[1]
+    assert Recording(back).description.recovered
+    assert not Recording(original).description.recovered
+
+
+def test_what_is_there_already_is_only_replaced_by_force(whole, tmp_path):
+    data, _, ends = whole
+    cut_off = tmp_path / "cut.mcap"
+    cut_off.write_bytes(data[: ends[4] + 9])
+    there = tmp_path / "cut.recovered.mcap"
+    there.write_bytes(b"mine")
+    with pytest.raises(ConfigError, match="is there already"):
+        recover(cut_off)
+    assert there.read_bytes() == b"mine"
+    assert recover(cut_off, force=True) == there
+    assert len(told(there)[0]) == 15
+
+
+@pytest.mark.parametrize("none, comes_back", [(MOST_NONE, True), (MOST_NONE + 1, False)])
+def test_so_many_messages_may_be_none_and_not_one_more(none, comes_back, tmp_path):
+    path, chunk = tmp_path / "cut.mcap", cut(noise(5), 1000.0, samples=5)[0]
+    with path.open("wb") as file:
+        made = McapFile(file, Description(SPEC, 0))
+        made.add("samples", encode_samples(chunk), int(chunk.t_ns[-1]))
+        for _ in range(none):
+            made.add("samples", b"none", 1)
+        made.flush()
+    if comes_back:
+        assert all_parts(Recording(recover(path))) == all_parts([chunk])
+    else:
+        with pytest.raises(RecordingError, match="messages are none"):
+            recover(path)
+
+
+def test_without_a_whole_message_nothing_comes_back(tmp_path):
+    path = tmp_path / "cut.mcap"
+    with path.open("wb") as file:
+        made = McapFile(file, Description(SPEC, 0))
+        made.add("samples", b"none", 1)
+        made.flush()
+    with pytest.raises(RecordingError, match="nothing in it is whole"):
+        recover(path)
+    assert list(tmp_path.iterdir()) == [path]

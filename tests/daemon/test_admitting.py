@@ -1,0 +1,140 @@
+"""One admission alone: what is asked of the trial and given to the classifier."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx")
+
+from tactile_rt.classifier.classifier import EVERY
+from tactile_rt.classifier.trial import Trial, TrialLimits
+from tactile_rt.daemon import admission as module
+from tactile_rt.daemon.admission import Admission, file_stamp, model_path
+from tactile_rt.daemon.config import LimitsConfig, ModelConfig
+from tactile_rt.daemon.items import Opened
+from tactile_rt.stream import ModelError
+from tactile_rt.testing import ArraySource, cut
+from tests.helpers.tiny_model import CARD, STEPS, write_model
+from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, signal, stream
+from tests.helpers.waiting import PATIENCE_S
+
+LIMITS = LimitsConfig(model_mb=300.0, model_s=7.0)
+STEP_MS = CARD.substeps * CARD.period_ns / 1e6
+
+
+class Trials:
+    """Stands in for the process that tries a model; says what it was asked."""
+
+    def __init__(self, monkeypatch, step_s=0.001, during=lambda: None):
+        self.asked = []
+        self.found = Trial("a" * 64, 0.25, step_s, 22.0)
+        self._during = during
+        monkeypatch.setattr(module, "try_model", self)
+
+    def __call__(self, path, limits, every, given_up):
+        self.asked.append((path, limits, every))
+        self._during()
+        return self.found
+
+
+@pytest.fixture
+def model(tmp_path):
+    return write_model(tmp_path / "m.onnx")
+
+
+def opened(live=True):
+    source = ArraySource(SAME_RATE, cut(np.zeros((1, *SAME_RATE.shape), np.float32), 100.0))
+    source.live = live
+    return Opened("a", SAME_RATE, "url", source, 1, 0, ())
+
+
+def admitted(model, stream_of=None, age=lambda t_ns: 0.0, known=None, **config):
+    made = Admission(ModelConfig(file=str(model), **config), LIMITS, stream_of, age, known)
+    assert made.finished.wait(PATIENCE_S)
+    return made
+
+
+@pytest.mark.parametrize(
+    "config, every",
+    [
+        ({}, 0),
+        ({"every": 3}, 0),
+        ({"mode": "sliding"}, EVERY),
+        ({"mode": "sliding", "every": 3}, 3),
+    ],
+)
+def test_the_trial_steps_as_the_classifier_will(model, monkeypatch, config, every):
+    trials = Trials(monkeypatch)
+    made = admitted(model, **config)
+    assert trials.asked == [(model, TrialLimits(300.0, 7.0), every)]
+    assert made.error is None and made.classifier is None and made.trial is trials.found
+
+
+def test_what_was_tried_is_not_tried_again(model, monkeypatch):
+    trials = Trials(monkeypatch)
+    made = admitted(model, opened(), known=trials.found)
+    assert trials.asked == [] and made.classifier is not None
+
+
+@pytest.mark.parametrize("step_ms, said", [(STEP_MS, False), (STEP_MS + 0.01, True)])
+def test_one_that_cannot_keep_up_is_admitted_and_told(model, monkeypatch, step_ms, said):
+    Trials(monkeypatch, step_s=step_ms / 1e3)
+    made = admitted(model, opened())
+    assert ("it cannot keep up" in made.words) == said
+    assert made.words.startswith(f"{model}, sha256 {'a' * 12}: warm after 0.25 s, 22 MB, ")
+    assert "cannot keep up" not in admitted(model, None).words
+
+
+def test_behind_ms_and_deadline_ms_are_milliseconds(model, monkeypatch):
+    """Old by 0.3 s: beyond a deadline of 0.2 s, within 0.4 s."""
+    Trials(monkeypatch)
+    values = signal([(QUIET, QUIET + 60, 1.0)], QUIET + 100)
+    for behind_ms, deadline_ms, decided, late in (
+        (400.0, 200.0, STEPS, STEPS), (400.0, 400.0, STEPS, 0), (250.0, 0.0, 0, 0),
+    ):  # fmt: skip
+        made = admitted(
+            model, opened(), age=lambda t_ns: 0.3, behind_ms=behind_ms, deadline_ms=deadline_ms
+        )
+        found = push_all(made.classifier, stream(values))
+        assert (len(found), made.classifier.stats.late) == (decided, late)
+
+
+def test_of_a_recording_nothing_is_old(model, monkeypatch):
+    Trials(monkeypatch)
+    made = admitted(model, opened(live=False), age=lambda t_ns: 100.0)
+    values = signal([(QUIET, QUIET + 60, 1.0)], QUIET + 100)
+    assert len(push_all(made.classifier, stream(values))) == STEPS
+
+
+def test_a_file_that_changes_while_it_is_tried_is_refused(model, monkeypatch):
+    Trials(monkeypatch, during=lambda: write_model(model, temperature=2.0))
+    made = admitted(model, opened())
+    assert isinstance(made.error, ModelError) and "written while it was being tried" in made.words
+    assert made.stamp != file_stamp(model)
+
+
+def test_whatever_goes_wrong_is_the_model_s_fault_and_names_it(model, monkeypatch):
+    def fail():
+        raise ZeroDivisionError("by zero")
+
+    Trials(monkeypatch, during=fail)
+    made = admitted(model)
+    assert made.words == f"{model}: ZeroDivisionError: by zero"
+
+
+def test_who_is_given_up_loads_nothing(model, monkeypatch):
+    made = Admission(ModelConfig(file=str(model)), LIMITS, opened(), lambda t_ns: 0.0, None)
+    made.give_up()
+    assert made.finished.wait(PATIENCE_S)
+    assert made.classifier is None
+
+
+def test_a_file_s_stamp_is_another_when_it_is(tmp_path):
+    path = tmp_path / "x"
+    assert file_stamp(path) == () == file_stamp(tmp_path / "\0")
+    path.write_bytes(b"a")
+    first = file_stamp(path)
+    assert first and file_stamp(path) == first
+    path.write_bytes(b"ab")
+    assert file_stamp(path) != first
+    assert model_path(ModelConfig(file="y")).name == "y"
+    assert model_path(ModelConfig()).name.endswith(".onnx")
