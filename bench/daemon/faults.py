@@ -36,7 +36,7 @@ HOLD_S = 1.2  # that a fault lasts after it is seen, for what else might be told
 PATIENCE_S = 12.0
 # Two looks further apart, or a thread of the daemon that waited longer for a processor: the machine
 # has other things to do.
-BUSY_S = 0.25
+BUSY_S, TURN_NS = 0.25, 150_000
 RETRIES = 3
 DEGRADED = re.compile(rb"^tactile_degraded_parts (\d+)", re.M)
 TROUBLE = re.compile(rb"^tactile_trouble\{.*\} 1$", re.M)
@@ -180,9 +180,13 @@ def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repeti
 
 
 def _waited(pid: int) -> dict[str, int]:
-    """How long each thread has waited for a processor so far, by the kernel's account, ns."""
-    tasks = Path(f"/proc/{pid}/task").iterdir()
-    return {task.name: int((task / "schedstat").read_text().split()[1]) for task in tasks}
+    """How long each thread has waited for a processor so far, by the kernel's account and beyond
+    what every turn takes, ns."""
+    found = {}
+    for task in Path(f"/proc/{pid}/task").iterdir():
+        _, waited, turns = map(int, (task / "schedstat").read_text().split())
+        found[task.name] = waited - TURN_NS * turns
+    return found
 
 
 def faults(times: int, only: tuple[str, ...] = (), resume: Path | None = None) -> list[Record]:
