@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier import runtime, stepper
-from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.classifier.classifier import Classification, Classifier, without_bad_samples
 from tactile_rt.classifier.exits import Deadline
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.stepper import Stepper
@@ -386,3 +386,12 @@ def test_another_array_size_has_its_own_buffers(tmp_path: Path) -> None:
     pairs = [(a.push(chunk), b.push(chunk)) for chunk in chunks]
     assert same([d for x, _ in pairs for d in x], expected)
     assert same([d for _, y in pairs for d in y], expected)
+
+
+def test_what_no_sensor_measures_is_zero_and_not_valid() -> None:
+    values = np.ones((2, *SAME_RATE.shape), dtype=np.float32)
+    values[0, 1, 0], values[1, 2, 1] = np.nan, 1e12
+    good, bad = without_bad_samples(Chunk(np.arange(2), np.arange(2), values, values[..., 0] == 1))
+    assert bad == 1  # the other was not marked as valid
+    assert not good.values[0, 1].any() and not good.values[1, 2].any() and not good.valid[1, 2]
+    assert good.values.sum() == values.shape[1] * values.shape[2] * 2 - 4

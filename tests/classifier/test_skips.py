@@ -144,3 +144,40 @@ def test_age_makes_a_step_late_as_work_does() -> None:
 def test_an_unknown_way_to_catch_up_is_refused(model: Path) -> None:
     with pytest.raises(ConfigError, match="catch_up: 'oldest'; it can be newest, all"):
         Classifier(model, SAME_RATE, catch_up="oldest")  # type: ignore[arg-type]
+
+
+def test_at_its_bounds_a_step_is_taken() -> None:
+    age = [0.0]
+    skips = Skips(most_s=1.0, age=lambda t_ns: age[0])
+    age[0] = 1.0
+    assert not skips.after_step(1, 1.0)  # as old as may be
+    # A fifth of what the last step took is expected of the next; four fifths may be over by then.
+    age[0] = 0.6
+    assert not skips.before_step(2)
+    age[0] = 0.61
+    assert skips.before_step(3)
+
+
+def test_a_skip_is_at_least_a_nanosecond() -> None:
+    skips = Skips(most_s=0.0, age=lambda t_ns: 1e-12)
+    assert skips.after_step(5, 0.0)
+    assert skips.found == [Skip(5, 6)] and skips.covers(5) and not skips.covers(6)
+
+
+def test_what_was_sure_in_an_episode_that_was_cut_does_not_count_in_the_next(model: Path) -> None:
+    plain = push_all(Classifier(model, SAME_RATE, sure=0.01, in_a_row=3), stream(VALUES))
+    assert [d.step for d in plain if d.final] == [3] * len(TOUCHES)
+    cut = Skip(plain[1].t_ns + 1, plain[1].t_ns + 10 * PERIOD_NS)
+    again = push_all(
+        Classifier(model, SAME_RATE, sure=0.01, in_a_row=3, skips=[cut]), stream(VALUES)
+    )
+    assert same(again, plain[:2] + plain[3:])
+
+
+def test_while_something_is_touched_it_is_deciding_though_the_episode_is_skipped(
+    model: Path,
+) -> None:
+    skips = [Skip((QUIET + 5) * PERIOD_NS, (QUIET + 20) * PERIOD_NS)]
+    classifier = Classifier(model, SAME_RATE, skips=skips)
+    push_all(classifier, stream(VALUES[: QUIET + 40]))
+    assert classifier.deciding and classifier.stats.skips == 1

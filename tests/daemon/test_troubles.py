@@ -103,11 +103,22 @@ def test_what_is_no_fault_of_a_source_is_not_told(changes):
         ({"skips": Losses(1, 1)}, "missing decisions: model.a: it cannot keep up"),
         ({"lost": Losses(9, 9)}, "missing decisions: model.a: it was too slow"),
         ({"part": part("model.a", "waiting", "no file")}, "no decisions: model.a fails: no file"),
+        (
+            {"part": part("model.a", "starting", "no file", 1)},
+            "no decisions: model.a fails: no file",
+        ),
+        (
+            {"part": part("model.a", "starting", since_ns=NOW - S)},
+            "no decisions: model.a: it is still being tried",
+        ),
     ],
 )
 def test_a_model_is_named_by_what_it_did_not_decide(changes, words):
     (line,) = told(models=[replace(MODEL, **changes)])
     assert line.startswith(words) and line.endswith("; recording goes on")
+    waits = replace(RECORDER, part=part("recorder", "starting"))
+    (line,) = told(models=[replace(MODEL, **changes)], consumers=[waits, ZMQ])
+    assert line.endswith("; acquisition goes on")
     (line,) = told(models=[replace(MODEL, **changes)], consumers=[])
     assert line.endswith("; acquisition goes on")
 
@@ -160,6 +171,19 @@ def test_the_recorder_is_named_by_what_is_not_on_the_disk(disk, source, words):
         if line.startswith("no recording")
     ]
     assert found == ([f"no recording: recorder: {words}; acquisition goes on"] if words else [])
+
+
+def test_what_is_as_old_as_it_may_be_is_well():
+    young = part("model.a", "starting", since_ns=NOW - 3 * S // 4)
+    assert told(models=[replace(MODEL, part=young)]) == []
+    assert told(models=[replace(MODEL, behind_s=0.75)]) == []
+    assert told(consumers=[RECORDER, replace(ZMQ, behind_s=0.75)]) == []
+    lost = replace(DISK, lost_ns=NOW - S, lost_why="no room")
+    assert told(consumers=[replace(RECORDER, on_disk={"a": lost})]) == []
+    slow = {"rate_hz": 0.5, "newest_ns": NOW - 6 * S, "read_ns": NOW - 6 * S}  # three periods
+    assert told([replace(SOURCE, **slow)]) == []
+    (line,) = told([replace(SOURCE, **{**slow, "read_ns": NOW - 6 * S - 1})])
+    assert line.startswith("no samples: source.a: none has come for 6 s")
 
 
 def test_a_process_without_a_turn_blames_none_of_its_parts():
