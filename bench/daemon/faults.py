@@ -34,9 +34,9 @@ ASK_S = 0.04
 SEEN_S, GONE_S = 1.0, 2.0  # stated
 HOLD_S = 1.2  # that a fault lasts after it is seen, for what else might be told
 PATIENCE_S = 12.0
-# Two looks further apart, or a thread of the daemon that waited longer for a processor: the machine
-# has other things to do.
-BUSY_S, TURN_NS = 0.25, 150_000
+# Two looks further apart, or a thread of the daemon that waited longer for a processor, beside what
+# every turn takes: the machine has other things to do.
+BUSY_S, WAITED_S, TURN_NS = 0.25, 0.15, 150_000
 RETRIES = 3
 DEGRADED = re.compile(rb"^tactile_degraded_parts (\d+)", re.M)
 TROUBLE = re.compile(rb"^tactile_trouble\{.*\} 1$", re.M)
@@ -172,7 +172,7 @@ def _once(scene: FaultScene, watcher: _Watcher, kind: FaultKind) -> tuple[Repeti
     more = _waited(scene.daemon.process.pid)
     longest_s = max(ns - waited.get(task, 0) for task, ns in more.items()) / 1e9
     # while a process is stopped nobody answers
-    busy = max(float(gaps.max()), longest_s) > BUSY_S and not kind.blind
+    busy = (gaps.max() > BUSY_S or longest_s > WAITED_S) and not kind.blind
     scene.tidy()
     return Repetition(
         max(0.0, seen - effect), max(0.0, gone - ended), tuple(wrong), watcher.disagreed - disagreed
