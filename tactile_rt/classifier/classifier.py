@@ -152,8 +152,8 @@ class Classifier:
         detector: The contact detector, which holds the stream's contact state and tare.
         tared: (element, channel) The last resampled sample less the tare, SI; zeros before the
             tare. The next `push` overwrites it.
-        touches: When contact began (t_ns, True) or ended (t_ns, False), the newest 256; whoever
-            reads them takes them out.
+        touches: The newest 256 changes of contact, as stream time (ns) and whether it began;
+            whoever reads them takes them out.
         stats: The counters of steps, late steps and bad samples.
         skips: The stretches of the stream that the network skips.
         providers: Names of the execution providers in use, as onnxruntime has them.
