@@ -48,6 +48,7 @@ CODECS = {
     ("serial", "mlx_hex"): f"{_HERE}.mlx_hex:MlxHex",
     ("serial", "hx711_whisker"): f"{_HERE}.hx711_whisker:Hx711Whisker",
     ("serial", "ascii_line"): f"{_HERE}.ascii_line:AsciiLine",
+    ("serial", "binary_frame"): f"{_HERE}.binary_frame:BinaryFrame",
     ("serial", "ft300"): f"{_HERE}.ft300:Ft300",
     ("serial", "tsf85"): f"{_HERE}.tsf85:Tsf85",
     ("serial", "ati_485"): f"{_HERE}.ati_485:Ati485",
@@ -110,7 +111,7 @@ class Step(Generic[Packet]):
     what: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False, slots=True)
 class Samples:
     """n >= 1 samples as the device numbers and times them.
 

@@ -155,12 +155,13 @@ def prepare_serial(target: str, fields: dict[str, str], array: ArraySpec | None 
     kind = _kind("serial", target, fields)
     assert issubclass(kind, SerialCodec)
     options, own = take_options(f"serial:{target}", fields, SerialOptions, kind.Options)
-    baud, parity = options.baud or kind.baud, options.parity or kind.parity
+    codec = kind(own)
+    baud, parity = options.baud or codec.baud, options.parity or codec.parity
 
     def connect() -> Link[Any]:
         return SerialLink(target, baud, parity, options.dtr)
 
-    return _prepared(connect, kind(own), options, target, fields, array)
+    return _prepared(connect, codec, options, target, fields, array)
 
 
 def prepare_can(target: str, fields: dict[str, str], array: ArraySpec | None = None) -> Prepared:

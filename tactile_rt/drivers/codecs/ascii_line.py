@@ -87,7 +87,7 @@ class AsciiLine(SerialCodec):
         if options.mapping:
             mapping = read_mapping(options.mapping)
         else:
-            mapping = LineMapping(tuple(w.strip() for w in options.columns.split(",")))
+            mapping = LineMapping(columns=tuple(w.strip() for w in options.columns.split(",")))
         if options.rate_hz:
             mapping = msgspec.structs.replace(mapping, rate_hz=options.rate_hz)
         prefix = f"{where}: columns" if options.mapping else where

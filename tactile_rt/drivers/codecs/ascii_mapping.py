@@ -22,7 +22,16 @@ import numpy as np
 from tactile_rt.settings import convert, read_toml
 from tactile_rt.stream import ArraySpec, ConfigError
 
-__all__ = ["UNITS", "Column", "Element", "LineMapping", "array_of", "parse_column", "read_mapping"]
+__all__ = [
+    "UNITS",
+    "ArrayTable",
+    "Column",
+    "Element",
+    "LineMapping",
+    "array_of",
+    "parse_column",
+    "read_mapping",
+]
 
 VERSION: Final = 1
 MOST_BITS: Final = 53  # of a counter: what a float64 holds
@@ -69,34 +78,44 @@ class Element(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
 
 
-class LineMapping(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a board prints, key by key as in its TOML file; docs/codecs/ascii_line.toml is one.
+class ArrayTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The array that a mapping file is of.
 
     Attributes:
-        columns: The columns of a line, in order, as the module's docstring says.
-        version: Version of this file format.
+        version: Version of the file's format.
         name: Name of the array.
         frame: Name of the mount frame.
-        rate_hz: Rate at which the board prints, Hz.
-        labels: Whether numbers have names before them, ``x:1.5 y=2``.
-        start: Text to send so that the board begins.
-        stop: Text to send so that the board ends.
-        poll: Text to send for each sample; without one the board prints by itself.
+        rate_hz: Rate at which the device sends samples, Hz.
         elements: The place of each element, by name. Elements without a grid get their row and
             column from their names if all are named like whiskers, A0 to Z99; else they stand in
             one row.
     """
 
-    columns: tuple[str, ...]
     version: int = VERSION
-    name: str = "ascii_line"
+    name: str = "array"
     frame: str = "mount"
     rate_hz: float = 100.0
+    elements: dict[str, Element] = {}
+
+
+class LineMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """What a board prints, key by key as in its TOML file; docs/codecs/ascii_line.toml is one.
+
+    Attributes:
+        columns: The columns of a line, in order, as the module's docstring says.
+        name: Name of the array.
+        labels: Whether numbers have names before them, ``x:1.5 y=2``.
+        start: Text to send so that the board begins.
+        stop: Text to send so that the board ends.
+        poll: Text to send for each sample; without one the board prints by itself.
+    """
+
+    columns: tuple[str, ...]
+    name: str = "ascii_line"
     labels: bool = False
     start: str = ""
     stop: str = ""
     poll: str = ""
-    elements: dict[str, Element] = {}
 
 
 @dataclass(frozen=True)
@@ -119,6 +138,13 @@ class Column:
     element: str = ""
     channel: str = ""
     unit: str = ""
+
+    @classmethod
+    def measured(cls, element: str, channel: str, unit: str, scale: float = 1.0) -> "Column":
+        """A measurement, of which a one stands for `scale` of a unit of `UNITS`; without a unit
+        for that which the channel's name says."""
+        si, factor, offset = UNITS[unit or _KNOWN.get(channel, "1")]
+        return cls("value", scale * factor, offset, 0, element, channel, si)
 
 
 def read_mapping(path: str) -> LineMapping:
@@ -158,14 +184,12 @@ def parse_column(word: str, where: str) -> Column:
             "count, time:ms, time:s, or - for nothing"
         )
     element, channel, scale, unit = found.groups()
-    unit = unit or _KNOWN.get(channel, "1")
-    if unit not in UNITS:
+    if unit and unit not in UNITS:
         raise ConfigError(f"{where}: unknown unit {unit!r}; there are {', '.join(UNITS)}")
-    si, factor, offset = UNITS[unit]
-    return Column("value", _scale(scale, where) * factor, offset, 0, element, channel, si)
+    return Column.measured(element, channel, unit or "", _scale(scale, where))
 
 
-def array_of(mapping: LineMapping, columns: tuple[Column, ...], where: str) -> ArraySpec:
+def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> ArraySpec:
     """The array that the columns make up, elements and channels as they first come.
 
     Args:
