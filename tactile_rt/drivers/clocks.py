@@ -46,6 +46,10 @@ BUCKETS: Final = 240
 LONGEST_BUCKET_NS: Final = 5 * NS_PER_S // 2  # so ten minutes are looked back on
 DRIFT_SEEN_AFTER: Final = 1e-3  # s of uncertainty over the allowed drift: when a slope means much
 EARLY_NS: Final = 20_000_000  # a sample this early is no prompt one: the device's clock stepped
+# ... and one that is only this early, where the promptest of each of the last buckets were within
+# half of that.
+PROMPT_EARLY_NS: Final = 4_000_000
+PROMPT_BUCKETS: Final = 8
 LATE_NS: Final = 30_000_000  # so late for ...
 LATE_FOR_NS: Final = 2 * NS_PER_S  # ... so long: it stepped back
 LEAST_STEP: Final = 0.5  # of the device's, between two samples when the estimate moves back
@@ -153,32 +157,29 @@ class DeviceClock:
         for tick, arrived in zip(ticks.tolist(), arrived_ns.tolist(), strict=True):
             step = self._step(tick, arrived)
             x = self._x + step
-            early = arrived - self._base - x - self._a - self.drift * x < -EARLY_NS
+            early = arrived - self._base - x - self._a - self.drift * x < -self._early_ns
             if self._tick is None or early:
                 # In a backlog, samples are early only against a first one that came late.
-                self.steps += step - (arrived - self._arrived) > EARLY_NS
-                told += self._tell(waiting)
+                self.steps += step - (arrived - self._arrived) > self._early_ns
+                told += [self._tell(*sample) for sample in waiting]
                 waiting, x, step = [], 0.0, 0.0
                 self._begin(arrived)
             self._x, self._tick, self._arrived = x, tick, arrived
             self._observe(x, arrived)
             waiting.append((x, step, arrived))
         # told only now: the last sample of a packet is the promptest, and dates the others
-        return np.array(told + self._tell(waiting), np.int64)
+        return np.array(told + [self._tell(*sample) for sample in waiting], np.int64)
 
     def resume(self) -> None:
         """The device was away: its clock may have begun anew."""
         self._tick = None
 
-    def _tell(self, waiting: list[tuple[float, float, int]]) -> list[int]:
-        """Host times of these samples, by what is known of the clock now."""
-        told = []
-        for x, step, arrived in waiting:
-            t = min(self._base + round(x + self._a + self.drift * x), arrived)
-            room = min(LEAST_STEP * step, arrived - self._told)
-            self._told = max(t, self._told + max(1, round(room)))
-            told.append(self._told)
-        return told
+    def _tell(self, x: float, step: float, arrived: int) -> int:
+        """Host time of a sample, by what is known of the clock now."""
+        t = min(self._base + round(x + self._a + self.drift * x), arrived)
+        room = min(LEAST_STEP * step, arrived - self._told)
+        self._told = max(t, self._told + max(1, round(room)))
+        return self._told
 
     def _step(self, tick: int, arrived: int) -> float:
         """Device time since the last sample, ns."""
@@ -199,6 +200,7 @@ class DeviceClock:
         self._a = 0.0
         self._late_since: int | None = None  # host time
         self._late_best = (0.0, 0.0)
+        self._early_ns = EARLY_NS
 
     def _observe(self, x: float, arrived: int) -> None:
         d = float(arrived - self._base - x)
@@ -243,7 +245,11 @@ class DeviceClock:
         if points[-1][0] - points[0][0] >= self._drift_after_ns:
             slope = _slope_below(points)
             self.drift = min(max(slope, -self._tolerance), self._tolerance)
-        self._a = min(d - self.drift * x for x, d in points)
+        above = [d - self.drift * x for x, d in points]
+        self._a = min(above)
+        last = above[-PROMPT_BUCKETS:]
+        prompt = len(last) == PROMPT_BUCKETS and max(last) - self._a < PROMPT_EARLY_NS / 2
+        self._early_ns = PROMPT_EARLY_NS if prompt else EARLY_NS
 
 
 def _slope_below(points: Sequence[tuple[float, float]]) -> float:

@@ -36,12 +36,14 @@ class SyntheticOptions:
         seconds: Length of the stream, s; 0 for an endless one.
         seed: Seed of the noise; the same seed gives the same stream.
         pace: ``realtime`` delivers samples when they are due, ``fast`` at once.
+        touches: Whether bumps pass over the array; without, it is at rest, and there is only noise.
     """
 
     rate_hz: float = 1000.0
     seconds: float = 0.0
     seed: int = 0
     pace: str = "realtime"
+    touches: bool = True
 
     def __post_init__(self) -> None:
         if self.pace not in ("realtime", "fast"):
@@ -89,6 +91,7 @@ class SyntheticSource(Source):
         self._rng = np.random.default_rng(options.seed)
         self._left = round(options.seconds * options.rate_hz) if options.seconds else None
         self._peak = np.array([PEAK[unit] for unit in self.spec.units])
+        self._touches = options.touches
         self._at = REST_S + np.array([r + c / 10 for r, c in self.spec.grid]) * 0.05  # s
         self._sent, self._start_ns, self._closed = 0, -1, False
 
@@ -127,7 +130,7 @@ class SyntheticSource(Source):
         phase = (t_s[:, None] - self._at) % EVERY_S / BUMP_S  # (n, element)
         bump = np.where(phase < 1, np.sin(np.pi * np.minimum(phase, 1)), 0.0)
         share = np.cos(np.arange(len(self._peak)) * 1.1)  # channels differ in size and sign
-        clean = bump[..., None] * (share * self._peak)
+        clean = self._touches * bump[..., None] * (share * self._peak)
         noise = self._rng.normal(size=clean.shape) * (NOISE * self._peak)
         values: NDArray[np.float32] = (clean + noise).astype(np.float32)
         return values

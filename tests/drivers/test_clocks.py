@@ -78,6 +78,27 @@ def test_a_jump_of_the_device_s_clock_is_left_behind(jump_s):
     assert np.abs(told - world.taken)[20_000:].max() < 1 * MS
 
 
+@pytest.mark.parametrize("burst_ms", [0.0, 1.0])
+@pytest.mark.parametrize("jump_ms", [5, 10, 15, 19, 30])
+def test_a_small_jump_ahead_is_seen_where_samples_come_promptly(jump_ms, burst_ms):
+    world = World(40, 50.0, burst_ms)
+    world.ticks[15_000:] = (world.ticks[15_000:] + 1000 * jump_ms) % world.wrap
+    told = world.told()
+    assert world.clock.steps == 1
+    assert (np.diff(told) > 0).all()
+    assert np.abs(told - world.taken)[15_100:].max() < 1.5 * MS
+
+
+def test_a_line_that_was_late_for_long_and_is_prompt_at_last_saw_no_jump():
+    """16 ms of an adapter's timer, and then it is told to wait no longer."""
+    world = World(40, 50.0, 16.0)
+    prompt = World(40, 50.0)
+    world.arrived[20_000:] = np.maximum(prompt.arrived[20_000:], world.arrived[19_999])
+    told = world.told()
+    assert world.clock.steps == 0
+    assert np.abs(told - world.taken)[30_000:].max() < 1 * MS
+
+
 def test_a_device_that_begins_anew_is_followed():
     world = World(40)
     world.ticks[15_000:] = np.arange(len(world.ticks) - 15_000) * 1000

@@ -26,6 +26,7 @@ from tactile_rt.stream import ArraySpec, ConfigError
 
 __all__ = ["DbcMapping", "FramePart", "Signal", "read_mapping"]
 
+LARGEST: Final = 1e30  # reading that an integer of a frame may stand for
 FLOATS: Final = {16: ">e", 32: ">f", 64: ">d"}
 
 Cell = tuple[int, int]
@@ -243,6 +244,12 @@ class _Reader:
                 signals.append(found)
                 gain.append(signal.scale * channel.scale)
                 bias.append(signal.offset * channel.scale + channel.offset)
+                largest = abs(gain[-1]) * 2.0 ** (0 if found.real else found.length) + abs(bias[-1])
+                if not largest < LARGEST:
+                    raise ConfigError(
+                        f"{where}, channel {channel.name}: by the factor and offset of signal "
+                        f"{found.name} its readings go up to {largest:.3g}, as no sensor's do"
+                    )
         singles = [
             self._integer(what, getattr(file, what)) for what in ("counter", "time", "status")
         ]

@@ -152,3 +152,17 @@ def test_mistakes_are_named() -> None:
     ):
         with pytest.raises(ConfigError, match=message):
             ati(**wrong)
+
+
+def test_what_another_host_asks_is_no_damage() -> None:
+    """Its requests have the identifiers of the replies, and no data or the number of a row."""
+    host = started()
+    before = host.stats.intact, host.stats.corrupt
+    asked = [step.send[0] for step in ati(calibration=-1).commands(Command.START)]
+    asked += [ati().commands(Command.POLL)[0].send[0]] * 816
+    assert host.feed(asked, T0) is None
+    assert (host.stats.intact, host.stats.corrupt) == before
+    assert host.stats.skipped == len(asked)
+    first, second, values = wire(ati(), 1)
+    found = host.feed([first[0], asked[-1], second[0]], T0)
+    assert found is not None and found.values[0] == pytest.approx(values[0], abs=0.01)

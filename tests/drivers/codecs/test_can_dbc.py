@@ -1,5 +1,6 @@
 """CAN sensors described by a DBC file."""
 
+import re
 from pathlib import Path
 
 import cantools
@@ -275,3 +276,15 @@ def test_no_mapping_or_no_such() -> None:
         CanDbcOptions()
     with pytest.raises(ConfigError, match=r"nowhere.toml: no such file"):
         CanDbc(CanDbcOptions("nowhere.toml"))
+
+
+@pytest.mark.parametrize("factor, offset", [("1e308", "0"), ("0.001", "1e300"), ("1e27", "0")])
+def test_a_factor_that_no_sensor_has_is_named(folder: Path, factor: str, offset: str) -> None:
+    dbc = (folder / "patch.dbc").read_text()
+    wrong = re.sub(r"(SG_ X : \S+) \([^)]*\)", rf"\1 ({factor},{offset})", dbc, count=1)
+    assert wrong != dbc
+    (folder / "patch.dbc").write_text(wrong)
+    (folder / "patch.toml").write_text(PATCH_TOML)
+    with pytest.raises(ConfigError, match=r"signal X its readings go up to .* as no") as caught:
+        CanDbc(CanDbcOptions(str(folder / "patch.toml")))
+    assert "\n" not in str(caught.value)
