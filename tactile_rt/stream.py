@@ -293,6 +293,12 @@ class Source(abc.ABC):
     def close(self) -> None:
         """Release the device; safe to call twice. Reading afterwards raises `EndOfStream`."""
 
+    def fileno(self) -> int:
+        """A descriptor to wait for with `select` and its like: once it is readable, `read` with a
+        timeout of 0 takes what has come. It changes when a line is lost and opened again; -1: there
+        is none now, or never."""
+        return -1
+
     def __iter__(self) -> Iterator[Chunk]:
         while True:
             try:

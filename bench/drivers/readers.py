@@ -10,6 +10,7 @@ from multiprocessing.connection import Connection
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.drivers.reader import Reader
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, Source, SourceStats
 
@@ -89,12 +90,31 @@ class _Notes:
         return Came(seq, at, told, self.reads, replace(source.stats), drift)
 
 
-def read_sources(pipe: Connection, urls: list[str], samples: int) -> None:
-    """Open these, say that, read so many samples of each; say [`Came`] and the share of a core."""
+def read_sources(
+    pipe: Connection, urls: list[str], samples: int, gather_s: float | None = None
+) -> None:
+    """Open these, say that, read so many samples of each; say [`Came`] and the share of a core.
+
+    Args:
+        pipe: to whom to say it.
+        urls: of the sources.
+        samples: of each.
+        gather_s: that one reader for all of them lets samples gather; None: a thread for each.
+    """
     sources = [open_source(url) for url in urls]
     pipe.send("open")
     notes = [_Notes() for _ in sources]
     bill = _Bill()
+
+    def read_all() -> None:
+        note = dict(zip(sources, notes, strict=True))
+        reader = Reader(sources, gather_s or 0.0)
+        last = time.monotonic()
+        while any(len(n.seq) < samples for n in notes) and time.monotonic() - last < SILENCE_S:
+            for source, chunk in reader.read(0.1):
+                note[source].add(chunk)
+                last = time.monotonic()
+        bill.end()
 
     def read(source: Source, note: _Notes) -> None:
         last = time.monotonic()
@@ -107,6 +127,8 @@ def read_sources(pipe: Connection, urls: list[str], samples: int) -> None:
 
     pairs = list(zip(sources, notes, strict=True))
     threads = [threading.Thread(target=read, args=pair) for pair in pairs]
+    if gather_s is not None:
+        threads = [threading.Thread(target=read_all)]
     for thread in threads:
         thread.start()
     bill.begin()

@@ -34,6 +34,9 @@ class CalibratedSource(Source):
     def close(self) -> None:
         self.source.close()
 
+    def fileno(self) -> int:
+        return self.source.fileno()
+
     def __getattr__(self, name: str) -> Any:
         # While it is copied or unpickled there is no source yet to ask.
         if name == "source" or name.startswith("__"):

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
+from tactile_rt.daemon.acquisition import Acquisition
 from tactile_rt.daemon.admission import file_stamp, model_path
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import config_text
@@ -62,6 +63,7 @@ class Daemon:
         self._configured: list[str] = []  # the names of its file that are held
         self._freeze = freeze
         self._hub = Hub()
+        self._lines = Acquisition()
         self._sources: dict[str, SourcePart] = {}
         self._models: dict[str, tuple[Any, ModelPart]] = {}
         self._consumers: dict[str, tuple[Any, ConsumerPart]] = {}
@@ -261,7 +263,7 @@ class Daemon:
             if name in self._sources:
                 self._sources[name].limits = limits
             else:
-                part = SourcePart(source, self._hub, self.report, limits, self._clock)
+                part = SourcePart(source, self._hub, self.report, limits, self._clock, self._lines)
                 self._sources[name] = part
                 part.start()
 

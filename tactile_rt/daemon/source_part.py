@@ -4,9 +4,12 @@ import dataclasses
 import math
 import threading
 import time
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from tactile_rt.classifier.classifier import without_bad_samples
+from tactile_rt.daemon.acquisition import Acquisition
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, SourceConfig
 from tactile_rt.daemon.frozen import FrozenJudge, frozen_after
@@ -19,7 +22,7 @@ from tactile_rt.drivers.device_source import DeviceSource, device_of
 from tactile_rt.drivers.health import Health, State
 from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import NS_PER_S, ArraySpec, EndOfStream, Source, SourceStats
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
 
 __all__ = ["SourcePart", "keeps_host_time"]
 
@@ -33,13 +36,20 @@ class SourcePart(Part):
 
     Args:
         config: its table.
-        hub, report, limits, clock: of the daemon.
+        hub, report, limits, clock, lines: of the daemon.
     """
 
     def __init__(
-        self, config: SourceConfig, hub: Hub, report: Report, limits: LimitsConfig, clock: Clock
+        self,
+        config: SourceConfig,
+        hub: Hub,
+        report: Report,
+        limits: LimitsConfig,
+        clock: Clock,
+        lines: Acquisition,
     ) -> None:
         super().__init__(f"source.{config.name}", report, limits)
+        self._lines = lines
         self.config = config
         self._hub, self._clock = hub, clock
         self._stream: Source | None = None
@@ -50,7 +60,7 @@ class SourcePart(Part):
         self._frozen = FrozenJudge()
         self._losses, self._bads = LossWindow(), LossWindow()
         self._offset_ns = 0
-        self._look_ns = 0
+        self._look_ns = self._pause_ns = 0
         self._told: tuple[Any, ...] = ()
         self._opening = self._announced = self._left = False
         self._telling = threading.Lock()  # of the stream's end
@@ -123,33 +133,39 @@ class SourcePart(Part):
         self._busy_ns = time.monotonic_ns()
         self._announce(stream)
         self._up()
-        pause_ns = NS_PER_S * oldest_s(self.limits, stream.spec.rate_hz)
-        while not self._stop.is_set():
-            self._busy_ns = time.monotonic_ns()
-            try:
-                chunk = stream.read(POLL_S)
-            except EndOfStream:
-                break
-            if self._left:
-                return
-            now = time.monotonic_ns()
-            if now >= self._look_ns:
-                self._look(now)
-            if chunk is None:
-                continue
-            self._samples += len(chunk)
-            if now - self._read_ns > pause_ns:
-                self._flowing_ns = now
-            # A host's time that is ahead of the host would hide for how long nothing came.
-            self._read_ns, taken = now, int(chunk.t_ns[-1])
-            self._newest_ns = min(now, taken) if stream.live and keeps_host_time(stream) else now
-            good, bad = without_bad_samples(chunk)
-            useless = ~chunk.valid.any(axis=1)  # the device says so itself, or its codec does
-            self._bad += bad + int(useless.sum()) * chunk.valid.shape[1]
-            self._frozen.add(good)
-            self._hub.post(SourceChunk(self.config.name, stream.spec, chunk, now, self._offset_ns))
-            if not stream.live:
-                self._await_room()
+        self._pause_ns = round(NS_PER_S * oldest_s(self.limits, stream.spec.rate_hz))
+        take = partial(self._take, stream)
+        with suppress(EndOfStream):
+            while self._wanted():
+                self._busy_ns = time.monotonic_ns()
+                if stream.fileno() >= 0:
+                    self._lines.attend(stream, take, self._wanted)
+                else:
+                    take(stream.read(POLL_S))
+
+    def _wanted(self) -> bool:
+        return not (self._stop.is_set() or self._left)
+
+    def _take(self, stream: Source, chunk: Chunk | None) -> None:
+        """What has been read, in whichever thread."""
+        now = self._busy_ns = time.monotonic_ns()
+        if now >= self._look_ns:
+            self._look(now)
+        if chunk is None or self._left:
+            return
+        self._samples += len(chunk)
+        if now - self._read_ns > self._pause_ns:
+            self._flowing_ns = now
+        # A host's time that is ahead of the host would hide for how long nothing came.
+        self._read_ns, taken = now, int(chunk.t_ns[-1])
+        self._newest_ns = min(now, taken) if stream.live and keeps_host_time(stream) else now
+        good, bad = without_bad_samples(chunk)
+        useless = ~chunk.valid.any(axis=1)  # the device says so itself, or its codec does
+        self._bad += bad + int(useless.sum()) * chunk.valid.shape[1]
+        self._frozen.add(good)
+        self._hub.post(SourceChunk(self.config.name, stream.spec, chunk, now, self._offset_ns))
+        if not stream.live:
+            self._await_room()
 
     def _release(self) -> None:
         stream, self._stream, self._device = self._stream, None, None

@@ -82,35 +82,44 @@ class Sequencer:
             self._stats.corrupt += sum(damaged)
             self._next += n
             return self._next - n + np.arange(n), np.ones(n, np.bool_)
-        seq, keep = [0] * n, [True] * n
         ticks = [0] * n if samples.ticks is None else samples.ticks.tolist()
-        for i, count in enumerate(samples.count.tolist()):
-            content = hash((count, ticks[i], samples.values[i].tobytes()))
-            self._damaged += damaged[i]
-            gap = self._gap(count, ticks[i])
-            # While the clock stands still, the same content may be a sample of a later turn.
-            if content in self._seen and (gap < 0 or ticks[i] != self._tick):
-                keep[i], seq[i] = False, self._next
-                self._stats.duplicates += 1
-                continue
-            if gap < 0:
-                self.resets += 1
-                self._seen.clear()
-                self._run = gap = 0
-            elif self._count is not None:
-                self._run = self._run + gap + 1 if ticks[i] == self._tick else 0
-                self._longest_run = max(self._longest_run, self._run)
-            if gap:
-                corrupt = min(self._damaged, gap)
-                self._stats.corrupt += corrupt
-                self._stats.missing += gap - corrupt
-            seq[i] = self._next + gap
-            self._next = seq[i] + 1
-            self._count, self._tick, self._damaged = count, ticks[i], 0
-            self._seen[content] = None
-            if len(self._seen) > self._remembered:
-                del self._seen[next(iter(self._seen))]
-        return np.array(seq, np.int64), np.array(keep, np.bool_)
+        counts = samples.count.tolist()
+        seq = [
+            self._number(counts[i], ticks[i], damaged[i], samples.values[i].tobytes())
+            for i in range(n)
+        ]
+        if None not in seq:
+            return np.array(seq, np.int64), np.ones(n, np.bool_)
+        keep = np.array([number is not None for number in seq], np.bool_)
+        return np.array([number or 0 for number in seq], np.int64), keep
+
+    def _number(self, count: int, tick: int, damaged: int, values: bytes) -> int | None:
+        """The number of one sample; None: it came before."""
+        content = hash((count, tick, values))
+        self._damaged += damaged
+        gap = self._gap(count, tick)
+        # While the clock stands still, the same content may be a sample of a later turn.
+        if content in self._seen and (gap < 0 or tick != self._tick):
+            self._stats.duplicates += 1
+            return None
+        if gap < 0:
+            self.resets += 1
+            self._seen.clear()
+            self._run = gap = 0
+        elif self._count is not None:
+            self._run = self._run + gap + 1 if tick == self._tick else 0
+            self._longest_run = max(self._longest_run, self._run)
+        if gap:
+            corrupt = min(self._damaged, gap)
+            self._stats.corrupt += corrupt
+            self._stats.missing += gap - corrupt
+        number = self._next + gap
+        self._next = number + 1
+        self._count, self._tick, self._damaged = count, tick, 0
+        self._seen[content] = None
+        if len(self._seen) > self._remembered:
+            del self._seen[next(iter(self._seen))]
+        return number
 
     def _gap(self, count: int, tick: int) -> int:
         """Samples between the newest one and this; negative: none, it is not after it."""

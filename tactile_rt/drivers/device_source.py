@@ -137,6 +137,11 @@ class DeviceSource(Source):
                 pass  # it is gone, which is what we want
         self._drop()
 
+    def fileno(self) -> int:
+        link = self._link
+        # One that is asked for each sample must be read to be asked.
+        return -1 if link is None or self._early or self.codec.polls else link.fileno()
+
     def tap(self, on_packet: Tap | None) -> None:
         """Pass every packet on as it came, before it is decoded; None: no longer.
 

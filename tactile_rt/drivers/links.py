@@ -53,6 +53,10 @@ class Link(abc.ABC, Generic[Packet]):
     def close(self) -> None:
         """Release the line; safe to call twice."""
 
+    def fileno(self) -> int:
+        """The descriptor that is readable when something has arrived; -1: there is none."""
+        return -1
+
 
 class SerialLink(Link[bytes]):
     """Any port that pyserial opens: a device, a pty, ``socket://``, ``rfc2217://``.
@@ -83,6 +87,7 @@ class SerialLink(Link[bytes]):
             raise SourceError(f"{port}: {_why(port, error)}") from None
         try:
             self._fd: int | None = self._port.fileno()
+            self._terminal = os.isatty(self._fd)
             self._poll = select.poll()
             self._poll.register(self._fd, select.POLLIN)
         except Exception:  # each pyserial handler without one says so in its own way
@@ -92,9 +97,11 @@ class SerialLink(Link[bytes]):
         try:
             if self._fd is None:
                 return self._receive_slowly(timeout_s)
-            if not self._poll.poll(1e3 * max(timeout_s, 0.0)):
+            if timeout_s > 0 and not self._poll.poll(1e3 * timeout_s):
                 return None
             data = os.read(self._fd, READ_BYTES)
+            if not data and timeout_s <= 0 and self._terminal and not self._hung_up():
+                return None  # a terminal that has nothing gives nothing; it may have by now
         except BlockingIOError:
             return None
         except (OSError, ValueError, TypeError) as error:  # closed meanwhile, or unplugged
@@ -102,6 +109,9 @@ class SerialLink(Link[bytes]):
         if not data:
             raise SourceError(f"{self.name}: the line is gone (unplugged, or hung up)")
         return data, time.monotonic_ns()
+
+    def _hung_up(self) -> bool:
+        return any(events & ~select.POLLIN for _, events in self._poll.poll(0))
 
     def _receive_slowly(self, timeout_s: float) -> tuple[bytes, int] | None:
         end = time.monotonic() + timeout_s
@@ -119,10 +129,14 @@ class SerialLink(Link[bytes]):
             raise SourceError(f"{self.name}: cannot be written to ({_reason(error)})") from None
 
     def close(self) -> None:
+        self._fd = None
         try:
             self._port.close()
         except (OSError, TypeError):
             pass  # it is gone, which is what we want
+
+    def fileno(self) -> int:
+        return -1 if self._fd is None else self._fd
 
 
 class CanLink(Link[Sequence[CanFrame]]):
@@ -250,6 +264,9 @@ class SlcanLink(Link[Sequence[CanFrame]]):
         except SourceError:
             pass  # it is gone, which is what we want
         self._serial.close()
+
+    def fileno(self) -> int:
+        return self._serial.fileno()
 
 
 def _reason(error: BaseException) -> str:

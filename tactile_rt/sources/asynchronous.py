@@ -1,0 +1,46 @@
+"""A source in an event loop.
+
+async for chunk in chunks(source):
+    ...
+"""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import suppress
+
+from tactile_rt.stream import Chunk, EndOfStream, Source
+
+__all__ = ["chunks"]
+
+LOOK_S = 0.1  # how often a source is looked at though nothing has come
+
+
+async def chunks(source: Source) -> AsyncIterator[Chunk]:
+    """The chunks of a source as they come, until it ends; it stays the caller's to close.
+
+    As long as the source has a descriptor to wait for, the loop waits for that and no thread is
+    needed. A source without one, or a line that is lost, is read in a thread, 0.1 s at a time.
+
+    Raises:
+        SourceError: the device broke.
+    """
+    loop, came = asyncio.get_running_loop(), asyncio.Event()
+    while True:
+        fd = source.fileno()
+        try:
+            if fd < 0:
+                chunk = await asyncio.to_thread(source.read, LOOK_S)
+            else:
+                chunk = source.read(0.0)
+        except EndOfStream:
+            return
+        if chunk is not None:
+            yield chunk
+        elif fd >= 0:
+            came.clear()
+            loop.add_reader(fd, came.set)
+            try:
+                with suppress(TimeoutError):
+                    await asyncio.wait_for(came.wait(), LOOK_S)
+            finally:
+                loop.remove_reader(fd)
