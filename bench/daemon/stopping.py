@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from bench.daemon.disturbed import CONFIGURATION
 from bench.daemon.models import finger_array, whisker_array, write_wide_model
 from bench.daemon.overload import HOG, HOGS_PER_CORE, STEP_MS, slow_down
 from bench.daemon.process import DaemonProcess, free_port, until
@@ -31,29 +32,6 @@ TIMES, QUICK = 25, 2  # of each way
 STATED_S = 2.0
 RELOADS, QUICK_RELOADS = 10, 2
 STREAM_S = 3600.0
-CONFIGURATION = """version = 1
-[[source]]
-name = "whiskers"
-url = "{whiskers}"
-[[source]]
-name = "finger"
-url = "{finger}"
-[[model]]
-source = "whiskers"
-file = "wide.onnx"
-[[model]]
-source = "finger"
-[[publisher]]
-kind = "jsonl"
-options = {{ file = "said.jsonl" }}
-[recorder]
-folder = "recordings"
-min_free_mb = 0
-[page]
-port = {page}
-[metrics]
-port = {metrics}
-"""
 EXCHANGED = """version = 1
 [[source]]
 name = "a"
@@ -110,7 +88,7 @@ class _Rig:
         new.replace(self.model)
 
     def daemon(self) -> DaemonProcess:
-        ports = {name: free_port() for name in ("page", "metrics")}
+        ports = {name: free_port() for name in ("zmq", "page", "metrics")}
         text = CONFIGURATION.format(**self._urls, **ports)
         return DaemonProcess(self.folder, text, ports["metrics"])
 

@@ -75,27 +75,13 @@ class Acquisition:
                 self._read(self._lent[source])
 
     def _read(self, lent: _Lent) -> None:
-        source = lent.source
-        try:
-            chunk = source.read(0.0)
-        except Exception as error:
-            lent.error = error
-            self._give_back(lent)
-            return
-        self._call(lent, chunk)
-        if source.fileno() < 0 and source in self._lent:
-            self._give_back(lent)
-
-    def _call(self, lent: _Lent, chunk: Chunk | None) -> None:
         try:
             if lent.wanted():
-                lent.take(chunk)
-                return
+                lent.take(lent.source.read(0.0))
+                if lent.source.fileno() >= 0:
+                    return
         except Exception as error:
             lent.error = error
-        self._give_back(lent)
-
-    def _give_back(self, lent: _Lent) -> None:
         del self._lent[lent.source]
         self._reader.remove(lent.source)
         lent.over.set()

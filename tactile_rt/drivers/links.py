@@ -87,7 +87,7 @@ class SerialLink(Link[bytes]):
             raise SourceError(f"{port}: {_why(port, error)}") from None
         try:
             self._fd: int | None = self._port.fileno()
-            self._terminal = os.isatty(self._fd)
+            self._terminal, self._blocks = os.isatty(self._fd), os.get_blocking(self._fd)
             self._poll = select.poll()
             self._poll.register(self._fd, select.POLLIN)
         except Exception:  # each pyserial handler without one says so in its own way
@@ -97,8 +97,9 @@ class SerialLink(Link[bytes]):
         try:
             if self._fd is None:
                 return self._receive_slowly(timeout_s)
-            if timeout_s > 0 and not self._poll.poll(1e3 * timeout_s):
-                return None
+            if timeout_s > 0 or self._blocks:
+                if not self._poll.poll(1e3 * max(timeout_s, 0.0)):
+                    return None
             data = os.read(self._fd, READ_BYTES)
             if not data and timeout_s <= 0 and self._terminal and not self._hung_up():
                 return None  # a terminal that has nothing gives nothing; it may have by now

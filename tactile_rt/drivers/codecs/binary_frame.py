@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
-from tactile_rt.drivers.codecs.frame_mapping import as_bytes, read_frame_mapping
+from tactile_rt.drivers.codecs.frame_layout import FrameLayout, as_bytes
+from tactile_rt.drivers.codecs.frame_mapping import read_frame_mapping
 from tactile_rt.drivers.codecs.framing import FrameFinder
 from tactile_rt.stream import Chunk, ConfigError
 
@@ -46,8 +47,8 @@ class BinaryFrame(SerialCodec):
     )
 
     def __init__(self, options: BinaryFrameOptions) -> None:
-        self.frame = frame = read_frame_mapping(options.mapping)
-        mapping, where = frame.mapping, options.mapping
+        mapping, where = read_frame_mapping(options.mapping), options.mapping
+        self.frame = frame = FrameLayout(mapping, where)
         super().__init__(frame.spec)
         self.baud, self.parity = mapping.baud, mapping.parity  # type: ignore[misc]
         self.count_bits = frame.count.bits if frame.count else None
