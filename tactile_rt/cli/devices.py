@@ -65,7 +65,11 @@ def doctor(
 
 
 @app.command()
-def codecs() -> None:
+def codecs(
+    frame: Annotated[
+        str, typer.Option(help="Print the description of this device's frame, to change a copy.")
+    ] = "",
+) -> None:
     """Show what devices can speak, their options, and what each protocol cannot show."""
     import inspect
 
@@ -75,6 +79,15 @@ def codecs() -> None:
     from tactile_rt.drivers.codec import CODECS, codec_class
     from tactile_rt.stream import ConfigError
 
+    if frame:
+        from tactile_rt.drivers.codecs.binary_frame import FRAMES
+
+        described = {path.stem: path for path in sorted(FRAMES.glob("*.toml"))}
+        with starting():
+            if frame not in described:
+                raise ConfigError(f"--frame {frame}: described are {', '.join(described)}")
+        typer.echo(described[frame].read_text("utf-8"), nl=False)
+        return
     table = Table("wire", "codec", "device", "options", "cannot detect", header_style="bold")
     for wire, name in sorted(CODECS):
         try:

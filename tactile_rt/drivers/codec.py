@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib import import_module, metadata
+from pathlib import Path
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -52,13 +53,15 @@ CODECS = {
     ("serial", "ft300"): f"{_HERE}.ft300:Ft300",
     ("serial", "tsf85"): f"{_HERE}.tsf85:Tsf85",
     ("serial", "ati_485"): f"{_HERE}.ati_485:Ati485",
-    ("serial", "kwr75"): f"{_HERE}.kwr75:Kwr75",
     ("can", "xela"): f"{_HERE}.xela:Xela",
     ("can", "can-dbc"): f"{_HERE}.can_dbc:CanDbc",
     ("can", "ati_can"): f"{_HERE}.ati_can:AtiCan",
     ("can", "aft200"): f"{_HERE}.aft200:Aft200",
     ("can", "icub_skin"): f"{_HERE}.icub_skin:IcubSkin",
 }
+# a device whose frame is described, and which needs no more: NAME.toml
+for _frame in sorted(Path(__file__).with_name("codecs").glob("frames/*.toml")):
+    CODECS.setdefault(("serial", _frame.stem), f"{_HERE}.binary_frame:{_frame.stem}.toml")
 
 
 class Command(StrEnum):
@@ -311,7 +314,11 @@ def codec_class(wire: str, name: str) -> type[Codec[Any]]:
     if (wire, name) in CODECS:
         module, _, attribute = CODECS[wire, name].partition(":")
         try:
-            found: type[Codec[Any]] = getattr(import_module(module), attribute)
+            there = import_module(module)
+            if attribute.endswith(".toml"):
+                described: type[Codec[Any]] = there.frame_codec(name)
+                return described
+            found: type[Codec[Any]] = getattr(there, attribute)
         except ModuleNotFoundError as error:
             if (error.name or "").startswith("tactile_rt"):
                 raise

@@ -1,23 +1,53 @@
 """Any sensor that sends frames of one length over a serial line, described in a TOML file."""
 
+import textwrap
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
+from tactile_rt.drivers.codecs.endings import EndFinder, Found, StrideFinder
 from tactile_rt.drivers.codecs.frame_layout import FrameLayout, as_bytes
-from tactile_rt.drivers.codecs.frame_mapping import read_frame_mapping
+from tactile_rt.drivers.codecs.frame_mapping import FrameMapping, read_frame_mapping
 from tactile_rt.drivers.codecs.framing import FrameFinder
 from tactile_rt.stream import Chunk, ConfigError
 
-__all__ = ["BinaryFrame", "BinaryFrameOptions"]
+__all__ = [
+    "BinaryFrame",
+    "BinaryFrameOptions",
+    "DescribedFrame",
+    "FrameOptions",
+    "frame_codec",
+    "shipped_frame",
+]
+
+DISTINCT = 4  # bytes of an ending that no measurement has
+FRAMES = Path(__file__).with_name("frames")  # the devices whose frames are described
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameOptions:
+    """Options of a device whose frame is described.
+
+    Attributes:
+        rate_hz: Rate at which the device sends, or is asked, Hz; 0 for that of its description.
+    """
+
+    rate_hz: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.rate_hz < np.inf:
+            raise ConfigError(f"rate_hz must be positive, not {self.rate_hz}")
 
 
 @dataclass(frozen=True)
-class BinaryFrameOptions:
-    """Options of a described binary frame.
+class BinaryFrameOptions(FrameOptions):
+    """Options of a binary frame that you describe.
 
     Attributes:
         mapping: Path of a TOML file, like docs/codecs/binary_frame.toml.
@@ -26,6 +56,7 @@ class BinaryFrameOptions:
     mapping: str = ""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not self.mapping:
             raise ConfigError(
                 "binary_frame has to know the frame: give mapping=FILE.toml, as "
@@ -33,76 +64,109 @@ class BinaryFrameOptions:
             )
 
 
-class BinaryFrame(SerialCodec):
-    """Frames with a beginning and a length; counter, clock, status and checksum if they have one.
+class DescribedFrame(SerialCodec):
+    """Frames of one length; counter, clock, status and checksum if they have one.
+
+    Args:
+        mapping: what a frame is, and what the host sends.
+        where: the place of that description, for what is raised.
+        rate_hz: rate at which the device sends, or is asked, Hz; 0 for that of the description.
+
+    Raises:
+        ConfigError: the frame cannot be so; names place and key.
 
     Attributes:
         frame: The frame as it was described.
     """
 
-    Options = BinaryFrameOptions
     cannot_detect = (
         "What the frame has nothing for: without a checksum changed values, without a counter or "
         "clock frames that never came or came twice."
     )
 
-    def __init__(self, options: BinaryFrameOptions) -> None:
-        mapping, where = read_frame_mapping(options.mapping), options.mapping
+    def __init__(self, mapping: FrameMapping, where: str, rate_hz: float = 0.0) -> None:
+        if rate_hz:
+            mapping = msgspec.structs.replace(mapping, rate_hz=rate_hz)
         self.frame = frame = FrameLayout(mapping, where)
         super().__init__(frame.spec)
         self.baud, self.parity = mapping.baud, mapping.parity  # type: ignore[misc]
         self.count_bits = frame.count.bits if frame.count else None
         if mapping.time is not None and frame.time is not None:
             self.tick_ns, self.tick_bits = 1e3 * mapping.time.tick_us, frame.time.bits
-        self._invalid = 0
+        self._invalid = self._refused = 0
         if mapping.status is not None:
             self.status_bits = frame.meanings  # type: ignore[misc]
             self._invalid = sum(1 << bit for bit in mapping.status.invalid)
+            self._refused = sum(1 << bit for bit in mapping.status.invalid[:1])
         self._steps = {
             command: tuple(
                 Step(
                     as_bytes(m.send, f"{where}: {command}"),
                     as_bytes(m.expect, f"{where}: {command}") if m.expect else None,
-                    m.wait_s, m.pause_s, f"the {command} command {m.send}",
+                    m.wait_s, m.pause_s, f"the {command} command {textwrap.shorten(m.send, 40)}",
                 )
                 for m in messages
             )
             for command, messages in (
-                (Command.START, mapping.start), (Command.STOP, mapping.stop),
+                (Command.STOP, mapping.stop), (Command.START, mapping.start),
             )
         }  # fmt: skip
         poll = as_bytes(mapping.poll, f"{where}: poll")
         self._steps[Command.POLL] = (Step(poll),) if poll else ()
         self.polls = bool(poll)
         self.streaming = not self.polls and not mapping.start
-        self._finder = FrameFinder(
-            frame.sync, mapping.length, frame.intact, frame.between, self.stats
-        )
+        self._finder: FrameFinder | EndFinder | StrideFinder
+        if frame.sync:
+            self._finder = FrameFinder(
+                frame.sync, mapping.length, frame.intact, frame.between, self.stats,
+                head=frame.usually,
+            )  # fmt: skip
+        elif len(frame.ends) >= DISTINCT:
+            self._finder = EndFinder(frame.ends, mapping.length, self.stats)
+        else:
+            self._finder = StrideFinder(frame.ends, mapping.length, frame.possible, self.stats)
         self._heard = b""
+
+    @property
+    def lock_confidence(self) -> float:
+        """Certainty about where frames begin: below 1 while other places fit as well, for frames
+        that have neither a beginning nor an ending of their own."""
+        return self._finder.confidence if isinstance(self._finder, StrideFinder) else 1.0
 
     # the host's side
 
     def feed(self, packet: bytes, t_ns: int) -> Samples | None:
-        found, damaged = self._finder.find(packet)
+        found, damaged, arrived = self._find(packet, t_ns)
         if not found:
             return None
         frame, n, length = self.frame, len(found), self.frame.mapping.length
         data = b"".join(found)
         values = np.empty((n, frame.spec.shape[0] * frame.spec.shape[1]))
+        valid = np.ones((n, frame.spec.shape[0]), np.bool_)
         with np.errstate(over="ignore", invalid="ignore"):  # a damaged value may be any
             for block in frame.blocks:
-                raw = block.numbers.read(data, n, length)
-                values[:, block.cells] = raw.astype(np.float64) * block.gain + block.bias
+                raw = block.numbers.read(data, n, length).astype(np.float64)
+                if len(block.cells):
+                    values[:, block.cells] = raw * block.gain + block.bias
+                block.judge(raw, valid)
             loads = values.astype(np.float32).reshape(n, *frame.spec.shape)
         count, ticks, status = (
             None if one is None else one.read(data, n, length)[:, 0].astype(np.int64)
             for one in (frame.count, frame.time, frame.status)
         )
-        valid = np.asarray(np.isfinite(loads).all(axis=2))
+        valid &= np.isfinite(loads).all(axis=2)
         if status is not None:
             valid &= (status & self._invalid == 0)[:, None]
-        arrived = np.full(n, t_ns, np.int64)
-        return Samples(loads, valid, arrived, np.array(damaged, np.int64), count, ticks, status)
+        return Samples(
+            loads, valid, np.array(arrived, np.int64), np.array(damaged, np.int64), count, ticks,
+            status,
+        )  # fmt: skip
+
+    def _find(self, packet: bytes, t_ns: int) -> Found:
+        if isinstance(self._finder, FrameFinder):
+            found, damaged = self._finder.find(packet)
+            return found, damaged, [t_ns] * len(found)
+        return self._finder.find(packet, t_ns)
 
     def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         return self._steps[command]
@@ -113,18 +177,26 @@ class BinaryFrame(SerialCodec):
     # the device's side
 
     def encode(self, chunk: Chunk) -> list[bytes]:
-        flat = chunk.values.astype(np.float64).reshape(len(chunk), -1)
+        known = chunk.valid & np.isfinite(chunk.values).all(axis=2)
+        values = np.where(chunk.valid[..., None], chunk.values, np.nan).astype(np.float64)
+        if self._refused:  # it says so in its status
+            values = np.nan_to_num(values)
+        flat = values.reshape(len(chunk), -1)
         ticks = np.rint(chunk.t_ns / (self.tick_ns or 1.0))
-        return [self._encoded(flat[k], int(chunk.seq[k]), int(ticks[k])) for k in range(len(chunk))]
+        return [
+            self._encoded(flat[k], bool(known[k].all()), int(chunk.seq[k]), int(ticks[k]))
+            for k in range(len(chunk))
+        ]
 
-    def _encoded(self, values: NDArray[np.float64], count: int, ticks: int) -> bytes:
+    def _encoded(self, values: NDArray[np.float64], good: bool, count: int, ticks: int) -> bytes:
         frame = self.frame
         made = bytearray(frame.mapping.length)
         made[: len(frame.sync)] = frame.sync
         made[len(made) - len(frame.ends) :] = frame.ends
         for block in frame.blocks:
-            block.numbers.write(made, (values[block.cells] - block.bias) / block.gain)
-        for number, place in ((count, frame.count), (ticks, frame.time)):
+            block.write(made, values)
+        status = 0 if good else self._refused
+        for number, place in ((count, frame.count), (ticks, frame.time), (status, frame.status)):
             if place is not None:
                 place.write(made, np.array([number % (1 << place.bits)]))
         return frame.seal(made)
@@ -142,14 +214,50 @@ class BinaryFrame(SerialCodec):
             for step in steps:
                 if step.send and self._heard.endswith(step.send):
                     self._heard = b""
-                    self._obey(command, step)
+                    self._follow(command, step)
                     return step.expect if isinstance(step.expect, bytes) else b""
         return b""
 
-    def _obey(self, command: Command, step: Step[Any]) -> None:
+    def _follow(self, command: Command, step: Step[Any]) -> None:
         if command == Command.POLL:
             self.polled += 1
         elif command == Command.STOP:
             self.streaming = False
         elif step is self._steps[command][-1]:
             self.streaming = not self.polls
+
+
+class BinaryFrame(DescribedFrame):
+    """A frame of which you give the description, ``mapping=FILE.toml``."""
+
+    Options = BinaryFrameOptions
+
+    def __init__(self, options: BinaryFrameOptions) -> None:
+        super().__init__(read_frame_mapping(options.mapping), options.mapping, options.rate_hz)
+
+
+def shipped_frame(name: str) -> FrameMapping:
+    """The description in `FRAMES` of a device's frame."""
+    return read_frame_mapping(str(FRAMES / f"{name}.toml"))
+
+
+@cache
+def frame_codec(name: str) -> type[DescribedFrame]:
+    """The codec of a device whose frame is described in `FRAMES`, and of which that is all."""
+
+    class Described(DescribedFrame):
+        Options = FrameOptions
+
+        def __init__(self, options: FrameOptions) -> None:
+            super().__init__(shipped_frame(name), name, options.rate_hz)
+
+    Described.__name__ = Described.__qualname__ = name
+    frame = shipped_frame(name)
+    unseen = [] if frame.checksum else ["changed values"]
+    if not frame.count:
+        clock = ", but for steps of its clock" if frame.time else ""
+        unseen.append(f"frames that never came or came twice{clock}")
+    Described.cannot_detect = "; ".join(unseen)
+    about, _, _ = (FRAMES / f"{name}.toml").read_text("utf-8").partition("\n#\n")
+    Described.__doc__ = about.replace("# ", "")
+    return Described

@@ -10,38 +10,23 @@ bota_driver/rokubimini_serial and of the maker's Python and Arduino examples.
 """
 
 import re
+import struct
 from dataclasses import dataclass
-from typing import ClassVar, Final
+from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
+from msgspec.structs import replace
 
-from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
-from tactile_rt.drivers.codecs.framing import FrameFinder, crc16_x25
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, shipped_frame
+from tactile_rt.drivers.codecs.frame_mapping import Values
+from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = ["Bota", "BotaOptions"]
 
-SYNC: Final = b"\xaa"
-USUAL: Final = SYNC + bytes(2)  # a good status; most of its bits are never set
-FRAME: Final = np.dtype(
-    [
-        ("sync", "u1"),
-        ("status", "<u2"),
-        ("load", "<f4", 6),
-        ("time", "<u4"),
-        ("temperature", "<f4"),
-        ("check", "<u2"),
-    ]
-)
 BAUDS: Final = {9600: 0, 57_600: 1, 115_200: 2, 230_400: 3, 460_800: 4}
 SINC_S: Final = 19.53125e-6  # of time between samples, for each unit of the sinc filter's length
 LEAST_SINC, LARGEST_SINC = 51, 512
-OVERRANGE, INVALID, RAW = 1, 2, 3  # bits of the status
-UNUSABLE: Final = 1 << OVERRANGE | 1 << INVALID | 1 << RAW  # a slow one is late, yet right
-ZERO_C: Final = 273.15  # K
-ROOM: Final = 298.15  # K, of an emulated device that does not measure it
-TEXT: Final = re.compile(rb"App Init|r,\d,[\w#],\d")
+TEMPERATURE: Final = 31  # place in a frame
+ROOM: Final = 25.0  # C, of an emulated device that does not measure it
 COMMAND: Final = re.compile(rb"c(?:,\d){4}|f,\d{2,3}(?:,\d){3}|[CIR#s]")
 INPUT: Final = 64  # bytes that the device can hold of commands
 
@@ -78,18 +63,10 @@ class BotaOptions:
             raise ConfigError(f"baud must be one of {known} for a Bota sensor, not {self.baud}")
 
 
-class Bota(SerialCodec):
+class Bota(DescribedFrame):
     """One six-axis sensor: forces and moments at its reference point, N and N m."""
 
     Options = BotaOptions
-    baud = 460_800
-    tick_ns = 1000.0
-    status_bits: ClassVar[dict[int, str]] = {
-        0: "skips measurements: the sinc filter is too short for its other settings",
-        OVERRANGE: "measuring range exceeded",
-        INVALID: "measurements invalid: the sensor may be damaged",
-        RAW: "sends raw gauge readings: its calibration matrix is off",
-    }
     cannot_detect = (
         "It has no sample counter: frames that never came, or came twice, show only in the steps "
         "of its clock."
@@ -97,84 +74,35 @@ class Bota(SerialCodec):
     )
 
     def __init__(self, options: BotaOptions) -> None:
-        channels: tuple[str, ...] = ("fx", "fy", "fz", "mx", "my", "mz")
-        units: tuple[str, ...] = ("N",) * 3 + ("N m",) * 3
-        if options.temperature:
-            channels, units = (*channels, "temperature"), (*units, "K")
-        super().__init__(
-            ArraySpec(
-                name="bota",
-                elements=("sensor",),
-                grid=((0, 0),),
-                positions=((0.0, 0.0, 0.0),),  # loads are told at the frame's origin
-                orientations=((1.0, 0.0, 0.0, 0.0),),
-                channels=channels,
-                units=units,
-                rate_hz=1 / (SINC_S * options.sinc),
-                frame="sensor",
-            )
-        )
-        self._options = options
-        self._finder = FrameFinder(SYNC, FRAME.itemsize, _intact, TEXT, self.stats, head=USUAL)
-        self._commands = bytearray()
-        self._configuring = False
-
-    # the host's side
-
-    def feed(self, packet: bytes, t_ns: int) -> Samples | None:
-        found, damaged = self._finder.find(packet)
-        if not found:
-            return None
-        frames = np.frombuffer(b"".join(found), FRAME)
-        values: NDArray[np.float32] = frames["load"]
-        if self._options.temperature:
-            with np.errstate(all="ignore"):  # it may be any bits, though the CRC is right
-                kelvin = frames["temperature"] + np.float32(ZERO_C)
-            values = np.column_stack([values, kelvin])
-        usable = (frames["status"] & UNUSABLE == 0) & np.isfinite(values).all(axis=1)
-        return Samples(
-            np.ascontiguousarray(values, np.float32)[:, None],
-            usable[:, None],
-            np.full(len(found), t_ns, np.int64),
-            np.array(damaged, np.int64),
-            ticks=frames["time"].astype(np.int64),
-            status=frames["status"].astype(np.int64),
-        )
-
-    def commands(self, command: Command) -> tuple[Step[bytes], ...]:
-        o = self._options
-        configure = Step(b"C", b"r,0,C,0", what="the command to configure it")
-        if command == Command.STOP:
-            return (configure,)
-        if command != Command.START:
-            return ()
+        o, frame = options, shipped_frame("bota")
         line = f"c,{o.temperature_compensation:d},1,0,{BAUDS[o.baud]}"  # calibrated, binary
         filters = f"f,{o.sinc},{o.chop:d},{o.fast:d},{o.skip_fir:d}"
-        return (
-            configure,
-            Step(line.encode(), b"r,0,c,0", what="the set-up of its line"),
-            Step(filters.encode(), b"r,0,f,0", what="the set-up of its filters"),
-            Step(b"R", b"r,0,R,0", what="the command to run"),
-        )
-
-    def forget(self) -> None:
-        self._finder.forget()
+        configure, set_line, set_filters, run = frame.start
+        start = (
+            configure, replace(set_line, send=f"text:{line}"),
+            replace(set_filters, send=f"text:{filters}"), run,
+        )  # fmt: skip
+        values = frame.values
+        if o.temperature:
+            place = Values(at=TEMPERATURE, type="float32", channels=("temperature",), unit="degC")
+            values = (*values, place)
+        frame = replace(frame, start=start, values=values, baud=o.baud)
+        super().__init__(frame, "bota", rate_hz=1 / (SINC_S * o.sinc))
+        self._measures_temperature = o.temperature
+        self.streaming = True  # from power-on
+        self._commands = bytearray()
+        self._configuring = False
 
     # the device's side
 
     def encode(self, chunk: Chunk) -> list[bytes]:
-        frames = np.zeros(len(chunk), FRAME)
-        values = chunk.values[:, 0].astype(np.float64)
-        known = chunk.valid[:, 0] & np.isfinite(values).all(axis=1)
-        limit = np.finfo(np.float32).max
-        values = np.clip(np.nan_to_num(values), -limit, limit)
-        frames["sync"] = SYNC[0]
-        frames["status"] = np.where(known, 0, 1 << INVALID)
-        frames["load"] = values[:, :6]
-        frames["time"] = chunk.t_ns // 1000 & 0xFFFFFFFF
-        frames["temperature"] = (values[:, 6] if self._options.temperature else ROOM) - ZERO_C
-        whole = (frame.tobytes() for frame in frames)
-        return [w[:-2] + crc16_x25(w[1:-2]).to_bytes(2, "little") for w in whole]
+        packets = super().encode(chunk)
+        return packets if self._measures_temperature else [self._at_room(p) for p in packets]
+
+    def _at_room(self, packet: bytes) -> bytes:
+        frame = bytearray(packet)
+        struct.pack_into("<f", frame, TEMPERATURE, ROOM)
+        return self.frame.seal(frame)
 
     def respond(self, packet: bytes) -> bytes:
         self._commands += packet
@@ -198,7 +126,3 @@ class Bota(SerialCodec):
         elif not self._configuring:
             error = 1
         return b"r,0,%s,%d\r\n" % (kind, error)
-
-
-def _intact(frame: bytes) -> bool:
-    return crc16_x25(frame[1:-2]) == int.from_bytes(frame[-2:], "little")

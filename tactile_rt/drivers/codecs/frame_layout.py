@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS, Column, array_of
-from tactile_rt.drivers.codecs.frame_mapping import FrameCounter, FrameMapping
+from tactile_rt.drivers.codecs.frame_mapping import UNHEARD, FrameCounter, FrameMapping, Values
 from tactile_rt.drivers.codecs.framing import crc16_modbus, crc16_x25, crc16_xmodem
 from tactile_rt.stream import ArraySpec, ConfigError
 
@@ -37,16 +37,19 @@ class Numbers:
     """Where numbers of one type are in a frame.
 
     Args:
-        at, step: offset of the first, and from one to the next.
-        n: how many.
+        at: offset of the first.
         kind: their type.
         order: their byte order.
+        groups, n: how many groups there are, of how many that touch.
+        stride: bytes from one group to the next; 0 if groups touch, too.
     """
 
-    def __init__(self, at: int, n: int, kind: str, order: str, step: int = 0) -> None:
+    def __init__(
+        self, at: int, kind: str, order: str, groups: int = 1, n: int = 1, stride: int = 0
+    ) -> None:
         self.bits = int("".join(filter(str.isdigit, kind)))
         self.width = self.bits // 8
-        self.at, self.n, self.step = at, n, step or self.width
+        self.at, self.shape, self.stride = at, (groups, n), stride or n * self.width
         self._odd = self.width == 3
         self._signed, self._little = kind.startswith("int"), order == "little"
         letter = kind[0]
@@ -66,24 +69,29 @@ class Numbers:
     @property
     def covered(self) -> set[int]:
         """Offsets of all bytes that they take."""
-        return {self.at + k * self.step + b for k in range(self.n) for b in range(self.width)}
+        return {at + b for at in self._places() for b in range(self.width)}
+
+    def _places(self) -> list[int]:
+        groups, n = self.shape
+        return [self.at + g * self.stride + k * self.width for g in range(groups) for k in range(n)]
 
     def read(self, frames: bytes, count: int, length: int) -> NDArray[Any]:
-        """(count, n) of so many frames."""
+        """(count, number) of so many frames."""
+        shape, strides = (count, *self.shape), (length, self.stride, self.width)
         if not self._odd:
-            return np.ndarray((count, self.n), self._dtype, frames, self.at, (length, self.step))
-        parts = np.ndarray((count, self.n, 3), np.uint8, frames, self.at, (length, self.step, 1))
+            found = np.ndarray(shape, self._dtype, frames, self.at, strides)
+            return found.reshape(count, -1)
+        parts = np.ndarray((*shape, 3), np.uint8, frames, self.at, (*strides, 1))
         parts = parts if self._little else parts[..., ::-1]
-        found: NDArray[Any] = parts.astype(np.int64) @ (1, 1 << 8, 1 << 16)
+        found = (parts.astype(np.int64) @ (1, 1 << 8, 1 << 16)).reshape(count, -1)
         return np.where(found >> 23, found - (1 << 24), found) if self._signed else found
 
     def write(self, frame: bytearray, values: NDArray[Any]) -> None:
         """Put these, clipped to what the type can tell, into a frame."""
-        numbers = np.clip(np.nan_to_num(values), self.low, self.high)
+        numbers = np.clip(values, self.low, self.high)
         if self.whole:
-            numbers = np.rint(numbers)
-        for k, number in enumerate(numbers.tolist()):
-            at = self.at + k * self.step
+            numbers = np.rint(np.nan_to_num(numbers))
+        for at, number in zip(self._places(), numbers.tolist(), strict=True):
             if self.whole:
                 order: Literal["little", "big"] = "little" if self._little else "big"
                 raw = (int(number) & ((1 << self.bits) - 1)).to_bytes(self.width, order)
@@ -95,8 +103,43 @@ class Numbers:
 class Block:
     """Measured numbers, with where they go and what they stand for."""
 
-    def __init__(self, numbers: Numbers, gain: Row, bias: Row, cells: list[int]) -> None:
-        self.numbers, self.gain, self.bias, self.cells = numbers, gain, bias, np.array(cells)
+    def __init__(
+        self, values: Values, numbers: Numbers, gain: Row, bias: Row, cells: list[int],
+        elements: list[int],
+    ) -> None:  # fmt: skip
+        self.numbers, self.gain, self.bias = numbers, gain, bias
+        self.cells = np.array(cells, np.intp)  # of a sample; of none for numbers not delivered
+        self._values, self._elements = values, elements
+        self._limited = bool(values.possible or values.valid or values.smallest)
+
+    def possible(self, raw: Row) -> NDArray[np.bool_]:
+        """Which of these the device can send."""
+        values, size = self._values, np.abs(raw)
+        can: NDArray[np.bool_] = (size >= values.smallest) | (size == 0)
+        return can & _within(raw, values.possible)
+
+    def judge(self, raw: Row, valid: NDArray[np.bool_]) -> None:
+        """Make the elements, (n, element), of numbers that are no measurements invalid."""
+        if not self._limited:
+            return
+        good = self.possible(raw) & _within(raw, self._values.valid)
+        for k, element in enumerate(self._elements):
+            valid[:, element] &= good[:, k]
+
+    def write(self, frame: bytearray, sample: Row) -> None:
+        """Put what a device would send of a sample into its frame."""
+        if not len(self.cells):
+            return
+        wire = (sample[self.cells] - self.bias) / self.gain
+        if self._values.possible:
+            wire = np.clip(wire, *self._values.possible)
+        self.numbers.write(frame, np.where(np.abs(wire) < self._values.smallest, 0.0, wire))
+
+
+def _within(raw: Row, limits: tuple[float, float] | None) -> NDArray[np.bool_]:
+    least, most = limits or (-np.inf, np.inf)
+    within: NDArray[np.bool_] = (raw >= least) & (raw <= most)
+    return within
 
 
 class FrameLayout:
@@ -128,8 +171,11 @@ class FrameLayout:
         self.between = re.compile(b"|".join(patterns) or rb"(?!)", re.DOTALL)
         self.sync = _bytes(mapping.sync, f"{path}: sync")
         self.ends = _bytes(mapping.ends, f"{path}: ends") if mapping.ends else b""
-        if not self.sync:
-            raise ConfigError(f"{path}: sync must be at least one byte")
+        self.usually = _bytes(mapping.usually, f"{path}: usually")
+        if not self.sync and not self.ends:
+            raise ConfigError(f"{path}: give the bytes that each frame begins with, or ends: sync")
+        if self.usually and not self.usually.startswith(self.sync):
+            raise ConfigError(f"{path}: usually must begin with sync")
         taken: dict[int, str] = {}
         length = mapping.length
 
@@ -142,7 +188,7 @@ class FrameLayout:
                 taken[at] = what
 
         def place(one: FrameCounter, what: str) -> Numbers:
-            found = Numbers(one.at, 1, one.type, one.order or mapping.order)
+            found = Numbers(one.at, one.type, one.order or mapping.order)
             take(found.covered, what)
             return found
 
@@ -178,11 +224,10 @@ class FrameLayout:
     def _measured(
         self, path: str, take: Callable[[set[int], str], None]
     ) -> tuple[ArraySpec, list[Block]]:
-        found: list[tuple[Numbers, Row, Row, list[Column]]] = []
+        found: list[tuple[Values, Numbers, Row, Row, list[Column]]] = []
         for k, values in enumerate(self.mapping.values):
             where = f"values[{k}]"
-            names = values.elements
-            elements = tuple(f"T{i}" for i in range(names)) if isinstance(names, int) else names
+            elements = _elements(values.elements, f"{path}: {where}")
             pairs = list(product(elements, values.channels))
             if values.by == "channel":
                 pairs = [(e, c) for c, e in product(values.channels, elements)]
@@ -202,15 +247,37 @@ class FrameLayout:
             unit = np.array([Column.measured(e, c, values.unit).scale for e, c in pairs])
             gain = np.array([column.scale for column in columns])
             order = values.order or self.mapping.order
-            numbers = Numbers(values.at, len(pairs), values.type, order, values.step)
+            groups = len(elements) if values.by == "element" else len(values.channels)
+            n = len(pairs) // groups
+            numbers = Numbers(values.at, values.type, order, groups, n, values.stride)
             take(numbers.covered, where)
-            found.append((numbers, gain, values.offset * unit + columns[0].offset, columns))
-        spec = array_of(self.mapping, tuple(c for *_, cs in found for c in cs), path)
+            bias = values.offset * unit + columns[0].offset
+            found.append((values, numbers, gain, bias, columns))
+        measured = tuple(c for *_, cs in found for c in cs if c.channel != UNHEARD)
+        spec = array_of(self.mapping, measured, path)
         cell = {(e, c): i for i, (e, c) in enumerate(product(spec.elements, spec.channels))}
-        return spec, [
-            Block(numbers, gain, bias, [cell[c.element, c.channel] for c in columns])
-            for numbers, gain, bias, columns in found
-        ]
+        blocks = []
+        for k, (values, numbers, gain, bias, columns) in enumerate(found):
+            heard = UNHEARD not in values.channels
+            cells = [cell[c.element, c.channel] for c in columns] if heard else []
+            for column in columns:
+                if column.element not in spec.elements:
+                    raise ConfigError(
+                        f"{path}: values[{k}]: nothing is measured of {column.element}"
+                    )
+            rows = [spec.elements.index(c.element) for c in columns]
+            blocks.append(Block(values, numbers, gain, bias, cells, rows))
+        return spec, blocks
+
+    def possible(self, frames: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """Which of these, (n, length) bytes, the device can have sent."""
+        n, data = len(frames), frames.tobytes()
+        can = np.array([frame.tobytes().endswith(self.ends) for frame in frames], np.bool_)
+        with np.errstate(invalid="ignore"):  # a signalling NaN is only a NaN
+            for block in self.blocks:
+                raw = block.numbers.read(data, n, self.mapping.length).astype(np.float64)
+                can &= block.possible(raw).all(axis=1)
+        return can
 
     def intact(self, frame: bytes) -> bool:
         """Whether a frame that begins right ends right, and its checksum is its own."""
@@ -231,6 +298,22 @@ class FrameLayout:
         return self._sum(covered).to_bytes(self.check_width, self._check_order)
 
 
+def _elements(told: int | tuple[str | int, ...], where: str) -> tuple[str, ...]:
+    if isinstance(told, int):
+        return tuple(f"T{k}" for k in range(told))
+    names = tuple(name for name in told if isinstance(name, str))
+    if len(names) == len(told):
+        return names
+    rows, columns = (*told, 0)[:2] if len(told) == 2 and not names else (0, 0)
+    if not (isinstance(rows, int) and isinstance(columns, int) and 1 <= rows <= 26):
+        raise ConfigError(
+            f"{where}: elements: names, or how many, or rows (26 at most) and columns"
+        )
+    if columns > 100:
+        raise ConfigError(f"{where}: elements: a matrix has 100 columns at most, not {columns}")
+    return tuple(f"{chr(ord('A') + r)}{c}" for r in range(rows) for c in range(columns))
+
+
 def as_bytes(text: str, where: str) -> bytes:
     """What a message says: hexadecimal, or ``text:`` and characters."""
     if text.startswith("text:"):
@@ -239,6 +322,8 @@ def as_bytes(text: str, where: str) -> bytes:
 
 
 def _pattern(text: str, where: str) -> bytes:
+    if text.startswith("text:"):
+        return re.escape(as_bytes(text, where))
     words = text.replace("..", " .. ").split()
     return b"".join(b"." if w == ".." else re.escape(_bytes(w, where)) for w in words)
 

@@ -11,16 +11,19 @@ import msgspec
 from tactile_rt.drivers.codecs.ascii_mapping import ArrayTable
 from tactile_rt.settings import convert, read_toml, refusal
 
-__all__ = ["FrameCounter", "FrameMapping", "Message", "read_frame_mapping"]
+__all__ = ["UNHEARD", "FrameCounter", "FrameMapping", "Message", "Values", "read_frame_mapping"]
 
 LONGEST: Final = 65_536  # bytes of a frame
 VERSION: Final = 1
+UNHEARD: Final = "-"  # channel of numbers that are not delivered
 
 Order: TypeAlias = Literal["little", "big"]
 Kind: TypeAlias = Literal[
     "int8", "uint8", "int16", "uint16", "int24", "uint24", "int32", "uint32", "int64", "float32",
     "float64",
 ]  # fmt: skip
+Count: TypeAlias = Annotated[int, msgspec.Meta(ge=1, le=10_000)]
+Range: TypeAlias = tuple[float, float]
 At: TypeAlias = Annotated[int, msgspec.Meta(ge=0, lt=LONGEST)]
 Whole: TypeAlias = Literal["uint8", "uint16", "uint24", "uint32"]
 
@@ -52,12 +55,20 @@ class Values(_Table, frozen=True, kw_only=True):
     Attributes:
         at: Offset of the first number.
         type: Type of the numbers.
-        channels: Names of the channels.
-        elements: Names of the elements; a whole number n for ``T0`` to ``Tn-1``.
+        channels: Names of the channels; ``-`` for numbers that are not delivered, of which
+            `possible` and `valid` are looked at.
+        elements: Names of the elements; a whole number n for ``T0`` to ``Tn-1``, two for the rows
+            (``A``, ``B``, ...) and columns (``A0``, ``A1``, ...) of a matrix.
         unit: Unit of a one times `scale`; empty for the unit that the channels' names say.
         scale: What a one stands for in `unit`, of all channels or of each in turn.
         offset: What a zero stands for in `unit`.
-        step: Bytes from one number to the next; 0 for as many as the type has.
+        stride: Bytes from one element to the next, if other numbers lie between; 0 for none. (By
+            channel: from one channel to the next.)
+        possible: The least and the largest number that the device can send, as they are in the
+            frame; what else stands there is no measurement, nor the frame one, where it has no
+            beginning.
+        smallest: The smallest number besides 0 that the device can send, whatever its sign.
+        valid: Numbers between which the element is valid, as they are in the frame.
         by: Whether all channels of an ``element`` come together, or all elements of a ``channel``.
         order: Byte order of the numbers; empty for that of the file.
     """
@@ -65,11 +76,14 @@ class Values(_Table, frozen=True, kw_only=True):
     at: At
     type: Kind
     channels: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
-    elements: Annotated[int, msgspec.Meta(ge=1, le=10_000)] | tuple[str, ...] = ("sensor",)
+    elements: Count | tuple[str | Count, ...] = ("sensor",)
     unit: str = ""
     scale: float | tuple[float, ...] = 1.0
     offset: float = 0.0
-    step: Annotated[int, msgspec.Meta(ge=0, lt=LONGEST)] = 0
+    stride: At = 0
+    possible: Range | None = None
+    smallest: Annotated[float, msgspec.Meta(ge=0)] = 0.0
+    valid: Range | None = None
     by: Literal["element", "channel"] = "element"
     order: Order | Literal[""] = ""
 
@@ -103,7 +117,8 @@ class FrameStatus(FrameCounter, frozen=True, kw_only=True):
 
     Attributes:
         bits: What each bit means when it is set, by its number.
-        invalid: Numbers of the bits that say that the values are none.
+        invalid: Numbers of the bits that say that the values are none; an emulated device sets the
+            first.
     """
 
     bits: dict[str, str] = {}
@@ -114,7 +129,7 @@ class Message(_Table, frozen=True, kw_only=True):
     """``[[start]]``, ``[[stop]]``: what the host sends, in order.
 
     Attributes:
-        send: Bytes to send, or ``text:...`` for characters.
+        send: Bytes to send, or ``text:...`` for characters; empty to wait only.
         expect: What the answer contains; empty if none is awaited.
         wait_s: Longest time that the answer may take, s.
         pause_s: Time to wait before the next, s.
@@ -131,14 +146,16 @@ class FrameMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=
 
     Attributes:
         length: Length of a frame, bytes.
-        sync: The bytes with which each frame begins.
+        sync: The bytes with which each frame begins; empty for frames that only end alike.
+        usually: Bytes with which a frame mostly begins, where a sync of one or two bytes is no
+            evidence that damaged bytes were a frame.
         values: The numbers that are measured.
         baud: Speed of the line, bit/s.
         parity: Parity of the line: ``N``, ``E`` or ``O``.
         order: Byte order of all numbers that do not say their own.
         ends: The bytes with which each frame ends; empty if they are not always the same.
-        between: What else the device sends between frames, answers for example; ``..`` stands for
-            any byte.
+        between: What else the device sends between frames, answers for example, in hexadecimal
+            where ``..`` stands for any byte, or ``text:...``.
         checksum: The frame's checksum, if it has one.
         count: The number of the sample, if it is there.
         time: The device's clock, if it is there.
@@ -149,11 +166,12 @@ class FrameMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=
     """
 
     length: Annotated[int, msgspec.Meta(ge=2, le=LONGEST)]
-    sync: str
     values: Annotated[tuple[Values, ...], msgspec.Meta(min_length=1)]
     baud: Annotated[int, msgspec.Meta(ge=1)] = 115200
     parity: Literal["N", "E", "O"] = "N"
     order: Order = "little"
+    sync: str = ""
+    usually: str = ""
     ends: str = ""
     between: tuple[str, ...] = ()
     checksum: Checksum | None = None

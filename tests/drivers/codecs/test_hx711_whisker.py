@@ -126,7 +126,7 @@ def test_bytes_without_an_ending_do_not_pile_up() -> None:
     whole, cut = hx711(), hx711()
     a, b = decode(whole, stream), decode(cut, stream, range(1, len(stream)))
     assert stacked(a, "damaged").tolist() == stacked(b, "damaged").tolist() == [0, 0, 53]
-    assert whole.stats == cut.stats and len(cut._data) == 0
+    assert whole.stats == cut.stats and len(cut._finder._data) == 0
 
 
 def test_it_finds_back_after_any_damage() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.drivers.codec import Command
-from tactile_rt.drivers.codecs.kwr75 import Kwr75, Kwr75Options
+from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, FrameOptions, frame_codec
 from tactile_rt.stream import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
@@ -16,8 +16,8 @@ LOADS = [9.80665, -19.6133, 4.903325, 2.4516625, -1.22583125, 0.0]
 START, STOP, ASK = (bytes.fromhex(x) for x in ("48aa0d0a", "43aa0d0a", "49aa0d0a"))  # datasheet
 
 
-def kwr75(**options: object) -> Kwr75:
-    return Kwr75(Kwr75Options(**options))
+def kwr75(poll: bool = False, **options: float) -> DescribedFrame:
+    return frame_codec("kwr75_polled" if poll else "kwr75")(FrameOptions(**options))
 
 
 def signal(n: int = 40) -> np.ndarray:
@@ -48,19 +48,20 @@ def test_an_answer_to_a_single_request_begins_otherwise() -> None:
 
 
 def test_the_ends_of_a_frame_may_occur_inside_it() -> None:
-    inside = np.array(struct.unpack("<6f", bytes.fromhex("48aa0041" + "0d0a0041" * 5)))
-    codec = kwr75(newton=1.0)
+    kilograms = np.array(struct.unpack("<6f", bytes.fromhex("48aa0041" + "0d0a0041" * 5)))
+    inside = (9.80665 * kilograms).astype(np.float32)
+    codec = kwr75()
     wire = b"".join(codec.encode(chunk_of(codec, np.tile(inside, (20, 1, 1)))))
     values = stacked(decode(codec, wire, range(1, len(wire))), "values")
-    assert len(values) == 20 and (values == inside.astype(np.float32)).all()
+    assert len(values) == 20 and (values == inside).all()
     # damage is found where it hits an end, and costs that frame
     hurt = bytearray(wire)
     hurt[28 * 5] ^= 1
     hurt[28 * 9 + 27] ^= 1
-    codec = kwr75(newton=1.0)
+    codec = kwr75()
     values = stacked(decode(codec, bytes(hurt)), "values")
     assert len(values) == 18 and codec.stats.corrupt == 2
-    assert (values == inside.astype(np.float32)).all()
+    assert (values == inside).all()
 
 
 def test_what_is_no_number_is_invalid_and_what_is_too_large_saturates() -> None:
@@ -69,9 +70,7 @@ def test_what_is_no_number_is_invalid_and_what_is_too_large_saturates() -> None:
     samples = codec.feed(b"\x48\xaa" + body + b"\r\n" + GOLDEN, T0)
     assert samples.valid.ravel().tolist() == [False, True]
     sent = codec.encode(chunk_of(codec, np.full((1, 1, 6), [np.nan, np.inf, 1, 0, 0, 0])))[0]
-    assert struct.unpack_from("<3f", sent, 2) == pytest.approx(
-        (0, 3.4028235e38, 1 / 9.80665), rel=1e-6
-    )
+    assert not codec.feed(sent, T0).valid.any()
 
 
 def test_the_commands() -> None:
@@ -85,11 +84,12 @@ def test_the_commands() -> None:
     assert not device.streaming
     asks = kwr75(poll=True)
     assert asks.polls and [s.send for s in asks.commands(Command.START)] == [STOP]
+    device = kwr75(poll=True)
     device.respond(asks.commands(Command.POLL)[0].send + ASK)
     assert device.polled == 2 and not device.streaming
 
 
-@pytest.mark.parametrize("wrong", [{"rate_hz": 0.0}, {"newton": -1.0}, {"newton": float("nan")}])
-def test_options_are_checked(wrong: dict[str, float]) -> None:
-    with pytest.raises(ConfigError, match="must be positive"):
-        kwr75(**wrong)
+def test_a_rate_is_checked() -> None:
+    assert kwr75(rate_hz=250.0).spec.rate_hz == 250.0 and kwr75().spec.rate_hz == 1000.0
+    with pytest.raises(ConfigError, match="rate_hz must be positive, not -1"):
+        kwr75(rate_hz=-1.0)

@@ -1,0 +1,26 @@
+"""`tactile-rt codecs`: what devices can speak."""
+
+import tomllib
+
+from tactile_rt.drivers.codec import CODECS
+
+
+def test_every_codec_has_a_row(call):
+    code, said, _ = call("codecs")
+    assert code == 0
+    assert said.count("serial") >= sum(wire == "serial" for wire, _ in CODECS)
+
+
+def test_the_description_of_a_frame_is_printed_to_be_changed(call, tmp_path):
+    code, said, _ = call("codecs", "--frame", "kwr75")
+    assert code == 0 and tomllib.loads(said)["sync"] == "48 AA"
+    mine = tmp_path / "mine.toml"
+    mine.write_text(said.replace("1000.0", "500.0"))
+    code, _, told = call("describe", f"serial:///dev/none?codec=binary_frame&mapping={mine}")
+    assert code == 2 and "/dev/none" in told
+
+
+def test_a_frame_that_is_not_described_is_one_line(call):
+    code, _, said = call("codecs", "--frame", "bota2")
+    assert code == 2 and said.count("\n") == 1
+    assert "--frame bota2: described are anyskin, bota" in said
