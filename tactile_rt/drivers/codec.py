@@ -178,6 +178,8 @@ class Codec(abc.ABC, Generic[Packet]):
         spec: What the samples are; None until the device has described itself. Whoever knows it
             beforehand sets it, and the device is then not asked.
         stats: Counts of the frames that have come so far.
+        complaint: Why what came last is no sample, for the user, where the codec can tell; else
+            empty.
     """
 
     wire: ClassVar[str]
@@ -187,6 +189,7 @@ class Codec(abc.ABC, Generic[Packet]):
     tick_bits: int = 32
     status_bits: ClassVar[dict[int, str]] = {}
     cannot_detect: ClassVar[str] = ""
+    complaint = ""
 
     def __init__(self, spec: ArraySpec | None) -> None:
         self.spec = spec

@@ -335,10 +335,13 @@ class DeviceSource(Source):
                 "as `tactile-rt describe` writes it"
             )
         rate = "baud rate" if self.codec.wire == "serial" else "bit rate or identifier"
+        guess = (
+            f"wrong codec, or wrong {rate}? ({stats.corrupt} damaged frames, {stats.skipped} "
+            f"{things} beside frames)"
+        )
         return (
-            f"{came} {things} came in {seconds}, and no whole {self.options.codec} sample: wrong "
-            f"codec, or wrong {rate}? ({stats.corrupt} damaged frames, {stats.skipped} {things} "
-            f"beside frames); `tactile-rt dump` shows what comes"
+            f"{came} {things} came in {seconds}, and no whole {self.options.codec} sample: "
+            f"{self.codec.complaint or guess}; `tactile-rt dump` shows what comes"
         )
 
     def _lose(self, why: str) -> None:

@@ -126,7 +126,7 @@ class CodecContract:
             for what in ("values", "valid", "count", "ticks", "status", "damaged"):
                 a, b = stacked(whole, what), stacked(pieces, what)
                 assert (a is None) == (b is None)
-                assert a is None or np.array_equal(a, b)
+                assert a is None or np.array_equal(a, b, equal_nan=True)
 
     def test_damage_is_recognised_and_left_behind(self, sent: tuple[Any, np.ndarray]) -> None:
         wire, signal = sent

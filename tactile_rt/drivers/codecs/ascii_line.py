@@ -1,13 +1,15 @@
-"""Any board that prints numbers, a line per sample; a file says which column is what.
+"""Any board that prints numbers; a file, or a few words, say which number is what.
 
-Numbers stand between spaces, tabs, commas or semicolons in any mixture; lines end with a carriage
-return, a line feed or both. The first line after joining is not believed, for it may have lost its
-beginning; banners and headers are known by their words.
+Numbers stand at their places in a line, between spaces, tabs, commas, semicolons and brackets; or
+after their names, in one line, in several, or in JSON; or where a regular expression says. Lines
+end with a carriage return, a line feed or both. The first line after joining is not believed, for
+it may have lost its beginning; banners and headers are known by their words.
 """
 
 import re
 from dataclasses import dataclass
-from typing import Final
+from datetime import UTC, datetime
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -15,21 +17,24 @@ from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.ascii_mapping import (
+    Column,
     LineMapping,
     array_of,
     parse_column,
     read_mapping,
 )
+from tactile_rt.drivers.codecs.ascii_text import Names, fields, number, quoted
 from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = ["AsciiLine", "AsciiLineOptions"]
 
-TICK_NS: Final = {"s": 1e3, "ms": 1e6, "us": 1e3, "ns": 1.0}
+TICK_NS: Final = {"s": 1e3, "iso": 1e3, "ms": 1e6, "us": 1e3, "ns": 1.0}
 NEVER_WRAPS: Final = 62  # bits, for a time in seconds
 EXACT: Final = 2.0**53  # whole numbers up to here are exact
+NAN: Final = float("nan")
 
 _SPACES: Final = bytes.maketrans(b",;\t", b"   ")
-_LABEL: Final = re.compile(rb"[A-Za-z_]\w*[ ]*[:=]")
+_PLAIN: Final = re.compile(rb"[-+0-9.eE \t;,]*")
 
 
 @dataclass(frozen=True)
@@ -40,7 +45,6 @@ class AsciiLineOptions:
         mapping: Path of a TOML file, like docs/codecs/ascii_line.toml.
         columns: The columns between commas, e.g. ``time:ms,A0.fx*0.5:mN,A0.fy*0.5:mN,-``; how they
             are written is told in `ascii_mapping`.
-        labels: Whether numbers have names before them, ``x:1.5 y=2``.
         rate_hz: Rate at which the board prints, Hz; 0 stands for the rate in the file, else 100 Hz.
         start: Text to send so that the board begins (in a URL ``%0A`` is a line feed).
         stop: Text to send so that the board ends.
@@ -49,7 +53,6 @@ class AsciiLineOptions:
 
     mapping: str = ""
     columns: str = ""
-    labels: bool = False
     rate_hz: float = 0.0
     start: str = ""
     stop: str = ""
@@ -96,7 +99,7 @@ class AsciiLine(SerialCodec):
         )
         spec = array_of(mapping, columns, where)
         super().__init__(spec)
-        self._width = len(columns)
+        self._columns, self._width = columns, len(columns)
         at = {(c.element, c.channel): i for i, c in enumerate(columns)}
         self._order = [at[e, c] for e in spec.elements for c in spec.channels]
         self._scale = np.array([columns[i].scale for i in self._order])
@@ -109,9 +112,10 @@ class AsciiLine(SerialCodec):
             elif c.kind in TICK_NS:
                 self._time, self.tick_ns = i, TICK_NS[c.kind]
                 self.tick_bits = c.bits
-                if c.kind == "s":
+                if c.kind in ("s", "iso"):
                     self.tick_bits, self._per_tick = NEVER_WRAPS, 1e-6 / c.scale
-        self._labels = options.labels or mapping.labels
+        self._names, self._pattern = _names(mapping, columns, where)
+        self._record = mapping.record
         self._start = (options.start or mapping.start).encode()
         self._stop = (options.stop or mapping.stop).encode()
         self._poll = (options.poll or mapping.poll).encode()
@@ -119,39 +123,39 @@ class AsciiLine(SerialCodec):
         self.streaming = not self._start and not self.polls
         self._longest = 256 + 64 * self._width
         self._data, self._heard = bytearray(), b""
-        self._joined = self._overlong = self._printed = False
-        self._damaged = 0
+        self._printed = False
+        self.forget()
 
     # the host's side
 
     def feed(self, packet: bytes, t_ns: int) -> Samples | None:
         self._data += packet
         *lines, self._data = self._data.replace(b"\r", b"\n").split(b"\n")
-        rows: list[list[float]] = []
-        damaged: list[int] = []
+        self._rows: list[list[float]] = []
+        self._about: list[tuple[int, int]] = []  # of each: arrival, and frames damaged before
         for line in lines:
-            row = self._row(line)
-            if row is not None:
-                rows.append(row)
-                damaged.append(self._damaged)
-                self._damaged = 0
+            self._line(line, t_ns)
         if len(self._data) > self._longest:
             self.stats.skipped += len(self._data)
             self._overlong = True
             self._data.clear()
-        self.stats.intact += len(rows)
-        return self._samples(np.array(rows), damaged, t_ns) if rows else None
+            self.complaint = f"{self._longest} bytes came without a line end"
+        self.stats.intact += len(self._rows)
+        return self._samples() if self._rows else None
+
+    def forget(self) -> None:
+        self._data.clear()
+        self._joined = self._overlong = False
+        self._damaged = 0
+        self._open: dict[int, float] = {}  # of a sample of several lines: what has come
+        self._lines: list[str] = []
+        self._open_ns = 0
 
     def commands(self, command: Command) -> tuple[Step[bytes], ...]:
         send = {Command.START: self._start, Command.STOP: self._stop, Command.POLL: self._poll}[
             command
         ]
         return (Step(send),) if send else ()
-
-    def forget(self) -> None:
-        self._data.clear()
-        self._joined = self._overlong = False
-        self._damaged = 0
 
     # the device's side
 
@@ -163,19 +167,43 @@ class AsciiLine(SerialCodec):
             chunk.seq.tolist(), chunk.t_ns.tolist(), numbers.tolist(), strict=True
         ):
             words = ["0"] * self._width
-            for at, number in zip(self._order, row, strict=True):
-                words[at] = f"{number:.9g}"
+            for at, value in zip(self._order, row, strict=True):
+                words[at] = f"{value:.9g}"
             if self.count_bits is not None:
                 words[self._count] = str(seq % (1 << self.count_bits))
             if self.tick_ns is not None:
                 ticks = t_ns // int(self.tick_ns) % (1 << self.tick_bits)
                 decimal = self.tick_bits == NEVER_WRAPS
                 words[self._time] = f"{ticks * self._per_tick:.9f}" if decimal else str(ticks)
+                if self._columns[self._time].kind == "iso":
+                    words[self._time] = f"{datetime.fromtimestamp(1e-6 * ticks, UTC):%F %T.%f}"
             # one who joins does not believe what stands before the first line end
             begin = b"" if self._printed else b"\r\n"
             self._printed = True
-            packets.append(begin + ",".join(words).encode() + b"\r\n")
+            packets.append(begin + self._printed_line(words).encode() + b"\r\n")
         return packets
+
+    def _printed_line(self, words: list[str]) -> str:
+        if self._pattern is not None:
+            raise ConfigError("a board that a pattern describes cannot be emulated: give columns")
+        if self._names is None:
+            return self._record + " " * bool(self._record) + ",".join(words)
+        said: dict[str, Any] = {}
+        for column, word in zip(self._columns, words, strict=True):
+            *path, last = column.label.split(".")
+            if column.kind == "-" or (path and last.isdecimal()):
+                continue
+            here = said
+            for key in path:
+                here = here.setdefault(key, {})
+            here[last] = word if column.kind == "iso" else float(word)
+        for column, word in zip(self._columns, words, strict=True):
+            base, _, place = column.label.rpartition(".")
+            if base and place.isdecimal():
+                row = said.setdefault(base, [])
+                row += [0.0] * (int(place) + 1 - len(row))
+                row[int(place)] = float(word)
+        return msgspec.json.encode(said).decode()
 
     def respond(self, packet: bytes) -> bytes:
         words = [w for w in (self._start, self._stop, self._poll) if w]
@@ -192,39 +220,153 @@ class AsciiLine(SerialCodec):
 
     # lines
 
-    def _row(self, line: bytearray) -> list[float] | None:
-        """The numbers of a line that is a sample, else None, counted as what it is."""
+    def _line(self, line: bytearray, t_ns: int) -> None:
         joined, self._joined = self._joined, True
         overlong, self._overlong = self._overlong or len(line) > self._longest, False
         if not joined or overlong:
             self.stats.skipped += len(line)
             if joined:
                 self._refuse()
-            return None
-        if self._labels:
-            line = bytearray(_LABEL.sub(b" ", line))
-        words = line.translate(_SPACES).split()
-        row = [x for x in map(_number, words) if x is not None]
-        if len(row) == len(words) == self._width and self._counts(row):
-            return row
-        if 2 * len(row) < len(words):  # mostly words: not meant as a sample
-            self.stats.skipped += len(line)
-        elif words:
-            self._refuse()
-        return None
+            return
+        if self._names is None and self._pattern is None and not self._record:
+            words = line.translate(_SPACES).split()
+            if len(words) == self._width and _PLAIN.fullmatch(line) and b",," not in line:
+                try:
+                    self._take([float(word) for word in words], len(line), t_ns)
+                    return
+                except ValueError:  # 1-2, say
+                    pass
+        text = line.decode("utf-8", "replace")
+        if self._names is not None and self._pattern is None:
+            self._gather(text, t_ns)
+            return
+        if self._record and text.lstrip().startswith(self._record):
+            if self._lines:
+                self._refused(" ".join(self._lines))
+            self._lines = [text.lstrip().removeprefix(self._record)]
+        elif self._record and not self._lines:
+            self.stats.skipped += len(text)
+            self.complaint = f"line {quoted(text)} does not begin with {self._record!r}"
+            return
+        else:
+            self._lines.append(text)
+        whole = "\n".join(self._lines)
+        row = self._row(whole)
+        if row is not None:
+            self._lines = []
+            self._take(row, len(whole), t_ns)
+        elif not self._record or len(whole) > self._longest:
+            self._refused(whole)
 
-    def _counts(self, row: list[float]) -> bool:
-        """Whether what counts is a whole number, and the time a time."""
+    def _take(self, row: list[float], length: int, t_ns: int) -> None:
+        """A row is a sample, if what counts in it is a whole number, and the time a time."""
         count = row[self._count] if self.count_bits is not None else 0.0
         ticks = row[self._time] / self._per_tick if self.tick_ns is not None else 0.0
-        return abs(ticks) < EXACT and abs(count) < EXACT and count.is_integer()
+        if abs(ticks) < EXACT and abs(count) < EXACT and count.is_integer():
+            self._rows.append(row)
+            self._about.append((t_ns, self._damaged))
+            self._damaged = 0
+        else:
+            at = self._time if abs(count) < EXACT and count.is_integer() else self._count
+            self.complaint = f"column {at + 1} ({self._columns[at].kind}) is {row[at]:g}"
+            self._refuse()
+
+    def _row(self, text: str) -> list[float] | None:
+        """The numbers of a sample, by their places or by the pattern."""
+        if self._pattern is not None:
+            found = self._pattern.search(text)
+            if found is None:
+                return None
+            said = found.groupdict()
+            return [_or_nan(said[c.label]) if c.label else NAN for c in self._columns]
+        for words_are_names in (False, True):
+            words = fields(text, words_are_names)
+            if text.rstrip().endswith((",", ";")) and len(words) == self._width - 1:
+                words.append("nan")
+            for some in (words, [w for w in words if any(map(str.isdigit, w)) or number(w)]):
+                row = self._fitting(some)
+                if row is not None and 2 * len(row) >= len(words):
+                    return row
+        return None
+
+    def _fitting(self, words: list[str]) -> list[float] | None:
+        """The numbers of these words if they are a sample; a word in place of one is none (NaN)."""
+        if len(words) != self._width:
+            return None
+        row, measured, missing = [], 0, 0
+        for column, word in zip(self._columns, words, strict=True):
+            value = number(word)
+            if value is None:
+                if column.kind not in ("-", "value") or (
+                    column.kind == "value" and any(map(str.isdigit, word))
+                ):
+                    return None
+                missing += column.kind == "value"
+            measured += column.kind == "value"
+            row.append(NAN if value is None else value)
+        return row if 2 * missing <= measured else None
+
+    def _gather(self, text: str, t_ns: int) -> None:
+        """Numbers by their names: a sample is whole when all have come, and over when one comes
+        again."""
+        assert self._names is not None
+        found = self._names.find(text)
+        if not found:
+            self.stats.skipped += len(text)
+            if text.strip():
+                names = ", ".join(repr(c.label) for c in self._columns)
+                self.complaint = f"line {quoted(text)} has none of {names}"
+            return
+        if not found.keys().isdisjoint(self._open):
+            self._end_sample()
+        self._open |= found
+        self._open_ns = t_ns
+        if len(self._open) == self._width:
+            self._end_sample()
+
+    def _end_sample(self) -> None:
+        came, self._open = self._open, {}
+        if len(came) < self._width:
+            absent = [c.label for i, c in enumerate(self._columns) if i not in came]
+            self.complaint = f"{', '.join(map(repr, absent))} did not come"
+        if 2 * len(came) >= self._width:
+            self._take([came.get(i, NAN) for i in range(self._width)], 0, self._open_ns)
+        else:
+            self._refuse()
+
+    def _refused(self, text: str) -> None:
+        """Count a line that is no sample as what it is, and say why it is none."""
+        self._lines = []
+        words = fields(text)
+        numbers = [w for w in words if number(w) is not None]
+        if words:
+            self.complaint = self._why(text, words)
+        if 2 * len(numbers) < len(words):  # mostly words: not meant as a sample
+            self.stats.skipped += len(text)
+        elif words:
+            self._refuse()
+
+    def _why(self, text: str, words: list[str]) -> str:
+        if sum(not c.isprintable() or c == "\ufffd" for c in text) * 8 > len(text):
+            return "what comes is not text: wrong baud rate?"
+        line = f"line {quoted(text.strip())}"
+        if self._pattern is not None:
+            return f"{line} does not match the pattern"
+        for k, (column, word) in enumerate(zip(self._columns, words, strict=False)):
+            if number(word) is None and column.kind != "-":
+                name = f"{column.element}.{column.channel}" if column.element else column.kind
+                return f"{line}: column {k + 1} ({name}) is {word!r}, no number"
+        last = f"column {len(words)} is {words[-1]!r}"
+        return f"{line} has {len(words)} columns, {self._width} are described; {last}"
 
     def _refuse(self) -> None:
         self.stats.corrupt += 1
         self._damaged += 1
 
-    def _samples(self, wire: NDArray[np.float64], damaged: list[int], t_ns: int) -> Samples:
+    def _samples(self) -> Samples:
         assert self.spec is not None
+        wire: NDArray[np.float64] = np.array(self._rows)
+        arrived, damaged = np.array(self._about, np.int64).T
         with np.errstate(over="ignore", invalid="ignore"):
             values = (wire[:, self._order] * self._scale + self._offset).astype(np.float32)
         values = values.reshape(len(wire), *self.spec.shape)
@@ -234,19 +376,32 @@ class AsciiLine(SerialCodec):
         if self.tick_ns is not None:
             ticks = np.rint(wire[:, self._time] / self._per_tick).astype(np.int64)
             ticks %= 1 << self.tick_bits
-        return Samples(
-            values,
-            np.isfinite(values).all(axis=2),
-            np.full(len(wire), t_ns, np.int64),
-            np.array(damaged, np.int64),
-            count,
-            ticks,
-        )
+        return Samples(values, np.isfinite(values).all(axis=2), arrived, damaged, count, ticks)
 
 
-def _number(word: bytearray) -> float | None:
-    """What is printed; NaN for what a board prints in place of one, None for a word."""
-    try:
-        return None if b"_" in word else float(word)
-    except ValueError:
-        return float("nan") if word == b"ovf" else None  # Arduino's for what is over 4e9
+def _or_nan(word: str | None) -> float:
+    found = number(fields(word)[0]) if word and fields(word) else None
+    return NAN if found is None else found
+
+
+def _names(
+    mapping: LineMapping, columns: tuple[Column, ...], where: str
+) -> tuple[Names | None, re.Pattern[str] | None]:
+    """How numbers are found, if not by their places."""
+    labels = {c.label: i for i, c in enumerate(columns) if c.label}
+    pattern = None
+    if mapping.pattern:
+        try:
+            pattern = re.compile(mapping.pattern, re.DOTALL)
+        except re.error as error:
+            raise ConfigError(f"{where}: pattern: {error}") from None
+        for label in labels:
+            if label not in pattern.groupindex:
+                raise ConfigError(f"{where}: pattern has no group (?P<{label}>...)")
+    if not labels and not pattern:
+        return None, None
+    if len(labels) != len(columns):
+        told = [c.label for c in columns]
+        what = next((f"{t!r} stands there twice" for t in told if t and told.count(t) > 1), "")
+        raise ConfigError(f"{where}: " + (what or "give all columns a name, NAME=COLUMN, or none"))
+    return Names(labels), pattern

@@ -6,13 +6,18 @@ A column is written in one word:
     count[:BITS]                      the sample's number, which wraps at 2^BITS (32)
     time[*SCALE]:s                    seconds, with decimals
     time:ms|us|ns[:BITS]              whole milli-, micro- or nanoseconds, wrapping at 2^BITS (32)
+    time:iso                          2024-05-10 09:48:16.222, or a time of day
     ELEMENT.CHANNEL[*SCALE][:UNIT]    a measurement
+
+or, where names stand before the numbers, ``NAME=COLUMN``: ``X=M0.bx:uT``. Then numbers are found
+by their names, in whatever order they come and in as many lines, or in JSON: ``mag.x=M0.bx:uT`` is
+in an object, ``Raw.6=M0.bx`` the seventh number after a name.
 
 SCALE is what a one on the wire stands for, in UNIT; what is stored is SI. Without UNIT it is SI.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -103,9 +108,12 @@ class LineMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=T
     """What a board prints, key by key as in its TOML file; docs/codecs/ascii_line.toml is one.
 
     Attributes:
-        columns: The columns of a line, in order, as the module's docstring says.
+        columns: The columns of a line, in order or with their names, as the module's docstring
+            says.
         name: Name of the array.
-        labels: Whether numbers have names before them, ``x:1.5 y=2``.
+        pattern: Regular expression that a sample matches; its named groups are the names.
+        record: Text with which the first line of a sample begins, if a sample has several lines
+            and no names.
         start: Text to send so that the board begins.
         stop: Text to send so that the board ends.
         poll: Text to send for each sample; without one the board prints by itself.
@@ -113,7 +121,8 @@ class LineMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     columns: tuple[str, ...]
     name: str = "ascii_line"
-    labels: bool = False
+    pattern: str = ""
+    record: str = ""
     start: str = ""
     stop: str = ""
     poll: str = ""
@@ -124,12 +133,13 @@ class Column:
     """One column; what is measured is number x scale + offset in SI.
 
     Attributes:
-        kind: What the column is: ``value``, ``count``, ``s`` (decimal time), ``ms``, ``us``, ``ns``
-            or ``-``.
+        kind: What the column is: ``value``, ``count``, ``s`` (decimal time), ``iso`` (a date),
+            ``ms``, ``us``, ``ns`` or ``-``.
         bits: Width of a counter or of a whole-numbered time, in bits.
         element: Name of the element that was measured; empty for other columns.
         channel: Name of the channel that was measured; empty for other columns.
         unit: SI unit of the measured value.
+        label: Name that stands before the number; empty where places tell.
     """
 
     kind: str
@@ -139,6 +149,7 @@ class Column:
     element: str = ""
     channel: str = ""
     unit: str = ""
+    label: str = ""
 
     @classmethod
     def measured(cls, element: str, channel: str, unit: str, scale: float = 1.0) -> "Column":
@@ -170,8 +181,15 @@ def parse_column(word: str, where: str) -> Column:
     Raises:
         ConfigError: not of that form, an unknown unit, a scale that is none.
     """
+    label, named, plain = word.rpartition("=")
+    if named:
+        if not label.strip():
+            raise ConfigError(f"{where}: {word!r} has no name before =")
+        return replace(parse_column(plain.strip(), where), label=label.strip())
     if word == "-":
         return Column("-")
+    if word == "time:iso":
+        return Column("iso")
     if found := _COUNT.fullmatch(word):
         return Column("count", bits=_bits(found[1], where))
     if found := _SECONDS.fullmatch(word):
@@ -182,7 +200,7 @@ def parse_column(word: str, where: str) -> Column:
     if found is None:
         raise ConfigError(
             f"{where}: {word!r} is no column: write ELEMENT.CHANNEL*SCALE:UNIT (A0.fx*0.5:mN), "
-            "count, time:ms, time:s, or - for nothing"
+            "count, time:ms, time:s, time:iso, or - for nothing"
         )
     element, channel, scale, unit = found.groups()
     if unit and unit not in UNITS:
@@ -222,7 +240,7 @@ def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> Ar
                 raise ConfigError(
                     f"{where}: no column {element}.{channel}; every element needs every channel"
                 )
-    for what, kinds in (("count", ["count"]), ("time", ["s", "ms", "us", "ns"])):
+    for what, kinds in (("count", ["count"]), ("time", ["s", "iso", "ms", "us", "ns"])):
         if sum(c.kind in kinds for c in columns) > 1:
             raise ConfigError(f"{where}: {what} stands there twice")
     for name in mapping.elements:

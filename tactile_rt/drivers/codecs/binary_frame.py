@@ -133,6 +133,21 @@ class DescribedFrame(SerialCodec):
         that have neither a beginning nor an ending of their own."""
         return self._finder.confidence if isinstance(self._finder, StrideFinder) else 1.0
 
+    @property
+    def complaint(self) -> str:  # type: ignore[override]
+        frame, mapping = self.frame, self.frame.mapping
+        if self.stats.intact:
+            return ""
+        if not frame.sync:
+            return f"nothing ends with {mapping.ends} every {mapping.length} bytes"
+        if not frame.begun:
+            return f"nothing begins with {mapping.sync}"
+        if frame.ended_otherwise == frame.begun:
+            ends = f"ends with {mapping.ends} at byte {mapping.length}"
+            return f"{frame.begun} frames began, and none {ends}"
+        name = mapping.checksum.name if mapping.checksum else ""
+        return f"{frame.begun} frames began, and of none {name} is the checksum that it has"
+
     # the host's side
 
     def feed(self, packet: bytes, t_ns: int) -> Samples | None:

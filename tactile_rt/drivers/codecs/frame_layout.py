@@ -161,6 +161,7 @@ class FrameLayout:
         count, time, status: The place of each of these; None without it.
         meanings: What the bits of the status mean, by their number.
         check_at, check_first: Offsets of the checksum, and of the first byte that it covers.
+        begun, ended_otherwise: Numbers of beginnings found, and of those without the ending.
     """
 
     def __init__(self, mapping: FrameMapping, path: str) -> None:
@@ -204,6 +205,7 @@ class FrameLayout:
                 raise ConfigError(f"{path}: status.bits: {bit!r} is no bit of it")
             self.meanings[int(bit)] = meaning
         self.spec, self.blocks = self._measured(path, take)
+        self.begun = self.ended_otherwise = 0
 
     def _check(self, path: str, take: Callable[[set[int], str], None]) -> None:
         check = self.mapping.checksum
@@ -281,11 +283,13 @@ class FrameLayout:
 
     def intact(self, frame: bytes) -> bool:
         """Whether a frame that begins right ends right, and its checksum is its own."""
+        self.begun += 1
         if not frame.endswith(self.ends):
+            self.ended_otherwise += 1
             return False
-        return not self.check_width or frame[self.check_at :][: self.check_width] == self._sum_of(
-            frame
-        )
+        if not self.check_width:
+            return True
+        return frame[self.check_at :][: self.check_width] == self._sum_of(frame)
 
     def seal(self, frame: bytearray) -> bytes:
         """The frame with its checksum."""

@@ -1,0 +1,173 @@
+"""Numbers in a line that a board prints for people: beside words, units, brackets, dates and names.
+
+one, two = fields("2024-05-10 09:48:16.222  (6.37, kg)")       by their places
+Names({"x": 0, "Raw.6": 1}).find('{"x": 1.5, "Raw": [0, 1, ...]}')  by the names before them
+"""
+
+import re
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from typing import Any, Final
+
+import msgspec
+
+__all__ = ["Names", "fields", "number", "quoted"]
+
+NAN: Final = float("nan")
+# What boards print in place of a number; ovf is Arduino's for what is over 4e9.
+MISSING: Final = frozenset(
+    "ovf null none na n/a - -- --- ---- err error fail failed timeout undefined".split()
+)
+NUMBER: Final = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_WITH_UNIT: Final = re.compile(rf"({NUMBER})[A-Za-z%°µμ\ufffd]+(?:/[A-Za-z]+[²2]?)?")
+_HEX: Final = re.compile(r"[+-]?0[xX][0-9A-Fa-f]+")
+_DATE: Final = re.compile(
+    r"(\d{4})[-/.](\d\d)[-/.](\d\d)[T ]+(\d\d):(\d\d):(\d\d)(?:[.,](\d{1,9}))?(Z|[+-]\d\d:?\d\d)?"
+)
+_CLOCK: Final = re.compile(r"(?<![\d:.-])(\d\d?):(\d\d):(\d\d)(?:[.,](\d{1,9}))?(?![\d:])")
+_NAME: Final = re.compile(r"[A-Za-z_]\w*\s*[:=](?!=)")
+_NAMES: Final = re.compile(r"[A-Za-z_]\w*(?:[ \t]+[A-Za-z_]\w*)*\s*[:=](?!=)")
+_NOTHING: Final = re.compile(r"(?:^|(?<=[,;]))\s*(?=[,;])")  # between two commas, or before one
+_BRACKETS: Final = str.maketrans(dict.fromkeys("()[]{}<>\"'|", " "))
+_SEPARATORS: Final = re.compile(r"[\s,;]+")
+_ARROW: Final = re.compile(r"[-=]>")
+_SIGNS: Final = frozenset("=:/~#*")
+
+
+def number(word: Any) -> float | None:
+    """What is printed; NaN for what a board prints in place of a number, None for another word."""
+    if isinstance(word, bool):
+        return float(word)
+    if isinstance(word, int | float):
+        return float(word) if abs(word) < 1e300 else NAN
+    if word is None:
+        return NAN
+    if not isinstance(word, str):
+        return None
+    try:
+        return None if "_" in word else float(word)
+    except ValueError:
+        pass
+    if word.lower() in MISSING:
+        return NAN
+    if _HEX.fullmatch(word):
+        return float(int(word, 16))
+    found = _WITH_UNIT.fullmatch(word)
+    return float(found[1]) if found else None
+
+
+def fields(line: str, words_are_names: bool = False) -> list[str]:
+    """The words of a line: between spaces, commas, semicolons and brackets. The name before a
+    number (``x:``, ``y =``) is none of them, a date with a time is one (in seconds), and between
+    two commas with nothing between them is one, too (``nan``).
+
+    Args:
+        line: the line.
+        words_are_names: whether a name may be several words, ``one reading: 5``.
+    """
+    text = (_NAMES if words_are_names else _NAME).sub(" ", _ARROW.sub(" ", _in_seconds(line)))
+    text = _NOTHING.sub("nan", text.rstrip().removesuffix(",").removesuffix(";"))
+    words = _SEPARATORS.split(text.translate(_BRACKETS))
+    return [w for w in words if w and w not in _SIGNS]
+
+
+class Names:
+    """Finds numbers by what stands before them.
+
+    Args:
+        names: place of each, by its name; ``a.b`` for a number in an object of JSON, ``a.2`` for
+            the third after a name.
+    """
+
+    def __init__(self, names: Mapping[str, int]) -> None:
+        self._names = names
+        self._patterns = {place: _pattern(name) for name, place in names.items()}
+
+    def find(self, line: str) -> dict[int, float]:
+        """The numbers of a line, by their places: NaN where a name stands before none."""
+        if line.lstrip()[:1] == "{":
+            try:
+                said = msgspec.json.decode(line)
+            except (msgspec.DecodeError, UnicodeEncodeError):
+                said = None  # Python's dictionaries look alike
+            if isinstance(said, dict):
+                return {
+                    place: _or_nan(value)
+                    for name, place in self._names.items()
+                    if (value := _within(said, name.split("."))) is not ABSENT
+                }
+        text = _in_seconds(line)
+        return {
+            place: _or_nan(found[1])
+            for place, pattern in self._patterns.items()
+            if (found := pattern.search(text))
+        }
+
+
+ABSENT: Final = object()
+
+
+def _within(said: Any, path: list[str]) -> Any:
+    """The value at a path of keys and places; a key may have dots itself."""
+    if not path:
+        return said
+    if isinstance(said, list):
+        at = int(path[0]) if path[0].isdecimal() else len(said)
+        return _within(said[at], path[1:]) if at < len(said) else ABSENT
+    if not isinstance(said, dict):
+        return ABSENT
+    for n in range(len(path), 0, -1):
+        if (key := ".".join(path[:n])) in said:
+            return _within(said[key], path[n:])
+    return ABSENT
+
+
+def _or_nan(value: Any) -> float:
+    if isinstance(value, str) and (dated := _in_seconds(value)) != value:
+        value = dated
+    found = number(value)
+    return NAN if found is None else found
+
+
+def _pattern(name: str) -> re.Pattern[str]:
+    base, _, place = name.rpartition(".")
+    if not (base and place.isdecimal()):
+        base, place = name, "0"
+    before = r"(?<![\w.])" if base[:1].isalnum() or base[:1] == "_" else ""
+    between = r"(?:\s*->\s*|[\"'\s:=\[(|>~]{1,8})"
+    value = r"[^\s,;:=\[\](){}|\"']+"
+    return re.compile(
+        before + re.escape(base) + between + rf"(?:{value}\s*[,;\s]\s*){{{int(place)}}}({value})"
+    )
+
+
+def _in_seconds(line: str) -> str:
+    """The line with dates and times of day in seconds: since 1970 (UTC unless it says), or since
+    midnight."""
+    if ":" not in line:
+        return line
+    return _CLOCK.sub(_of_day, _DATE.sub(_since_1970, line))
+
+
+def _since_1970(found: re.Match[str]) -> str:
+    *whole, part, zone = found.groups()
+    try:
+        year, month, day, hour, minute, second = map(int, whole)
+        at = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
+    except ValueError:
+        return found[0]
+    seconds = int(at.timestamp())
+    if zone and zone != "Z":
+        minutes = int(zone[1:3]) * 60 + int(zone[-2:])
+        seconds -= 60 * (minutes if zone[0] == "+" else -minutes)
+    return f"{seconds}.{part or 0}"
+
+
+def _of_day(found: re.Match[str]) -> str:
+    hours, minutes, seconds, part = found.groups()
+    return f"{3600 * int(hours) + 60 * int(minutes) + int(seconds)}.{part or 0}"
+
+
+def quoted(line: str) -> str:
+    """A line as a message can show it."""
+    return repr(line if len(line) <= 70 else line[:67] + "...")
