@@ -40,7 +40,8 @@ def emulate(
     ] = None,
     faults: Annotated[Path | None, typer.Option(help="A .toml of what goes wrong.")] = None,
     option: Annotated[
-        list[str] | None, typer.Option(help="Of the codec: NAME=VALUE; may be repeated.")
+        list[str] | None,
+        typer.Option(help="Of codec or line (baud, bitrate; 0: no speed): NAME=VALUE; repeated."),
     ] = None,
     fast: Annotated[
         bool, typer.Option("--fast", help="As fast as the host reads, not in real time.")
@@ -55,12 +56,12 @@ def emulate(
     It sends once it is listened to and, if that is its protocol, asked to.
     With --faults it misbehaves as scheduled. Each fault has a kind
     (bit_flip, truncate, duplicate, burst, stall, drop, clock_drift,
-    clock_jump, sequence_reset, unplug, can_error), a rate per second or
+    clock_jump, sequence_reset, unplug, gather, can_error), a rate per second or
     at_s, and, where the kind has them, duration_s and amount.
 
     Ctrl-C leaves.
     """
-    from tactile_rt.drivers.codec import CODECS
+    from tactile_rt.drivers.codec import CODECS, codec_class
     from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
     from tactile_rt.drivers.emulation.faults import read_faults
     from tactile_rt.drivers.opening import make_codec
@@ -81,7 +82,10 @@ def emulate(
         raise ConfigError("--wire can needs --bus INTERFACE:CHANNEL, and only it takes one")
     if bus is not None and link is not None:
         raise ConfigError("--link names a port; a --bus has none")
-    make_codec("serial" if wire == "serial" else "can", codec, fields)  # refused before the rest
+    speed = "baud" if wire == "serial" else "bitrate"  # of the line, unless the codec has such one
+    known = codec_class("serial" if wire == "serial" else "can", codec).Options
+    own = {k: v for k, v in fields.items() if k != speed or k in known.__dataclass_fields__}
+    make_codec("serial" if wire == "serial" else "can", codec, own)  # refused before the rest
     further: dict[str, Any] = {
         "options": fields,
         "faults": read_faults(faults) if faults else None,

@@ -178,6 +178,13 @@ class Codec(abc.ABC, Generic[Packet]):
         spec: What the samples are; None until the device has described itself. Whoever knows it
             beforehand sets it, and the device is then not asked.
         stats: Counts of the frames that have come so far.
+        greeting: What the device says when it is switched on, before anything else.
+        measures: Whether the device measures although no host has asked for samples. The device's
+            side.
+        newest: The newest sample of a device that measures and does not send, None if there is
+            none. The device's side.
+        commanded_hz: Rate at which hosts have told the device to send, Hz; None for none. The
+            device's side.
         complaint: Why what came last is no sample, for the user, where the codec can tell; else
             empty.
     """
@@ -190,6 +197,10 @@ class Codec(abc.ABC, Generic[Packet]):
     status_bits: ClassVar[dict[int, str]] = {}
     cannot_detect: ClassVar[str] = ""
     complaint = ""
+    greeting: ClassVar[Any] = None
+    commanded_hz: float | None = None
+    measures = False
+    newest: Chunk | None = None
 
     def __init__(self, spec: ArraySpec | None) -> None:
         self.spec = spec
@@ -241,9 +252,11 @@ class SerialCodec(Codec[bytes]):
     Attributes:
         baud: Speed of the line that the device has by default, bit/s.
         parity: Parity that the device has by default: ``N``, ``E`` or ``O``.
+        usb: Whether the device is attached by USB itself, so that its speed means nothing.
     """
 
     wire = "serial"
+    usb: ClassVar[bool] = False
     baud: ClassVar[int] = 115200
     parity: ClassVar[str] = "N"
 

@@ -200,6 +200,7 @@ class SlcanAdapter:
         open: Whether the host has opened the channel.
         hears: Whether frames come through: the channel is open, and at the bus's bit rate.
         flags: Status that F reports and clears: bit 3 is a data overrun, bit 7 a bus error.
+        data_bitrate: Speed of CAN FD's data phase, bit/s, once the host has set it.
     """
 
     VERSION = b"V1013"
@@ -213,6 +214,12 @@ class SlcanAdapter:
         self._stamps = False
         self._silent = False
         self._rest = b""
+        self.data_bitrate: int | None = None
+
+    @property
+    def bitrate(self) -> int:
+        """Speed of the bus, bit/s: its own, or what the host has set, or 1 Mbit/s."""
+        return next((rate for rate, code in BITRATES.items() if code == self._rate), 1_000_000)
 
     @property
     def hears(self) -> bool:
@@ -267,6 +274,8 @@ class SlcanAdapter:
                 if value not in (b"0", b"1"):
                     return BELL
                 self._stamps = value == b"1"
+            case b"Y" if line in DATA_BITRATES.values():
+                self.data_bitrate = next(r for r, code in DATA_BITRATES.items() if code == line)
             case b"s" | b"Y" | b"X" | b"M" | b"m" | b"W" | b"Q":
                 pass  # taken, and of no effect here
             case _:

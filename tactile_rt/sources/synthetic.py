@@ -23,6 +23,9 @@ CHUNK_S = 0.009
 BUMP_S, EVERY_S = 0.3, 1.5  # a bump's length, and from one to the next
 REST_S = 0.6  # before the first, for a tare
 PEAK = {"N": 2e-3, "N m": 2e-5}
+# of what a device measures, that can be bought
+LOADS = {"N": 5.0, "N m": 0.1, "T": 1e-3, "Pa": 1e4, "V": 5e-3, "m/s2": 5.0, "F": 1e-12, "1": 1e3}
+REST = {"K": 298.15}
 NOISE = 0.005  # of the peak, RMS
 NAMES = ("fx", "fy", "fz", "mx", "my", "mz")
 
@@ -90,10 +93,21 @@ class SyntheticSource(Source):
         self.live = options.pace == "realtime"
         self._rng = np.random.default_rng(options.seed)
         self._left = round(options.seconds * options.rate_hz) if options.seconds else None
+        self._options = options
         self._peak = np.array([PEAK[unit] for unit in self.spec.units])
+        self._rest = np.zeros(len(self._peak))
         self._touches = options.touches
         self._at = REST_S + np.array([r + c / 10 for r, c in self.spec.grid]) * 0.05  # s
         self._sent, self._start_ns, self._closed = 0, -1, False
+
+    def like(self, spec: ArraySpec) -> "SyntheticSource":
+        """Such bumps on another array, of the size that its device measures, at its rate."""
+        source = SyntheticSource("", replace(self._options, rate_hz=spec.rate_hz))
+        Source.__init__(source, spec)
+        source._peak = np.array([LOADS.get(unit, 1.0) for unit in spec.units])
+        source._rest = np.array([REST.get(unit, 0.0) for unit in spec.units])
+        source._at = REST_S + np.array([r + c / 10 for r, c in spec.grid]) * 0.05
+        return source
 
     @staticmethod
     def check(size: str, options: SyntheticOptions) -> ArraySpec:
@@ -132,7 +146,7 @@ class SyntheticSource(Source):
         share = np.cos(np.arange(len(self._peak)) * 1.1)  # channels differ in size and sign
         clean = self._touches * bump[..., None] * (share * self._peak)
         noise = self._rng.normal(size=clean.shape) * (NOISE * self._peak)
-        values: NDArray[np.float32] = (clean + noise).astype(np.float32)
+        values: NDArray[np.float32] = (self._rest + clean + noise).astype(np.float32)
         return values
 
 

@@ -90,6 +90,7 @@ class DescribedFrame(SerialCodec):
         self.frame = frame = FrameLayout(mapping, where)
         super().__init__(frame.spec)
         self.baud, self.parity = mapping.baud, mapping.parity  # type: ignore[misc]
+        self.usb = mapping.usb  # type: ignore[misc]
         self.count_bits = frame.count.bits if frame.count else None
         if mapping.time is not None and frame.time is not None:
             self.tick_ns, self.tick_bits = 1e3 * mapping.time.tick_us, frame.time.bits

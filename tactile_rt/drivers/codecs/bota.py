@@ -67,6 +67,7 @@ class Bota(DescribedFrame):
     """One six-axis sensor: forces and moments at its reference point, N and N m."""
 
     Options = BotaOptions
+    greeting = b"App Init\r\n"
     cannot_detect = (
         "It has no sample counter: frames that never came, or came twice, show only in the steps "
         "of its clock."
@@ -118,11 +119,13 @@ class Bota(DescribedFrame):
         kind, error = command[:1], 0
         if kind == b"#":
             self.streaming, self._configuring = True, False
-            return b"App Init\r\n"
+            return self.greeting
         if kind in b"CI":
             self.streaming, self._configuring = False, kind == b"C"
         elif kind == b"R":
             self.streaming, self._configuring = True, False
         elif not self._configuring:
             error = 1
+        elif kind == b"f":
+            self.commanded_hz = 1 / (SINC_S * int(command.split(b",")[1]))
         return b"r,0,%s,%d\r\n" % (kind, error)

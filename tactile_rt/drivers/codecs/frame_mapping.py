@@ -151,6 +151,7 @@ class FrameMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=
             evidence that damaged bytes were a frame.
         values: The numbers that are measured.
         baud: Speed of the line, bit/s.
+        usb: Whether the device is attached by USB itself, so that the speed means nothing.
         parity: Parity of the line: ``N``, ``E`` or ``O``.
         order: Byte order of all numbers that do not say their own.
         ends: The bytes with which each frame ends; empty if they are not always the same.
@@ -168,6 +169,7 @@ class FrameMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=
     length: Annotated[int, msgspec.Meta(ge=2, le=LONGEST)]
     values: Annotated[tuple[Values, ...], msgspec.Meta(min_length=1)]
     baud: Annotated[int, msgspec.Meta(ge=1)] = 115200
+    usb: bool = False
     parity: Literal["N", "E", "O"] = "N"
     order: Order = "little"
     sync: str = ""

@@ -8,6 +8,7 @@ Sources: Robotiq, FT 300 Instruction Manual, section 4 (control); facts of the m
 robotiq_ft_sensor (rq_sensor_com.cpp).
 """
 
+import struct
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,9 +20,13 @@ from tactile_rt.stream import ConfigError
 
 __all__ = ["Ft300", "Ft300Options"]
 
-WRITE: Final = 16  # Modbus function: write registers
+READ_HOLDING, READ_INPUT, WRITE_ONE, WRITE = REQUESTS = (3, 4, 6, 16)  # Modbus functions
+ERROR, NO_SUCH_ADDRESS = 0x80, 2
 OUTPUT, STREAM = 410, 0x0200  # the register that selects the output, and its value
+LOADS, GRAVITY, SERIAL, YEAR = 180, 190, 510, 514  # other registers that it has
+SERIAL_NUMBER: Final = "FTS-0001"  # of an emulated one
 JAM: Final = 50  # bytes FF that end the stream
+LONGEST: Final = 64  # bytes of a request, or of a jam
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,7 @@ class Ft300(DescribedFrame):
     """
 
     Options = Ft300Options
+    measures = True
     cannot_detect = (
         "It sends neither a counter nor a time: frames that never came, repeated frames and the "
         "device's overload cannot be seen."
@@ -54,6 +60,7 @@ class Ft300(DescribedFrame):
     )
 
     def __init__(self, options: Ft300Options) -> None:
+        self._slave = options.slave
         select = bytes((options.slave, WRITE)) + OUTPUT.to_bytes(2, "big") + b"\0\1"
         self._request = _checked(select + b"\2" + STREAM.to_bytes(2, "big"))
         self._echo = _checked(select)
@@ -64,17 +71,59 @@ class Ft300(DescribedFrame):
             replace(frame, start=(jam, request), between=(self._request.hex(),)), "ft300"
         )
 
+    # the device's side
+
     def respond(self, packet: bytes) -> bytes:
-        answer = b""
-        for k in range(len(packet)):
-            self._heard += packet[k : k + 1]
-            if self._heard.endswith(b"\xff" * JAM):
-                self.streaming, self._heard = False, b""
-            elif not self.streaming and self._heard.endswith(self._request):
-                self.streaming, self._heard = True, b""
-                answer += self._echo
-            self._heard = self._heard[-JAM:]
+        self._heard += packet
+        if (jam := self._heard.rfind(b"\xff" * JAM)) >= 0:
+            self.streaming, self._heard = False, self._heard[jam + JAM :]
+        answer, at = b"", 0
+        while not self.streaming and at < len(self._heard):
+            length = _length(self._heard[at:], self._slave)
+            request = self._heard[at : at + length]
+            if 0 < length <= len(request) and _checked(request[:-2]) == request:
+                answer += _checked(request[:1] + self._obey(request[1:-2]))
+                self._heard, at = self._heard[at + length :], 0
+            elif length > len(request):
+                break  # the rest is still to come
+            else:
+                at += 1
+        self._heard = self._heard[-LONGEST:]
         return answer
+
+    def _obey(self, request: bytes) -> bytes:
+        """What a Modbus slave answers to a function, without address and checksum."""
+        kind, first, n = request[0], *struct.unpack(">HH", request[1:5])
+        if kind in (READ_HOLDING, READ_INPUT):
+            registers = self._registers()
+            if n < 1 or any(k not in registers for k in range(first, first + n)):
+                return bytes((kind | ERROR, NO_SUCH_ADDRESS))
+            values = [registers[k] for k in range(first, first + n)]
+            return bytes((kind, 2 * n)) + struct.pack(f">{n}H", *values)
+        if first != OUTPUT or (kind == WRITE and n != 1):
+            return bytes((kind | ERROR, NO_SUCH_ADDRESS))
+        output = n if kind == WRITE_ONE else int.from_bytes(request[6:8], "big")
+        self.streaming = output == STREAM
+        return request[:5]
+
+    def _registers(self) -> dict[int, int]:
+        loads = [0] * 6
+        if self.newest is not None:
+            frame = super().encode(self.newest)[0]
+            loads = list(struct.unpack("<6H", frame[2:14]))
+        words = dict(enumerate(loads, LOADS)) | dict.fromkeys(range(GRAVITY, GRAVITY + 3), 0)
+        text = SERIAL_NUMBER.encode()
+        serial = enumerate(struct.unpack(">4H", text), SERIAL)
+        return words | dict(serial) | {OUTPUT: STREAM * self.streaming, YEAR: 2020}
+
+
+def _length(heard: bytes, slave: int) -> int:
+    """Length of the request that begins here; 0: none does, more than there is: not yet known."""
+    if heard[0] != slave or (len(heard) > 1 and heard[1] not in REQUESTS):
+        return 0
+    if len(heard) < 2 or (heard[1] == WRITE and len(heard) < 7):
+        return len(heard) + 1
+    return 9 + heard[6] if heard[1] == WRITE else 8
 
 
 def _checked(message: bytes) -> bytes:

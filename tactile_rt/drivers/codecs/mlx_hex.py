@@ -73,6 +73,7 @@ class MlxHex(SerialCodec):
     """
 
     Options = MlxHexOptions
+    usb = True
     baud = 115200  # nominal: it speaks over USB
     status_bits = {  # noqa: RUF012
         2: "the chip was reset",

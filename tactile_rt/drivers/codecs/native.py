@@ -95,6 +95,7 @@ class NativeSerial(SerialCodec):
     """Our reference firmware's protocol: counted, timed, described and checked."""
 
     Options = NativeOptions
+    usb = True
     baud = 2_000_000  # nominal: most boards speak it over USB, which has no baud rate
     count_bits = 32
     tick_ns = 1000.0

@@ -149,25 +149,27 @@ class _Messages:
         messages["status"] = np.where(bad > 0, 1 << FAILURE | first, 0) | (bad > 1) << SEVERAL
         return [_summed(message.tobytes()[:-2]) for message in messages]
 
-    def respond(self, packet: bytes) -> tuple[bytes, bool | None]:
-        """The answer, and whether the device streams now (None: as before)."""
+    def respond(self, packet: bytes) -> tuple[bytes, int | None]:
+        """The answer, and at which rate the device streams now, Hz (0: it does not; None: as
+        before)."""
         self._heard += packet
-        answer, streaming, done = b"", None, 0
+        answer, rate, done = b"", None, 0
         for settings in SETTINGS.finditer(self._heard):
             done = settings.end()
             speed, filter_, _ = settings[0][4:7]
             good = _intact(settings[0]) and speed in (0, *SPEEDS.values()) and filter_ <= 6
             if good:
-                streaming = speed > 0
+                rate = next((hz for hz, code in SPEEDS.items() if code == speed), 0)
             answer += _summed(ANSWER + bytes((not good,)))
         self._heard = self._heard[max(done, len(self._heard) - 8) :]
-        return answer, streaming
+        return answer, rate
 
 
 class OptoForceSerial(SerialCodec):
     """An OptoForce DAQ on USB."""
 
     Options = OptoForceOptions
+    usb = True
     baud = 1_000_000
     count_bits = 16
     status_bits: ClassVar[dict[int, str]] = {
@@ -211,8 +213,9 @@ class OptoForceSerial(SerialCodec):
         return self._messages.encode(chunk)
 
     def respond(self, packet: bytes) -> bytes:
-        answer, streaming = self._messages.respond(packet)
-        self.streaming = self.streaming if streaming is None else streaming
+        answer, rate = self._messages.respond(packet)
+        if rate is not None:
+            self.streaming, self.commanded_hz = rate > 0, rate or None
         return answer
 
 
@@ -283,8 +286,9 @@ class OptoForceCan(CanCodec):
 
     def respond(self, packet: Sequence[CanFrame]) -> Sequence[CanFrame]:
         heard = b"".join(f.data for f in packet if f.id == self._host_id and not f.extended)
-        answer, streaming = self._messages.respond(heard)
-        self.streaming = self.streaming if streaming is None else streaming
+        answer, rate = self._messages.respond(heard)
+        if rate is not None:
+            self.streaming, self.commanded_hz = rate > 0, rate or None
         return self._frames(self._id, answer)
 
     @staticmethod

@@ -80,6 +80,7 @@ class Tsf85(SerialCodec):
     """
 
     Options = Tsf85Options
+    usb = True
     baud = 115_200  # nominal: USB has none
     tick_bits = 48  # of the 64 sent
     cannot_detect = (
@@ -213,6 +214,7 @@ class Tsf85(SerialCodec):
                 self.polled += 1
             else:
                 self.streaming = data != b"\0"
+                self.commanded_hz = 1000.0 / data[0] if data[0] else None
 
     # both
 

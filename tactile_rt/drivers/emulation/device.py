@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import Any, ClassVar, Self
 from urllib.parse import quote, urlencode
 
-from tactile_rt.drivers.codec import Codec
+from tactile_rt.drivers.codec import Codec, SerialCodec, codec_class
 from tactile_rt.drivers.emulation.emulator import Emulator
 from tactile_rt.drivers.emulation.endpoints import (
     BusEndpoint,
@@ -20,7 +20,9 @@ from tactile_rt.drivers.emulation.endpoints import (
 )
 from tactile_rt.drivers.emulation.faults import FaultSchedule
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.stream import Source
+from tactile_rt.stream import ConfigError, Source
+
+SPEEDS = ("baud", "bitrate")  # of a line; 0 for none
 
 __all__ = ["EmulatedCan", "EmulatedDevice", "EmulatedSerial"]
 
@@ -41,17 +43,20 @@ class EmulatedDevice:
     def __init__(
         self,
         source: Source,
-        codec: str,
+        name: str,
+        codec: Codec[Any],
         endpoint: Endpoint[Any],
         *,
-        options: dict[str, str] | None = None,
+        options: dict[str, str],
         faults: FaultSchedule | None = None,
         pace: str = "realtime",
         **emulator: Any,
     ) -> None:
-        self._name, self._options = codec, dict(options or {})
-        self.codec: Codec[Any] = make_codec(self.wire, codec, self._options)
-        self.emulator = Emulator(self.codec, source, endpoint, faults, pace=pace, **emulator)
+        self._name, self._options, self.codec = name, options, codec
+        like = getattr(source, "like", None)  # a made-up array has the device's array, and loads
+        if like is not None and codec.spec is not None:
+            source = like(codec.spec)
+        self.emulator = Emulator(codec, source, endpoint, faults, pace=pace, **emulator)
 
     @property
     def port(self) -> str:
@@ -62,7 +67,8 @@ class EmulatedDevice:
     def url(self) -> str:
         """What `open_source` opens: the line, the codec and its options."""
         # a + is a + in our URLs, not the space that web forms make of it
-        query = urlencode({"codec": self._name, **self._options}, quote_via=quote)
+        told = {k: v for k, v in self._options.items() if k not in SPEEDS or v != "0"}
+        query = urlencode({"codec": self._name, **told}, quote_via=quote)
         return f"{quote(self.emulator.address, safe=':/')}?{query}"
 
     def unplug(self) -> None:
@@ -94,17 +100,36 @@ class EmulatedDevice:
         self.close()
 
 
+def _made(
+    wire: str, name: str, options: dict[str, str], speed: str
+) -> tuple[Codec[Any], int | None]:
+    """The codec, and the line's speed where the options tell one."""
+    fields = dict(options)
+    told = None
+    if speed in fields and speed not in codec_class(wire, name).Options.__dataclass_fields__:
+        text = fields.pop(speed)
+        if not text.isdecimal():
+            raise ConfigError(f"{speed} must be a whole number, bit/s, not {text!r}")
+        told = int(text)
+    return make_codec(wire, name, fields), told
+
+
 class EmulatedSerial(EmulatedDevice):
     """A device on a serial port: a pty, which any program can open. Unix only.
+
+    In real time what it sends takes the time that it takes at the line's speed, what does not fit
+    is not sent, and a host with another baud rate hears nonsense. A device that is attached by USB
+    has no such speed, unless an option ``baud`` tells one; with ``baud=0`` none has.
 
     Args:
         source: What the device measures.
         codec: Name of the codec that it speaks.
         link: A symbolic link to the port, so that the port has the same name when it is plugged
             in again; None: /dev/pts/N.
-        options: Options of the codec, as in a URL.
+        options: Options of the codec, and ``baud``, as in a URL.
         faults: What goes wrong on the line.
-        pace: ``realtime``, or ``fast``: every sample is sent as soon as it is read.
+        pace: ``realtime``, or ``fast``: every sample is sent as soon as it is read, over a line
+            without a speed.
         emulator: Further options of `Emulator`.
     """
 
@@ -116,13 +141,24 @@ class EmulatedSerial(EmulatedDevice):
         codec: str = "native",
         *,
         link: str | Path | None = None,
+        options: dict[str, str] | None = None,
+        pace: str = "realtime",
         **further: Any,
     ) -> None:
-        super().__init__(source, codec, SerialEndpoint(link), **further)
+        fields = dict(options or {})
+        spoken, baud = _made("serial", codec, fields, "baud")
+        assert isinstance(spoken, SerialCodec)
+        if baud is None:
+            baud = 0 if spoken.usb or pace == "fast" else spoken.baud
+        endpoint = SerialEndpoint(link, baud=baud, parity=spoken.parity)
+        super().__init__(source, codec, spoken, endpoint, options=fields, pace=pace, **further)
 
 
 class EmulatedCan(EmulatedDevice):
     """A device on a CAN bus: behind an slcan adapter on a pty, or on a bus of python-can.
+
+    In real time frames behind an slcan adapter take the time that they take on a bus of the bit
+    rate that the host chose; with an option ``bitrate=0`` they take none.
 
     Args:
         bus: ``INTERFACE:CHANNEL``, e.g. ``virtual:test``; None: slcan.
@@ -142,9 +178,15 @@ class EmulatedCan(EmulatedDevice):
         fd: bool | None = None,
         link: str | Path | None = None,
         options: dict[str, str] | None = None,
+        pace: str = "realtime",
         **further: Any,
     ) -> None:
+        fields = dict(options or {})
+        spoken, bitrate = _made("can", codec, fields, "bitrate")
         if fd is None:
-            fd = (options or {}).get("fd", "").lower() in ("1", "true")
-        endpoint = SlcanEndpoint(link) if bus is None else BusEndpoint(bus, fd)
-        super().__init__(source, codec, endpoint, options=options, **further)
+            fd = fields.get("fd", "").lower() in ("1", "true")
+        paced = pace == "realtime" and bitrate != 0
+        endpoint: Endpoint[Any] = SlcanEndpoint(link, bitrate or None, paced=paced)
+        if bus is not None:
+            endpoint = BusEndpoint(bus, fd)
+        super().__init__(source, codec, spoken, endpoint, options=fields, pace=pace, **further)

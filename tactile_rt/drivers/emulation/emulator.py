@@ -15,7 +15,12 @@ import numpy as np
 from tactile_rt.drivers.codec import Codec
 from tactile_rt.drivers.emulation.endpoints import Endpoint
 from tactile_rt.drivers.emulation.faults import QUIET_S, DeviceLog, FaultSchedule
-from tactile_rt.drivers.emulation.transmitter import EmulatedClock, Transmitter, fit
+from tactile_rt.drivers.emulation.transmitter import (
+    EmulatedClock,
+    RateConverter,
+    Transmitter,
+    fit,
+)
 from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, EndOfStream, Source
 
 __all__ = ["PACES", "Emulator"]
@@ -45,7 +50,8 @@ class Emulator:
         log: What was done to each sample: a record of each (17 bytes) if asked for, else counts
             only.
         pace: ``realtime`` sends samples when they are due (a live source has its own pace);
-            ``fast`` as soon as the host takes them.
+            ``fast`` as soon as the host takes them. In real time a device sends at its own rate, or
+            at that which the host has commanded, whatever the source's.
         seconds: How long the source's stream is, if known, else where to stop; s of the source's
             time. The schedule keeps the end quiet. Not needed for a source that is not live.
         start_count: First value of the device's counter, e.g. just before it wraps.
@@ -91,6 +97,7 @@ class Emulator:
             codec.may_whisk = source.may_whisk  # what it cannot do is not acknowledged
         self.log = DeviceLog(log)
         self._fit = fit(source.spec, codec.spec)
+        self._rate = RateConverter(source.spec.rate_hz, codec) if pace == "realtime" else None
         self._seconds = seconds
         self._ahead_ns = QUIET_S * NS_PER_S if faults and not source.live else 0.0
         self._settle_s = settle_s
@@ -207,6 +214,8 @@ class Emulator:
                     heard = self.endpoint.heard
                     if heard != (self._heard_at is not None):
                         self._heard_at = time.monotonic() if heard else None
+                        if heard and self.codec.greeting:
+                            self.endpoint.send(self.codec.greeting, answer=True)
                     elif not packet:
                         continue
                     if packet:
@@ -228,7 +237,9 @@ class Emulator:
         try:
             if self._wait_for_host():
                 for chunk in self._chunks():
-                    self._play(self._fit(chunk))
+                    sampled = chunk if self._rate is None else self._rate.at_rate(chunk)
+                    if sampled is not None:
+                        self._play(self._fit(sampled))
             with self._state:
                 self._out.finish()
         except BaseException as error:
@@ -302,7 +313,8 @@ class Emulator:
         """Wait until a host wants samples and there is room for them; False: we are closing."""
         with self._state:
             while not self._stopping:
-                wanted = self.codec.streaming or self.codec.polled > 0
+                measures = self.codec.measures and not self._waits
+                wanted = self.codec.streaming or self.codec.polled > 0 or measures
                 left = SLICE_S
                 if self._heard_at is not None and self.endpoint.heard and wanted:
                     settled = self._heard_at + (self._settle_s if self._unasked else 0.0)
@@ -321,7 +333,7 @@ class Emulator:
             if self.codec.streaming:
                 self._out.send(piece)
             else:
-                self._newest = _slice(piece, -1, None)
+                self._newest = self.codec.newest = _slice(piece, -1, None)
                 if self._out.away:  # nobody can ask, and only time brings it back
                     self._out.look(int(self._newest.t_ns[0]))
                 self._answer_polls(self._newest)

@@ -12,11 +12,13 @@ from typing import Any, ClassVar, Generic
 
 from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.emulation.pseudo_terminal import Pty
+from tactile_rt.drivers.emulation.wire import Wire, bytes_s, frames_s
 from tactile_rt.drivers.slcan import SlcanAdapter
 from tactile_rt.stream import ConfigError
 
 __all__ = ["BusEndpoint", "Endpoint", "SerialEndpoint", "SlcanEndpoint"]
 
+UART_BYTES = 4096  # what a device holds that the line has not yet carried
 FIFO_BYTES = 1 << 20  # a second of 1 kHz x 850 B: a busy host machine is no fault of the device
 LOOK_S = 0.005  # how often a bus that is not there is looked at
 WAIT_S = 0.05  # how soon a wait on a bus notices that the device is closed
@@ -73,6 +75,9 @@ class Endpoint(abc.ABC, Generic[Packet]):
     def error(self, frames: int) -> None:
         """Send so many CAN error frames."""
 
+    def gather(self, seconds: float) -> None:
+        """Hand on what has come every so often only, s; 0: at once."""
+
     @property
     def backlog(self) -> int:
         """Bytes accepted and not yet sent."""
@@ -89,8 +94,10 @@ class Endpoint(abc.ABC, Generic[Packet]):
 class _PtyEndpoint(Endpoint[Packet]):
     """What a device on a pty has, whatever it speaks."""
 
-    def __init__(self, link: str | Path | None, fifo_bytes: int) -> None:
-        self.pty = Pty(link, fifo_bytes)
+    def __init__(
+        self, link: str | Path | None, fifo_bytes: int, wire: Wire | None = None, baud: int = 0
+    ) -> None:
+        self.pty = Pty(link, fifo_bytes if wire is None else UART_BYTES, wire, baud)
 
     @property
     def heard(self) -> bool:
@@ -99,6 +106,9 @@ class _PtyEndpoint(Endpoint[Packet]):
     @property
     def backlog(self) -> int:
         return self.pty.queued
+
+    def gather(self, seconds: float) -> None:
+        self.pty.gather(seconds)
 
     def pull(self) -> None:
         self.pty.pull()
@@ -116,12 +126,22 @@ class SerialEndpoint(_PtyEndpoint[bytes]):
     Args:
         link: A name under which the port appears, besides /dev/pts/N.
         fifo_bytes: How many bytes the port holds for a host that does not read.
+        baud: Speed of the line, bit/s: what is sent takes its time, and a host with another one
+            hears nonsense; 0 for a line without a speed, as USB is.
+        parity: Parity of the line: ``N``, ``E`` or ``O``.
     """
 
     wire = "serial"
 
-    def __init__(self, link: str | Path | None = None, fifo_bytes: int = FIFO_BYTES) -> None:
-        super().__init__(link, fifo_bytes)
+    def __init__(
+        self,
+        link: str | Path | None = None,
+        fifo_bytes: int = FIFO_BYTES,
+        baud: int = 0,
+        parity: str = "N",
+    ) -> None:
+        super().__init__(link, fifo_bytes, Wire() if baud else None, baud)
+        self._byte_s = bytes_s(1, baud, parity) if baud else 0.0
 
     def plug(self) -> None:
         self.pty.plug()
@@ -131,10 +151,10 @@ class SerialEndpoint(_PtyEndpoint[bytes]):
         return self.pty.read(timeout_s)
 
     def send(self, packet: bytes, answer: bool = False) -> bool:
-        return self.pty.write(packet, answer)
+        return self.pty.write(packet, answer, len(packet) * self._byte_s)
 
     def disturb(self, amount: int, draw: random.Random) -> None:
-        self.pty.write(draw.randbytes(amount))
+        self.send(draw.randbytes(amount))
 
 
 class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
@@ -145,6 +165,7 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
         bitrate: Speed of the bus, bit/s; a host that chooses another one hears nothing. None
             accepts any.
         fifo_bytes: How many bytes the port holds for a host that does not read.
+        paced: Whether frames take the time that they take on a bus of the host's bit rate.
     """
 
     wire = "can"
@@ -154,8 +175,9 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
         link: str | Path | None = None,
         bitrate: int | None = None,
         fifo_bytes: int = FIFO_BYTES,
+        paced: bool = False,
     ) -> None:
-        super().__init__(link, fifo_bytes)
+        super().__init__(link, fifo_bytes, Wire() if paced else None)
         self._bitrate = bitrate
         self.adapter = SlcanAdapter(bitrate)
 
@@ -180,7 +202,8 @@ class SlcanEndpoint(_PtyEndpoint[Sequence[CanFrame]]):
     def send(self, packet: Sequence[CanFrame], answer: bool = False) -> bool:
         with self.pty.lock:
             data = self.adapter.encode(packet, time.monotonic_ns())
-            return bool(data) and self.pty.write(data, answer)
+            takes_s = frames_s(packet, self.adapter.bitrate, self.adapter.data_bitrate)
+            return bool(data) and self.pty.write(data, answer, takes_s)
 
     def disturb(self, amount: int, draw: random.Random) -> None:
         # with an end of line: what follows is a line of its own

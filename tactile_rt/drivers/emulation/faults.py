@@ -47,6 +47,7 @@ __all__ = [
     "read_faults",
 ]
 
+FOR_EVER = ("clock_drift", "gather")  # kinds that may last to the end
 QUIET_S = 0.5  # undisturbed at either end
 BESIDE_RESET_S = 0.05  # undisturbed on either side of a restart
 
@@ -71,6 +72,7 @@ KINDS = {
     "clock_jump": Kind(1, "seconds, negative: back", whole=False),
     "sequence_reset": Kind(0, "", whole=False),
     "unplug": Kind(0, "", lasts=True),
+    "gather": Kind(16, "ms for which an adapter keeps what has come", lasts=True),
     "can_error": Kind(1, "error frames"),
 }
 
@@ -87,8 +89,8 @@ class Fault:
             given.
         at_s: Time at which the fault happens, once, in seconds of the stream; None if `rate` is
             given.
-        duration_s: Length of the fault, s, for ``stall``, ``unplug`` and ``clock_drift`` (0: to the
-            end).
+        duration_s: Length of the fault, s, for ``stall``, ``unplug``, ``clock_drift`` and
+            ``gather`` (these two, 0: to the end).
         amount: Size of the fault, in the unit that `KINDS` tells; None for the default of its kind.
 
     Raises:
@@ -116,7 +118,7 @@ class Fault:
             )
         if self.duration_s and not kind.lasts:
             raise ConfigError(f"duration_s: {self.kind} has none")
-        if kind.lasts and self.kind != "clock_drift" and not self.duration_s:
+        if kind.lasts and self.kind not in FOR_EVER and not self.duration_s:
             raise ConfigError(f"duration_s must be more than 0 for {self.kind}")
         if self.amount is not None:
             if not kind.unit:

@@ -1,21 +1,33 @@
 """A pseudo-terminal as a device's port: raw, named, never blocking, and it can be pulled out."""
 
+import fcntl
+import itertools
 import os
 import pty
 import select
+import struct
+import sys
 import termios
 import threading
 import time
 import tty
 from collections import deque
 from pathlib import Path
+from typing import Final
 
+from tactile_rt.drivers.emulation.wire import Wire, misheard
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Pty"]
 
 LOOK_S = 0.005  # how often a port that nobody has open is looked at
 READ_BYTES = 65_536
+ANSWER_BYTES = 1 << 20
+PIECE_S: Final = 0.001  # of what takes long on the wire, so much comes at a time
+TCGETS2, SPEED_AT = (
+    0x802C542A,
+    40,
+)  # Linux: the settings of a terminal, where its speed stands there
 
 
 class Pty:
@@ -27,7 +39,10 @@ class Pty:
     Args:
         link: A symbolic link that comes and goes with the terminal; None for none.
         fifo_bytes: How many bytes are held for a host that does not read, beyond the kernel's 18
-            kB.
+            kB; or, on a wire, for what it has not yet carried.
+        wire: The line's speed; None: whatever is written is there at once.
+        baud: Speed at which bytes are sent, bit/s: a host with another one hears nonsense; 0: any
+            hears it.
 
     Attributes:
         path: Path of the terminal, once plugged in.
@@ -36,7 +51,14 @@ class Pty:
         lock: The lock that is held wherever the terminal's state is used.
     """
 
-    def __init__(self, link: str | Path | None, fifo_bytes: int) -> None:
+    def __init__(
+        self,
+        link: str | Path | None,
+        fifo_bytes: int,
+        wire: Wire | None = None,
+        baud: int = 0,
+    ) -> None:
+        self._wire, self._baud = wire, baud
         self.link = None if link is None else Path(link)
         self.path = ""
         self.heard = False
@@ -44,9 +66,9 @@ class Pty:
         self.lock = threading.RLock()
         self._master = -1
         self._plugged = 0  # times; a descriptor's number may come again, this does not
-        self._fifo: deque[bytes] = deque()
+        self._fifo: deque[tuple[float, bytes]] = deque()  # when it is at the other end, and what
         self.queued = 0
-        self._wake = (-1, -1)
+        self._waking = (-1, -1)
 
     @property
     def name(self) -> str:
@@ -76,10 +98,10 @@ class Pty:
                     raise ConfigError(f"{self.link}: {error.strerror}") from None
             self._master = master
             self._plugged += 1
-            if self._wake[0] < 0:
-                self._wake = os.pipe()
-                os.set_blocking(self._wake[0], False)
-                os.set_blocking(self._wake[1], False)
+            if self._waking[0] < 0:
+                self._waking = os.pipe()
+                os.set_blocking(self._waking[0], False)
+                os.set_blocking(self._waking[1], False)
 
     def pull(self) -> None:
         """Disappear; what was not read is lost."""
@@ -99,37 +121,61 @@ class Pty:
         """Disappear for good; safe to call twice."""
         with self.lock:
             self.pull()
-            for end in self._wake:
+            for end in self._waking:
                 if end >= 0:
                     os.close(end)
-            self._wake = (-1, -1)
+            self._waking = (-1, -1)
 
-    def write(self, data: bytes, answer: bool = False) -> bool:
+    def write(self, data: bytes, answer: bool = False, takes_s: float = 0.0) -> bool:
         """Queue all of these bytes, or none: nobody has it open, or there is no room.
 
         Args:
             data: The bytes to send.
-            answer: Whether this answers a command, which may take as much room again.
+            answer: Whether this answers a command, for which there is more room.
+            takes_s: The time that they take on the wire, s.
         """
         with self.lock:
-            room = self.fifo_bytes * (2 if answer else 1)
+            room = self.fifo_bytes + (ANSWER_BYTES if answer else 0)
             if not self.heard or self.queued + len(data) > room:
                 return False
+            if self._wire is not None:
+                self._delay(self._wire, data, takes_s)
+                return True
             if not self._fifo:
                 data = data[self._put(data) :]
                 if not data:
                     return True
                 self.wake()  # the reader's thread shall now wait for room, too
-            self._fifo.append(data)
+            self._fifo.append((0.0, data))
             self.queued += len(data)
             return True
+
+    def _delay(self, wire: Wire, data: bytes, takes_s: float) -> None:
+        if not self._fifo:
+            self.wake()  # the reader's thread shall now wait for the wire, too
+        n = max(1, min(len(data), round(takes_s / PIECE_S)))
+        edges = [k * len(data) // n for k in range(n + 1)]
+        for first, last in itertools.pairwise(edges):
+            share = takes_s * (last - first) / len(data)
+            self._fifo.append((wire.heard_at(share, time.monotonic()), data[first:last]))
+        self.queued += len(data)
+
+    def gather(self, seconds: float) -> None:
+        """Let what is written wait for a multiple of so many seconds; 0: for nothing."""
+        with self.lock:
+            if self._wire is None and seconds:
+                self._wire = Wire()
+            if self._wire is not None:
+                self._wire.gather_s = seconds
 
     def read(self, timeout_s: float) -> bytes:
         """What the host has sent; meanwhile it gets what is queued."""
         with self.lock:
-            master, plugged, wake = self._master, self._plugged, self._wake[0]
+            master, plugged, wake = self._master, self._plugged, self._waking[0]
             sleep_s = timeout_s if self.heard else min(timeout_s, LOOK_S)
-            mask = select.POLLIN | (select.POLLOUT if self._fifo else 0)
+            left_s = self._fifo[0][0] - time.monotonic() if self._fifo else sleep_s
+            mask = select.POLLIN | (select.POLLOUT if self._fifo and left_s <= 0 else 0)
+            sleep_s = min(sleep_s, left_s) if left_s > 0 else sleep_s
             heard = self.heard
         if wake < 0:
             time.sleep(timeout_s)
@@ -144,9 +190,9 @@ class Pty:
             poll.register(master, mask)
             poll.poll(1e3 * sleep_s)
         with self.lock:
-            if self._wake[0] >= 0:
+            if self._waking[0] >= 0:
                 try:
-                    os.read(self._wake[0], 4096)
+                    os.read(self._waking[0], 4096)
                 except BlockingIOError:
                     pass
             if self._master < 0 or self._plugged != plugged:
@@ -156,9 +202,9 @@ class Pty:
     def wake(self) -> None:
         """End a wait in `read`."""
         with self.lock:
-            if self._wake[1] >= 0:
+            if self._waking[1] >= 0:
                 try:
-                    os.write(self._wake[1], b"\0")
+                    os.write(self._waking[1], b"\0")
                 except BlockingIOError:
                     pass  # it is awake
 
@@ -172,12 +218,13 @@ class Pty:
         else:
             self.heard = True
         if self.heard and events & select.POLLOUT:
-            while self._fifo:
-                data = self._fifo.popleft()
+            now = time.monotonic()
+            while self._fifo and self._fifo[0][0] <= now:
+                due, data = self._fifo.popleft()
                 done = self._put(data)
                 self.queued -= done
                 if done < len(data):
-                    self._fifo.appendleft(data[done:])
+                    self._fifo.appendleft((due, data[done:]))
                     break
         if not events & select.POLLIN:
             return b""
@@ -187,7 +234,11 @@ class Pty:
             return b""
 
     def _put(self, data: bytes) -> int:
+        heard = _speed(self._master) if self._baud else 0
         try:
+            if heard and heard != self._baud:
+                os.write(self._master, misheard(data, self._baud, heard))
+                return len(data)
             return os.write(self._master, data)
         except OSError:  # no room, or nobody there
             return 0
@@ -215,3 +266,14 @@ class Pty:
             self.link.unlink()  # left by a device that is no more
             return
         raise ConfigError(f"{self.link} is there already: name another link, or remove it")
+
+
+def _speed(master: int) -> int:
+    """The speed that the host has set the terminal to, bit/s; 0 where that cannot be told."""
+    if not sys.platform.startswith("linux"):
+        return 0
+    try:
+        settings = fcntl.ioctl(master, TCGETS2, bytes(64))
+    except OSError:
+        return 0
+    return int(struct.unpack_from("I", settings, SPEED_AT)[0])

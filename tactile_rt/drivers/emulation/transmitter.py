@@ -18,7 +18,9 @@ from tactile_rt.drivers.emulation.faults import (
 )
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
-__all__ = ["EmulatedClock", "Transmitter", "fit"]
+__all__ = ["EmulatedClock", "RateConverter", "Transmitter", "fit"]
+
+SAME = 1e-3  # relative: rates that differ by less are one
 
 
 class Transmitter:
@@ -52,6 +54,7 @@ class Transmitter:
         self._count = start_count
         self._first_ns = 0
         self.end_ns: float = np.inf
+        self._gathers_until_ns: float = np.inf
         self.away = False
         self._held: list[tuple[int, Any, Fate]] = []  # while nothing gets through
 
@@ -103,6 +106,9 @@ class Transmitter:
         quiet = t_ns > self.end_ns - QUIET_S * NS_PER_S
         fault = self._faults.at(elapsed_s, quiet)
         self._clock.look(t_ns)
+        if t_ns >= self._gathers_until_ns:
+            self._endpoint.gather(0.0)
+            self._gathers_until_ns = np.inf
         if fault is None:
             return None
         if fault.kind == "clock_drift":
@@ -111,6 +117,11 @@ class Transmitter:
             self._clock.jump(t_ns, round(fault.size * NS_PER_S))
         elif fault.kind == "sequence_reset":
             self.restart(t_ns)
+        elif fault.kind == "gather":
+            self._endpoint.gather(1e-3 * fault.size)
+            self._gathers_until_ns = (
+                t_ns + fault.duration_s * NS_PER_S if fault.duration_s else np.inf
+            )
         return fault
 
     def _emit(self, seq: int, t_ns: int, packet: Any, hit: Fault | None) -> None:
@@ -222,6 +233,52 @@ class EmulatedClock:
     def _anchor(self, t_ns: int) -> None:
         self._there = int(self.at(np.array([t_ns]))[0])
         self._here = t_ns
+
+
+class RateConverter:
+    """Samples a source at the rate at which the device does: the newest sample at each moment.
+
+    Args:
+        source_hz: rate of the source, Hz.
+        codec: the device's, which knows its rate and what a host has commanded.
+    """
+
+    def __init__(self, source_hz: float, codec: Codec[Any]) -> None:
+        self._source_hz, self._codec = source_hz, codec
+        self._next_ns: float | None = None
+        self._seq = 0
+        self._last: Chunk | None = None
+
+    def at_rate(self, chunk: Chunk) -> Chunk | None:
+        """A chunk as the device samples it; None if none of its moments is in it."""
+        spec = self._codec.spec
+        assert spec is not None
+        rate_hz = self._codec.commanded_hz or spec.rate_hz
+        if abs(rate_hz / self._source_hz - 1) < SAME:
+            self._next_ns = None
+            return chunk
+        if self._next_ns is None:
+            self._next_ns = float(chunk.t_ns[0])
+        period_ns, end_ns = NS_PER_S / rate_hz, int(chunk.t_ns[-1])
+        n = int(np.floor((end_ns - self._next_ns) / period_ns)) + 1
+        if n <= 0:
+            self._last = chunk
+            return None
+        at = self._next_ns + np.arange(n) * period_ns
+        self._next_ns = float(at[-1] + period_ns)
+        t_ns = np.round(at).astype(np.int64)
+        before = self._last
+        if before is not None:  # the newest of the last chunk is still the newest
+            chunk = Chunk(
+                np.append(before.seq[-1:], chunk.seq), np.append(before.t_ns[-1:], chunk.t_ns),
+                np.append(before.values[-1:], chunk.values, 0),
+                np.append(before.valid[-1:], chunk.valid, 0),
+            )  # fmt: skip
+        self._last = chunk
+        newest = np.maximum(np.searchsorted(chunk.t_ns, t_ns, "right") - 1, 0)
+        self._seq += n
+        seq = np.arange(self._seq - n, self._seq, dtype=np.int64)
+        return Chunk(seq, t_ns, chunk.values[newest], chunk.valid[newest])
 
 
 def fit(source: ArraySpec, device: ArraySpec) -> Callable[[Chunk], Chunk]:
