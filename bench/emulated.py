@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tactile_rt.drivers.emulation.device import EmulatedDevice
 from tactile_rt.drivers.emulation.endpoints import SerialEndpoint, SlcanEndpoint
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
+from tactile_rt.drivers.opening import make_codec
 from tactile_rt.sources.synthetic import SyntheticOptions, SyntheticSource
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
@@ -227,8 +228,10 @@ class EmulatedArray(EmulatedDevice):
         self._last = felt[0]
         self._source = LoopedSource(script.spec, felt, script.samples)
         faults = FaultSchedule(script.faults, script.seed) if script.faults else None
+        options = dict(script.options)
+        codec = make_codec(self.wire, "native", options)
         super().__init__(
-            self._source, "native", self._endpoint, options=script.options, faults=faults,
+            self._source, "native", codec, self._endpoint, options=options, faults=faults,
             pace=script.pace,
         )  # fmt: skip
         encode, counter = self.codec.encode, itertools.count()

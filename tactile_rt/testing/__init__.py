@@ -95,7 +95,8 @@ class ArraySource(Source):
 
 
 class FakeSerial(EmulatedSerial):
-    """A device on a serial port, plugged in while entered: see `EmulatedSerial`.
+    """A device on a serial port, plugged in while entered: see `EmulatedSerial`. Its line carries
+    all that it sends, unless an option ``baud`` says how fast it is.
 
     Args:
         signal: What the device measures: (n, element, channel) in SI units, or a source.
@@ -106,6 +107,8 @@ class FakeSerial(EmulatedSerial):
     Raises:
         ConfigError: The codec or an option is unknown, or the signal has another shape.
     """
+
+    paced = False
 
     def __init__(
         self,
@@ -119,10 +122,13 @@ class FakeSerial(EmulatedSerial):
 
 
 class FakeCan(EmulatedCan):
-    """A device on a CAN bus, plugged in while entered: see `EmulatedCan`.
+    """A device on a CAN bus, plugged in while entered: see `EmulatedCan`. Its bus carries all that
+    it sends, unless an option ``bitrate`` says how fast it is.
 
     The arguments are those of `FakeSerial`, and `EmulatedCan` has further options.
     """
+
+    paced = False
 
     def __init__(
         self,

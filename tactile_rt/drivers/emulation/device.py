@@ -39,6 +39,7 @@ class EmulatedDevice:
     """
 
     wire: ClassVar[str]
+    paced: ClassVar[bool] = True  # whether, in real time, its line has a speed
 
     def __init__(
         self,
@@ -149,7 +150,7 @@ class EmulatedSerial(EmulatedDevice):
         spoken, baud = _made("serial", codec, fields, "baud")
         assert isinstance(spoken, SerialCodec)
         if baud is None:
-            baud = 0 if spoken.usb or pace == "fast" else spoken.baud
+            baud = spoken.baud if self.paced and pace == "realtime" and not spoken.usb else 0
         endpoint = SerialEndpoint(link, baud=baud, parity=spoken.parity)
         super().__init__(source, codec, spoken, endpoint, options=fields, pace=pace, **further)
 
@@ -185,7 +186,10 @@ class EmulatedCan(EmulatedDevice):
         spoken, bitrate = _made("can", codec, fields, "bitrate")
         if fd is None:
             fd = fields.get("fd", "").lower() in ("1", "true")
-        paced = pace == "realtime" and bitrate != 0
+        if bitrate is None:
+            paced = self.paced and pace == "realtime"
+        else:
+            paced = bitrate > 0
         endpoint: Endpoint[Any] = SlcanEndpoint(link, bitrate or None, paced=paced)
         if bus is not None:
             endpoint = BusEndpoint(bus, fd)
