@@ -6,12 +6,12 @@ from bench.drivers.fuzzing import fuzzing
 from bench.drivers.losses import losses
 from bench.drivers.recordings import recordings
 from bench.drivers.unplugging import unplugging
-from bench.drivers.wires import can, serial
+from bench.drivers.wires import can, readers, serial
 from tactile_rt.evidence.records import Record
 
 __all__ = ["run"]
 
-PARTS = (serial, can, losses, unplugging, clocks, consumers, recordings, fuzzing)
+PARTS = (serial, readers, can, losses, unplugging, clocks, consumers, recordings, fuzzing)
 
 
 def run(quick: bool) -> list[Record]:

@@ -37,6 +37,8 @@ class Beat:
         twins: Whether each device has a twin that sends the same bytes at the same moment to a
             reader that only reads.
         options: Options of the native codec, as in a URL.
+        phase: When devices send beside each other: ``together``, ``apart`` by equal parts of a
+            period, or ``any``: as they were started.
     """
 
     wire: str
@@ -47,6 +49,7 @@ class Beat:
     fast: bool = False
     twins: bool = False
     options: dict[str, str] = field(default_factory=dict)
+    phase: str = "any"
 
     @property
     def samples(self) -> int:
@@ -76,8 +79,8 @@ class Sent:
 class _Device:
     """One device, and its twin."""
 
-    def __init__(self, beat: Beat, drift_ppm: float) -> None:
-        self.beat = beat
+    def __init__(self, beat: Beat, drift_ppm: float, share: float = 0.0) -> None:
+        self.beat, self._share = beat, share
         self.codec = make_codec(
             "serial" if beat.wire == "serial" else "can", "native", beat.options
         )
@@ -116,6 +119,10 @@ class _Device:
             self.endpoint.send(answer, answer=True)
         if self.codec.streaming and not self._begun_ns:
             self._begun_ns = time.monotonic_ns() + round(LISTEN_S * NS_PER_S)
+            if self.beat.phase != "any":
+                share = self._share if self.beat.phase == "apart" else 0.0
+                periods = self._begun_ns // self._period_ns + share
+                self._begun_ns = round(periods * self._period_ns)
             self._clock.begin(self._begun_ns)
             self.prepare()
 
@@ -156,7 +163,8 @@ class _Device:
 
 def play(pipe: Connection, beat: Beat) -> None:
     """Say [(address, the twin's path)], play, say [`Sent`]; stay until the pipe is closed."""
-    devices = [_Device(beat, drift) for drift in beat.drifts_ppm]
+    n = len(beat.drifts_ppm)
+    devices = [_Device(beat, drift, k / n) for k, drift in enumerate(beat.drifts_ppm)]
     pipe.send([(d.endpoint.address, d.twin.pty.path if d.twin else "") for d in devices])
     listened, turn = 0.0, False
     while not all(device.over for device in devices) and not pipe.poll(0):

@@ -15,7 +15,19 @@ from tactile_rt.evidence.records import Record
 from tactile_rt.sources.synthetic import synthetic_spec
 from tactile_rt.stream import Chunk, SourceStats
 
-__all__ = ["can", "serial"]
+__all__ = ["can", "readers", "serial"]
+
+READERS: dict[str, float | None] = {"thread": None, "one": 0.0, "gather": 0.001}
+HOW = {
+    "thread": "a thread for each device", "one": "one thread for all",
+    "gather": "one thread for all, handed on each millisecond",
+}  # fmt: skip
+BARS = {  # % of a core, and that by a thread for each
+    ("one", "together"): ("<= 13", "<= 0.45"), ("one", "apart"): ("<= 15", "<= 0.55"),
+    ("gather", "together"): ("<= 13.5", ""), ("gather", "apart"): ("<= 13.5", ""),
+}  # fmt: skip
+READERS_QUICK_S, READERS_S, QUICK_ROUNDS, ROUNDS = 3.0, 8.0, 1, 5
+MANY = 16
 
 DEVICES_PPM = (0.0, 200.0, -200.0, 50.0)  # the clocks of the four devices
 SERIAL_QUICK_S, SERIAL_S = 8.0, 600.0
@@ -91,6 +103,68 @@ def serial(quick: bool) -> list[Record]:
         ),
         *_clock(sent, came, seconds),
     ]  # fmt: skip
+
+
+def readers(quick: bool) -> list[Record]:
+    """The ways to read four devices of 1 kHz x 869 B, one after the other in turn; then sixteen."""
+    seconds, rounds = (READERS_QUICK_S, QUICK_ROUNDS) if quick else (READERS_S, ROUNDS)
+    shares: dict[tuple[str, str], list[float]] = {}
+    late: dict[tuple[str, str], list[float]] = {}
+    lost = 0
+    for _ in range(rounds):
+        for phase in ("together", "apart"):
+            for name, gather_s in READERS.items():
+                share, p99, gone = _read_by(gather_s, 4, phase, seconds)
+                shares.setdefault((name, phase), []).append(100 * share)
+                late.setdefault((name, phase), []).append(p99)
+                lost += gone
+    many, many_p99, gone = _read_by(0.0, MANY, "apart", seconds)
+    records = [
+        Record("drivers.readers.lost", lost + gone, "samples", "== 0", "", "of all these runs")
+    ]
+    for (name, phase), found in shares.items():
+        bar, ratio_bar = BARS.get((name, phase), ("", ""))
+        median = float(np.median(found))
+        by_threads = np.array(shares["thread", phase])
+        ratio = float(np.median(np.array(found) / by_threads))
+        p99 = float(np.median(late[name, phase]))
+        told = (
+            f"{HOW[name]}, 4 devices x 1 kHz x 869 B, samples {phase}; median of {rounds} x "
+            f"{seconds:g} s in turn, {min(found):.1f} to {max(found):.1f}; p99 of the latency "
+            f"{p99:.0f} us"
+        )
+        records.append(
+            Record(f"drivers.readers.{name}_{phase}", median, "% of a core", bar, "", told)
+        )
+        if ratio_bar:
+            threads_p99 = float(np.median(late["thread", phase]))
+            records += [
+                Record(
+                    f"drivers.readers.{name}_{phase}_ratio", ratio, "x", ratio_bar,
+                    HOW["thread"], "of the same round; median",
+                ),
+                Record(
+                    f"drivers.readers.{name}_{phase}_p99", p99 / threads_p99, "x", "<= 1",
+                    f"{HOW['thread']}: {threads_p99:.0f} us", f"{p99:.0f} us",
+                ),
+            ]  # fmt: skip
+    what = f"{MANY} devices x 1 kHz x 869 B, one thread; p99 of the latency {many_p99:.0f} us"
+    return [*records, Record("drivers.readers.many", 100 * many, "% of a core", "<= 50", "", what)]
+
+
+def _read_by(
+    gather_s: float | None, devices: int, phase: str, seconds: float
+) -> tuple[float, float, int]:
+    """(share of a core, p99 of the latency in us, samples lost) of one way to read them."""
+    beat = Beat("serial", (0.0,) * devices, 35, 1000.0, seconds, phase=phase)
+    with Helper(play, beat) as device:
+        urls = [f"{address}?codec=native" for address, _ in device.hear()]
+        with Helper(read_sources, urls, beat.samples, gather_s) as ours:
+            ours.hear()
+            sent = device.hear(beat.seconds)
+            came, share = ours.hear()
+    late = np.concatenate([_late(c, s.at_ns) for c, s in zip(came, sent, strict=True)])
+    return share, float(np.percentile(late, 99)), _lost(sent, came)
 
 
 def _warm_us() -> float:
