@@ -103,7 +103,7 @@ def _copy(path: Path, records: "Iterator[Record]", new: BinaryIO, about: Descrip
     # A damaged first chunk takes the names of the channels with it, but we number them alike.
     numbered = (topic for topic, wire in CHANNELS if wire in ("", about.wire))
     names = dict(enumerate(numbered, 1))
-    whole = none = 0
+    whole, none = False, 0
     for record in records:
         if isinstance(record, Channel):
             names[record.id] = record.topic
@@ -111,7 +111,7 @@ def _copy(path: Path, records: "Iterator[Record]", new: BinaryIO, about: Descrip
             topic = names[record.channel_id]
             if is_message(topic, record.data, about.spec.shape):
                 file.add(topic, record.data, _host_ns(record, about))
-                whole += 1
+                whole = True
             else:
                 none += 1
         if none > MOST_NONE:

@@ -1,5 +1,6 @@
 """Models on trial: what they need is known before they are let in, and hostile ones are not."""
 
+import ast
 import json
 import os
 import signal
@@ -12,6 +13,7 @@ import pytest
 
 pytest.importorskip("onnx")
 
+from tactile_rt.classifier import trial
 from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.classifier.trial import TrialLimits, try_model
 from tactile_rt.stream import ModelError
@@ -120,3 +122,64 @@ def test_a_trial_dies_with_whoever_started_it(tmp_path: Path) -> None:
     parent.send_signal(signal.SIGKILL)
     parent.wait()
     until(lambda: not Path(f"/proc/{child}").exists())
+
+
+LIMITED = """
+import os, resource, sys
+import tactile_rt.classifier.model_file as model_file
+import tactile_rt.classifier.trial as trial
+from tactile_rt.stream import ModelError
+
+def load_model(path):
+    kinds = resource.RLIMIT_CPU, resource.RLIMIT_CORE, resource.RLIMIT_DATA
+    raise ModelError(f"{[resource.getrlimit(k) for k in kinds]}, {os.nice(0)}")
+
+model_file.load_model = load_model
+sys.exit(trial._main())
+"""
+
+
+def limits_of(path: Path) -> list:
+    """What the child of a trial may: processor time, core file, memory; and its niceness."""
+    task = {"path": str(path), "every": 0, "limits": {"memory_mb": 300.0, "seconds": 7.0}}
+    done = subprocess.run(
+        [sys.executable, "-c", LIMITED], input=json.dumps(task), capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    return ast.literal_eval(f"[{json.loads(done.stdout)['refused']}]")
+
+
+def test_the_child_limits_itself_before_it_loads(tmp_path: Path) -> None:
+    small, large = tmp_path / "small.onnx", tmp_path / "large.onnx"
+    small.write_bytes(b"x")
+    large.write_bytes(bytes(50_000_000))
+    (cpu, core, data), nice = limits_of(small)
+    (_, _, more), _ = limits_of(large)
+    assert cpu == (9, 10) and core == (0, 0) and nice >= 5
+    assert data[0] == data[1] > 300e6
+    assert more[0] - data[0] == pytest.approx(200e6, abs=20e6)  # four times the file
+
+
+TOLD = b'{"sha256": "ab", "load_s": 1.0, "step_s": 0.1, "memory_mb": 2.0}'
+
+
+@pytest.mark.parametrize(
+    "code, said, why",
+    [
+        (-signal.SIGXCPU, b"", r"more than limits.model_s = 60 s of the processor"),
+        (-signal.SIGKILL, b"", "needs more memory than limits.model_mb = 256 MB"),
+        (77, b"", "needs more memory"),
+        (3, TOLD, "its trial ended with exit code 3"),
+        (0, b"{}", "its trial ended with exit code 0"),
+        (0, b"no JSON", "its trial ended with exit code 0"),
+        (0, b'{"refused": "for a reason"}', "for a reason"),
+    ],
+)
+def test_how_a_trial_ended_is_told(code: int, said: bytes, why: str) -> None:
+    with pytest.raises(ModelError, match=why):
+        trial._result(Path("a.onnx"), TrialLimits(), code, said)
+
+
+def test_a_trial_that_went_well() -> None:
+    found = trial._result(Path("a.onnx"), TrialLimits(), 0, TOLD)
+    assert (found.sha256, found.load_s, found.step_s, found.memory_mb) == ("ab", 1.0, 0.1, 2.0)
