@@ -76,9 +76,10 @@ class Reader:
         Args:
             timeout: how long to wait, s; None: for ever.
         """
-        for source in [s for s in self._blind if s.fileno() >= 0]:
-            self._neglect(source)
-            self._attend(source)
+        if self._blind:
+            for source in [s for s in self._blind if s.fileno() >= 0]:
+                self._neglect(source)
+                self._attend(source)
         now = time.monotonic()
         if now >= self._look_at:
             self._look_at = now + LOOK_S
@@ -88,9 +89,10 @@ class Reader:
         if found and self._gather_s:
             time.sleep(self._gather_s)
             found = self._poll.poll(0)
-        if found and any(fd == self._woken for fd, _ in found):
+        ready = [self._lines[fd] for fd, _ in found if fd in self._lines]
+        if len(ready) < len(found):  # the other is `wake`
             os.read(self._woken, 4096)
-        return [self._lines[fd] for fd, _ in found if fd in self._lines] + self._blind
+        return ready + self._blind if self._blind else ready
 
     def take(self, source: Source) -> Chunk | None:
         """What has come of a source that is ready; None: nothing, or it has ended.
