@@ -16,12 +16,14 @@ import resource
 import socket
 import stat
 import threading
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
 __all__ = ["ConnectionLimit"]
 
 LOOK_S: Final = 0.1  # on loopback, some thousand may come meanwhile
+BYE_S: Final = 0.2
 AGAIN_S: Final = 0.002  # while they come
 CALM: Final = 20  # looks without anyone to shut down, after which they have gone
 Key = tuple[int, int]  # descriptor and inode: a socket, as long as it is open
@@ -60,8 +62,20 @@ class ConnectionLimit:
         """Whether whoever comes now is shut down."""
         return len(self._kept) >= self._most
 
-    def close(self) -> None:
-        """Look no more."""
+    def close(self, stop: Callable[[], object] | None = None) -> None:
+        """Look no more.
+
+        Args:
+            stop: What ends the listening, before that. Who is connected may take `BYE_S` to say
+                goodbye and is then shut down: for one that never said a word, Foxglove's server
+                and Zenoh wait for ever.
+        """
+        if stop is not None:
+            stopping = threading.Thread(target=stop, name=f"{self._thread.name} stop", daemon=True)
+            stopping.start()
+            stopping.join(BYE_S)
+            self._most = 0
+            stopping.join()
         self._over.set()
         self._thread.join()
         os.close(self._spare)
@@ -80,7 +94,8 @@ class ConnectionLimit:
     def _look(self, empty: int) -> int:
         """Shut down who is too many; how many that were."""
         numbers = _descriptors()
-        if numbers == self._numbers:  # what has changed all the same is noticed at the next change
+        # What has changed all the same is noticed at the next change.
+        if numbers == self._numbers and len(self._kept) <= self._most:
             return 0
         self._numbers = numbers
         new, open_now = [], set()
@@ -94,6 +109,7 @@ class ConnectionLimit:
                         new.append(key)
         self._kept &= open_now
         self._others &= open_now
+        new += [self._kept.pop() for _ in range(len(self._kept) - self._most)]
         dropped = 0
         for key in new:
             with suppress(OSError):

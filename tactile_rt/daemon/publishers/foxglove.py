@@ -133,13 +133,13 @@ class FoxglovePublisher(Consumer):
     def close(self) -> None:
         server, self._server = self._server, None
         limit, self._limit = self._limit, None
-        if limit is not None:
-            limit.close()
         channels, self._channels = self._channels, {}
         self._scenes.clear()
         for channel in channels.values():
             channel.close()
-        if server is not None:
+        if limit is not None and server is not None:
+            limit.close(server.stop)
+        elif server is not None:
             server.stop()
 
     def trouble(self) -> str:

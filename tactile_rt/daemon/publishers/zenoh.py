@@ -92,9 +92,9 @@ class ZenohPublisher(Sender):
     def close(self) -> None:
         session, self._session = self._session, None
         limit, self._limit = self._limit, None
-        if limit is not None:
-            limit.close()
-        if session is not None:
+        if limit is not None and session is not None:
+            limit.close(session.close)
+        elif session is not None:
             session.close()  # type: ignore[no-untyped-call]
 
     def details(self) -> dict[str, str | int | float]:
