@@ -140,7 +140,7 @@ class DisturbedDaemon:
             )
         )  # fmt: skip
         os.close(out)
-        self.daemon.await_state(lambda s: s["state"] == "running")
+        self.daemon.await_state(lambda s: s["state"] in ("running", "degraded"))  # disturbed by then
         until(lambda: self._connected)
         end, count = time.monotonic() + SETTLED_MOST_S, -1
         while count < len(self._told) and time.monotonic() < end:
