@@ -3,16 +3,19 @@
 import json
 import math
 import os
+import socket
 import subprocess
 import sys
 import threading
 import time
 import types
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
 
 from tactile_rt.classifier.classifier import Classification
+from tactile_rt.daemon import lock
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, LogConfig
 from tactile_rt.daemon.health import EDGES_S, LatencyMeter
@@ -391,6 +394,57 @@ def test_a_lock_of_another_user_is_a_lock_and_names_the_user(tmp_path):
         with pytest.raises(AlreadyRunning, match=f"process {other.pid} of user 65534"):
             Locks().hold([key])
         other.kill()
+
+
+def bound(key):
+    """What has a lock's name, and does not listen yet."""
+    holder = socket.socket(socket.AF_UNIX)
+    holder.bind(lock._name(key))
+    return holder
+
+
+def test_a_holder_that_listens_a_moment_later_is_named(tmp_path, monkeypatch):
+    key = f"device {tmp_path}/tty"
+    with bound(key) as holder:
+        monkeypatch.setattr(lock.time, "sleep", lambda _: holder.listen())
+        with pytest.raises(AlreadyRunning, match=f"in use by process {os.getpid()}$"):
+            Locks().hold([key])
+
+
+def test_a_holder_that_never_listens_is_a_lock_too(tmp_path):
+    key = f"device {tmp_path}/tty"
+    with bound(key), pytest.raises(AlreadyRunning, match="by a process that does not tell who"):
+        Locks().hold([key])
+
+
+def test_a_holder_that_very_many_have_asked_is_not_waited_for(tmp_path):
+    key = f"device {tmp_path}/tty"
+    with bound(key) as holder, ExitStack() as asking:
+        holder.listen(1)
+        with pytest.raises(BlockingIOError):
+            for _ in range(100):
+                one = asking.enter_context(socket.socket(socket.AF_UNIX))
+                one.setblocking(False)
+                one.connect(lock._name(key))
+        with pytest.raises(AlreadyRunning, match="in use by another process"):
+            Locks().hold([key])
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="makes a container")
+def test_a_holder_outside_of_the_container_is_a_lock(tmp_path):
+    key, held = f"device {tmp_path}/tty", Locks()
+    held.hold([key])
+    code = "import sys; from tactile_rt.daemon.lock import Locks; Locks().hold([sys.argv[1]])"
+    command = ["unshare", "--pid", "--fork", sys.executable, "-c", code, key]
+    asked = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S)
+    held.close()
+    if "unshare" in asked.stderr:
+        pytest.skip(asked.stderr.strip())
+    assert "in use by a process that cannot be seen from this container" in asked.stderr
+
+
+def test_ports_that_differ_after_a_hash_are_two():
+    assert len(device_keys(["serial:///dev/null#1?codec=bota", "serial:///dev/null#2"])) == 2
 
 
 def test_two_names_of_a_configuration_or_a_port_are_one(tmp_path):
