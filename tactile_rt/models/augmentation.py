@@ -190,7 +190,8 @@ def as_published(
     if not reverse:
         return frames
     steps = frames.unflatten(2, (-1, channels))  # (batch, step, sub-step, channel, row, column)
-    return -steps.flip(1, 2).flatten(2, 3)
+    back: Tensor = -steps.flip(1, 2).flatten(2, 3)
+    return back
 
 
 def turned(frames: Tensor, turns: int) -> Tensor:
