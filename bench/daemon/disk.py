@@ -5,6 +5,7 @@ import resource
 import time
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from bench.daemon.accounts import recorded
@@ -41,7 +42,8 @@ def disk_full(times: int) -> list[Record]:
             time.sleep(LOOK_S)
         state, played, code = scene.finish()
         # In the log: when the last of them is told the publishers have been closed.
-        told = [line for line in scene.daemon.log().splitlines() if FULL in line]
+        lines = [msgspec.json.decode(line) for line in scene.daemon.log().splitlines()]
+        told = [line for line in lines if _failed(line["part"], line["reason"])]
         cut = [f for f in sorted(folder.glob("*.mcap")) if not is_finished(f)]
         whole = scene.folder / "whole"
         whole.mkdir()

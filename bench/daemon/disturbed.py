@@ -140,7 +140,8 @@ class DisturbedDaemon:
             )
         )  # fmt: skip
         os.close(out)
-        self.daemon.await_state(lambda s: s["state"] == "running")
+        # A scene may be disturbed from its first second on.
+        self.daemon.await_state(lambda s: s["state"] in ("running", "degraded"))
         until(lambda: self._connected)
         end, count = time.monotonic() + SETTLED_MOST_S, -1
         while count < len(self._told) and time.monotonic() < end:

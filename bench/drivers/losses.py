@@ -105,8 +105,10 @@ def _compare(name: str, script: ArrayScript, got: _Received, log: Played) -> Rec
     wrong += int((~came & ~hurt & ~gone & ~on_the_way).sum()) + int((came & gone).sum())
     if script.wire == "serial":
         wrong += int((came & hurt).sum())
-        # of a damaged one on its way when the plug was pulled or put in, some may have come
-        least, most = int((hurt & ~on_the_way).sum()), int(hurt.sum())
+        # of a damaged one on its way when the plug was pulled or put in, some may have come; and
+        # one that was cut by that is damaged, too
+        pulled = int((np.diff((fate == Fate.UNHEARD).astype(np.int8)) == 1).sum())
+        least, most = int((hurt & ~on_the_way).sum()), int(hurt.sum()) + pulled
         wrong += max(0, least - stats.corrupt, stats.corrupt - most)
         wrong += abs(stats.corrupt + stats.missing - int((~came).sum()))
     else:  # what is left of a sample is delivered; what was in the lost frames is marked
