@@ -6,6 +6,9 @@ The folders: `tactile-nn` of github.com/neuroagents-lab/2025-tactile-whisking (c
 github.com/neuroagents-lab/PyTorchTNN (commit 50713d9), which are imported, see `published`. Needs
 the `train` extra and torchvision, einops, omegaconf.
 
+Part "protocol" compares what else was published: cells, augmentations, losses, LARS, schedules;
+`--store FILE` keeps figures of theirs for the tests.
+
 Parity is with the layer norm's epsilon of our cells set to theirs (decision 6), and the largest
 logit 1. Times are CPU seconds of one thread, in turn in one process, the best of each.
 """
@@ -23,11 +26,14 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import torch
 from rich.console import Console
 from torch import Tensor
 
+from bench.models import published_protocol as theirs_by
+from bench.models.protocol import computed, digest, pictures, view
 from bench.models.published import EPSILON, NETWORKS, NetworkPair, in_our_order, open_code
 from bench.models.training_speed import STEPS, training_step
 from tactile_rt.classifier.model_file import load_model
@@ -38,6 +44,7 @@ from tactile_rt.models.ead import count_parameters
 from tactile_rt.stream import ConfigError
 
 PARTS = ("parity", "training", "window")
+SEEDS = 40
 
 
 class Comparison(NetworkPair):
@@ -65,7 +72,9 @@ class Comparison(NetworkPair):
         records = [
             self.record("parameters", counts[0], "", f"== {counts[1]}", "bar: theirs"),
             self.record("parity", gap(*single), "", "<= 1e-6", "logits, both in fp32"),
-            self.record("parity_double", gap(*exact), "", "", "logits, both in double precision"),
+            self.record(
+                "parity_double", gap(*exact), "", "<= 1e-12", "logits, both in double precision"
+            ),
         ]
         if self.graph:  # S4's C has changed since; batch norm's buffers have no gradient
             theirs, own = in_our_order(gradients[0], self.ours), gradients[1]
@@ -123,6 +132,27 @@ class Comparison(NetworkPair):
         return Record(f"{self.name}.{name}", value, unit, bar if promised else "", "", how)
 
 
+def protocol(store: Path | None) -> list[Record]:
+    """Each thing of the protocol, ours and theirs; and what theirs draws from some seeds."""
+    ours, theirs = computed(), theirs_by.computed_by_theirs()
+    worst: dict[str, float] = {}
+    for name, found in theirs.items():
+        kind = name if name.startswith(("loss", "rates")) else name.partition(" ")[0]
+        apart = max(gap(a, b) for a, b in zip(ours[name], found, strict=True))
+        worst[kind] = max(worst.get(kind, 0.0), apart)
+    views = [theirs_by.drawn_view(seed) for seed in range(SEEDS)]
+    worst["views of seeds"] = max(gap(view(*drawn), made) for drawn, made in views)
+    shots = [theirs_by.drawn_pictures(s, weak) for s in range(SEEDS) for weak in (False, True)]
+    worst["pictures of seeds"] = max(gap(pictures(drawn), made) for drawn, made in shots)
+    if store is not None:
+        figures = {k: [digest(a.detach().numpy()) for a in found] for k, found in theirs.items()}
+        store.write_bytes(msgspec.json.format(msgspec.json.encode(figures), indent=1) + b"\n")
+    return [
+        Record(f"peer.protocol.{kind}", apart, "", "<= 1e-6", "", "largest difference")
+        for kind, apart in worst.items()
+    ]
+
+
 def gap(a: Tensor, b: Tensor) -> float:
     return float((a - b).abs().max())
 
@@ -143,7 +173,9 @@ def main() -> int:
     parser.add_argument("tactile_nn", type=Path)
     parser.add_argument("pytorch_tnn", type=Path)
     parser.add_argument("--network", action="append", choices=NETWORKS, help="may be repeated")
-    parser.add_argument("--part", action="append", choices=PARTS, help="may be repeated")
+    parts = (*PARTS, "protocol")
+    parser.add_argument("--part", action="append", choices=parts, help="may be repeated")
+    parser.add_argument("--store", type=Path, help="of part protocol: keep their figures here")
     parser.add_argument("--repeats", type=int, default=3)
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -153,8 +185,11 @@ def main() -> int:
     except ConfigError as error:
         parser.error(str(error))
     records = []
+    chosen = args.part or parts
+    if "protocol" in chosen:
+        records += protocol(args.store)
     for name in args.network or NETWORKS:
-        for part in args.part or PARTS:
+        for part in [part for part in chosen if part != "protocol"]:
             records += getattr(Comparison(name, code), part)(args.repeats)  # training changes it
     show(records, Console())
     return 1 if any(r.met is False for r in records) else 0

@@ -9,6 +9,7 @@ import contextlib
 import io
 import logging
 import sys
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -25,13 +26,34 @@ __all__ = ["EPSILON", "NETWORKS", "NetworkPair", "in_our_order", "open_code"]
 
 CODE = "tactile_model"
 EPSILON = 1e-5  # torch's own, as in pt_tnn/recurrent_cells/intersection_cell.py
+GRAPH = "model_configs/rnn_fdb_converted_{}.json"
+GATES = {  # of our cells' convolutions: where in theirs each is
+    "ugrnn": (1, 0), "intersection": (1, 3, 0, 2), "gru": (0, 1), "lstm": (0, 1, 2, 3),
+}  # fmt: skip
+NORMS = {  # theirs by our rows
+    "ugrnn": ("ln_c_act", "ln_g_act"),
+    "intersection": ("ln_h_act", "ln_y_act", "ln_gh_act", "ln_gy_act"),
+    "gru": ("ln_r_pre", "ln_u_pre", "ln_c_pre"),
+    "lstm": ("ln_input", "ln_transform", "ln_forget", "ln_output", "ln_state"),
+}
+GRAPHS = {  # by our cells, their files of the graph
+    "timedecay": "modern",
+    "ugrnn": "modern_ugrnn", "ugrnn-ln": "modern_ugrnn_ln",
+    "gru": "modern_gru", "gru-ln": "modern_gru_ln",
+    "lstm": "modern_lstm", "lstm-ln-published": "modern_lstm_ln",
+    "intersection": "modern_intersection", "intersection-ln": "modern_intersection_ln",
+}  # fmt: skip
 NETWORKS = {  # encoder and attender: ours, then theirs, and the attender's width
     "intersection_ln": ("zhuang-intersection-ln", "none", "zhuang_return_all", None, 512),
     "intersection_ln_gpt": ("zhuang-intersection-ln", "gpt", "zhuang_return_all", "gpt", 512),
     "resnet18_gpt": ("resnet18", "gpt", "pytorch_resnet18", "gpt", 256),
     "s4_gpt": ("s4", "gpt", "s4", "gpt", 512),
+    "s4": ("s4", "none", "s4", None, 512),
+} | {
+    cell.replace("-", "_"): (f"zhuang-{cell}", "none", "zhuang_return_all", None, 512)
+    for cell in GRAPHS
+    if cell != "intersection-ln"
 }
-GRAPH = "model_configs/rnn_fdb_converted_modern_intersection_ln.json"
 
 
 def open_code(tactile_nn: Path, pytorch_tnn: Path) -> Path:
@@ -65,11 +87,14 @@ class Published(nn.Module):
 
     Args:
         code: from `open_code`.
+        graph: the name of the file of their graph, where it is one.
         encoder, attender: names of their configurations.
         width: of what the attender gives.
     """
 
-    def __init__(self, code: Path, encoder: str, attender: str | None, width: int) -> None:
+    def __init__(
+        self, code: Path, graph: str, encoder: str, attender: str | None, width: int
+    ) -> None:
         super().__init__()
         with contextlib.redirect_stdout(io.StringIO()):
             from enc_att_dec.model import EncAttDec
@@ -78,7 +103,7 @@ class Published(nn.Module):
         parts = {"encoder": encoder, "attender": attender, "decoder": "linear"}
         folder = code / "hydra_configs/model"
         model = {k: OmegaConf.load(folder / k / f"{v}.yaml") for k, v in parts.items() if v}
-        model["encoder"].model_config_file = str(code / GRAPH)
+        model["encoder"].model_config_file = str(code / GRAPH.format(graph))
         sizes = {"repr_dim": 512, "hidden_dim": width, "out_dim": CLASSES}
         data = {"input_shape": [30, 5, 7], "n_times": STEPS}
         config = OmegaConf.create({"model": {**model, **sizes}, "data": data})
@@ -93,6 +118,9 @@ class Published(nn.Module):
             scale = self.eval()(x).abs().max()
             for parameter in self.network.decoder.parameters():
                 parameter /= scale
+            for module in self.modules():  # S4's roots of unity, in single precision
+                for cached in ("omega", "z"):
+                    module.__dict__.pop(cached, None)
             for name, buffer in self.named_buffers():
                 if name.endswith("l_kernel"):  # as before the first call, which changes S4's C
                     buffer.zero_()
@@ -108,8 +136,9 @@ class NetworkPair:
     def __init__(self, name: str, code: Path) -> None:
         torch.manual_seed(0)
         encoder, attender, *published = NETWORKS[name]
-        self.name, self.graph = f"peer.{name}", name.startswith("intersection")
-        self.theirs = Published(code, *published).eval()
+        self.name, self.graph = f"peer.{name}", encoder.startswith("zhuang-")
+        graph = GRAPHS.get(encoder.removeprefix("zhuang-"), "modern")
+        self.theirs = Published(code, graph, *published).eval()
         config = EADConfig(CLASSES, encoder, attender)
         self.model, self.card = random_model(read_model(shipped_model())[0].array, config, name)
         self.ours = self.model.network
@@ -127,7 +156,12 @@ def in_our_order(theirs: dict[str, Tensor], ours: EAD) -> dict[str, Tensor]:
         if not rest.endswith((".attn.bias", "l_kernel")):  # no weights: a mask, a length
             parts[part][rest] = value
     encoder, attender = parts["encoder"], list(parts["attender"].values())
-    layouts = {"zhuang": _zhuang, "s4": _s4, "resnet18": lambda e: list(e.values())}
+    cell = ours.config.encoder.removeprefix("zhuang-")
+    layouts = {
+        "zhuang": partial(_zhuang, cell=cell),
+        "s4": _s4,
+        "resnet18": lambda e: list(e.values()),
+    }
     order = layouts[ours.config.encoder.partition("-")[0]](encoder)
     order += attender[:1] + attender[3:4] + attender[1:3] + attender[4:]  # positions come second
     order += parts["decoder"].values()
@@ -135,20 +169,31 @@ def in_our_order(theirs: dict[str, Tensor], ours: EAD) -> dict[str, Tensor]:
     return {k: v.reshape(own[k].shape) for k, v in zip(own, order, strict=True)}
 
 
-def _zhuang(encoder: dict[str, Tensor]) -> list[Tensor]:
+def _zhuang(encoder: dict[str, Tensor], cell: str) -> list[Tensor]:
     order = []
     for i in range(1, 7):
         conv = f"TG.conv{i}._pre_memory.conv"
         order += [encoder[f"{conv}.weight"].movedim(1, -1), encoder[f"{conv}.bias"]]
+    kind = cell.partition("-")[0]
     for i in range(1, 7):
-        cell = f"TG.conv{i}._recurrent_cell."
-        for kind in ("weight", "bias"):  # our gates: m, n, p, y
-            norms = [encoder[f"{cell}ln_{gate}_act.{kind}"] for gate in ("h", "y", "gh", "gy")]
-            order.append(torch.stack(norms))
-        for kind in ("weight", "bias"):  # theirs: gh, h, gy, y
-            gates = encoder[f"{cell}conv.{kind}"].chunk(4)
-            joined = torch.cat([gates[g] for g in (1, 3, 0, 2)])
-            order.append(joined.movedim(1, -1) if kind == "weight" else joined)
+        node = f"TG.conv{i}._recurrent_cell."
+        if cell == "timedecay":
+            order.append(encoder[f"{node}tau"])
+            continue
+        if "-ln" in cell:
+            for part in ("weight", "bias"):
+                order.append(torch.stack([encoder[f"{node}{n}.{part}"] for n in NORMS[kind]]))
+        for part in ("weight", "bias"):
+            gates = encoder[f"{node}conv{'_ru' if kind == 'gru' else ''}.{part}"].chunk(
+                len(GATES[kind])
+            )
+            joined = torch.cat([gates[g] for g in GATES[kind]])
+            order.append(joined.movedim(1, -1) if part == "weight" else joined)
+        if kind == "gru":
+            candidate = [encoder[f"{node}conv_c.{part}"] for part in ("weight", "bias")]
+            order += [candidate[0].movedim(1, -1), candidate[1]]
+    if cell == "timedecay":
+        order += [encoder[f"TG.fc{i}._recurrent_cell.tau"] for i in (7, 8)]
     dense = [encoder[f"TG.fc{i}._pre_memory.lin.{k}"] for i in (7, 8) for k in ("weight", "bias")]
     dense[0] = dense[0].unflatten(1, (-1, 24)).transpose(1, 2)  # channel, site -> site, channel
     return order + dense

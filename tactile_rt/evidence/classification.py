@@ -62,7 +62,7 @@ def evaluate_model(
     """
     session, card = load_model(model)
     run = stepped(session, card)
-    test = _labelled(SweepSet.read(data, "test"), card.classes, model, data)
+    test = _labelled(SweepSet.read(data, "test"), card, model, data)
     differences = card.array.differences(test.manifest.spec, ignore=("name", "rate_hz"))
     if differences:
         raise SpecMismatch(f"{model} was made for another array: " + "; ".join(differences))
@@ -79,7 +79,7 @@ def evaluate_model(
     # What may fail comes first, lest it fail after minutes.
     other = None
     if accurate is not None:
-        other = _labelled(SweepSet.read(accurate, "test"), card.classes, model, accurate)
+        other = _labelled(SweepSet.read(accurate, "test"), card, model, accurate)
     if other and not set(other.sweeps.objects.tolist()) <= set(objects.tolist()):
         raise ConfigError(f"{accurate} tests on other objects than {data}")
     if pictures is not None:
@@ -146,7 +146,7 @@ def evaluate_model(
     records.append(Record("models.undetected sweeps", undetected, "%", "", "", sample))
     unknown = None
     if test.manifest.split.get(WITHHELD):
-        unknown = SweepSet.read(data, WITHHELD)
+        unknown = replace(SweepSet.read(data, WITHHELD), window=test.window)
         if quick:
             unknown = _first_of_each(unknown, QUICK_SWEEPS)
         records.append(_open_set(model, unknown, test))
@@ -179,8 +179,9 @@ def evaluate_model(
     return records
 
 
-def _labelled(test: SweepSet, known: tuple[str, ...], model: Path, data: Path) -> SweepSet:
-    """The set with the labels that the model has for its categories."""
+def _labelled(test: SweepSet, card: ModelCard, model: Path, data: Path) -> SweepSet:
+    """The set with the labels that the model has for its categories, and its windows."""
+    known = card.classes
     strange = [name for name in test.manifest.categories if name not in known]
     if strange:
         raise ConfigError(
@@ -188,7 +189,13 @@ def _labelled(test: SweepSet, known: tuple[str, ...], model: Path, data: Path) -
             "objects.categories, or name them in objects.withheld"
         )
     number = np.array([known.index(name) for name in test.manifest.categories])
-    return replace(test, sweeps=replace(test.sweeps, labels=number[test.sweeps.labels]))
+    test = replace(test, sweeps=replace(test.sweeps, labels=number[test.sweeps.labels]))
+    training = card.provenance.get("training")
+    return (
+        replace(test, window=training.get("window", "onset"))
+        if isinstance(training, dict)
+        else test
+    )
 
 
 def _met(card: ModelCard, test: SweepSet) -> bool:

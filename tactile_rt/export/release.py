@@ -19,7 +19,7 @@ from tactile_rt.export.precision import Precision
 from tactile_rt.export.promises import fitted_rules
 from tactile_rt.models.checkpoints import NETWORK
 from tactile_rt.models.data_checks import trained_on
-from tactile_rt.models.datasets import SweepSet, joined, relabelled
+from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
 from tactile_rt.models.evaluation import Step, among, hits, predict, run_windows
 from tactile_rt.models.training import (
     TactileClassifier,
@@ -64,7 +64,7 @@ def release(
         for folder in folders
         if SweepManifest.read(folder).split.get("validation")
     ]
-    validation = joined(sets)
+    validation = drawn_as(joined(sets), config)
     # Half clean, half at rated noise: what the checkpoint was chosen by, too.
     posteriors = np.concatenate([predict(validation, run_on(model), level) for level in (0.0, 1.0)])
     labels = np.tile(validation.sweeps.labels, 2)

@@ -48,9 +48,7 @@ def streaming(network: EAD, integer: bool = False) -> EAD:
     out._modules = dict(network._modules)  # a shallow copy would share it
     encoder = network.encoder
     if isinstance(encoder, GraphEncoder):
-        if all(
-            len(encoder.inputs) == 1 and _plain(encoder, node.name) for node in encoder.graph.nodes
-        ):
+        if all(_plain(encoder, node.name) for node in encoder.graph.nodes):
             out.encoder = StreamingGraph(encoder, integer)
     elif isinstance(encoder, ResNet18Encoder):
         out.encoder = StreamingResNet18(encoder)
@@ -212,7 +210,7 @@ class StreamingGraph(nn.Module):
         new: dict[str, Tensor] = {}
         for node in self.graph.nodes:
             sources = [e.source for e in node.reads]
-            read = [now if s == self.graph.inputs[0].name else state[f"{s}_h"] for s in sources]
+            read = [now if s == self.graph.frame.name else state[f"{s}_h"] for s in sources]
             drive = self.drives[node.name]
             x = self._dense(drive, read) if node.kind == "dense" else drive(*read)
             if node.name in self.cells:

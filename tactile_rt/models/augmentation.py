@@ -3,13 +3,15 @@
 - "tactile": the array is mirrored across its columns or rows, turned by a quarter, time reversed;
   drawn for every window, on the loads in SI units. Whiskers are only permuted, and force and
   moment vectors are mirrored and turned with the array.
-- "tactile-paper": the published variant (Chung et al. 2025, Fig. 2b) on the frames: one draw for
-  a whole batch, vectors left as they are, and a turned 5 x 7 grid loses its outer columns.
+- "tactile-paper": as published (Chung et al. 2025, Fig. 2b, and its code) on the frames: one draw
+  for a whole batch, vectors left as they are, and a turned 5 x 7 grid loses its outer columns.
 - "image": the control: colour jitter, greyscale, blur and noise (Chen et al. 2020), the loads of a
   cell taken for its colours.
+- "image-paper", "image-paper-weak": the published controls, of SimCLR and of SimSiam: forces and
+  moments are the three colours of two pictures each, of values from 0 to 1; one draw for a batch.
 
-The paper gives no probabilities: mirroring, turning and reversal happen in half of the windows
-each; the image operations as in SimCLR. Temporal masking blanks whole steps.
+Mirroring, turning and reversal of "tactile" happen in half of the windows each; the image
+operations as in SimCLR. Temporal masking blanks whole steps.
 """
 
 from collections.abc import Callable
@@ -22,12 +24,21 @@ import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
+from tactile_rt.models import published_pictures
 from tactile_rt.models.array_symmetries import Symmetry, compose, symmetries
-from tactile_rt.stream import ArraySpec
+from tactile_rt.stream import ArraySpec, ConfigError
 
-__all__ = ["AUGMENTATIONS", "Augmentation", "build", "image", "mask_steps", "tactile_paper"]
+__all__ = [
+    "AUGMENTATIONS",
+    "Augmentation",
+    "as_published",
+    "build",
+    "image",
+    "mask_steps",
+    "tactile_paper",
+]
 
-AUGMENTATIONS = ("none", "tactile", "tactile-paper", "image")
+AUGMENTATIONS = ("none", "tactile", "tactile-paper", "image", "image-paper", "image-paper-weak")
 HALF = 0.5
 JITTER, JITTER_CHANCE, GREY_CHANCE, NOISE = 0.8, 0.8, 0.2, 0.1  # SimCLR's, and a noise of the log
 BLUR = (1.0, 2.0, 1.0)
@@ -60,16 +71,26 @@ def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
         masking: share of steps that are blanked, too.
 
     Raises:
-        ConfigError: the array has no symmetries ("tactile").
+        ConfigError: the array has no symmetries ("tactile"), or its channels are not the colours
+            of pictures ("image-paper").
     """
+    colours = len(spec.channels)
     loads: Callable[[Loads, Generator], Loads] = _as_is
     frames: Callable[[Tensor, Generator], Tensor] = _as_is
     if name == "tactile":
         loads = Tactile(spec)
     elif name == "tactile-paper":
-        frames = tactile_paper
+        frames = partial(tactile_paper, channels=colours)
     elif name == "image":
-        frames = partial(image, colours=len(spec.channels))
+        frames = partial(image, colours=colours)
+    elif name != "none":
+        if colours % published_pictures.COLOURS:
+            raise ConfigError(
+                f"augmentation {name} takes channels for the three colours of pictures: this "
+                f"array has {colours}; take image"
+            )
+        jitter = published_pictures.JITTERS[name]
+        frames = partial(published_pictures.augment, jitter=jitter)
 
     def then_mask(x: Tensor, generator: Generator) -> Tensor:
         return mask_steps(frames(x, generator), masking, generator)
@@ -131,28 +152,58 @@ def _tables(every: list[Symmetry]) -> tuple[Tensor, Tensor]:
     return torch.from_numpy(source), torch.from_numpy(matrix.astype(np.float32))
 
 
-def tactile_paper(frames: Tensor, generator: Generator) -> Tensor:
-    """The published variant: one draw for the batch; (batch, step, channel, row, column)."""
-    device = generator.device
-    drawn = torch.rand(4, generator=generator, device=device) < HALF
-    columns, rows, turn, reverse = drawn.tolist()
-    if columns:
-        frames = frames.flip(-1)
-    if rows:
-        frames = frames.flip(-2)
-    if turn:
-        frames = quarter_turn(frames)
-    return -frames.flip(1) if reverse else frames
+def tactile_paper(frames: Tensor, generator: Generator, channels: int = 6) -> Tensor:
+    """The published variant, one draw for the batch.
+
+    With even chances it is either the columns or the rows that may be flipped, and they are in half
+    of the cases; any of four quarter turns is as likely; half of the windows run backwards.
+
+    Args:
+        frames: (batch, step, sub-step * channel, row, column).
+        generator: on their device.
+        channels: of a sub-step.
+    """
+
+    def draw(below: int) -> int:
+        return int(torch.randint(below, (), generator=generator, device=generator.device))
+
+    axis, flipped, turns, reverse = (draw(n) for n in (2, 2, 4, 2))
+    mirrored = (-1, -2)[axis] if flipped else 0
+    return as_published(frames, mirrored, turns, bool(reverse), channels)
 
 
-def quarter_turn(frames: Tensor) -> Tensor:
-    """An image turned by 90 degrees in its own frame: what leaves it is lost."""
+def as_published(
+    frames: Tensor, mirrored: int, turns: int, reverse: bool, channels: int = 6
+) -> Tensor:
+    """Frames as `tactile_paper` makes them once it has drawn what to do.
+
+    Args:
+        frames: (batch, step, sub-step * channel, row, column).
+        mirrored: the axis that is flipped, -1 or -2; 0: none.
+        turns: quarter turns, counter-clockwise; what leaves the grid is lost.
+        reverse: run all sub-steps backwards, with the other sign.
+        channels: of a sub-step.
+    """
+    if mirrored:
+        frames = frames.flip(mirrored)
+    frames = turned(frames, turns)
+    if not reverse:
+        return frames
+    steps = frames.unflatten(2, (-1, channels))  # (batch, step, sub-step, channel, row, column)
+    back: Tensor = -steps.flip(1, 2).flatten(2, 3)
+    return back
+
+
+def turned(frames: Tensor, turns: int) -> Tensor:
+    """Images turned by quarters, counter-clockwise, in their own frame: what leaves it is lost."""
+    if turns % 2 == 0:
+        return frames.flip((-2, -1)) if turns % 4 else frames
     side = min(frames.shape[-2:])
     top, left = (frames.shape[-2] - side) // 2, (frames.shape[-1] - side) // 2
-    turned = torch.zeros_like(frames)
+    out = torch.zeros_like(frames)
     square = frames[..., top : top + side, left : left + side]
-    turned[..., top : top + side, left : left + side] = square.rot90(1, (-2, -1))
-    return turned
+    out[..., top : top + side, left : left + side] = square.rot90(turns, (-2, -1))
+    return out
 
 
 def image(frames: Tensor, generator: Generator, colours: int = 6) -> Tensor:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from tactile_rt.models.ead import EAD, EADConfig
-from tactile_rt.models.inputs import InputStage
+from tactile_rt.models.inputs import InputStage, paper_units
 from tactile_rt.sensor_spec import ChannelLimits, channel_limits
 from tactile_rt.stream import ArraySpec, ConfigError, ModelError, SpecMismatch
 from tactile_rt.timing import Timing
@@ -31,7 +31,10 @@ __all__ = [
 
 
 # of a network's configuration, what a training configuration says
-NETWORK = ("encoder", "attender", "decoder", "width", "readout", "dropout", "graph")
+NETWORK = (
+    "encoder", "attender", "decoder", "width", "readout", "dropout", "graph", "norm_epsilon",
+    "preprocessing",
+)  # fmt: skip
 
 
 class TactileClassifier(nn.Module):
@@ -44,17 +47,19 @@ class TactileClassifier(nn.Module):
             without a described sensor.
 
     Raises:
-        ConfigError: the network is for another array.
+        ConfigError: the network is for another array, or its preprocessing for other units.
     """
 
     def __init__(
         self, spec: ArraySpec, network: EADConfig, limits: ChannelLimits | None = None
     ) -> None:
         super().__init__()
-        limits = limits or channel_limits(spec)
-        self.inputs = InputStage(
-            spec.grid, spec.grid_shape, limits.clip.tolist(), limits.scale.tolist()
-        )
+        if network.preprocessing == "paper":
+            clip, scale = paper_units(spec)
+        else:
+            limits = limits or channel_limits(spec)
+            clip, scale = limits.clip.tolist(), limits.scale.tolist()
+        self.inputs = InputStage(spec.grid, spec.grid_shape, clip, scale, network.preprocessing)
         channels, *grid = network.frame
         if tuple(grid) != tuple(spec.grid_shape) or channels % len(spec.channels):
             found = " x ".join(map(str, network.frame))

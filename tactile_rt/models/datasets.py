@@ -4,7 +4,7 @@ A window is what the classifier would feed the network: it starts where `Contact
 onset on the noisy signal, and carries the tare that the detector had measured by then.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -18,25 +18,29 @@ from torch import Tensor
 from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.models.implausible import IMPLAUSIBLE, implausible
 from tactile_rt.models.onsets import Onsets, find_onsets
+from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.stream import ConfigError
-from tactile_rt.sweep_set import SweepManifest, Sweeps, join_manifests, read_sweeps
+from tactile_rt.sweep_set import FAULTS, SweepManifest, Sweeps, join_manifests, read_sweeps
 from tactile_rt.timing import MOUSE, Timing
 
 __all__ = [
+    "JITTER",
     "Onsets",
     "SweepSet",
     "TrainingBatches",
+    "drawn_as",
     "find_onsets",
     "frame_of",
     "joined",
     "of_categories",
     "relabelled",
     "windows",
+    "with_faults",
 ]
 
 NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the rated noise, at which training finds onsets
 CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others are drawn evenly
-JITTER = 5  # samples either side of the onset
+JITTER = 5  # samples either side of where a window begins, unless told otherwise
 
 
 def frame_of(manifest: SweepManifest) -> tuple[int, int, int]:
@@ -48,12 +52,22 @@ def frame_of(manifest: SweepManifest) -> tuple[int, int, int]:
 
 @dataclass(frozen=True)
 class SweepSet:
-    """One split of a sweep set, with what its windows need."""
+    """One split of a sweep set, with what its windows need.
+
+    Attributes:
+        manifest: The manifest of the whole set.
+        sweeps: The sweeps of the split.
+        noise: (channel,) The rated noise per sample, SI.
+        floor: (channel,) The smallest sigma of the detector, SI.
+        window: The first sample of a sweep's window: "onset", where the detector hears the touch,
+            or "sweep", where the object sets out, with nothing to be tared.
+    """
 
     manifest: SweepManifest
     sweeps: Sweeps
-    noise: NDArray[np.float32]  # (channel,) rated noise per sample, SI
-    floor: NDArray[np.float32]  # (channel,) smallest sigma of the detector, SI
+    noise: NDArray[np.float32]
+    floor: NDArray[np.float32]
+    window: str = "onset"
 
     @classmethod
     def read(cls, folder: Path, split: str) -> "SweepSet":
@@ -65,6 +79,15 @@ class SweepSet:
         manifest = SweepManifest.read(folder)
         limits = manifest.limits
         return cls(manifest, read_sweeps(folder, split), limits.noise, limits.floor)
+
+    def onsets(self, values: NDArray[np.float32]) -> Onsets:
+        """Where the windows of sweeps (sweep, sample, element, channel) begin, and their tares."""
+        if self.window == "onset":
+            return find_onsets(values, self.floor)
+        n, shape = len(values), self.manifest.spec.shape
+        sigma = np.broadcast_to(self.floor, (n, *shape)).astype(np.float32)
+        start = np.full(n, self.manifest.lead, dtype=np.int64)
+        return Onsets(start, np.zeros((n, *shape), dtype=np.float32), sigma)
 
     @property
     def timing(self) -> Timing:
@@ -111,7 +134,7 @@ class SweepSet:
             noise = rng.standard_normal(values.shape, dtype=np.float32) * self.noise
             noise[recorded] = 0
             noisy = (values + np.float32(level) * noise for level in self._levels)
-            starts.append(np.stack([find_onsets(v, self.floor).start for v in noisy]))
+            starts.append(np.stack([self.onsets(v).start for v in noisy]))
         return np.concatenate(starts, axis=1)
 
     @cached_property
@@ -120,7 +143,7 @@ class SweepSet:
         onset, of recorded sweeps; 0 of others, of which training draws them."""
         offset, sigma = np.zeros((2, len(self.sweeps), *self.manifest.spec.shape), dtype=np.float32)
         if self.recorded.any():
-            found = find_onsets(self.sweeps.values[self.recorded], self.floor)
+            found = self.onsets(self.sweeps.values[self.recorded])
             offset[self.recorded], sigma[self.recorded] = found.offset, found.sigma
         return offset, sigma
 
@@ -175,9 +198,20 @@ def _lengthened(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
 def of_categories(data: SweepSet) -> SweepSet:
     """The sweeps of its categories alone, of which training then spoils none."""
     known = np.flatnonzero(data.sweeps.labels >= 0)
-    faults = replace(data.manifest.faults, implausible=0.0)
-    recipe = {**data.manifest.recipe, "faults": asdict(faults)}
-    return replace(data[known], manifest=replace(data.manifest, recipe=recipe))
+    return with_faults(data[known], replace(data.manifest.faults, implausible=0.0))
+
+
+def drawn_as(data: SweepSet, training: Mapping[str, Any]) -> SweepSet:
+    """The set whose windows begin, and whose sensor fails, as a run's configuration says."""
+    data = replace(data, window=training.get("window", data.window))
+    faults = training.get("faults")
+    return with_faults(data, SensorFaults(**faults)) if faults else data
+
+
+def with_faults(data: SweepSet, faults: SensorFaults) -> SweepSet:
+    """The set with other faults of the sensor to be drawn for training."""
+    recipe = {**data.manifest.recipe, FAULTS: asdict(faults)}
+    return replace(data, manifest=replace(data.manifest, recipe=recipe))
 
 
 def relabelled(data: SweepSet, categories: Sequence[str]) -> SweepSet:
@@ -208,6 +242,12 @@ class TrainingBatches:
     as when a classifier meets it. Labels beyond the categories are those of the set's `refusals`,
     in their order.
 
+    Args:
+        data: the sweeps.
+        batch: windows in a batch.
+        seed: of all that is drawn.
+        jitter: samples by which a window may begin earlier or later.
+
     Attributes:
         easy_epochs: The number of epochs in which noise, offset and drift rise to what is said: a
             network that meets them at once takes far longer to learn.
@@ -216,8 +256,8 @@ class TrainingBatches:
         ConfigError: not even one batch of sweeps with a touch.
     """
 
-    def __init__(self, data: SweepSet, batch: int, seed: int) -> None:
-        self._data, self._batch, self._seed = data, batch, seed
+    def __init__(self, data: SweepSet, batch: int, seed: int, jitter: int = JITTER) -> None:
+        self._data, self._batch, self._seed, self._jitter = data, batch, seed, jitter
         self.easy_epochs = 0
         self._faults, self._refusals = data.manifest.faults, data.refusals
         starts = data.noisy_starts
@@ -258,7 +298,7 @@ class TrainingBatches:
         level[recorded] = 0
         found_at = np.array(NOISE_LEVELS[: len(self._starts)])
         nearest = np.abs(level[:, None] - found_at).argmin(axis=1)
-        start = self._starts[nearest, at] + rng.integers(-JITTER, JITTER + 1, n)
+        start = self._starts[nearest, at] + rng.integers(-self._jitter, self._jitter + 1, n)
         values = data.sweeps.values[at]
         # Relative to rest, where a magnetometer reads its magnet's field, and a load cell nothing.
         rest = np.zeros((n, elements, channels), dtype=np.float32)

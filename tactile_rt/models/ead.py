@@ -12,6 +12,7 @@ for streaming, and gives the same logits. The logits of a step use no later fram
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -22,7 +23,8 @@ from torch.nn import functional as F
 
 from tactile_rt.models import attenders, decoders
 from tactile_rt.models.encoders import MOUSE_FRAME
-from tactile_rt.models.encoders.cells import CELLS
+from tactile_rt.models.encoders.cells import CELLS, Cell
+from tactile_rt.models.inputs import PREPROCESSINGS
 from tactile_rt.stream import ConfigError
 
 __all__ = [
@@ -72,6 +74,8 @@ class EADConfig:
     max_steps: int = 22  # an episode; the GPT's positions end here
     graph: str = ""  # of encoder "graph": the text of a TOML file, see `encoders.graph_files`
     frame: tuple[int, int, int] = MOUSE_FRAME  # channels, rows and columns of what it reads
+    norm_epsilon: float = 0.0  # of the cells' layer norms; 0: each cell's own, see `cells`
+    preprocessing: str = "log"  # of the input stage, see `inputs`
 
     def __post_init__(self) -> None:
         for field, known in (
@@ -79,6 +83,7 @@ class EADConfig:
             ("attender", ATTENDERS),
             ("decoder", DECODERS),
             ("readout", READOUTS),
+            ("preprocessing", PREPROCESSINGS),
         ):
             if (value := getattr(self, field)) not in known:
                 raise ConfigError(f"{field} is {value!r}, not one of {', '.join(known)}")
@@ -89,6 +94,8 @@ class EADConfig:
                 f"width is {self.width}, must be a positive multiple of 1/{WIDTH_UNIT}, "
                 f"at most {WIDEST}"
             )
+        if not 0 <= self.norm_epsilon < math.inf:
+            raise ConfigError(f"norm_epsilon is {self.norm_epsilon}, must be 0 or more")
         if not 0 <= self.dropout < 1:
             raise ConfigError(f"dropout is {self.dropout}, must be in [0, 1)")
         if not 1 <= self.max_steps <= attenders.MAX_STEPS:
@@ -103,9 +110,6 @@ class EADConfig:
 class EAD(nn.Module):
     """The network of one `EADConfig`; see the module's docstring.
 
-    `others`, where a method takes them, are the further inputs of encoder "graph", each
-    (batch, step, channel[, row, column]) for a window, without the step for one step.
-
     Attributes:
         lag: The number of steps that a frame takes to reach the logits: the first `lag` steps of a
             window know of no frame, the last `lag` frames do not count.
@@ -115,6 +119,10 @@ class EAD(nn.Module):
         super().__init__()
         self.config = config
         self.encoder: Any = _encoder(config)
+        if config.norm_epsilon:
+            for cell in self.encoder.modules():
+                if isinstance(cell, Cell):
+                    cell.epsilon = config.norm_epsilon
         self._alone = _alone(config)
         self.lag: int = self.encoder.lag
         width: int = self.encoder.features
@@ -132,19 +140,19 @@ class EAD(nn.Module):
             config.decoder, width, config.classes, config.width, config.max_steps
         )
 
-    def features(self, frames: Tensor, *others: Tensor) -> Tensor:
+    def features(self, frames: Tensor) -> Tensor:
         """What the decoder reads of frames, (batch, step, feature)."""
         frames = F.pad(frames, (0, 1)) if self._alone else frames
-        features: Tensor = self.attender(self.encoder(frames, *others))
+        features: Tensor = self.attender(self.encoder(frames))
         return features
 
-    def embed(self, frames: Tensor, *others: Tensor) -> Tensor:
+    def embed(self, frames: Tensor) -> Tensor:
         """What the decoder's last layer reads of frames at each step, (batch, step, unit)."""
-        return self.decoder.embed(self.features(frames, *others))
+        return self.decoder.embed(self.features(frames))
 
-    def forward(self, frames: Tensor, *others: Tensor) -> Tensor:
+    def forward(self, frames: Tensor) -> Tensor:
         """frames (batch, step, channel, row, column) -> logits (batch, step, class)"""
-        logits: Tensor = self.decoder(self.features(frames, *others))
+        logits: Tensor = self.decoder(self.features(frames))
         if self.config.readout == "last":
             return logits
         # At least single precision: sums of many steps would stall in autocast's types.
@@ -166,18 +174,16 @@ class EAD(nn.Module):
             state["logits_sum"] = weight.new_zeros(batch, self.config.classes)
         return state
 
-    def step(
-        self, frame: Tensor, state: dict[str, Tensor], *others: Tensor
-    ) -> tuple[Tensor, dict[str, Tensor]]:
+    def step(self, frame: Tensor, state: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """One step: frame (batch, channel, row, column) to logits (batch, class), the next state.
 
         A lane is reset by putting its rows of `initial_state` back.
         """
-        logits, _, new = self.step_embedded(frame, state, *others)
+        logits, _, new = self.step_embedded(frame, state)
         return logits, new
 
     def step_embedded(
-        self, frame: Tensor, state: dict[str, Tensor], *others: Tensor
+        self, frame: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
         """As `step`, with the step's embedding (batch, unit) between logits and state.
 
@@ -185,7 +191,7 @@ class EAD(nn.Module):
         """
         index = state["index"]
         frame = F.pad(frame, (0, 1)) if self._alone else frame
-        features, encoder = self.encoder.step(frame, index, state, *others)  # (batch, feature)
+        features, encoder = self.encoder.step(frame, index, state)  # (batch, feature)
         features, attender = self.attender.step(features, index, state)
         embedding, decoder = self.decoder.step(features, index, state)  # (batch, unit)
         logits = self.decoder.logits(embedding)  # (batch, class)
@@ -205,12 +211,12 @@ def _encoder(config: EADConfig) -> Any:
         from tactile_rt.models.encoders.graph_files import parse_graph
 
         graph = parse_graph(config.graph)
-        first = graph.inputs[0]
-        if (found := (first.channels, first.rows, first.columns)) != config.frame:
+        read = graph.frame
+        if (found := (read.channels, read.rows, read.columns)) != config.frame:
             sizes = (" x ".join(map(str, size)) for size in (found, config.frame))
             raise ConfigError(
                 "the graph's {} has {} channels, rows and columns, the array's frames "
-                "{}: change the graph".format(first.name, *sizes)
+                "{}: change the graph".format(read.name, *sizes)
             )
         return kind(graph.scaled(config.width))
     if config.encoder.startswith("zhuang-"):

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.classifier import fuse
 from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.models.onsets import find_onsets
 
 __all__ = [
     "Interval",
@@ -102,7 +101,7 @@ def run_windows(
     for i in range(0, len(data.sweeps), batch):
         part = data[i : i + batch]
         values = disturbance.of_samples(part.sweeps.values, part, rng)
-        found = find_onsets(values, data.floor)
+        found = part.onsets(values)
         cut = disturbance.of_windows(windows(values, found.start, data.timing), data, rng)
         parts.append(run(cut, found.offset, found.sigma))
         detected.append(found.start >= 0)

@@ -6,6 +6,9 @@ logarithm would magnify silent channels into signals.
 
 A recurrent network would never forget a number that is none. So a sample that is NaN or infinite
 counts as no load, and so does a channel whose tare or noise is: also in a file that others run.
+
+The paper's own preprocessing ("paper") has no logarithm: forces in mN and moments in uN m as they
+are, limited to 1000 of either (Chung et al. 2025, and its code).
 """
 
 from __future__ import annotations
@@ -16,8 +19,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import ArraySpec, ConfigError
 
+PREPROCESSINGS = ("log", "paper")
+PAPER_UNITS = {"N": 1e-3, "N m": 1e-6}  # mN and uN m
+PAPER_CLIP = 1000.0  # of these units
 NOISE_FLOOR = 3.0  # standard deviations of the noise that count as silence
 
 
@@ -28,7 +34,9 @@ class InputStage(nn.Module):
         positions: grid (row, column) of each element, in the order of the samples.
         shape: rows and columns of the grid; cells without an element are zero.
         clip: per channel, the largest magnitude that is believed (channel,), SI.
-        scale: per channel, the floor of the logarithm's scale (channel,), SI.
+        scale: per channel, the floor of the logarithm's scale (channel,), SI; without a logarithm,
+            the unit.
+        preprocessing: one of `PREPROCESSINGS`.
 
     Raises:
         ConfigError: clip and scale of unlike lengths or not positive, two elements in one place,
@@ -45,8 +53,10 @@ class InputStage(nn.Module):
         shape: tuple[int, int],
         clip: Sequence[float],
         scale: Sequence[float],
+        preprocessing: str = "log",
     ) -> None:
         super().__init__()
+        self.logarithm = preprocessing == "log"
         rows, columns = shape
         if len(clip) != len(scale):
             raise ConfigError(f"{len(clip)} clip limits, but {len(scale)} scales")
@@ -90,8 +100,26 @@ class InputStage(nn.Module):
         value = torch.clamp(load, -self.clip, self.clip)  # as samples, SI
         scale = torch.sqrt(self.scale**2 + (NOISE_FLOOR * sigma) ** 2)  # as offset, SI
         scale = torch.where(scale < torch.inf, scale, torch.inf)  # of which any load is nothing
-        value = torch.sign(value) * torch.log1p(value.abs() / scale)  # as samples, no unit
+        if self.logarithm:
+            value = torch.sign(value) * torch.log1p(value.abs() / scale)  # as samples, no unit
+        else:
+            value = value / self.scale
         cells = F.pad(value, (0, 0, 0, 1)).index_select(-2, self.element)
         # (batch, ..., sub-step, cell, channel) -> (batch, ..., sub-step * channel, row, column)
         frames: Tensor = cells.transpose(-2, -1).flatten(-3, -2).unflatten(-1, self.shape)
         return frames
+
+
+def paper_units(spec: ArraySpec) -> tuple[list[float], list[float]]:
+    """Clip and unit of each channel (channel,), SI, of the preprocessing "paper".
+
+    Raises:
+        ConfigError: a channel that is neither a force nor a moment.
+    """
+    if unknown := sorted(set(spec.units) - set(PAPER_UNITS)):
+        raise ConfigError(
+            f"preprocessing paper is of forces and moments: this array has {', '.join(unknown)}; "
+            "take log"
+        )
+    units = [PAPER_UNITS[unit] for unit in spec.units]
+    return [PAPER_CLIP * unit for unit in units], units

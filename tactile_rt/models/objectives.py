@@ -12,7 +12,10 @@ augmentation of frames happens inside, drawn from the generator.
 - `Supervised`: cross-entropy with the category.
 - `SimCLR` (Chen et al. 2020): two views of a window are to be found among all others' views.
 - `SimSiam` (Chen and He 2021): one view predicts the other, which does not look back.
-- `Autoencoder` (Olshausen and Field 1996): sparse features of the last step rebuild the window.
+- `Autoencoder` (Olshausen and Field 1996): sparse features of each step rebuild its frame.
+
+At width 1 the heads and losses are those of the paper's code (neuroagents-lab,
+2025-tactile-whisking).
 """
 
 from collections.abc import Sequence
@@ -40,8 +43,9 @@ CONTRASTED = (2048, 128)  # SimCLR's neck: inside, and what comes out
 LEAST = 32  # the neck's output at any width: fewer directions cannot tell a batch apart
 TEMPERATURE = 0.1  # of SimCLR
 PROJECTED, BOTTLENECK = 2048, 512  # SimSiam's projector and predictor
-WIDE, NARROW = 256, 128  # channels between the autoencoder's deconvolutions
-SPARSITY = 1e-4  # of the autoencoder: weight of |features|_1
+NECK_SPREAD = 0.01  # standard deviation of the neck's first weights
+DECONVOLUTIONS = 3
+SPARSITY = 1e-4  # of the autoencoder: weight of the mean of |features|
 
 
 class Objective(nn.Module):
@@ -64,13 +68,13 @@ class Objective(nn.Module):
         """Augmented frames of a batch, (batch, step, sub-step * channel, row, column)."""
         return self.augmentation.frames(self.model.inputs(*loads), generator)
 
-    def embedding(self, loads: Loads, generator: Generator) -> Tensor:
-        """(batch, feature): what encoder and attender make of a window.
+    def embedding(self, frames: Tensor) -> Tensor:
+        """(batch, feature): what encoder and attender make of windows (batch, step, ...).
 
-        By its last step, or, where the network's readout is "mean", on average over all steps
+        By the last step, or, where the network's readout is "mean", on average over all steps
         that can know anything.
         """
-        features = self.model.features(self.frames(loads, generator))
+        features = self.model.features(frames)
         network = self.model.network
         if network.config.readout == "mean":
             return features[:, network.lag :].mean(dim=1)
@@ -146,7 +150,10 @@ def nt_xent(first: Tensor, second: Tensor, temperature: float = TEMPERATURE) -> 
 
 
 class SimCLR(Objective):
-    """Contrast of two views; the neck (Linear, BN, ReLU, Linear, BN) is thrown away afterwards."""
+    """Contrast of two views; the neck (Linear, BN, ReLU, Linear, BN) is thrown away afterwards.
+
+    Both views are one batch, to batch norms in the network, too.
+    """
 
     views = 2
 
@@ -155,15 +162,19 @@ class SimCLR(Objective):
         width, features = model.network.config.width, model.feature_size()
         hidden, out = _scaled(CONTRASTED[0], width), _scaled(CONTRASTED[1], width, LEAST)
         self.neck = nn.Sequential(
-            nn.Linear(features, hidden),
+            nn.Linear(features, hidden, bias=False),
             nn.BatchNorm1d(hidden),
             nn.ReLU(),
-            nn.Linear(hidden, out),
+            nn.Linear(hidden, out, bias=False),
             nn.BatchNorm1d(out),
         )
+        for layer in self.neck:
+            if isinstance(layer, nn.Linear):
+                nn.init.normal_(layer.weight, std=NECK_SPREAD)
 
     def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
-        first, second = (self.neck(self.embedding(v, generator)) for v in views)
+        frames = torch.cat([self.frames(view, generator) for view in views])
+        first, second = self.neck(self.embedding(frames)).chunk(2)
         with _in_single_precision(first):
             return nt_xent(_of_all_devices(first), _of_all_devices(second))
 
@@ -187,24 +198,26 @@ class SimSiam(Objective):
         width, features = model.network.config.width, model.feature_size()
         out, hidden = _scaled(PROJECTED, width), _scaled(BOTTLENECK, width)
         self.projector = nn.Sequential(
-            nn.Linear(features, out, bias=False),
+            nn.Linear(features, out),
             nn.BatchNorm1d(out),
             nn.ReLU(),
-            nn.Linear(out, out, bias=False),
+            nn.Linear(out, out),
             nn.BatchNorm1d(out),
             nn.ReLU(),
-            nn.Linear(out, out, bias=False),
-            nn.BatchNorm1d(out, affine=False),
+            nn.Linear(out, out),
+            nn.BatchNorm1d(out),
         )
         self.predictor = nn.Sequential(
-            nn.Linear(out, hidden, bias=False),
+            nn.Linear(out, hidden),
             nn.BatchNorm1d(hidden),
             nn.ReLU(),
             nn.Linear(hidden, out),
         )
 
     def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
-        first, second = (self.projector(self.embedding(v, generator)) for v in views)
+        first, second = (
+            self.projector(self.embedding(self.frames(view, generator))) for view in views
+        )
         predicted = self.predictor(first), self.predictor(second)
         with _in_single_precision(first):
             return 0.5 * (_distance(predicted[0], second) + _distance(predicted[1], first))
@@ -216,45 +229,33 @@ def _distance(prediction: Tensor, target: Tensor) -> Tensor:
 
 
 class Autoencoder(Objective):
-    """Three deconvolutions from a single site to the grid, all steps of the window as channels.
+    """A linear layer to the grid and three 3 x 3 deconvolutions rebuild each step's frame.
 
-    loss = 0.5 mean squared error of the (normalised) frames + 1e-4 |features|_1
-
-    The paper gives the number of layers and the two weights; sizes are ours.
+    loss = 0.5 mean squared error of the (normalised) frames + 1e-4 mean |features|
     """
 
     def __init__(self, model: TactileClassifier, augmentation: Augmentation) -> None:
         super().__init__(model, augmentation)
-        inputs, network = model.inputs, model.network
-        sizes = (
-            model.feature_size(),
-            _scaled(WIDE, network.config.width),
-            _scaled(NARROW, network.config.width),
-            network.config.max_steps * network.config.frame[0],
-        )
-        rows, columns = (_kernels(cells) for cells in inputs.shape)
-        self.decoder = nn.Sequential(
-            nn.ConvTranspose2d(sizes[0], sizes[1], (rows[0], columns[0])),
-            nn.ReLU(),
-            nn.ConvTranspose2d(sizes[1], sizes[2], (rows[1], columns[1])),
-            nn.ReLU(),
-            nn.ConvTranspose2d(sizes[2], sizes[3], (rows[2], columns[2])),
-        )
+        features, (channels, *grid) = model.feature_size(), model.network.config.frame
+        cells = grid[0] * grid[1]
+        first = min(channels, features // cells + 1)
+        layers: list[nn.Module] = [
+            nn.Linear(features, first * cells),
+            nn.Unflatten(1, (first, *grid)),
+        ]
+        for n in range(DECONVOLUTIONS):
+            layers += [nn.ReLU()] if n else []
+            layers.append(nn.ConvTranspose2d(channels if n else first, channels, 3, padding=1))
+        self.decoder = nn.Sequential(*layers)
 
     def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
         (loads,) = views
         frames = self.frames(loads, generator)
-        latent = self.model.features(frames)[:, -1]
-        rebuilt = self.decoder(latent[:, :, None, None]).view(frames.shape)
+        latent = self.model.features(frames)
+        rebuilt = self.decoder(latent.flatten(0, 1)).view(frames.shape)
         with _in_single_precision(frames):
             error = F.mse_loss(rebuilt.float(), frames.float())
-            return 0.5 * error + SPARSITY * latent.float().abs().sum(1).mean()
-
-
-def _kernels(cells: int) -> tuple[int, int, int]:
-    """Kernel sizes of three valid deconvolutions that grow one site to so many cells."""
-    grow = cells - 1
-    return 1 + grow // 3, 1 + (grow + 1) // 3, 1 + (grow + 2) // 3
+            return 0.5 * error + SPARSITY * latent.float().abs().mean()
 
 
 def _in_single_precision(like: Tensor) -> torch.autocast:

@@ -15,7 +15,6 @@ pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.models import datasets
 from tactile_rt.models.datasets import SweepSet, TrainingBatches, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import run_windows
@@ -137,8 +136,7 @@ def test_training_gets_what_a_classifier_feeds_its_network(here, night, call, mo
         assert np.allclose(seen[0][0], samples[place], rtol=1e-6, atol=0)
         assert np.allclose(seen[0][1], offset[place], rtol=1e-6, atol=0)
         assert np.allclose(seen[0][2], sigma[place], rtol=1e-6, atol=0)
-        monkeypatch.setattr(datasets, "JITTER", 0)
-        batches = TrainingBatches(data, len(data.sweeps), seed=3)
+        batches = TrainingBatches(data, len(data.sweeps), seed=3, jitter=0)
         ((x, o, s, _),) = (tuple(t.numpy() for t in batch) for batch in batches.epoch(0))
         order = np.random.default_rng([3, 0]).permutation(len(data.sweeps))
         drawn = np.array(place)[order]

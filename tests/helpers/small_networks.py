@@ -33,11 +33,11 @@ def frames(batch=2, steps=STEPS, seed=0) -> Tensor:
     return torch.randn(batch, steps, 30, 5, 7, generator=torch.Generator().manual_seed(seed))
 
 
-def stream(ead: EAD, x: Tensor, *others: Tensor) -> Tensor:
+def stream(ead: EAD, x: Tensor) -> Tensor:
     """Logits (batch, step, class), one step after the other."""
     state = ead.initial_state(len(x))
     logits = []
     for t in range(x.shape[1]):
-        out, state = ead.step(x[:, t], state, *(other[:, t] for other in others))
+        out, state = ead.step(x[:, t], state)
         logits.append(out)
     return torch.stack(logits, 1)

@@ -11,6 +11,7 @@ from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.models.datasets import (
     SweepSet,
     TrainingBatches,
+    drawn_as,
     find_onsets,
     joined,
     windows,
@@ -257,3 +258,32 @@ def test_faults_rise_to_what_is_said_in_the_easy_epochs() -> None:
     assert largest[0] < 1e-9
     assert largest[1:4] == pytest.approx([0.5, 1.0, 1.5], abs=0.15)
     assert largest[4:] == pytest.approx([2.0, 2.0], abs=0.2)
+
+
+SOUND = dict.fromkeys(("noise", "gain", "dead"), 0.0)
+
+
+def test_windows_may_begin_with_the_sweep_and_have_nothing_drawn():
+    """As the paper does: what is drawn is the order."""
+    values = touches(6)
+    data = drawn_as(sweeps(values), {"window": "sweep", "faults": SOUND})
+    samples, offset, sigma, labels = drawn(TrainingBatches(data, 6, 0, jitter=0))
+    assert sorted(labels.tolist()) == list(range(6))
+    flat = samples.reshape(6, -1, ELEMENTS, CHANNELS)
+    np.testing.assert_array_equal(flat, values[labels, LEAD : LEAD + flat.shape[1]])
+    assert not offset.any()
+    np.testing.assert_array_equal(sigma, np.broadcast_to(FLOOR, sigma.shape))
+
+
+def test_a_run_says_by_how_much_windows_begin_elsewhere():
+    data = drawn_as(sweeps(touches(40)), {"window": "sweep", "faults": SOUND})
+    for jitter in (0, 3):
+        samples, *_ = drawn(TrainingBatches(data, 40, 0, jitter=jitter), epochs=3)
+        silent = (samples.reshape(120, -1, ELEMENTS * CHANNELS) == 0).all(2).sum(1)
+        assert set(silent.tolist()) == set(range(jitter + 1))
+
+
+def test_a_run_of_before_these_keys_is_drawn_as_it_was():
+    data = sweeps(touches(6))
+    assert drawn_as(data, {}) == data
+    assert drawn_as(data, {"window": "onset", "faults": None}) == data

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
-from tactile_rt.models.inputs import InputStage
+from tactile_rt.models.inputs import InputStage, paper_units
 from tactile_rt.stream import ConfigError
+from tests.helpers.tiny_sweeps import plate, tiny_array
 
 EMPTY = {(0, 5), (0, 6), (1, 5), (1, 6), (4, 6)}
 POSITIONS = tuple((r, c) for r in range(5) for c in range(7) if (r, c) not in EMPTY)
@@ -129,3 +132,22 @@ def test_everything_it_needs_is_stored_with_it():
     samples = 1e-4 * torch.randn(1, 5, 30, 6, generator=torch.Generator().manual_seed(0))
     rest = torch.zeros(1, 30, 6)
     torch.testing.assert_close(other(samples, rest, rest), stage(samples, rest, rest))
+
+
+def test_the_papers_units_without_a_logarithm():
+    spec = tiny_array()
+    clip, unit = paper_units(spec)
+    stage = InputStage(spec.grid, (5, 7), clip, unit, "paper")
+    samples = torch.zeros(1, 5, 30, 6)
+    samples[0, 2, 7] = torch.tensor([1e-3, -2.5e-3, 7.0, 1e-6, -3e-2, float("nan")])
+    offset = torch.full((1, 30, 6), 0.0)
+    offset[0, 7, 0] = 4e-4
+    frame = stage(samples, offset, torch.full((1, 30, 6), 1e-3))  # whatever the noise was
+    found = frame[0, 12:18, *spec.grid[7]]
+    torch.testing.assert_close(found, torch.tensor([0.6, -2.5, 1000.0, 1.0, -1000.0, 0.0]))
+    assert frame.count_nonzero() == 5 + 4  # and the tare in the other sub-steps
+
+
+def test_the_papers_units_are_of_forces_and_moments():
+    with pytest.raises(ConfigError, match="this array has V; take log"):
+        paper_units(replace(plate(1, 2), units=("N", "N", "V", "N m", "N m", "N m")))

@@ -27,7 +27,13 @@ SUPERVISED = {
     "paper-zhuang-step": ({"zhuang-timedecay"}, "none", {"sgd"}, "step", E4),
     "paper-zhuang-constant": ({"zhuang-timedecay"}, "none", {"sgd"}, "constant", [0.01, 0.005]),
     "paper-gated": (GATED, "none", {"sgd", "adam", "adamw"}, "step", E4),
-    "paper-gated-ln": ({f"{e}-ln" for e in GATED}, "none", {"adamw"}, "step", E4),
+    "paper-gated-ln": (
+        {f"{e}-ln{'-published' * (e == 'zhuang-lstm')}" for e in GATED},
+        "none",
+        {"adamw"},
+        "step",
+        E4,
+    ),
     "paper-gpt-cosine": (WITH_GPT, "gpt", {"adamw"}, "cosine", [1e-4]),
     "paper-gpt-step": (WITH_GPT, "gpt", {"sgd", "adamw"}, "step", E4[:3]),
     "paper-mamba-cosine": (WITH_MAMBA, "mamba", {"adamw"}, "cosine", [1e-4]),
@@ -35,7 +41,7 @@ SUPERVISED = {
 }
 # Table A4: loss: (optimizer, schedule, warm-up, batch); Table A5: attender: encoders
 LOSSES = {
-    "simclr": ("lars", "cosine-annealing", 0.1, 256),
+    "simclr": ("lars-paper", "cosine-annealing", 0.1, 256),
     "simsiam": ("sgd", "cosine-annealing", 0.0, 1024),
     "simsiam-warmup": ("sgd", "cosine-annealing", 0.1, 1024),
     "autoencoder": ("sgd", "step", None, 256),
@@ -103,7 +109,7 @@ def test_self_supervised_recipes_are_those_of_the_tables(loss, attender):
     assert config.objective == loss.removesuffix("-warmup")
     assert (config.optimizer, config.schedule, config.batch) == (optimizer, schedule, batch)
     assert warmup is None or config.warmup == warmup
-    assert config.augmentation == ("none" if loss == "autoencoder" else "tactile")
+    assert config.augmentation == ("none" if loss == "autoencoder" else "tactile-paper")
 
 
 def test_overrides_come_last():

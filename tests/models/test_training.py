@@ -25,6 +25,7 @@ from tactile_rt.models.training import (
     train,
 )
 from tactile_rt.models.training.feeding import prefetched
+from tactile_rt.models.training.loop import build_objective, read_splits
 from tactile_rt.models.training.optimizers import (
     LARS,
     build_optimizer,
@@ -32,6 +33,7 @@ from tactile_rt.models.training.optimizers import (
     parameter_groups,
 )
 from tactile_rt.models.training.probing import linear_probe
+from tactile_rt.models.training.recipes import read_recipe
 from tactile_rt.stream import ConfigError, ModelError
 from tests.helpers.tiny_sweeps import write_tiny_set
 
@@ -136,6 +138,26 @@ def test_lars_is_a_plain_loop(published):
     assert bool(parameters[1].any()) != published  # began at zero
 
 
+def test_norms_that_are_stacked_are_no_layers_to_lars():
+    """Their rows move by the plain rate; or, as published, each by one of its own."""
+    start, slope = torch.tensor([[3.0, 4.0], [0.3, 0.4]]), torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    for published, trust in (
+        (False, torch.ones(2, 1)),
+        (True, 1e-3 * torch.tensor([[5.0], [0.5]])),
+    ):
+        parameter = nn.Parameter(start.clone())
+        parameter.grad = slope
+        LARS([{"params": [parameter], "stacked": True}], 0.1, published=published).step()
+        torch.testing.assert_close(parameter.detach(), start - 0.1 * trust * slope)
+
+
+def test_what_asks_for_its_own_rate_may_be_overruled():
+    model = nn.Sequential(nn.Linear(3, 2))
+    model[0].weight._optim = {"lr_scale": 0.1, "weight_decay": 0.0}
+    (group,) = parameter_groups(model, 0.5, 1e-4, own_rates=False)
+    assert (group["lr"], group["weight_decay"], len(group["params"])) == (0.5, 1e-4, 2)
+
+
 # Schedules
 
 
@@ -174,11 +196,11 @@ def test_cosine_rises_for_ten_epochs_and_falls_to_nothing():
     assert found[-1] < 1e-5
 
 
-def test_cosine_annealing_is_damped_in_its_warm_up():
+def test_cosine_annealing_comes_after_its_warm_up():
     found = rates(1000, schedule="cosine-annealing", warmup=0.1)
+    np.testing.assert_allclose(found[:101], np.linspace(1e-4, 1, 101), rtol=1e-12)
+    np.testing.assert_allclose(found[100:], 0.5 * (1 + np.cos(np.pi * np.arange(900) / 900)))
     cosine = 0.5 * (1 + np.cos(np.pi * np.arange(1000) / 1000))
-    damping = 1 - (1 - np.minimum(np.arange(1000) / 100, 1)) * (1 - 1e-4)
-    np.testing.assert_allclose(found, cosine * damping, rtol=1e-12)
     np.testing.assert_allclose(rates(1000, schedule="cosine-annealing", warmup=0.0), cosine)
 
 
@@ -190,6 +212,42 @@ def test_a_schedule_may_be_as_short_as_one_wants(schedule, updates):
     found = rates(updates, schedule=schedule, warmup=0.1)
     assert np.isfinite(found).all()
     assert (found > 0).any()
+
+
+def test_rates_may_change_by_epoch():
+    for schedule in ("step", "cosine", "cosine-annealing"):
+        settings = TrainingConfig(
+            "set", optimizer="sgd", schedule=schedule, warmup=0.1, rate_per="epoch"
+        )
+        optimizer = build_optimizer(nn.Linear(1, 1), settings)
+        plan, found = build_schedule(optimizer, settings, 57, 4), []  # the last epoch is short
+        for _ in range(57):
+            found.append(optimizer.param_groups[0]["lr"])
+            optimizer.step()
+            plan.step()
+        epochs = [set(found[k : k + 4]) for k in range(0, 57, 4)]
+        assert all(len(rates) == 1 for rates in epochs)
+        assert len(set.union(*epochs)) > (3 if schedule == "step" else 13)
+    with pytest.raises(ConfigError, match="one-cycle changes the rate per update"):
+        TrainingConfig("set", rate_per="epoch")
+
+
+def test_first_weights_are_drawn_as_published(tiny):
+    config = read_recipe("paper-gated-ln", tiny, width=0.125)
+    network = build_objective(config, read_splits(config)[0]).model.network
+    encoder = network.encoder
+    for name, bias in (("convs.conv3", 0.0), ("cells.conv3.conv", None), ("dense.fc7", 0.1)):
+        part = encoder.get_submodule(name)
+        bound = part.weight[0].numel() ** -0.5
+        spread = float(part.weight.detach().std())
+        assert part.weight.abs().max() <= bound and spread == pytest.approx(
+            bound / 3**0.5, rel=0.05
+        )
+        if bias is None:
+            assert 0 < part.bias.abs().max() <= bound
+        else:
+            assert (part.bias == bias).all()
+    assert {cell.epsilon for cell in encoder.cells.values()} == {1e-5}
 
 
 # Batches

@@ -28,7 +28,7 @@ from tactile_rt.models.ead import count_parameters
 from tactile_rt.models.encoders.graph import Graph, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 from tactile_rt.models.encoders.gru import GRUEncoder
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.stream import ArraySpec
 
 __all__ = ["checkpoint_layers", "network_layers", "reach", "untrained_layers"]
 
@@ -99,11 +99,11 @@ def network_layers(
 
 def reach(graph: Graph) -> dict[str, int]:
     """By node, the first step whose output depends on the frame: the shortest path to it."""
-    distance = {graph.inputs[0].name: -1}
+    distance = {graph.frame.name: -1}
     nodes = graph.nodes
     for _ in graph.nodes:
         for node in nodes:
-            # Inputs are read at once, everything else a step late.
+            # The frame is read at once, everything else a step late.
             known = [distance[e.source] for e in node.reads if e.source in distance]
             if known:
                 distance[node.name] = min(min(known) + 1, distance.get(node.name, len(nodes)))
@@ -113,9 +113,6 @@ def reach(graph: Graph) -> dict[str, int]:
 def _encoder(encoder: Any, frames: Tensor) -> tuple[Traces, Tensor, dict[str, int]]:
     """Traces, features (6, step, feature), and first steps."""
     if isinstance(encoder, GraphEncoder):
-        if len(encoder.inputs) > 1:
-            wanted = ", ".join(encoder.inputs[1:])
-            raise ConfigError(f"the network also wants {wanted}, of which the stimuli have none")
         traces, features = _graph(encoder, frames)
         return traces, features, {f"encoder.{k}": v for k, v in reach(encoder.graph).items()}
     if isinstance(encoder, GRUEncoder):

@@ -5,6 +5,9 @@ and returns the node's output and the new state. Input and state are convolved t
 is that convolution. With `layer_norm` each gate is normalised over its channels, per site, before
 the non-linearity; constants such as the forget bias come after it, or they would be normalised
 away. States begin at zero.
+
+Two cells differ between Nayebi et al.'s equations, "lstm-ln" and "vanilla", and the code that was
+published with the paper, "lstm-ln-published" and "vanilla-elu" or "vanilla-elu-ln".
 """
 
 from __future__ import annotations
@@ -27,9 +30,11 @@ __all__ = [
     "GRUCell",
     "IntersectionCell",
     "LSTMCell",
+    "PublishedLSTMCell",
     "TimeDecayCell",
     "UGRNNCell",
     "VanillaCell",
+    "VanillaELUCell",
 ]
 
 FORGET_BIAS = 1.0
@@ -54,7 +59,7 @@ class Cell(nn.Module):
     gates: ClassVar[int]
     norms: ClassVar[int]
     states: ClassVar[tuple[str, ...]] = ("s",)
-    epsilon: ClassVar[float] = NORM_EPSILON
+    epsilon: float = NORM_EPSILON
     gamma: nn.Parameter | None
     beta: nn.Parameter | None
 
@@ -67,6 +72,8 @@ class Cell(nn.Module):
         if layer_norm:
             self.gamma = nn.Parameter(torch.ones(self.norms, channels))
             self.beta = nn.Parameter(torch.zeros(self.norms, channels))
+            for norm in (self.gamma, self.beta):  # to an optimizer, each row is a tensor of a norm
+                norm._optim = {"stacked": True}  # type: ignore[attr-defined]
 
     def drive(self, x: Tensor) -> Tensor | None:
         """W*x + b alone, for an x that is known for many steps at once."""
@@ -124,6 +131,16 @@ class VanillaCell(Cell):
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
         s = torch.tanh(self.convolved(x, state[0], drive))
+        return s, (s,)
+
+
+class VanillaELUCell(Cell):
+    """s' = elu(W*x + U*s + b), h = s': the published code's plain cell, whose default is "-ln"."""
+
+    gates, norms = 1, 1
+
+    def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
+        s = F.elu(self.convolved(x, state[0], drive))
         return s, (s,)
 
 
@@ -199,13 +216,21 @@ class LSTMCell(Cell):
 
     gates, norms = 4, 5
     states = ("c", "s")
+    keeps_normal: ClassVar[bool] = False
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
         c, h = state
         i, j, f, o = self.convolved(x, h, drive).chunk(4, dim=-1)
         c = torch.sigmoid(f + FORGET_BIAS) * c + torch.sigmoid(i) * torch.tanh(j)
-        h = torch.sigmoid(o) * torch.tanh(self.normal(c, first=4))
-        return h, (c, h)
+        normal = self.normal(c, first=4)
+        h = torch.sigmoid(o) * torch.tanh(normal)
+        return h, (normal if self.keeps_normal else c, h)
+
+
+class PublishedLSTMCell(LSTMCell):
+    """As `LSTMCell`, but that the memory it keeps is the normalised one: another network."""
+
+    keeps_normal = True
 
 
 CELLS: dict[str, Callable[[int], Cell]] = {
@@ -213,6 +238,7 @@ CELLS: dict[str, Callable[[int], Cell]] = {
     for name, cell in (
         ("timedecay", TimeDecayCell),
         ("vanilla", VanillaCell),
+        ("vanilla-elu", VanillaELUCell),
         ("ugrnn", UGRNNCell),
         ("intersection", IntersectionCell),
         ("gru", GRUCell),
@@ -220,3 +246,4 @@ CELLS: dict[str, Callable[[int], Cell]] = {
     )
     for suffix in ("", "-ln")
 }
+CELLS["lstm-ln-published"] = partial(PublishedLSTMCell, layer_norm=True)

@@ -1,7 +1,7 @@
-"""A network as data: inputs, nodes and the edges between them, feedback included.
+"""A network as data: what enters, nodes and the edges between them, feedback included.
 
 Time is unrolled as in biology: a step costs every edge the same delay, so at step t a node reads
-what its predecessors put out at step t-1 (nothing at t = 0); only inputs are read at step t itself.
+what its predecessors put out at step t-1 (nothing at t = 0); only the frame is read at step t.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ DENSE_CELLS = ("none", "timedecay", "timedecay-ln")
 
 @dataclass(frozen=True)
 class Input:
-    """What enters at every step: a map, or a vector (1 x 1), such as whisker angles."""
+    """What enters at every step: the frame, a map."""
 
     name: str
     channels: int
@@ -65,29 +65,27 @@ class Node:
 
 @dataclass(frozen=True)
 class Graph:
-    """Inputs, of which the first is the frame, nodes, and the dense node that is read out.
+    """The frame, nodes, and the dense node that is read out.
 
     Raises:
         ConfigError: from the constructor, in one line that names the node and what is wrong.
     """
 
-    inputs: tuple[Input, ...]
+    frame: Input
     nodes: tuple[Node, ...]
     readout: str
 
     def __post_init__(self) -> None:
-        parts: tuple[Input | Node, ...] = (*self.inputs, *self.nodes)
+        parts: tuple[Input | Node, ...] = (self.frame, *self.nodes)
         names = [part.name for part in parts]
-        if not self.inputs:
-            raise ConfigError("the graph has no input")
         for part in parts:
             if not part.name.isidentifier() or names.count(part.name) > 1:
                 raise ConfigError(f"{part.name!r} must be a name of its own, of letters and digits")
             if part.channels < 1:
                 raise ConfigError(f"{part.name}: channels is {part.channels}, must be at least 1")
-        for i in self.inputs:
-            if i.rows < 1 or i.columns < 1:
-                raise ConfigError(f"{i.name}: {i.rows} x {i.columns} sites, must be at least 1 x 1")
+        if self.frame.rows < 1 or self.frame.columns < 1:
+            sites = f"{self.frame.rows} x {self.frame.columns}"
+            raise ConfigError(f"{self.frame.name}: {sites} sites, must be at least 1 x 1")
         for node in self.nodes:
             _check_node(node, names)
         if self.readout not in {node.name for node in self.nodes if node.kind == "dense"}:
@@ -96,13 +94,13 @@ class Graph:
         idle = sorted(n.name for n in self.nodes if n.name not in self.remaining)
         if idle:
             raise ConfigError(f"{', '.join(idle)} cannot reach the readout {self.readout}")
-        if self.inputs[0].name not in self.remaining:
-            raise ConfigError(f"no path from {self.inputs[0].name} to the readout {self.readout}")
+        if self.frame.name not in self.remaining:
+            raise ConfigError(f"no path from {self.frame.name} to the readout {self.readout}")
 
     @property
     def sizes(self) -> dict[str, tuple[int, int]]:
-        """Rows and columns of every input and node; 1 x 1 for a vector."""
-        sizes = {i.name: (i.rows, i.columns) for i in self.inputs}
+        """Rows and columns of the frame and every node; 1 x 1 for a vector."""
+        sizes = {self.frame.name: (self.frame.rows, self.frame.columns)}
         sizes |= {node.name: (1, 1) for node in self.nodes if node.kind == "dense"}
         for _ in self.nodes:  # feedback may come from a node whose size is not known yet
             for node in self.nodes:
@@ -125,13 +123,13 @@ class Graph:
 
     @property
     def remaining(self) -> dict[str, int]:
-        """Steps from each node's output to the readout's, for inputs as if the reader's own."""
+        """Steps from each node's output to the readout's, for the frame as if the reader's own."""
         distance = {self.readout: 0}
-        inputs, nodes = {i.name for i in self.inputs}, {node.name: node for node in self.nodes}
+        nodes = {node.name: node for node in self.nodes}
         queue = [self.readout]
         for name in queue:  # breadth first, against the edges
             for edge in nodes[name].reads:
-                if edge.source in inputs:
+                if edge.source == self.frame.name:
                     distance.setdefault(edge.source, distance[name])
                 elif edge.source not in distance:
                     distance[edge.source] = distance[name] + 1
@@ -141,7 +139,7 @@ class Graph:
     @property
     def lag(self) -> int:
         """Steps from the frame to the readout, by the shortest path."""
-        return self.remaining[self.inputs[0].name]
+        return self.remaining[self.frame.name]
 
     @property
     def components(self) -> tuple[tuple[Node, ...], ...]:

@@ -16,7 +16,7 @@ from tactile_rt.models.encoders.cells import CELLS, Cell
 from tactile_rt.models.encoders.convolution import Convolution, convolve, convolve_valid
 from tactile_rt.models.encoders.graph import Graph, Input, Node
 
-__all__ = ["GraphEncoder"]
+__all__ = ["GraphEncoder", "draw_as_published"]
 
 
 class Fusion(nn.Module):
@@ -44,7 +44,7 @@ class Fusion(nn.Module):
 
 
 class GraphEncoder(nn.Module):
-    """Frames `(batch, step, channel, row, column)`, and what else the graph takes, to features.
+    """Frames `(batch, step, channel, row, column)` to features.
 
     Args:
         graph: what to build; its channel counts are final (see `Graph.scaled`).
@@ -61,9 +61,8 @@ class GraphEncoder(nn.Module):
         self.lag = graph.lag
         self.sizes = graph.sizes
         self.remaining = graph.remaining
-        self.inputs = [i.name for i in graph.inputs]
         self.heard = {edge.source for node in graph.nodes for edge in node.reads}
-        parts: tuple[Input | Node, ...] = (*graph.inputs, *graph.nodes)
+        parts: tuple[Input | Node, ...] = (graph.frame, *graph.nodes)
         channels = {part.name: part.channels for part in parts}
         self.convs = nn.ModuleDict()
         self.cells = nn.ModuleDict()
@@ -103,30 +102,29 @@ class GraphEncoder(nn.Module):
         return state
 
     def step(
-        self, frame: Tensor, index: Tensor, state: dict[str, Tensor], *others: Tensor
+        self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """One step. frame (batch, channel, row, column) -> features (batch, feature), new state.
 
-        others: the graph's further inputs, (batch, channel) or (batch, channel, row, column);
         index does not matter to a network without positions.
         """
-        now = {name: _inside(x) for name, x in zip(self.inputs, (frame, *others), strict=True)}
+        name, now = self.graph.frame.name, _inside(frame)
         keys = [key for node in self.graph.nodes for key in self._keys(node)]
         old = {key: _from_state(state[key]) for key in keys}
         new: dict[str, Tensor] = {}
         for node in self.graph.nodes:
-            read = [now[s] if s in now else old[f"{s}_h"] for s in (e.source for e in node.reads)]
+            sources = [edge.source for edge in node.reads]
+            read = [now if source == name else old[f"{source}_h"] for source in sources]
             memory = tuple(old[key] for key in self._memory(node))
             new[f"{node.name}_h"], memory = self._cell(node, self._drive(node, read), memory)
             new |= dict(zip(self._memory(node), memory, strict=True))
         features = new[f"{self.graph.readout}_h"][0, 0]
         return features, {key: _to_state(new[key], state[key].dim()) for key in keys}
 
-    def forward(self, frames: Tensor, *others: Tensor) -> Tensor:
+    def forward(self, frames: Tensor) -> Tensor:
         """A whole window at once: the features that `step` gives one by one.
 
-        frames (batch, step, channel, row, column); others (batch, step, channel[, row, column])
-        -> (batch, step, feature)
+        frames (batch, step, channel, row, column) -> (batch, step, feature)
 
         What does not depend on a loop of the graph is computed for all steps in one product, and
         what cannot reach a feature of this window is not computed. A node has one lane until the
@@ -134,9 +132,8 @@ class GraphEncoder(nn.Module):
         """
         batch, steps = frames.shape[:2]
         # What can be heard of every part of the graph, by the step in which it is read.
-        heard: dict[str, list[Tensor]] = {}
-        for name, x in zip(self.inputs, (frames, *others), strict=True):
-            heard[name] = list(_inside(x.transpose(0, 1).flatten(0, 1)).split(batch, 2))
+        every = _inside(frames.transpose(0, 1).flatten(0, 1))
+        heard = {self.graph.frame.name: list(every.split(batch, 2))}
         state = {key: _from_state(value) for key, value in self.initial_state(1).items()}
         for node in self.graph.nodes:
             heard[node.name] = [state[f"{node.name}_h"]] if node.name in self.heard else []
@@ -234,6 +231,23 @@ class GraphEncoder(nn.Module):
 
     def _keys(self, node: Node) -> list[str]:
         return self._memory(node) + [f"{node.name}_h"] * (node.name in self.heard)
+
+
+@torch.no_grad()
+def draw_as_published(encoder: nn.Module) -> None:
+    """Draw the first weights of a graph as the paper's code does: evenly, +-1 / sqrt(fan-in).
+
+    Biases of its cells are drawn as well; those of its convolutions stay 0, of its dense nodes 0.1.
+    """
+    for name, part in encoder.named_modules():
+        if isinstance(part, Convolution):
+            bound = part.weight[0].numel() ** -0.5
+            nn.init.uniform_(part.weight, -bound, bound)
+            if name.startswith("cells."):
+                nn.init.uniform_(part.bias, -bound, bound)
+        elif name.startswith("dense.") and isinstance(part, nn.Linear):
+            bound = part.in_features**-0.5
+            nn.init.uniform_(part.weight, -bound, bound)
 
 
 def _inside(x: Tensor) -> Tensor:

@@ -5,8 +5,6 @@ readout = "fc"
 channels = 30
 rows = 5
 columns = 7
-[inputs.whisker_angle]          # a vector: no rows and columns
-channels = 30
 [nodes.conv1]
 kind = "valid"
 channels = 96
@@ -15,7 +13,7 @@ cell = "gru-ln"
 [nodes.fc]
 kind = "dense"
 channels = 512
-reads = ["conv1", { source = "whisker_angle", fusion = "gate" }]
+reads = ["conv1"]
 """
 
 from pathlib import Path
@@ -71,12 +69,16 @@ def _graph(tree: SettingNode) -> Graph:
     for table in ("inputs", "nodes"):
         if not getattr(file, table):
             raise ConfigError(f"{tree.where}: {table} must be tables, [{table}.NAME]")
-    inputs = [Input(name, **msgspec.structs.asdict(i)) for name, i in file.inputs.items()]
+    if len(file.inputs) > 1:
+        raise ConfigError(
+            f"{tree.where}: a graph has one input, the frame, not {', '.join(file.inputs)}"
+        )
+    (frame,) = (Input(name, **msgspec.structs.asdict(i)) for name, i in file.inputs.items())
     nodes = []
     for name, node in file.nodes.items():
         reads = tuple(Edge(edge) if isinstance(edge, str) else edge for edge in node.reads)
         nodes.append(Node(name, node.channels, reads, node.kind, node.cell))
     try:
-        return Graph(tuple(inputs), tuple(nodes), file.readout)
+        return Graph(frame, tuple(nodes), file.readout)
     except ConfigError as error:  # how its parts fit together
         raise ConfigError(f"{tree.where}: {error}") from None

@@ -39,7 +39,7 @@ def zhuang_graph(cell: str = "intersection-ln", frame: tuple[int, int, int] = MO
         else:  # the mouse's 5 x 7 grid becomes 4 x 6 maps in conv1; a single row stays one
             less = name == "conv1" and min(frame[1:]) > 1
             nodes.append(Node(name, channels, reads, "valid" if less else "same", cell))
-    return Graph((Input("frame", *frame),), tuple(nodes), readout="fc8")
+    return Graph(Input("frame", *frame), tuple(nodes), readout="fc8")
 
 
 GRAPH = zhuang_graph()

@@ -1,11 +1,13 @@
 """What to train and how: one frozen dataclass, the whole of a run's `config.json`."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite
 
 from tactile_rt.models.augmentation import AUGMENTATIONS
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.encoders import MOUSE_FRAME
+from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.stream import ConfigError
 
 __all__ = [
@@ -14,6 +16,7 @@ __all__ = [
     "OPTIMIZERS",
     "PRECISIONS",
     "SCHEDULES",
+    "WINDOWS",
     "Progress",
     "TrainingConfig",
 ]
@@ -23,6 +26,9 @@ LOSSES = ("anytime", "last")
 OPTIMIZERS = ("sgd", "adam", "adamw", "lars", "lars-paper")
 SCHEDULES = ("step", "constant", "cosine", "cosine-annealing", "one-cycle")
 PRECISIONS = ("bf16", "fp32")
+FIRST_WEIGHTS = ("kaiming", "paper")
+RATES_PER = ("update", "epoch")
+WINDOWS = ("onset", "sweep")
 
 
 @dataclass(frozen=True)
@@ -36,8 +42,15 @@ class TrainingConfig:
         begin: A checkpoint to begin with, of the same array and network; what it tells apart that
             is not to be told apart now is forgotten, and what is new learnt from nothing. Empty: a
             network that knows nothing.
-        encoder, attender, decoder, width, readout, dropout, graph: Fields of the network, as in
-            `EADConfig`.
+        encoder, attender, decoder, width, readout, dropout, graph, norm_epsilon, preprocessing:
+            Fields of the network, as in `EADConfig`.
+        first_weights: The weights that a graph's training begins with: "kaiming", or "paper", as
+            `graph_encoder.draw_as_published` draws them.
+        window: The first sample of a window: "onset", where the runtime's detector hears the touch,
+            or "sweep", where the object sets out (the paper).
+        jitter: The number of samples by which a window may begin earlier or later.
+        faults: The sensor's faults that are drawn each time that a sweep is taken; None: those that
+            the set's recipe says.
         objective: The objective: "supervised", or self-supervised "simclr", "simsiam",
             "autoencoder".
         loss: The loss of the supervised objective: "anytime" (half of it on the last step, half on
@@ -47,8 +60,12 @@ class TrainingConfig:
         masking: The share of the steps of a window that is blanked, from 0 to less than 1.
         optimizer, schedule: Names of the optimizer and of the schedule of its rate, as in
             `optimizers`.
+        rate_per: The time after which the schedule changes the rate: "update", or "epoch" (the
+            paper).
         learning_rate: The peak of the learning rate.
         weight_decay: The weight decay of the optimizer.
+        own_rates: Whether parameters that ask for a rate and a decay of their own (the state spaces
+            of S4) get them; not so in the paper.
         warmup: The share of all updates in which the rate rises; 10 of the paper's 100 epochs are
             0.1.
         drop_every: The share of all updates between tenfold drops of the schedule "step";
@@ -79,14 +96,22 @@ class TrainingConfig:
     readout: str = "mean"
     dropout: float = 0.1
     graph: str = ""
+    norm_epsilon: float = 0.0
+    preprocessing: str = "log"
+    first_weights: str = "kaiming"
+    window: str = "onset"
+    jitter: int = 5
+    faults: SensorFaults | None = None
     objective: str = "supervised"
     loss: str = "anytime"
     augmentation: str = "none"
     masking: float = 0.0
     optimizer: str = "adamw"
     schedule: str = "one-cycle"
+    rate_per: str = "update"
     learning_rate: float = 5e-3
     weight_decay: float = 1e-4
+    own_rates: bool = True
     warmup: float = 0.05
     drop_every: float = 0.3
     easy: float = 0.0
@@ -99,12 +124,17 @@ class TrainingConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        if isinstance(self.faults, Mapping):  # from JSON
+            object.__setattr__(self, "faults", SensorFaults(**self.faults))
         for name, known in (
             ("objective", OBJECTIVES),
             ("loss", LOSSES),
             ("augmentation", AUGMENTATIONS),
             ("optimizer", OPTIMIZERS),
             ("schedule", SCHEDULES),
+            ("rate_per", RATES_PER),
+            ("window", WINDOWS),
+            ("first_weights", FIRST_WEIGHTS),
             ("precision", PRECISIONS),
         ):
             if (value := getattr(self, name)) not in known:
@@ -112,7 +142,7 @@ class TrainingConfig:
         for name in ("epochs", "batch", "learning_rate", "drop_every"):
             if not 0 < getattr(self, name) < float("inf"):  # which NaN is not either
                 raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
-        for name in ("updates", "clip_norm", "weight_decay"):
+        for name in ("updates", "clip_norm", "weight_decay", "jitter"):
             if not (getattr(self, name) >= 0 and isfinite(getattr(self, name))):
                 raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
         for name in ("masking", "warmup", "label_smoothing", "easy"):
@@ -122,6 +152,8 @@ class TrainingConfig:
             raise ConfigError(
                 f"{self.objective} compares sweeps of a batch: batch must be 2 or more"
             )
+        if self.schedule == "one-cycle" and self.rate_per == "epoch":
+            raise ConfigError("schedule one-cycle changes the rate per update, not per epoch")
         if not 0 <= self.seed < 2**32:
             raise ConfigError(f"seed must be 0 to {2**32 - 1}, not {self.seed}")
 
@@ -141,6 +173,8 @@ class TrainingConfig:
             dropout=self.dropout,
             graph=self.graph,
             frame=frame,
+            norm_epsilon=self.norm_epsilon,
+            preprocessing=self.preprocessing,
         )
 
 

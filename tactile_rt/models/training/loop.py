@@ -26,7 +26,15 @@ from tactile_rt.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import TactileClassifier, begin_from, reason, save_whole
 from tactile_rt.models.data_checks import check_labelled, check_sets, check_split
-from tactile_rt.models.datasets import SweepSet, TrainingBatches, frame_of, joined, relabelled
+from tactile_rt.models.datasets import (
+    SweepSet,
+    TrainingBatches,
+    drawn_as,
+    frame_of,
+    joined,
+    relabelled,
+)
+from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.objectives import Autoencoder, Objective, SimCLR, SimSiam, Supervised
 from tactile_rt.models.training.config import Progress, TrainingConfig
 from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
@@ -73,7 +81,7 @@ def train(
     """
     fabric = _launched(config, device)
     torch.manual_seed(config.seed)
-    training, validating = splits or read_splits(config)
+    training, validating = (drawn_as(one, asdict(config)) for one in splits or read_splits(config))
     objective = build_objective(config, training)
     if config.begin:
         begin_from(objective.model, Path(config.begin), labels_of(training))
@@ -82,7 +90,7 @@ def train(
         _begin_run(config, folder)
 
     share = Share(fabric.global_rank, fabric.world_size)
-    batches = TrainingBatches(training, config.batch, config.seed)
+    batches = TrainingBatches(training, config.batch, config.seed, config.jitter)
     if config.easy:
         updates = config.updates or config.epochs * len(batches)
         batches.easy_epochs = round(config.easy * updates / len(batches))
@@ -164,7 +172,7 @@ def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = Non
         ConfigError, RecordingError: as `train`.
     """
     torch.manual_seed(config.seed)
-    training, _ = splits or read_splits(config)
+    training = drawn_as((splits or read_splits(config))[0], asdict(config))
     objective = build_objective(config, training)
     folder.mkdir(parents=True, exist_ok=True)
     save_whole(folder / "best.pt", _card(config, objective, training, {"epoch": 0}))
@@ -217,6 +225,8 @@ def build_objective(config: TrainingConfig, training: SweepSet) -> Objective:
     manifest = training.manifest
     network = config.network(len(labels_of(training)), frame_of(manifest))
     model = TactileClassifier(manifest.spec, network, manifest.limits)
+    if config.first_weights == "paper" and isinstance(model.network.encoder, GraphEncoder):
+        draw_as_published(model.network.encoder)
     augmentation = build(config.augmentation, manifest.spec, config.masking)
     if config.objective == "supervised":
         return Supervised(model, augmentation, config.loss, config.label_smoothing)
@@ -245,7 +255,9 @@ class _Run:
     def __post_init__(self) -> None:
         self.updates = self.config.updates or self.config.epochs * self.per_epoch
         self.epochs = ceil(self.updates / self.per_epoch)
-        self.schedule: LRScheduler = build_schedule(self.optimizer, self.config, self.updates)
+        self.schedule: LRScheduler = build_schedule(
+            self.optimizer, self.config, self.updates, self.per_epoch
+        )
 
     def state(self) -> dict[str, Any]:
         return {

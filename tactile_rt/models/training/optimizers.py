@@ -1,7 +1,8 @@
 """Optimizers and schedules of the paper's Table A2, and the ones of the shipped recipe.
 
 A parameter may carry its own settings (state-space models want them), as in
-``parameter._optim = {"lr_scale": 0.1, "weight_decay": 0.0}``; equal settings share a group.
+``parameter._optim = {"lr_scale": 0.1, "weight_decay": 0.0}``; equal settings share a group. With
+``"stacked"`` each of its rows is a norm's, and would be a tensor of its own elsewhere.
 """
 
 import math
@@ -17,7 +18,7 @@ from tactile_rt.models.training.config import TrainingConfig
 __all__ = ["LARS", "build_optimizer", "build_schedule", "parameter_groups"]
 
 MOMENTUM = 0.9
-WARMUP_RATIO = 1e-4  # of "cosine-annealing": where the rate begins
+WARMUP_RATIO = 1e-4  # of "cosine-annealing": the rate begins above it
 TRUST = 1e-3  # LARS's coefficient (You et al. 2017)
 
 
@@ -59,11 +60,12 @@ class LARS(torch.optim.Optimizer):
 
     def _move(self, p: torch.Tensor, group: dict[str, Any]) -> None:
         assert p.grad is not None
-        layer = self._published or p.dim() > 1
+        stacked = group.get("stacked", False)
+        layer = self._published or (p.dim() > 1 and not stacked)
         decay = group["weight_decay"] if layer else 0.0
         rate = p.new_ones(())
         if layer:
-            size, slope = p.norm(), p.grad.norm()
+            size, slope = _size(p, stacked), _size(p.grad, stacked)
             ratio = TRUST * size / (slope + decay * size).clamp(min=1e-12)
             plain = torch.zeros_like(ratio) if self._published else rate
             rate = torch.where((size > 0) & (slope > 0), ratio, plain)
@@ -76,24 +78,42 @@ class LARS(torch.optim.Optimizer):
         p.sub_(state["momentum"])
 
 
-def parameter_groups(model: nn.Module, learning_rate: float, weight_decay: float) -> list[Any]:
-    """Groups of the parameters that are trained, by what their ``_optim`` asks for."""
-    groups: dict[tuple[float, float], list[nn.Parameter]] = {}
+def _size(tensor: torch.Tensor, stacked: bool) -> torch.Tensor:
+    """A tensor's norm, or that of each of its rows, to multiply the tensor with."""
+    size: torch.Tensor = torch.linalg.vector_norm(
+        tensor, dim=-1 if stacked else None, keepdim=stacked
+    )
+    return size
+
+
+def parameter_groups(
+    model: nn.Module, learning_rate: float, weight_decay: float, own_rates: bool = True
+) -> list[Any]:
+    """Groups of the parameters that are trained, by what their ``_optim`` asks for.
+
+    Args:
+        model: whose parameters.
+        learning_rate, weight_decay: of those that ask for none of their own.
+        own_rates: whether to heed those that do.
+    """
+    groups: dict[tuple[float, float, bool], list[nn.Parameter]] = {}
     for parameter in model.parameters():
         if parameter.requires_grad:
             own = getattr(parameter, "_optim", {})
-            key = own.get("lr_scale", 1.0), own.get("weight_decay", weight_decay)
+            asked = own if own_rates else {}
+            scale, decay = asked.get("lr_scale", 1.0), asked.get("weight_decay", weight_decay)
+            key = scale, decay, own.get("stacked", False)
             groups.setdefault(key, []).append(parameter)
     return [
-        {"params": members, "lr": learning_rate * scale, "weight_decay": decay}
-        for (scale, decay), members in groups.items()
+        {"params": members, "lr": learning_rate * scale, "weight_decay": decay, "stacked": stacked}
+        for (scale, decay, stacked), members in groups.items()
     ]
 
 
 def build_optimizer(model: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
     """The optimizer of a configuration: Table A2 has a weight decay of 1e-4 for all."""
-    groups = parameter_groups(model, config.learning_rate, config.weight_decay)
-    rate = config.learning_rate
+    rate, decay = config.learning_rate, config.weight_decay
+    groups = parameter_groups(model, rate, decay, config.own_rates)
     if config.optimizer == "sgd":
         return torch.optim.SGD(groups, rate, momentum=MOMENTUM)
     if config.optimizer == "adam":
@@ -104,15 +124,17 @@ def build_optimizer(model: nn.Module, config: TrainingConfig) -> torch.optim.Opt
 
 
 def build_schedule(
-    optimizer: torch.optim.Optimizer, config: TrainingConfig, updates: int
+    optimizer: torch.optim.Optimizer, config: TrainingConfig, updates: int, per_epoch: int = 1
 ) -> LRScheduler:
     """The schedule of a configuration, to be stepped after every one of so many updates.
 
-    - "step": tenfold down after every `drop_every` of all updates (StepLR).
+    Time is counted in updates, or, with `rate_per` "epoch", in epochs of `per_epoch` updates, as
+    the paper does.
+
+    - "step": tenfold down after every `drop_every` of all time (StepLR).
     - "constant".
     - "cosine": up from nothing in the warm-up, then a half cosine down to 0.
-    - "cosine-annealing": a half cosine down to 0 over all updates, damped in the warm-up, which
-      begins at 1e-4 of it.
+    - "cosine-annealing": up from 1e-4 in the warm-up, then a half cosine down to 0.
     - "one-cycle": Smith and Topin (2018), as torch has it.
     """
     if config.schedule == "one-cycle":
@@ -123,19 +145,23 @@ def build_schedule(
             pct_start=config.warmup,
             cycle_momentum=False,
         )
-    warm = round(config.warmup * updates)
-    drop = max(round(config.drop_every * updates), 1)
+    unit = per_epoch if config.rate_per == "epoch" else 1  # updates
+    end = math.ceil(updates / unit)
+    warm = round(config.warmup * end)
+    late = int(config.rate_per == "epoch")  # annealing counts epochs from 1
+    drop = max(round(config.drop_every * end), 1)
 
     def factor(update: int) -> float:
+        at = update // unit
         if config.schedule == "constant":
             return 1.0
         if config.schedule == "step":
-            return 0.1 ** (update // drop)
-        ramp = min((update + 1) / (warm + 1), 1.0)
+            return 0.1 ** (at // drop)
         if config.schedule == "cosine":
-            return ramp if update < warm else _half_cosine(update - warm, updates - warm)
-        damping = WARMUP_RATIO + (1 - WARMUP_RATIO) * min(update / max(warm, 1), 1.0)
-        return _half_cosine(update, updates) * (damping if warm else 1.0)
+            return at / warm if at < warm else _half_cosine(at - warm, end - warm)
+        if at < warm:
+            return 1 - (1 - (at + late) / warm) * (1 - WARMUP_RATIO)
+        return _half_cosine(at + late - warm, end - warm)
 
     return LambdaLR(optimizer, factor)
 

@@ -16,9 +16,10 @@ from torch.nn import functional as F
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
 from tactile_rt.models.data_checks import check_array, check_labelled, check_sets, check_split
 from tactile_rt.models.datasets import (
+    JITTER,
     SweepSet,
     TrainingBatches,
-    find_onsets,
+    drawn_as,
     of_categories,
     windows,
 )
@@ -101,9 +102,10 @@ def probe(
         splits = SweepSet.read(path, "train"), SweepSet.read(path, "validation")
         check_sets(path, splits)
     # a layer over categories learns nothing of what is refused
-    data, validation = (of_categories(one) for one in splits)
+    data, validation = (of_categories(drawn_as(one, saved["config"])) for one in splits)
     torch.manual_seed(config.seed)
-    batches = TrainingBatches(data, min(WINDOWS, len(data.sweeps)), config.seed)
+    jitter = saved["config"].get("jitter", JITTER)
+    batches = TrainingBatches(data, min(WINDOWS, len(data.sweeps)), config.seed, jitter)
     begin = trained.network.encoder.lag if config.readout == "mean" else -1
     drawn = [(_features(trained, begin, *loads), labels) for *loads, labels in batches.epoch(0)]
     features, labels = (torch.cat(part) for part in zip(*drawn, strict=True))
@@ -209,7 +211,7 @@ def _features(
 
 def _validation(model: TactileClassifier, begin: int, data: SweepSet) -> tuple[Tensor, Tensor]:
     """Features and labels of the clean sweeps in which contact is found."""
-    found = find_onsets(data.sweeps.values, data.floor)
+    found = data.onsets(data.sweeps.values)
     usable = torch.from_numpy(found.start >= 0).nonzero().flatten()
     if not len(usable):
         raise ConfigError("no touch was found in the validation sweeps: there is nothing to probe")

@@ -7,7 +7,7 @@ import torch
 
 from tactile_rt.models.augmentation import Augmentation
 from tactile_rt.models.checkpoints import run_on
-from tactile_rt.models.datasets import SweepSet, find_onsets, windows
+from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.evaluation import among, hits, predict
 from tactile_rt.models.objectives import Objective
 from tactile_rt.models.training.config import TrainingConfig
@@ -24,8 +24,8 @@ class Validation:
     """Measures an objective on the validation split.
 
     Supervised: top-1 without and with rated noise; the score is their mean, since a robot's
-    sensor is somewhere between. Self-supervised: the loss, augmented alike every time; the score
-    is its negative.
+    sensor is somewhere between, or the former alone where training draws no noise. Self-supervised:
+    the loss, augmented alike every time; the score is its negative.
 
     Args:
         config: of the run.
@@ -48,7 +48,7 @@ class Validation:
         supervised = config.objective == "supervised"
         self._measure: Callable[[Objective], Score] = self._top1 if supervised else self._loss
         if not supervised:
-            self._found = find_onsets(data.sweeps.values, data.floor)
+            self._found = data.onsets(data.sweeps.values)
             self._usable = np.flatnonzero(self._found.start >= 0)
 
     def __call__(self, objective: Objective) -> Score:
@@ -63,7 +63,7 @@ class Validation:
         clean = hits(among(predict(data, run)[:, -1], classes), labels).mean()
         noisy = hits(among(predict(data, run, 1.0)[:, -1], classes), labels).mean()
         metrics = {"validation_top1": float(clean), "validation_top1_noisy": float(noisy)}
-        return metrics, float(clean + noisy) / 2
+        return metrics, float(clean + noisy) / 2 if data.manifest.faults.noise else float(clean)
 
     @torch.inference_mode()
     def _loss(self, objective: Objective) -> Score:

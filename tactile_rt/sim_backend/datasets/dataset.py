@@ -341,7 +341,15 @@ def _chunk(recipe: SweepRecipe, loads: NDArray[np.float64]) -> Chunk:
 
 
 def _resampled(recipe: SweepRecipe, chunk: Chunk, rate_hz: float) -> NDArray[np.float32]:
-    """(sample, element, channel): what the live stream's own resampler makes of it."""
+    """(sample, element, channel): what the live stream's own resampler makes of it.
+
+    Or, where the recipe says so, the last sample by the time of each output.
+    """
+    if recipe.every_nth:
+        due_ns = chunk.t_ns[0] + recipe.period_ns * np.arange(1, recipe.samples + 1)
+        at = np.searchsorted(chunk.t_ns, due_ns, side="right") - 1
+        taken: NDArray[np.float32] = chunk.values[at]
+        return taken
     outputs = Resampler(recipe.period_ns, rate_hz).push(chunk)
     values = np.zeros((recipe.samples, *chunk.values.shape[1:]), dtype=np.float32)
     if outputs is not None:  # fewer where the last samples were dropped

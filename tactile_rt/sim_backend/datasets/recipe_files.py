@@ -107,6 +107,7 @@ class _File(msgspec.Struct):
     lead_ms: float | None = None
     length_ms: float | None = None
     contacts: bool = False
+    every_nth: bool = False
     objects: _Objects = msgspec.field(default_factory=_Objects)
     sweeps: _Sweeps = msgspec.field(default_factory=_Sweeps)
     sensor: SensorModel = msgspec.field(default_factory=SensorModel)
@@ -222,6 +223,7 @@ def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
             lead_ms=lead_ms if file.lead_ms is None else file.lead_ms,
             length_ms=length_ms if file.length_ms is None else file.length_ms,
             contacts=file.contacts,
+            every_nth=file.every_nth,
             objects=ObjectChoice(
                 source=_absolute(objects.source, folder) if all_of_it else objects.source,
                 categories=objects.categories,

@@ -8,6 +8,7 @@
     seed = 0
     period_ms = 9             # of the stored samples; 1 keeps the simulator's own 1 kHz
     contacts = true           # keep where each whisker touches, too; left out, it is not kept
+    every_nth = true          # keep the sample of each period as it is, not resampled (the paper)
     [objects]
     from = "shapes"           # the parametric ones, "varied-shapes", or a folder of meshes
     per_category = 60
@@ -298,6 +299,8 @@ class SweepRecipe:
         lead_ms: The time at rest before the simulation starts, ms: enough for a tare.
         length_ms: The length of one sweep with its lead, ms.
         contacts: Whether to store where along each whisker it touches, beside the loads.
+        every_nth: Whether to store every n-th of the simulator's samples as it is, with what that
+            aliases, as the paper does; else they go through the live stream's resampler.
         objects: The choice of what is swept.
         sweeps: The choice of how each object is swept.
         sensor: What the sensors make of the loads; perfect ones unless it says otherwise.
@@ -318,6 +321,7 @@ class SweepRecipe:
     lead_ms: float = 216.0
     length_ms: float = 1476.0  # 22 network steps from onset and to spare
     contacts: bool = False
+    every_nth: bool = False
     objects: ObjectChoice = OBJECTS
     sweeps: SweepChoice = SWEEPS
     sensor: SensorModel = PERFECT
@@ -375,7 +379,8 @@ class SweepRecipe:
         top = {f.name: getattr(self, f.name) for f in fields(self)}
         faults = _differing_from_default(self.faults)
         # unsaid, as in sets of releases that knew of none
-        for key, told in (("contacts", self.contacts), ("faults", faults)):
+        flags = {key: getattr(self, key) for key in ("contacts", "every_nth")}
+        for key, told in (*flags.items(), ("faults", faults)):
             if not told:
                 del top[key]
         return {

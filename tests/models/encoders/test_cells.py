@@ -51,6 +51,11 @@ def vanilla(cell, x, s):
     return s, s
 
 
+def vanilla_elu(cell, x, s):
+    s = F.elu(gates(cell, x, s)[0])
+    return s, s
+
+
 def ugrnn(cell, x, s):
     c, g = gates(cell, x, s)
     c, g = torch.tanh(c), torch.sigmoid(g + 1)
@@ -80,7 +85,18 @@ def lstm(cell, x, s):
     return h, (c, h)
 
 
-EQUATIONS = {f.__name__: f for f in (timedecay, vanilla, ugrnn, intersection, gru, lstm)}
+def lstm_ln_published(cell, x, s):
+    """It remembers what it normalised."""
+    h, (c, _) = lstm(cell, x, s)
+    return h, (norm(cell, 4, c), h)
+
+
+EQUATIONS = {
+    f.__name__.replace("_", "-"): f
+    for f in (
+        timedecay, vanilla, vanilla_elu, ugrnn, intersection, gru, lstm, lstm_ln_published,
+    )
+}  # fmt: skip
 
 
 def oracle(encoder: ZhuangEncoder, x: Tensor, cell: str) -> Tensor:

@@ -1,4 +1,4 @@
-"""Networks from data: paths, loops, fusion, a second modality, and what is refused."""
+"""Networks from data: paths, loops, fusion, and what is refused."""
 
 import pytest
 import torch
@@ -17,20 +17,14 @@ readout = "fc"
 channels = 30
 rows = 5
 columns = 7
-[inputs.whisker_angle]
-channels = 4
-[inputs.depth]
-channels = 3
-rows = 4
-columns = 6
 [nodes.first]
 kind = "valid"
 channels = 32
-reads = ["frame", { source = "whisker_angle", fusion = "gate" }]
+reads = ["frame", { source = "fc", fusion = "gate" }]
 cell = "gru-ln"
 [nodes.up]
 channels = 64
-reads = ["first", "down", "fc", { source = "depth", fusion = "sum" }]
+reads = ["first", "down", "fc", { source = "up", fusion = "sum" }]
 cell = "lstm-ln"
 [nodes.down]
 channels = 32
@@ -39,7 +33,7 @@ reads = ["up", "down"]
 kind = "dense"
 channels = 64
 cell = "timedecay"
-reads = ["up", { source = "whisker_angle", fusion = "gate" }]
+reads = ["up", { source = "down", fusion = "gate" }]
 """
 
 
@@ -54,10 +48,10 @@ def test_zhuangs_graph():
 def test_a_graph_from_toml():
     graph = parse_graph(TEXT)
     assert graph.lag == 2  # first -> up -> fc
-    assert graph.inputs[1] == Input("whisker_angle", 4)
-    assert graph.nodes[1].reads[3] == Edge("depth", "sum")
+    assert graph.frame == Input("frame", 30, 5, 7)
+    assert graph.nodes[1].reads[3] == Edge("up", "sum")
     assert [[n.name for n in group] for group in graph.components] == [
-        ["first"], ["up", "down", "fc"]]  # fmt: skip
+        ["first", "up", "down", "fc"]]  # fmt: skip
 
 
 @pytest.mark.parametrize("steps", [1, 2, 3, 9])
@@ -65,58 +59,54 @@ def test_stream_equals_window(steps):
     torch.manual_seed(0)
     ead = EAD(EADConfig(7, "graph", "none", readout="mean", graph=TEXT)).eval()
     stir(ead)
-    others = torch.randn(2, steps, 4), torch.randn(2, steps, 3, 4, 6)
     x = frames(2, steps)
     with torch.no_grad():
-        assert (ead(x, *others) - stream(ead, x, *others)).abs().max() <= TOLERANCE
+        assert (ead(x) - stream(ead, x)).abs().max() <= TOLERANCE
 
 
-def test_what_can_be_heard_when():
-    """The frame two steps late, whisker angles at once, at the node that the data name."""
+def test_a_frame_is_heard_two_steps_late():
     torch.manual_seed(0)
     encoder = GraphEncoder(parse_graph(TEXT))
     stir(encoder)
-    inputs = [frames(1, 6), torch.randn(1, 6, 4), torch.randn(1, 6, 3, 4, 6)]
-    wanted = [x.requires_grad_() for x in inputs]
-    gradients = torch.autograd.grad(encoder(*inputs)[:, -1].square().sum(), wanted)
-    heard = [g.flatten(2).abs().amax(dim=(0, 2)) > 0 for g in gradients]
-    assert [int(h.nonzero().max()) for h in heard] == [3, 5, 4]
+    x = frames(1, 6).requires_grad_()
+    (gradient,) = torch.autograd.grad(encoder(x)[:, -1].square().sum(), x)
+    heard = gradient.flatten(2).abs().amax(dim=(0, 2)) > 0
+    assert int(heard.nonzero().max()) == 3
 
 
 def test_fusion():
     """sum and gate, against their definitions, in a node that only adds up."""
     torch.manual_seed(0)
     for fusion in ("sum", "gate"):
-        reads = (Edge("frame"), Edge("angle", fusion))
-        graph = Graph(
-            (Input("frame", 30, 5, 7), Input("angle", 4)),
-            (Node("map", 8, reads, "same"), Node("fc", 8, (Edge("map"),), "dense")),
-            "fc",
-        )
+        reads = (Edge("frame"), Edge("fc", fusion))
+        nodes = Node("map", 8, reads, "same"), Node("fc", 4, (Edge("map"),), "dense")
+        graph = Graph(Input("frame", 30, 5, 7), nodes, "fc")
         encoder = GraphEncoder(graph)
         stir(encoder)
-        x, angle = frames(2, 3), torch.randn(2, 3, 4)
-        fused = encoder.fusions["map"]
-        added = (angle @ fused.projections[0].weight.T)[:, :, :, None, None].expand_as(x)
-        if fusion == "gate":
-            gate = fused.gates[0]
-            both = torch.cat([x, added], 2)
-            score = torch.einsum("btcij,c->btij", both, gate.weight[0]) + gate.bias
-            assert score.std() > 0.01
-            added = added * torch.sigmoid(score)[:, :, None]
-        plain = GraphEncoder(
-            Graph(graph.inputs[:1], (Node("map", 8, reads[:1], "same"), graph.nodes[1]), "fc")
-        )
+        without = Graph(graph.frame, (Node("map", 8, reads[:1], "same"), nodes[1]), "fc")
+        plain = GraphEncoder(without)
         kept = {k: v for k, v in encoder.state_dict().items() if not k.startswith("fusions")}
         plain.load_state_dict(kept)
-        torch.testing.assert_close(encoder(x, angle), plain(x + added), atol=1e-5, rtol=1e-5)
-        assert (encoder(x, angle) - plain(x)).abs().max() > 1e-3
+        x, fused = frames(2, 4), encoder.fusions["map"]
+        before, state, expected = torch.zeros(2, 4), plain.initial_state(2), []
+        for t in range(4):
+            added = (before @ fused.projections[0].weight.T)[:, :, None, None].expand_as(x[:, t])
+            if fusion == "gate":
+                gate = fused.gates[0]
+                both = torch.cat([x[:, t], added], 1)
+                score = torch.einsum("bcij,c->bij", both, gate.weight[0]) + gate.bias
+                assert score.std() > 0.01
+                added = added * torch.sigmoid(score)[:, None]
+            before, state = plain.step(x[:, t] + added, torch.zeros(2), state)
+            expected.append(before)
+        torch.testing.assert_close(encoder(x), torch.stack(expected, 1), atol=1e-5, rtol=1e-5)
+        assert (encoder(x) - plain(x)).abs().max() > 1e-3
 
 
-def test_width_scales_every_node_but_no_input():
+def test_width_scales_every_node_but_not_the_frame():
     half = parse_graph(TEXT).scaled(0.5)
     assert [n.channels for n in half.nodes] == [16, 32, 16, 32]
-    assert [i.channels for i in half.inputs] == [30, 4, 3]
+    assert half.frame.channels == 30
 
 
 @pytest.mark.parametrize(
@@ -146,9 +136,15 @@ def test_width_scales_every_node_but_no_input():
         ),
         ("[nodes.first]", "[nodes.frame]", "'frame' must be a name of its own"),
         ("[nodes.first]", '[nodes."a-b"]', "'a-b' must be a name"),
-        ('["first", "down", "fc"', '["down", "fc"', "first cannot reach the readout fc"),
+        ('["up", { source = "down"', '["first", { source = "first"', "reads the same node twice"),
+        ('"first", "down", "fc"', '"frame", "down", "fc"', "first cannot reach the readout fc"),
         ("[nodes.fc]", "[node.fc]", "the file has no key 'node'; did you mean nodes"),
         ("rows = 5", "rows = ", "Invalid value"),
+        (
+            "[nodes.first]",
+            "[inputs.angle]\nchannels = 4\n[nodes.first]",
+            "one input, the frame, not frame, angle",
+        ),
     ],
 )
 def test_a_mistake_is_named_in_one_line(tmp_path, old, new, match):
