@@ -93,8 +93,10 @@ def test_a_hostile_model_is_refused_and_the_one_before_goes_on(daemon, tmp_path,
     before = daemon.state()
     put(tmp_path, hostile(tmp_path, burden))
     daemon.reload()
-    found = daemon.await_state(lambda s: s["state"] == "degraded", every_s=0.02)
-    assert [t["what"] for t in found["troubles"]] == ["old model"]
+    found = daemon.await_state(
+        lambda s: "old model" in [t["what"] for t in s["troubles"]], every_s=0.02
+    )
+    assert found["state"] == "degraded"  # on a busy machine for another reason, too
     daemon.await_state(
         lambda s: s["models"][0]["decisions"] > before["models"][0]["decisions"] + 30
     )
