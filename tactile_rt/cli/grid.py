@@ -1,4 +1,4 @@
-"""`tactile-rt grid`: many networks under one budget, beside their random initialisations."""
+"""`tactile-rt grid`: many networks, each tuned alike and trained to its end."""
 
 from pathlib import Path
 from typing import Annotated
@@ -11,7 +11,7 @@ from tactile_rt.cli.app import app, check_output, needs
 
 @app.command()
 def grid(
-    plan: Annotated[str, typer.Argument(help="A TOML file, or the shipped `mouse24`.")],
+    plan: Annotated[str, typer.Argument(help="A TOML file, or the shipped `wide24`.")],
     folder: Annotated[Path, typer.Argument(help="Where it goes; what is done is kept.")],
     processes: Annotated[int, typer.Option(min=1, help="That train side by side.")] = 2,
     report: Annotated[
@@ -19,13 +19,13 @@ def grid(
         typer.Option(help="Train nothing: write the table of what is done into this page."),
     ] = None,
 ) -> None:
-    """Train encoder x attender x objective under equal budgets and draw how well they do.
+    """Train encoder x attender x objective, each tuned alike, and draw how well they do.
 
-    Killed at any time, it goes on where it was. FOLDER gets results.json, results.csv and
-    task_performance.png.
+    Killed at any time, it goes on where it was. FOLDER gets results.json, results.csv, curves.csv,
+    task_performance.png and learning_curves.png.
     """
     try:
-        from tactile_rt.models.grid.picture import draw_grid
+        from tactile_rt.models.grid.picture import draw_curves, draw_grid
         from tactile_rt.models.grid.plan import read_grid
         from tactile_rt.models.grid.pool import run_grid
         from tactile_rt.models.grid.results import gather, put_into, table, write_results
@@ -40,6 +40,7 @@ def grid(
         results = gather(wanted, folder)
         write_results(results, folder)
         draw_grid(results, folder / "task_performance.png")
+        draw_curves(results, folder / "learning_curves.png")
         if report is not None:
             put_into(report, table(results))
 
@@ -57,4 +58,4 @@ def grid(
     if report is None:
         run_grid(wanted, folder, processes, show)
     conclude()
-    console.print(f"{folder}: results.json, results.csv, task_performance.png")
+    console.print(f"{folder}: its tables and pictures")

@@ -203,7 +203,9 @@ def of_categories(data: SweepSet) -> SweepSet:
 
 def drawn_as(data: SweepSet, training: Mapping[str, Any]) -> SweepSet:
     """The set whose windows begin, and whose sensor fails, as a run's configuration says."""
-    data = replace(data, window=training.get("window", data.window))
+    window = training.get("window", data.window)
+    if window != data.window:  # else many trainings share the onsets that were found once
+        data = replace(data, window=window)
     faults = training.get("faults")
     return with_faults(data, SensorFaults(**faults)) if faults else data
 

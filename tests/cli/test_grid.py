@@ -7,7 +7,7 @@ for module in ("torch", "lightning", "matplotlib"):
 
 
 def test_no_such_grid(refused, tmp_path):
-    assert "no grid none: name a TOML file, or one of mouse24" in refused("grid", "none", tmp_path)
+    assert "no grid none: name a TOML file, or one of wide24" in refused("grid", "none", tmp_path)
 
 
 def test_a_damaged_grid_makes_nothing(refused, tmp_path):
@@ -21,9 +21,9 @@ def test_a_damaged_grid_makes_nothing(refused, tmp_path):
 
 def test_a_report_of_nothing_writes_nothing(refused, tmp_path):
     page = tmp_path / "page.md"
-    assert "has no outcome yet" in refused("grid", "mouse24", tmp_path / "o", "--report", page)
+    assert "has no outcome yet" in refused("grid", "wide24", tmp_path / "o", "--report", page)
     assert f"no folder {tmp_path / 'docs'}" in refused(
-        "grid", "mouse24", tmp_path / "o", "--report", tmp_path / "docs" / "page.md"
+        "grid", "wide24", tmp_path / "o", "--report", tmp_path / "docs" / "page.md"
     )
     assert not page.exists()
 

@@ -13,11 +13,18 @@ pytest.importorskip("lightning")
 pytest.importorskip("matplotlib")
 
 from tactile_rt.models.grid import pool, results
-from tactile_rt.models.grid.picture import draw_grid
-from tactile_rt.models.grid.plan import Task, read_grid, shipped_grids
+from tactile_rt.models.grid.picture import draw_curves, draw_grid
+from tactile_rt.models.grid.plan import Growth, Task, read_grid, shipped_grids
 from tactile_rt.models.grid.pool import run_grid
 from tactile_rt.models.grid.results import gather, put_into, table, write_results
-from tactile_rt.models.grid.work import Outcome, Workbench, outcome_path, read_outcome, settings_of
+from tactile_rt.models.grid.work import (
+    Outcome,
+    Point,
+    Workbench,
+    outcome_path,
+    read_outcome,
+    settings_of,
+)
 from tactile_rt.stream import ArraySpec, ConfigError, ModelError, RecordingError
 from tactile_rt.sweep_set import SweepManifest, write_object
 
@@ -39,13 +46,14 @@ SPLIT = {
 TOML = """
 data = "{data}"
 width = 0.03125
-updates = 2
 batch = 4
 seeds = 2
+search = {{ learning_rate = [1e-3, 1e-2], warmup = [0.1, 0.3], updates = 2 }}
+growth = {{ first = 1, most = 2, gain = 0.01 }}
 sweeps = {{ train = 2, validation = 1, test = 2 }}
 probe = {{ epochs = 2, drop_epochs = 1 }}
 [supervised]
-learning_rate = 1e-3
+clip_norm = 2
 [[cell]]
 encoder = "gru"
 [[cell]]
@@ -82,22 +90,17 @@ def plan(data: Path, tmp_path: Path) -> Path:
 
 
 def test_the_shipped_grid_is_the_papers_figure_and_its_controls() -> None:
-    assert shipped_grids() == ("mouse24",)
-    grid = read_grid("mouse24")
-    learning = [cell.learning for cell in grid.cells]
-    assert learning.count("supervised") >= 12
-    assert sum(one.startswith("simclr") for one in learning) >= 6
-    for control in ("tactile", "tactile-paper", "image", "tactile+masking"):
-        assert f"simclr {control}" in learning
+    assert shipped_grids() == ("wide24",)
+    grid = read_grid("wide24")
+    names = {cell.name for cell in grid.cells}
+    for encoder in ("gru", "s4", "resnet18", "mamba", "zhuang-intersection-ln"):
+        assert {encoder, f"{encoder}+gpt"} <= names
     assert grid.seeds == 3
-    assert any(cell.name == "gru" for cell in grid.cells)
     assert grid.svm
     tasks = grid.tasks()
     seeds = [task.seed for task in tasks]
     assert seeds == sorted(seeds), "all with the first seed before any with the second"
     assert len({task.slug for task in tasks}) == len(tasks)
-    assert all(grid.config(t, Path("x")).updates == grid.updates for t in tasks if t.cell)
-    assert len({grid.config(t, Path("x")).batch for t in tasks if t.cell}) <= 2
 
 
 @pytest.mark.parametrize(
@@ -108,7 +111,10 @@ def test_the_shipped_grid_is_the_papers_figure_and_its_controls() -> None:
         ("updates = 2", 'updates = "2"', "updates: expected a whole number, got '2'"),
         ("updates = 2", "updates = 0", "needs a cell, a seed and an update"),
         ("batch = 4", "bach = 4", "the file has no key 'bach'; did you mean batch?"),
-        ("learning_rate", "rate", "has no key 'rate'; "),
+        ("clip_norm", "clip", "has no key 'clip'; "),
+        ("[1e-3, 1e-2]", "[]", "search needs a learning_rate and a warmup"),
+        ('encoder = "gru"\nobj', 'encoder = "gru"\nshare = 2\nobj', "share must be above 0"),
+        ('encoder = "gru"\nobj', 'encoder = "gru"\nbegin = "s4"\nobj', "begins with 's4', which"),
         ('than = "svm"', 'than = "svn"', "compares 'svn', which no cell is"),
         ("[supervised]", "[supervised", "Expected ']'"),
         ('objective = "simclr"\naugmentation = "image"', "", "two cells are 'gru'"),
@@ -125,7 +131,7 @@ def test_a_slip_in_a_grid_is_named(plan: Path, old: str, new: str, said: str) ->
 
 def test_a_grid_that_is_not_there_is_told_with_those_that_are(tmp_path: Path) -> None:
     with pytest.raises(
-        ConfigError, match=r"no grid none\.toml: name a TOML file, or one of mouse24"
+        ConfigError, match=r"no grid none\.toml: name a TOML file, or one of wide24"
     ):
         read_grid("none.toml")
 
@@ -181,12 +187,31 @@ def test_a_grid_is_done_once_and_told(
     assert float(rows[1]["top1"]) == gru.top1.value
     assert json.loads((folder / "results.json").read_text())["objects"] == 8
     draw_grid(found, folder / "task_performance.png")
-    assert (folder / "task_performance.png").read_bytes().startswith(b"\x89PNG")
+    draw_curves(found, folder / "learning_curves.png")
+    for name in ("task_performance", "learning_curves"):
+        assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
     text = table(found)
     assert "| gru | supervised |" in text
     assert "| Do labels help? | gru - gru simclr image |" in text
 
-    changed = msgspec.structs.replace(grid, updates=3)
+    (first,) = [t for t in grid.tasks() if (t.name, t.seed) == ("gru", 0)]
+    outcome = read_outcome(grid, folder, first)
+    assert outcome is not None
+    # both rates with the first warm-up, the other warm-up with the better rate
+    tried = [(t.learning_rate, t.warmup, t.updates) for t in outcome.trials]
+    best = max(outcome.trials[:2], key=lambda t: t.score).learning_rate
+    assert tried == [(1e-3, 0.1, 2), (1e-2, 0.1, 2), (best, 0.3, 2)]
+    assert [p.updates for p in outcome.growth] == [1, 2]
+    assert outcome.chosen == max(outcome.growth, key=lambda p: p.score)
+    second = read_outcome(grid, folder, msgspec.structs.replace(first, seed=1))
+    assert second is not None
+    assert second.chosen is not None
+    assert (second.trials, second.growth) == ((), ()), "tuned by the first seed"
+    assert second.chosen.updates == outcome.chosen.updates
+    curves = list(csv.DictReader((folder / "curves.csv").read_text().splitlines()))
+    assert [int(row["updates"]) for row in curves if row["name"] == "gru"] == [1, 2]
+
+    changed = msgspec.structs.replace(grid, batch=3)
     with pytest.raises(ConfigError, match="'gru' trained with other settings"):
         run_grid(changed, folder)
 
@@ -206,9 +231,63 @@ def test_a_network_that_diverges_is_an_outcome(
         bench.do(task)
     rows = gather(grid, folder).rows
     assert rows[1].top1 is None
-    assert rows[1].failed == "training diverged in epoch 1"
-    assert "`gru`: training diverged in epoch 1" in table(gather(grid, folder))
+    assert rows[1].failed == "every training of it diverged"
+    assert "`gru`: every training of it diverged" in table(gather(grid, folder))
     draw_grid(gather(grid, folder), folder / "picture.png")
+
+
+def test_a_cell_begins_with_another_and_learns_from_fewer_objects(
+    plan: Path, tmp_path: Path
+) -> None:
+    plan.write_text(
+        plan.read_text().replace(
+            "[[question]]",
+            """[[cell]]
+encoder = "gru"
+begin = "gru simclr image"
+share = 0.5
+seeds = 1
+[[question]]""",
+        )
+    )
+    grid, folder = read_grid(plan), tmp_path / "out"
+    name = "gru after simclr image of 0.5"
+    assert [task.name for task in grid.tasks()].count(name) == 1, "one seed"
+    (task,) = [task for task in grid.tasks() if task.name == name]
+    assert grid.needs(task) == ("gru_simclr_image_seed0",)
+    pool.write_subset(Path(grid.data), folder / "sweeps", grid.sweeps)
+    bench = Workbench(grid, folder)
+    few = bench.splits_of(0.5)[0]
+    assert set(few.sweeps.objects) == {"mug-0", "mug-1", "car-0", "car-1"}
+    assert bench.splits_of(1.0)[0] is bench.splits[0]
+    assert (
+        bench.do(task).failed == "'gru simclr image' diverged, and there is nothing to begin with"
+    )
+    (before,) = [t for t in grid.tasks() if t.slug in grid.needs(task)]
+    assert not bench.do(before).failed
+    done = bench.do(task)
+    assert not done.failed
+    assert done.chosen is not None
+    config = json.loads(next((folder / "runs" / task.slug).glob("*/config.json")).read_text())
+    assert config["begin"].startswith(str(folder / "runs" / before.slug))
+    assert "after simclr image of 0.5" in table(gather(grid, folder))
+
+
+def test_the_longest_training_is_not_longer_than_it_helps(
+    plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid = msgspec.structs.replace(
+        read_grid(plan), growth=msgspec.convert({"first": 10, "most": 100}, Growth)
+    )
+    scores = {10: 0.5, 20: 0.6, 40: 0.605, 80: 0.9}
+    bench = object.__new__(Workbench)
+    bench.grid = grid
+    monkeypatch.setattr(
+        bench, "_train", lambda task, at, report: replace(at, score=scores[at.updates])
+    )
+    replace = msgspec.structs.replace
+    points = bench._grow(grid.tasks()[1], Point(1e-3, 0.1, 2, 0.0, 0.0), print)
+    assert [p.updates for p in points] == [10, 20, 40], "0.005 more is not worth going on"
 
 
 def test_a_grid_without_its_sweeps_says_so(plan: Path, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
-"""The paper's task-performance figure: every network trained, beside its random initialisation."""
+"""Two pictures of a grid: who ends best, as in the paper, and who learns fastest."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -11,7 +12,7 @@ from tactile_rt.models.evaluation import Interval
 from tactile_rt.models.grid.plan import SUPERVISED, SVM
 from tactile_rt.models.grid.results import GridResults, Row
 
-__all__ = ["draw_grid"]
+__all__ = ["draw_curves", "draw_grid"]
 
 FAMILIES = {
     "zhuang": ("ConvRNN (Zhuang's graph)", "tab:blue"),
@@ -65,12 +66,79 @@ def draw_grid(results: GridResults, path: Path) -> None:
     seeds = max((row.seeds for row in networks), default=0)
     figure.suptitle(
         f"What touched the whiskers? {results.classes} kinds of object, {results.objects} unseen "
-        f"objects, {results.sweeps} sweeps\nevery network under the same budget; "
+        f"objects, {results.sweeps} sweeps\n"
+        "every network tuned alike, trained until more helps no more; "
         + (f"mean of up to {seeds} seeds" if seeds > 1 else "one seed")
         + ", lines: 95 % by object and seed",
         fontsize=11,
     )
     figure.savefig(path, dpi=120)
+
+
+def draw_curves(results: GridResults, path: Path) -> None:
+    """Draw accuracy against updates, CPU time, parameters and training objects, as a PNG."""
+    networks = [row for row in results.rows if row.name != SVM]
+    figure = Figure(figsize=(11, 8.5), layout="constrained")
+    axes = figure.subplots(2, 2)
+    for row in networks:
+        if row.learning != SUPERVISED or not row.growth:
+            continue
+        scores = [100 * point.score for point in row.growth]
+        how = _line(row)
+        axes[0, 0].plot([point.updates for point in row.growth], scores, **how)
+        axes[0, 1].plot([point.seconds for point in row.growth], scores, **how)
+    whole = [row for row in networks if row.share == 1 and row.top1 is not None]
+    for row in whole:
+        if row.learning == SUPERVISED and row.top1 is not None:
+            how = _line(row)
+            axes[1, 0].plot(row.parameters, 100 * row.top1.value, **how)
+            axes[1, 0].annotate(
+                row.network, (row.parameters, 100 * row.top1.value), fontsize=7.5,
+                xytext=(4, 4), textcoords="offset points",
+            )  # fmt: skip
+    for network in dict.fromkeys(row.network for row in networks if row.share < 1):
+        of = sorted(
+            (row.share, row)
+            for row in networks
+            if row.network == network and row.learning.split(" of ")[0] == SUPERVISED
+        )
+        shown = [(share, row) for share, row in of if row.top1 is not None]
+        if len(shown) > 1:
+            values = [100 * row.top1.value for _, row in shown if row.top1 is not None]
+            how = _line(shown[-1][1])
+            axes[1, 1].plot([100 * share for share, _ in shown], values, **how)
+    for at, title, label in (
+        (axes[0, 0], "who learns fastest, by updates", "updates"),
+        (axes[0, 1], "who learns fastest, by arithmetic", "CPU time of the training (s)"),
+        (axes[1, 0], "who ends best, by size", "parameters"),
+        (axes[1, 1], "who ends best, by data", "share of the training objects (%)"),
+    ):
+        at.set_xscale("log")
+        at.set_title(title, fontsize=10, loc="left")
+        at.set_xlabel(label)
+        at.grid(alpha=0.25)
+        above = at in axes[0]
+        at.set_ylabel(f"top-1 (%), {'validation' if above else 'test'} objects")
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
+    figure.suptitle(
+        "Every point above is a whole training, with a rate and a warm-up of the network's own; "
+        "the last of a line gained less than a point, or was the longest tried",
+        fontsize=10,
+    )
+    figure.savefig(path, dpi=120)
+
+
+def _line(row: Row) -> dict[str, Any]:
+    """How a network's line is drawn: an attender dashes it."""
+    _, colour = _family(row)
+    return {
+        "color": colour,
+        "marker": "o",
+        "markersize": 4,
+        "linestyle": "--" if "+" in row.network else "-",
+        "label": _label(row),
+    }
 
 
 def _bars(axes: Axes, rows: list[Row]) -> None:

@@ -1,7 +1,11 @@
-"""What a grid trains: a TOML file of encoder x attender x objective under one budget.
+"""What a grid trains: a TOML file of encoder x attender x objective, each tuned alike.
 
-data = "data/default24"
-updates = 600
+Every cell is tuned by as many short trials as any other, then trained with more and more updates
+until more gain nothing, then with further seeds:
+
+data = "data/wide24"
+search = { learning_rate = [1e-3, 5e-3], warmup = [0.05, 0.3], updates = 500 }
+growth = { first = 1000, most = 8000, gain = 0.01 }
 [[cell]]
 encoder = "zhuang-gru"
 """
@@ -20,8 +24,10 @@ from tactile_rt.stream import ConfigError
 __all__ = [
     "Candidate",
     "Grid",
+    "Growth",
     "Pair",
     "Question",
+    "Search",
     "SweepCounts",
     "Task",
     "read_grid",
@@ -30,6 +36,7 @@ __all__ = [
 
 SHIPPED = resources.files("tactile_rt.models.grid")
 SUPERVISED, RANDOM, SVM = "supervised", "random", "svm"
+NAMING = ("pairs",)  # options that tell cells apart in their names
 
 
 class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -42,6 +49,11 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         augmentation: The augmentation that makes the views of a self-supervised objective.
         masking: The share of the steps of a view that is blanked, 0 to 1.
         width: The width of this network; 0 takes the grid's.
+        share: The share of the training objects of every category whose sweeps are learnt from, at
+            least one.
+        begin: The name of a cell whose trained network, of the same seed, this one begins with;
+            empty begins with nothing.
+        seeds: The number of seeds of this cell; 0 takes the grid's.
         options: Further fields of `TrainingConfig`, for this cell alone.
     """
 
@@ -51,6 +63,9 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     augmentation: str = "none"
     masking: float = 0.0
     width: float = 0.0
+    share: float = 1.0
+    begin: str = ""
+    seeds: int = 0
     options: dict[str, Any] = {}
 
     @property
@@ -61,15 +76,18 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def learning(self) -> str:
-        """Objective and views: ``simclr tactile+masking``."""
+        """Objective and views, what it began with, and of how much: ``simclr tactile+masking``."""
         views = [self.augmentation] if self.augmentation != "none" else []
         views += ["masking"] if self.masking else []
-        return " ".join([self.objective, "+".join(views)]).strip()
+        views += [str(self.options[key]) for key in NAMING if key in self.options]
+        before = f"after {self.begin.removeprefix(self.network).strip()}" if self.begin else ""
+        share = f"of {self.share:g}" if self.share < 1 else ""
+        return " ".join(filter(None, [self.objective, "+".join(views), before, share]))
 
     @property
     def name(self) -> str:
-        """Unique in a grid; a supervised cell goes by its network alone."""
-        return self.network + ("" if self.objective == SUPERVISED else f" {self.learning}")
+        """Unique in a grid; a supervised cell goes by its network, and what is not usual of it."""
+        return f"{self.network} {self.learning.removeprefix(SUPERVISED).strip()}".strip()
 
 
 class SweepCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -80,8 +98,43 @@ class SweepCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     test: int = 0
 
 
+class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The trials that choose a cell's rate and warm-up by the validation split; of its first seed.
+
+    Attributes:
+        learning_rate: The peaks that are tried, all with the first warm-up.
+        warmup: The shares of all updates in which the rate rises; the others are tried with the
+            best peak.
+        updates: The number of updates of a trial.
+    """
+
+    learning_rate: tuple[float, ...] = (5e-4, 1.5e-3, 5e-3, 1.5e-2)
+    warmup: tuple[float, ...] = (0.05, 0.3)
+    updates: int = 500
+
+
+class Growth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """How long a cell is trained: twice as long each time, until that gains less than `gain`.
+
+    Each time it is trained from the beginning, with a whole schedule of its rate.
+
+    Attributes:
+        first: The number of updates of the first time.
+        most: The number that is never passed.
+        gain: The least gain in the score of the validation split, 0 to 1.
+    """
+
+    first: int = 1000
+    most: int = 8000
+    gain: float = 0.01
+
+
 class Pair(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two cells to compare, by name; "svm" and "random NETWORK" are names too."""
+    """Two cells to compare, by name; "svm" and "random NETWORK" are names too.
+
+    Attributes:
+        better, than: The names.
+    """
 
     better: str
     than: str
@@ -125,7 +178,9 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         data: The folder of the sweep set.
         cells: The cells, in the order in which they are trained.
         width: The width of every network that has none of its own.
-        updates, batch: The budget of every cell: updates, and sweeps per update.
+        batch: The number of sweeps per update.
+        search: The trials of every cell.
+        growth: How long every cell is trained.
         seeds: The number of seeds; all cells are trained with the first before any with the second.
         sweeps: The number of sweeps of each object that are used, by split.
         supervised, self_supervised: Fields of `TrainingConfig` for cells of either kind.
@@ -137,8 +192,9 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     data: str
     cells: tuple[Candidate, ...] = msgspec.field(name="cell")
     width: float = 0.125
-    updates: int = 600
     batch: int = 32
+    search: Search = Search()
+    growth: Growth = Growth()
     seeds: int = 3
     sweeps: SweepCounts = SweepCounts()
     supervised: dict[str, Any] = {}
@@ -147,8 +203,13 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     svm: bool = True
     questions: tuple[Question, ...] = msgspec.field(name="question", default=())
 
-    def config(self, task: Task, data: Path) -> TrainingConfig:
+    def config(self, task: Task, data: Path, **chosen: Any) -> TrainingConfig:
         """How a task is trained on the sweep set at `data`.
+
+        Args:
+            task: of the grid.
+            data: the sweep set's folder.
+            chosen: what its trials and its growth have found, by the names of `TrainingConfig`.
 
         Raises:
             ConfigError: an option that there is not, or a value that it cannot have.
@@ -164,11 +225,11 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "augmentation": cell.augmentation,
             "masking": cell.masking,
             "width": cell.width or self.width,
-            "updates": self.updates,
             "batch": self.batch,
             "seed": task.seed,
             **common,
             **cell.options,
+            **chosen,
         }
         convert(make_node(options, f"cell {cell.name!r}", 0, Path()), TrainingConfig)
         # As it is written: whole numbers stay whole in what is stored of a run.
@@ -177,15 +238,26 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def tasks(self) -> list[Task]:
         """Everything to do, the first seed of all first."""
         tasks = [Task(SVM, 0, None)] if self.svm else []
-        for seed in range(self.seeds):
+        for seed in range(max([self.seeds, *(cell.seeds for cell in self.cells)])):
             seen: set[str] = set()
             for cell in self.cells:
+                if seed >= (cell.seeds or self.seeds):
+                    continue
                 tasks.append(Task(cell.name, seed, cell))
                 if cell.network not in seen:
                     seen.add(cell.network)
                     bare = Candidate(cell.encoder, cell.attender, width=cell.width)
                     tasks.append(Task(f"{RANDOM} {cell.network}", seed, bare))
         return tasks
+
+    def needs(self, task: Task) -> tuple[str, ...]:
+        """Slugs of the tasks that come before: the first seed, which tunes, and a beginning."""
+        cell = task.cell
+        if cell is None or task.random:
+            return ()
+        tuned = (Task(task.name, 0, cell),) if task.seed else ()
+        begun = (Task(cell.begin, task.seed, cell),) if cell.begin else ()
+        return tuple(one.slug for one in (*tuned, *begun))
 
 
 def shipped_grids() -> tuple[str, ...]:
@@ -221,11 +293,21 @@ def read_grid(name: str | Path) -> Grid:
                 raise ConfigError(f"cell {cell.name!r}: {error}") from None
         except ConfigError as error:
             raise ConfigError(f"{name}: {error}") from None
+    for cell in grid.cells:
+        if not 0 < cell.share <= 1:
+            raise ConfigError(f"{name}: share must be above 0, at most 1, not {cell.share}")
+        if cell.begin and cell.begin not in names[: names.index(cell.name)]:
+            raise ConfigError(
+                f"{name}: cell {cell.name!r} begins with {cell.begin!r}, which no cell before it is"
+            )
     known = {task.name for task in grid.tasks()}
     for question in grid.questions:
         for one in (name for pair in question.pairs for name in (pair.better, pair.than)):
             if one not in known:
                 raise ConfigError(f"{name}: {question.text!r} compares {one!r}, which no cell is")
-    if not grid.cells or grid.seeds < 1 or grid.updates < 1:
+    search, growth = grid.search, grid.growth
+    if not grid.cells or min(grid.seeds, search.updates, growth.first) < 1:
         raise ConfigError(f"{name}: a grid needs a cell, a seed and an update")
+    if not search.learning_rate or not search.warmup:
+        raise ConfigError(f"{name}: search needs a learning_rate and a warmup")
     return grid

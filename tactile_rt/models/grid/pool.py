@@ -56,35 +56,48 @@ def run_grid(
     if not waiting:
         return
     write_subset(Path(grid.data), folder / SUBSET, grid.sweeps)
-    done = len(tasks) - len(waiting)
+    finished = {task.slug for task in tasks} - {task.slug for task in waiting}
+
+    def ready() -> Task | None:
+        """The next task whose needs are done, no longer among those that wait."""
+        for task in waiting:
+            if finished.issuperset(grid.needs(task)):
+                waiting.remove(task)
+                return task
+        return None
+
+    def conclude(found: Outcome, task: Task) -> None:
+        finished.add(task.slug)
+        report(found, len(finished), len(tasks))
+
     if processes == 1:
         bench = Workbench(grid, folder)
-        for task in waiting:
-            done += 1
-            report(bench.do(task), done, len(tasks))
+        while task := ready():
+            conclude(bench.do(task), task)
         return
     # Spawned: torch does not survive a fork in every state.
     context = multiprocessing.get_context("spawn")
     todo: Any = context.Queue()
     outcomes: Any = context.Queue()
-    for task in waiting:
-        todo.put(task)
-    count = min(processes, len(waiting))
-    for _ in range(count):
-        todo.put(None)
     workers = [
         context.Process(target=_work, args=(grid, folder, todo, outcomes), daemon=True)
-        for _ in range(count)
+        for _ in range(min(processes, len(waiting)))
     ]
     for worker in workers:
         worker.start()
+    idle, busy = len(workers), 0
     try:
-        for _ in waiting:
+        while True:
+            while idle and (task := ready()):
+                todo.put(task)
+                idle, busy = idle - 1, busy + 1
+            if not busy:
+                return
             found = _next(outcomes, workers)
             if isinstance(found, TactileError):
                 raise found
-            done += 1
-            report(found, done, len(tasks))
+            idle, busy = idle + 1, busy - 1
+            conclude(*found)
     finally:
         for worker in workers:
             worker.terminate()
@@ -154,11 +167,9 @@ def _work(grid: Grid, folder: Path, todo: Any, outcomes: Any) -> None:
         while True:
             orphaned()
             try:
-                task: Task | None = todo.get(timeout=PATIENCE_S)
+                task: Task = todo.get(timeout=PATIENCE_S)
             except queue.Empty:
                 continue
-            if task is None:
-                return
-            outcomes.put(bench.do(task, orphaned))
+            outcomes.put((bench.do(task, orphaned), task))
     except TactileError as error:
         outcomes.put(error)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tactile_rt.files import write_whole
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import Interval, accuracy
-from tactile_rt.models.grid.plan import RANDOM, SVM, Grid
-from tactile_rt.models.grid.work import SUBSET, Outcome, read_outcome
+from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid, Growth
+from tactile_rt.models.grid.work import SUBSET, Outcome, Point, read_outcome
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Answer", "GridResults", "Row", "gather", "put_into", "table", "write_results"]
@@ -33,7 +33,11 @@ class Row:
             noise. None where there is no figure.
         random: The top-1 accuracy of a linear probe on the untrained network, 0 to 1.
         parameters: The number of parameters of the network.
-        seconds: The mean CPU time of a seed, s.
+        seconds: The mean CPU time of a seed's training, s.
+        share: The share of the training objects that it learnt from.
+        chosen: The settings of its training, which its trials chose; None if there were none.
+        growth: The trainings with more and more updates.
+        flat: Whether the last of these gained less than the grid asks for.
         failed: The reason why seeds are missing; empty if none failed.
     """
 
@@ -47,6 +51,10 @@ class Row:
     random: Interval | None = None
     parameters: int = 0
     seconds: float = 0.0
+    share: float = 1.0
+    chosen: Point | None = None
+    growth: tuple[Point, ...] = ()
+    flat: bool = False
     failed: str = ""
 
 
@@ -96,13 +104,11 @@ def gather(grid: Grid, folder: Path) -> GridResults:
     objects = test.sweeps.objects
     rows = []
     if SVM in found:
-        rows.append(_row(SVM, "", "", found[SVM], [], objects))
+        rows.append(_row(SVM, None, found[SVM], [], objects, grid.growth))
     for cell in grid.cells:
         if cell.name in found:
             random = found.get(f"{RANDOM} {cell.network}", [])
-            rows.append(
-                _row(cell.name, cell.network, cell.learning, found[cell.name], random, objects)
-            )
+            rows.append(_row(cell.name, cell, found[cell.name], random, objects, grid.growth))
     answers = []
     for question in grid.questions:
         for pair in question.pairs:
@@ -120,27 +126,33 @@ def gather(grid: Grid, folder: Path) -> GridResults:
 
 def _row(
     name: str,
-    network: str,
-    learning: str,
+    cell: Candidate | None,
     outcomes: list[Outcome],
     random: list[Outcome],
     objects: NDArray[np.str_],
+    until: Growth,
 ) -> Row:
     def estimate(these: list[Outcome], which: str) -> Interval | None:
         right = [one.right(which) for one in these if getattr(one, which)]
         return accuracy(np.stack(right), objects) if right else None
 
+    first = outcomes[0]
+    scores = [point.score for point in first.growth]
     return Row(
         name,
-        network,
-        learning,
+        cell.network if cell else "",
+        cell.learning if cell else "",
         sum(not one.failed for one in outcomes),
         estimate(outcomes, "top1"),
         estimate(outcomes, "top5"),
         estimate(outcomes, "noisy"),
         estimate(random, "top1"),
-        outcomes[0].parameters,
+        first.parameters,
         float(np.mean([one.seconds for one in outcomes])),
+        cell.share if cell else 1.0,
+        first.chosen,
+        first.growth,
+        len(scores) > 1 and scores[-1] < scores[-2] + until.gain,
         "; ".join(sorted({one.failed for one in outcomes if one.failed})),
     )
 
@@ -164,17 +176,22 @@ def table(results: GridResults) -> str:
     lines = [
         f"Top-1 on {results.objects} objects that no network trained on ({results.sweeps} sweeps, "
         f"{results.classes} categories, chance {100 / results.classes:.1f} %); in brackets 95 %, "
-        "by object and seed. Untrained: a linear probe on the network as it was initialised.",
+        "by object and seed. Untrained: a linear probe on the network as it was initialised. "
+        "Updates: those of the training that was scored; with + where twice as many would have "
+        "been too many to try, so that its end is not known.",
         "",
-        "| network | learning | parameters | top-1 (%) | untrained (%) | top-5 (%) "
-        "| at rated noise (%) | seeds | CPU s |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| network | learning | parameters | rate, warm-up | updates | top-1 (%) | untrained (%) "
+        "| top-5 (%) | at rated noise (%) | seeds | CPU s |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in results.rows:
+        at = row.chosen
         cells = [
             row.network or "RBF SVM",
             row.learning or "on the same windows",
             f"{row.parameters:,}" if row.parameters else "",
+            f"{at.learning_rate:g}, {at.warmup:g}" if at else "",
+            f"{at.updates:,}{'' if row.flat else ' +'}" if at else "",
             _percent(row.top1) if row.top1 else "failed" if row.failed else "",
             *(_percent(one) for one in (row.random, row.top5, row.noisy)),
             str(row.seeds),
@@ -205,7 +222,7 @@ def _percent(one: Interval | None) -> str:
 
 
 def write_results(results: GridResults, folder: Path) -> None:
-    """Write `results.json` and `results.csv` into a grid's folder."""
+    """Write `results.json`, `results.csv` and `curves.csv` into a grid's folder."""
     text = msgspec.json.format(msgspec.json.encode(results), indent=1)
     write_whole(folder / "results.json", lambda file: file.write(text))
     out = io.StringIO()
@@ -220,6 +237,14 @@ def write_results(results: GridResults, folder: Path) -> None:
             [*(getattr(row, p) for p in plain), *(v for three in values for v in three)]
         )
     write_whole(folder / "results.csv", lambda file: file.write(out.getvalue().encode()))
+    curves = io.StringIO()
+    writer = csv.writer(curves)
+    writer.writerow(["name", "learning_rate", "warmup", "updates", "seconds", "validation_top1"])
+    for row in results.rows:
+        for p in row.growth:
+            numbers = (p.learning_rate, p.warmup, p.updates, round(p.seconds, 1), round(p.score, 4))
+            writer.writerow([row.name, *numbers])
+    write_whole(folder / "curves.csv", lambda file: file.write(curves.getvalue().encode()))
 
 
 def put_into(page: Path, text: str) -> None:

@@ -1,7 +1,12 @@
-"""One task of a grid: train, probe, and score on the test objects."""
+"""One task of a grid: tune, train, probe, and score on the test objects.
+
+What a cell is tuned and trained by is the validation split alone; the test split is looked at once,
+when the network is chosen.
+"""
 
 import time
 from collections.abc import Callable
+from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +16,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.files import write_whole
 from tactile_rt.models.augmentation import build
+from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.data_checks import check_sets, check_split
 from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.disturbances import CLEAN, Disturbance
@@ -19,23 +25,34 @@ from tactile_rt.models.evaluation import Step, hits
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.models.svm import fit_svm
-from tactile_rt.models.training import (
-    ProbeConfig,
-    initialise,
-    load_checkpoint,
-    probe,
-    run_on,
-    train,
-)
+from tactile_rt.models.training import ProbeConfig, Progress, initialise, probe, train
 from tactile_rt.stream import ConfigError, ModelError
 from tactile_rt.sweep_set import SweepManifest
 
-__all__ = ["Outcome", "Workbench", "outcome_path", "read_outcome", "settings_of"]
+__all__ = ["Outcome", "Point", "Workbench", "outcome_path", "read_outcome", "settings_of"]
 
 BATCH = 128
 RATED = Disturbance(noise=1.0)
 SUBSET = "sweeps"  # folders of a grid
 RUNS, OUTCOMES = "runs", "outcomes"
+POINT = "point.json"
+
+
+class Point(msgspec.Struct, frozen=True):
+    """One training and what the validation split says of it.
+
+    Attributes:
+        learning_rate, warmup, updates: The settings of the training, as in `TrainingConfig`.
+        score: Top-1 of the validation split, 0 to 1, the mean of clean and noisy; of a
+            self-supervised network by its probe. 0 if it diverged.
+        seconds: The CPU time of its updates, and of what it was validated by, s.
+    """
+
+    learning_rate: float
+    warmup: float
+    updates: int
+    score: float
+    seconds: float
 
 
 class Outcome(msgspec.Struct, frozen=True):
@@ -47,7 +64,10 @@ class Outcome(msgspec.Struct, frozen=True):
         top1, top5, noisy: Hits as text, a 0 or 1 per test sweep: right, among the first five, right
             at the rated noise.
         parameters: The number of parameters of encoder, attender and decoder.
-        seconds: The CPU time that the task took, all included, s.
+        seconds: The CPU time of the training that was scored, s.
+        trials: The trials that chose rate and warm-up; of the first seed alone.
+        growth: The trainings with more and more updates; of the first seed alone.
+        chosen: The training that was scored.
         failed: The reason why there is no figure; empty if there is one.
     """
 
@@ -59,6 +79,9 @@ class Outcome(msgspec.Struct, frozen=True):
     noisy: str = ""
     parameters: int = 0
     seconds: float = 0.0
+    trials: tuple[Point, ...] = ()
+    growth: tuple[Point, ...] = ()
+    chosen: Point | None = None
     failed: str = ""
 
     def right(self, which: str = "top1") -> NDArray[np.bool_]:
@@ -100,6 +123,8 @@ def settings_of(grid: Grid, folder: Path, task: Task) -> str:
         config = msgspec.to_builtins(grid.config(task, Path()))
         if task.random:  # trained for no update at all
             config = {k: config[k] for k in ("encoder", "attender", "width", "seed")}
+        else:
+            settings |= {"search": grid.search, "growth": grid.growth, "cell": task.cell}
         settings |= {"config": config}
         if task.random or task.cell.objective != SUPERVISED:
             settings |= {"probe": grid.probe}
@@ -124,68 +149,172 @@ class Workbench:
         for task in grid.tasks():
             if task.cell is not None:  # an array that cannot be augmented so is told now
                 build(grid.config(task, self.data).augmentation, self.test.manifest.spec)
+        self._shares: dict[float, tuple[SweepSet, SweepSet]] = {}
         self._windows = {key: self._cut(d) for key, d in (("clean", CLEAN), ("noisy", RATED))}
 
     def do(self, task: Task, report: Callable[..., None] = lambda _: None) -> Outcome:
         """Do a task and keep its outcome; a network that diverges is an outcome too.
 
         Args:
-            task: of the grid.
+            task: of the grid, after those that it needs.
             report: called with `training.Progress` after every update.
         """
-        began = time.process_time()
         found = Outcome(task.name, task.seed, settings_of(self.grid, self.folder, task))
         try:
-            scores, parameters = self._svm() if task.cell is None else self._network(task, report)
-            found = msgspec.structs.replace(
-                found,
-                **{k: "".join("01"[int(one)] for one in v) for k, v in scores.items()},
-                parameters=parameters,
-            )
+            if task.cell is None:
+                found = self._svm(found)
+            elif task.random:
+                found = self._untrained(found, task)
+            else:
+                found = self._trained(found, task, report)
         except ModelError as error:
             found = msgspec.structs.replace(found, failed=str(error))
-        found = msgspec.structs.replace(found, seconds=time.process_time() - began)
         path = outcome_path(self.folder, task)
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, lambda file: file.write(msgspec.json.encode(found)))
         return found
 
-    def _network(
-        self, task: Task, report: Callable[..., None]
-    ) -> tuple[dict[str, NDArray[np.bool_]], int]:
-        assert task.cell is not None
-        config = self.grid.config(task, self.data)
-        run = self.folder / RUNS / task.slug
-        best = (
-            initialise(config, run, self.splits)
-            if task.random
-            else train(config, run, report, device="cpu", splits=self.splits)
+    def _trained(self, found: Outcome, task: Task, report: Callable[..., None]) -> Outcome:
+        if task.seed:
+            first = read_outcome(self.grid, self.folder, msgspec.structs.replace(task, seed=0))
+            if first is None or first.chosen is None:
+                raise ModelError("its first seed diverged, so nothing is known to train it with")
+            chosen = self._train(task, first.chosen, report)
+        else:
+            trials = self._search(task, report)
+            growth = self._grow(task, max(trials, key=_score), report)
+            found = msgspec.structs.replace(found, trials=trials, growth=growth)
+            chosen = max(growth, key=_score)
+        if not chosen.score:
+            raise ModelError("every training of it diverged")
+        run = self._run(task, chosen)
+        if task.cell is not None and task.cell.objective != SUPERVISED:
+            run = run / "probe"
+        return self._scored(
+            msgspec.structs.replace(found, chosen=chosen, seconds=chosen.seconds), run / "best.pt"
         )
-        if task.random or task.cell.objective != SUPERVISED:
-            how = ProbeConfig(**self.grid.probe)
-            best = probe(best, run / "probe", how, report, self.splits)
+
+    def _search(self, task: Task, report: Callable[..., None]) -> tuple[Point, ...]:
+        """The trials: every rate with the first warm-up, then the other warm-ups with the best."""
+        search = self.grid.search
+
+        def of(rate: float, warmup: float) -> Point:
+            return self._train(task, Point(rate, warmup, search.updates, 0.0, 0.0), report)
+
+        rates = [of(rate, search.warmup[0]) for rate in search.learning_rate]
+        best = max(rates, key=_score).learning_rate
+        return (*rates, *(of(best, warmup) for warmup in search.warmup[1:]))
+
+    def _grow(self, task: Task, best: Point, report: Callable[..., None]) -> tuple[Point, ...]:
+        """Trainings of twice as many updates each, until one gains too little."""
+        growth = self.grid.growth
+        points: list[Point] = []
+        updates, before = growth.first, -inf
+        while updates <= growth.most:
+            at = msgspec.structs.replace(best, updates=updates)
+            points.append(self._train(task, at, report))
+            if points[-1].score < before + growth.gain:
+                break
+            updates, before = 2 * updates, points[-1].score
+        return tuple(points)
+
+    def _train(self, task: Task, at: Point, report: Callable[..., None]) -> Point:
+        """One training, unless it is there; of a diverged one the score is 0."""
+        run = self._run(task, at)
+        if (run / POINT).exists():
+            return msgspec.json.decode((run / POINT).read_bytes(), type=Point)
+        chosen: dict[str, Any] = {
+            "learning_rate": at.learning_rate, "warmup": at.warmup, "updates": at.updates,
+        }  # fmt: skip
+        cell = task.cell
+        assert cell is not None
+        if cell.begin:
+            begun = read_outcome(self.grid, self.folder, self._begun(task))
+            if begun is None or begun.chosen is None:
+                raise ModelError(f"{cell.begin!r} diverged, and there is nothing to begin with")
+            chosen["begin"] = str(self._run(self._begun(task), begun.chosen) / "best.pt")
+        config = self.grid.config(task, self.data, **chosen)
+        began, updates = time.process_time(), 0
+
+        def count(progress: Progress) -> None:
+            nonlocal updates
+            updates += not progress.metrics
+            report(progress)
+
+        splits = self.splits_of(cell.share)
+        try:
+            best = train(config, run, count, device="cpu", splits=splits)
+            # what was done before an interruption cost as much
+            seconds = (time.process_time() - began) * at.updates / max(updates, 1)
+            if cell.objective != SUPERVISED:
+                best = probe(best, run / "probe", ProbeConfig(**self.grid.probe), report, splits)
+            metrics = load_checkpoint(best)[1]["metrics"]
+            score = (metrics["validation_top1"] + metrics["validation_top1_noisy"]) / 2
+        except ModelError:
+            run.mkdir(parents=True, exist_ok=True)
+            score, seconds = 0.0, time.process_time() - began
+        done = msgspec.structs.replace(at, score=score, seconds=seconds)
+        write_whole(run / POINT, lambda file: file.write(msgspec.json.encode(done)))
         for path in run.rglob("last.pt"):  # what is done needs not go on
             path.unlink()
+        return done
+
+    def _run(self, task: Task, at: Point) -> Path:
+        """The folder of one training."""
+        name = f"rate{at.learning_rate:g}_warmup{at.warmup:g}_updates{at.updates}"
+        return self.folder / RUNS / task.slug / name
+
+    def _begun(self, task: Task) -> Task:
+        """What a task's network begins with."""
+        assert task.cell is not None
+        names = {one.name: one for one in self.grid.cells}
+        return Task(task.cell.begin, task.seed, names[task.cell.begin])
+
+    def _untrained(self, found: Outcome, task: Task) -> Outcome:
+        run = self.folder / RUNS / task.slug
+        best = initialise(self.grid.config(task, self.data), run, self.splits)
+        best = probe(best, run / "probe", ProbeConfig(**self.grid.probe), splits=self.splits)
+        return self._scored(found, best)
+
+    def splits_of(self, share: float) -> tuple[SweepSet, SweepSet]:
+        """The splits to train and to validate on, with some of the objects to train on."""
+        if share == 1:
+            return self.splits
+        if share not in self._shares:
+            training, validating = self.splits
+            manifest = training.manifest
+            of: dict[str, list[str]] = {}
+            for name in manifest.split["train"]:
+                of.setdefault(manifest.category(name), []).append(name)
+            taken = [n for names in of.values() for n in names[: max(round(share * len(names)), 1)]]
+            some = training[np.flatnonzero(np.isin(training.sweeps.objects, taken))]
+            self._shares[share] = some, validating
+        return self._shares[share]
+
+    def _svm(self, found: Outcome) -> Outcome:
+        began = time.process_time()
+        right = fit_svm(*self.splits).hits(self.test)
+        seconds = time.process_time() - began
+        return msgspec.structs.replace(found, top1=_as_text(right), seconds=seconds)
+
+    def _scored(self, found: Outcome, best: Path) -> Outcome:
+        """The outcome with what a checkpoint's network makes of the test split."""
         model, _ = load_checkpoint(best)
-        return self._score(run_on(model)), count_parameters(model.network)
-
-    def _svm(self) -> tuple[dict[str, NDArray[np.bool_]], int]:
-        svm = fit_svm(*self.splits)
-        return {"top1": svm.hits(self.test)}, 0
-
-    def _score(self, run: Step) -> dict[str, NDArray[np.bool_]]:
+        run: Step = run_on(model)
         labels = self.test.sweeps.labels
         last, classes = {}, len(self.test.manifest.categories)
-        for name, (cut, offset, sigma, found) in self._windows.items():
+        for name, (cut, offset, sigma, touched) in self._windows.items():
             parts = [slice(i, i + BATCH) for i in range(0, len(cut), BATCH)]
             logits = np.concatenate([run(cut[p], offset[p], sigma[p])[:, -1] for p in parts])
-            logits[~found] = np.nan
+            logits[~touched] = np.nan
             last[name] = logits[:, :classes]  # had it to name one
-        return {
-            "top1": hits(last["clean"], labels),
-            "top5": hits(last["clean"], labels, 5),
-            "noisy": hits(last["noisy"], labels),
-        }
+        return msgspec.structs.replace(
+            found,
+            top1=_as_text(hits(last["clean"], labels)),
+            top5=_as_text(hits(last["clean"], labels, 5)),
+            noisy=_as_text(hits(last["noisy"], labels)),
+            parameters=count_parameters(model.network),
+        )
 
     def _cut(self, disturbance: Disturbance) -> tuple[NDArray[Any], ...]:
         rng = np.random.default_rng(0)
@@ -197,3 +326,11 @@ class Workbench:
             cut = windows(values, at.start, self.test.timing)
             parts.append((cut, at.offset, at.sigma, at.start >= 0))
         return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
+
+
+def _score(point: Point) -> float:
+    return point.score
+
+
+def _as_text(hits: NDArray[np.bool_]) -> str:
+    return "".join("01"[int(one)] for one in hits)
