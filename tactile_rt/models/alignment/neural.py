@@ -24,12 +24,21 @@ class NeuralSession:
         name: The name of the session.
         rates: (trial, unit) Firing rates in spikes per second, in the order of the trials.
         stimulus: (trial,) The stimulus of each trial, as an index into `STIMULI`.
+        course: (trial, bin, unit) Firing rates in spikes per second in bins of 45 ms from the
+            beginning of the window on, NaN from the choice on; None if it is not known.
+        depth: (unit,) The depth of each unit below the pia in um, NaN where it is not known; None
+            if it is known of no unit.
+        inhibitory: (unit,) Whether each unit is a putative inhibitory neuron; None if it is not
+            known.
     """
 
     animal: str
     name: str
     rates: Floats
     stimulus: NDArray[np.int64]
+    course: Floats | None = None
+    depth: Floats | None = None
+    inhibitory: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         rates, stimulus = self.rates, self.stimulus
