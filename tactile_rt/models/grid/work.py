@@ -25,7 +25,14 @@ from tactile_rt.models.evaluation import Step, hits
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.models.svm import fit_svm
-from tactile_rt.models.training import ProbeConfig, Progress, initialise, probe, train
+from tactile_rt.models.training import (
+    ProbeConfig,
+    Progress,
+    TrainingConfig,
+    initialise,
+    probe,
+    train,
+)
 from tactile_rt.stream import ConfigError, ModelError
 from tactile_rt.sweep_set import SweepManifest
 
@@ -120,10 +127,14 @@ def settings_of(grid: Grid, folder: Path, task: Task) -> str:
     """Everything that an outcome depends on, as JSON."""
     settings: dict[str, Any] = {"sweeps": msgspec.to_builtins(grid.sweeps), "data": grid.data}
     if task.cell is not None:
-        config = msgspec.to_builtins(grid.config(task, Path()))
+        config, usual = (
+            msgspec.to_builtins(one) for one in (grid.config(task, Path()), TrainingConfig(""))
+        )
         if task.random:  # trained for no update at all
             config = {k: config[k] for k in ("encoder", "attender", "width", "seed")}
         else:
+            # A key that was thought of later leaves what was done before as it is.
+            config = {k: v for k, v in config.items() if v != usual[k]}
             settings |= {"search": grid.search, "growth": grid.growth, "cell": task.cell}
         settings |= {"config": config}
         if task.random or task.cell.objective != SUPERVISED:
@@ -232,6 +243,7 @@ class Workbench:
             begun = read_outcome(self.grid, self.folder, self._begun(task))
             if begun is None or begun.chosen is None:
                 raise ModelError(f"{cell.begin!r} diverged, and there is nothing to begin with")
+            self._train(self._begun(task), begun.chosen, report)  # where only its outcome was kept
             chosen["begin"] = str(self._run(self._begun(task), begun.chosen) / "best.pt")
         config = self.grid.config(task, self.data, **chosen)
         began, updates = time.process_time(), 0
