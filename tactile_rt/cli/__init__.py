@@ -5,7 +5,7 @@ A user's mistake is one clear line on stderr and exit code 2; Ctrl-C leaves quie
 
 import os
 import sys
-from typing import NoReturn
+from typing import Any, NoReturn
 
 __all__ = ["main"]
 
@@ -19,6 +19,8 @@ def main() -> None:
         note_signals()
     # Each module adds its commands; what a command needs is imported when it runs, so that
     # `--help` is instant and a robot never imports torch.
+    import typer
+
     from tactile_rt.cli import (  # noqa: F401
         align,
         array,
@@ -49,11 +51,16 @@ def main() -> None:
     from tactile_rt.cli.app import INTERRUPTED, app
     from tactile_rt.stream import TactileError
 
+    # Typer brings a copy of click since 0.29: whose these are depends on its release.
+    usage_error: Any = typer.BadParameter.__base__
+
     try:
         try:
-            app()
+            sys.exit(app(prog_name="tactile-rt", standalone_mode=False))
         finally:
             sys.stdout.flush()  # while what goes wrong can still be told
+    except usage_error as error:
+        _misused(error)
     except TactileError as error:
         _give_up(str(error))
     except BrokenPipeError:  # whoever read it has gone
@@ -68,6 +75,16 @@ def main() -> None:
         sys.exit(INTERRUPTED)
 
 
+def _misused(error: Any) -> NoReturn:
+    """Say in a line what was wrong with the words of a command, and where to read about it."""
+    if type(error).__name__ == "NoArgsIsHelpError":  # nothing was said at all
+        error.show()
+        sys.exit(error.exit_code)
+    command = error.ctx.command_path if error.ctx else "tactile-rt"
+    said = " ".join(error.format_message().split()).rstrip(".")
+    _give_up(f"{said}; see {command} --help", error.exit_code)
+
+
 def _empty_stdout() -> None:
     """Print what is still buffered, or forget it: at exit Python would try, fail and say so."""
     try:
@@ -76,10 +93,10 @@ def _empty_stdout() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _give_up(why: str) -> NoReturn:
+def _give_up(why: str, code: int = 0) -> NoReturn:
     import typer
 
     from tactile_rt.cli.app import USER_ERROR
 
     typer.secho(f"tactile-rt: {why}", err=True, fg="red")
-    sys.exit(USER_ERROR)
+    sys.exit(code or USER_ERROR)

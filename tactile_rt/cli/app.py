@@ -46,7 +46,6 @@ app = typer.Typer(
     name="tactile-rt",
     help="Tactile perception in real time: whisker arrays in, what they touch out.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )

@@ -9,6 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.tables import Json, print_table, show_table
 from tactile_rt.stream import ConfigError, concatenate
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ def _array() -> None:
 
 
 @array.command("list")
-def show() -> None:
+def show(json: Json = None) -> None:
     """Show the arrays that have a name, for sim:NAME and new --array NAME.
 
     An animal's name takes a side: mouse-left, mouse-both.
@@ -38,14 +39,24 @@ def show() -> None:
             from tactile_rt.sim_backend.transducer import device_spec
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
-    table = Table("array", "whiskers", "channels", "rate, Hz", header_style="bold")
-    table.add_column("read by", overflow="fold")
+    found = []
     for name in (*SPECIES, *ROBOTS):
         spec = device_spec(load_animals(name))
-        channels = f"{' '.join(spec.channels)} ({', '.join(dict.fromkeys(spec.units))})"
-        reader = ROBOTS.get(name, "any device of such channels")
-        table.add_row(name, str(len(spec.elements)), channels, f"{spec.rate_hz:g}", reader)
-    Console().print(table)
+        found.append(
+            {
+                "array": name,
+                "whiskers": len(spec.elements),
+                "channels": list(spec.channels),
+                "units": list(dict.fromkeys(spec.units)),
+                "rate_hz": spec.rate_hz,
+                "reader": ROBOTS.get(name, "any device of such channels"),
+            }
+        )
+    headings = {
+        "array": "array", "whiskers": "whiskers", "channels": "channels", "units": "units",
+        "rate_hz": "rate, Hz", "reader": "read by",
+    }  # fmt: skip
+    show_table(found, headings, json)
 
 
 @array.command()
@@ -117,7 +128,7 @@ def _show(findings: "list[ArrayFinding]", console: Console) -> None:
     table = Table("quantity", "unit", "described", "measured", "ratio", box=None)
     for f in findings:
         table.add_row(*map(escape, f.words()))
-    console.print(table)
+    print_table(table, console)
     for f in findings:
         if f.note:
             console.print(f"{escape(f.what)}: {escape(f.note)}", soft_wrap=True)

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.tables import print_table
 from tactile_rt.stream import ConfigError
 
 CHECKOUT = Path(__file__).parents[2]
@@ -42,7 +43,7 @@ def bench(
     ] = None,
 ) -> None:
     """Measure speed and accuracy, each figure beside its bar and what it is compared to."""
-    from tactile_rt.evidence.records import show, write
+    from tactile_rt.evidence.records import as_table, write
 
     if area is not None and area not in AREAS:
         raise ConfigError(f"no benchmark area {area!r}: there are {', '.join(AREAS)}")
@@ -62,7 +63,7 @@ def bench(
                     records += _rig(name).run(quick)
             except ModuleNotFoundError as error:
                 raise needs(AREAS[name], error) from None
-    show(records, Console())
+    print_table(as_table(records))
     bars = [r for r in records if r.bar]
     typer.echo(f"{sum(bool(r.met) for r in bars)} of {len(bars)} bars met")
     if json:

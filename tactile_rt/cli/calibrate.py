@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output, starting
+from tactile_rt.cli.tables import print_table
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError, Source, concatenate
 
 if TYPE_CHECKING:
@@ -257,7 +258,7 @@ def _show_tare(measured: "Tare", console: Console) -> None:
             *map(escape, (channel, unit, span, f"{np.median(noise[:, c]):.2g}")),
             escape(f"{names[most]} {noise[most, c]:.2g}"),
         )
-    console.print(table)
+    print_table(table, console)
 
 
 def _show_fit(fit: "Fit", loads: "LoadTable", console: Console) -> None:
@@ -269,7 +270,7 @@ def _show_fit(fit: "Fit", loads: "LoadTable", console: Console) -> None:
         table.add_row(
             axis, unit, f"{full:.4g}", f"{rms:.2g}", share, f"{explained:.6f}" if full else "-"
         )
-    console.print(table)
+    print_table(table, console)
     console.print(
         f"{len(loads.lines)} loads; condition number {fit.condition:.3g} of the readings, "
         f"{fit.load_condition:.3g} of the loads",

@@ -2,34 +2,33 @@
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
+from tactile_rt.cli.tables import Json, show_table
 
 Url = Annotated[str, typer.Argument(help="URL of a source, e.g. serial:///dev/ttyUSB0?codec=bota.")]
 WINDOW_S = 1.0
 
 
 @app.command("list")
-def list_devices() -> None:
+def list_devices(json: Json = None) -> None:
     """Show serial ports and CAN buses, what is likely there, and the URL to begin with."""
-    from rich.console import Console
-    from rich.table import Table
-
     from tactile_rt.drivers.discovery import can_buses, serial_ports
 
-    table = Table("device", "likely", "url", box=None, header_style="bold")
-    for port in serial_ports():
-        table.add_row(port.path, port.likely, port.url)
+    found = [
+        {"device": port.path, "likely": port.likely, "url": port.url} for port in serial_ports()
+    ]
     for bus in can_buses():
         rate = f", {bus.bitrate} bit/s" if bus.bitrate else ""
-        table.add_row(bus.name, f"CAN bus, {'up' if bus.up else 'down'}{rate}", bus.url)
-    if not table.row_count:
+        likely = f"CAN bus, {'up' if bus.up else 'down'}{rate}"
+        found.append({"device": bus.name, "likely": likely, "url": bus.url})
+    if not found and json is None:
         typer.echo("no serial port and no CAN bus; `tactile-rt emulate native` makes a device")
         return
-    Console().print(table)
+    show_table(found, {"device": "device", "likely": "likely", "url": "url"}, json)
 
 
 @app.command()
@@ -66,15 +65,14 @@ def doctor(
 
 @app.command()
 def codecs(
+    codec: Annotated[str, typer.Argument(help="Tell all of this one.")] = "",
     frame: Annotated[
         str, typer.Option(help="Print the description of this device's frame, to change a copy.")
     ] = "",
+    json: Json = None,
 ) -> None:
-    """Show what devices can speak, their options, and what each protocol cannot show."""
+    """Show what devices can speak: a line a codec; of one, its options and what it cannot show."""
     import inspect
-
-    from rich.console import Console
-    from rich.table import Table
 
     from tactile_rt.drivers.codec import CODECS, codec_class
     from tactile_rt.stream import ConfigError
@@ -88,17 +86,33 @@ def codecs(
                 raise ConfigError(f"--frame {frame}: described are {', '.join(described)}")
         typer.echo(described[frame].read_text("utf-8"), nl=False)
         return
-    table = Table("wire", "codec", "device", "options", "cannot detect", header_style="bold")
-    for wire, name in sorted(CODECS):
+    names = sorted({name for _, name in CODECS})
+    if codec and codec not in names:
+        raise ConfigError(f"no codec {codec!r}: there are {', '.join(names)}")
+    found: list[dict[str, Any]] = []
+    for wire, name in sorted(CODECS, key=lambda key: key[::-1]):
+        if codec and name != codec:
+            continue
         try:
             kind = codec_class(wire, name)
-        except ConfigError as error:
-            table.add_row(wire, name, f"[dim]{error}[/]", "", "")
+        except ConfigError as error:  # somebody else's, or it needs an extra
+            found.append({"codec": name, "wire": wire, "device": str(error)})
             continue
-        about = (inspect.getdoc(kind) or "").partition("\n")[0]
-        options = ", ".join(kind.Options.__dataclass_fields__)
-        table.add_row(wire, name, about, options, kind.cannot_detect)
-    Console().print(table)
+        found.append(
+            {
+                "codec": name,
+                "wire": wire,
+                "device": (inspect.getdoc(kind) or "").partition("\n")[0].replace("``", ""),
+                "options": list(kind.Options.__dataclass_fields__),
+                "cannot_detect": kind.cannot_detect,
+            }
+        )
+    show_table(found, {"codec": "codec", "wire": "wire", "device": "device"}, json)
+    if codec and json is None:
+        for one in found:
+            options = ", ".join(one.get("options", ())) or "none"
+            typer.echo(f"\noptions over {one['wire']}: {options}")
+            typer.echo(f"cannot detect: {one.get('cannot_detect', 'unknown')}")
 
 
 @app.command()

@@ -7,6 +7,7 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.tables import print_table
 
 
 @app.command(name="eval")
@@ -31,12 +32,12 @@ def evaluate(
         from tactile_rt.evidence.classification import evaluate_model
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
-    from tactile_rt.evidence.records import show, write
+    from tactile_rt.evidence.records import as_table, write
 
     check_output(json)
     console = Console(stderr=True)
     with console.status("evaluating"):
         records = evaluate_model(model, data, accurate, svm, pictures, quick)
-    show(records, Console())
+    print_table(as_table(records))
     if json:
         write(records, json)

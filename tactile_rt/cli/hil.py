@@ -10,6 +10,7 @@ from rich.table import Table
 
 from tactile_rt.cli.app import INTERRUPTED, app, leaving, needs, starting
 from tactile_rt.cli.emulate import codec_options
+from tactile_rt.cli.tables import print_table
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def hil(
     with leaving(None), console.status(f"{wire}, {codec}"):
         loop.run()
     report = loop.report()
-    Console().print(_table(report, source, f"{codec} over {wire}"))
+    print_table(_table(report, source, f"{codec} over {wire}"))
     if not loop.complete:
         typer.echo("interrupted: what was on its way is missing above", err=True)
         raise typer.Exit(INTERRUPTED)

@@ -8,6 +8,7 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.tables import print_table
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.contact_point import WhiskerShapes
@@ -62,12 +63,12 @@ def evaluate(
         from tactile_rt.evidence.locating import contact_records
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
-    from tactile_rt.evidence.records import show, write
+    from tactile_rt.evidence.records import as_table, write
 
     check_output(json)
     with Console(stderr=True).status("evaluating"):
         records = contact_records(checkpoint, data)
-    show(records, Console())
+    print_table(as_table(records))
     if json:
         write(records, json)
 

@@ -4,12 +4,14 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from tactile_rt.cli.app import app
+from tactile_rt.cli.tables import STDOUT, Json, print_table, write_json
 from tactile_rt.stream import ModelError
 
 model = typer.Typer(help="Look into a model file, check it, time it.", no_args_is_help=True)
@@ -20,13 +22,17 @@ MANY = 8  # classes named before "..."
 
 
 @model.command()
-def show(file: File) -> None:
+def show(file: File, json: Json = None) -> None:
     """What a model is: read, not run."""
     from tactile_rt.classifier.model_card import one_line
     from tactile_rt.classifier.model_file import read_model
     from tactile_rt.stream import NS_PER_S
 
     card, contents, data = read_model(file)
+    if json is not None:
+        write_json(msgspec.to_builtins(card), json)
+        if json == STDOUT:
+            return
     spec = card.array
     period_ms = card.period_ns / NS_PER_S * 1e3
     rest = f", ... {card.classes[-1]}" if len(card.classes) > MANY else ""
@@ -75,7 +81,7 @@ def show(file: File) -> None:
             # Text of a stranger's file: nothing in it is for the terminal to obey.
             lines = "\n".join(one_line(line) for line in text.splitlines())
             table.add_row(what, escape(lines))
-    Console().print(table)
+    print_table(table)
 
 
 @model.command()
@@ -115,14 +121,14 @@ def bench(
     """How fast it is here: size, loading, memory, CPU time of a step, and the machine's limit."""
     from tactile_rt.classifier.model_file import read_model
     from tactile_rt.evidence.model_steps import Subject, measure_model
-    from tactile_rt.evidence.records import show as show_records
+    from tactile_rt.evidence.records import as_table
 
     card, _, _ = read_model(file)
     if card.kind != "step":
         raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
     with Console(stderr=True).status("measuring"):
         records = measure_model(Subject("model", file), steps)
-    show_records(records, Console())
+    print_table(as_table(records))
 
 
 def _channels(spec: Any, values: tuple[float, ...]) -> str:

@@ -6,9 +6,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 
 from tactile_rt.cli.app import app, needs, progress_bar, starting
+from tactile_rt.cli.tables import Json, show_table
 
 objects = typer.Typer(help="Objects that others made.", no_args_is_help=True)
 app.add_typer(objects, name="objects")
@@ -55,6 +55,7 @@ def get(
 @objects.command()
 def check(
     folder: Annotated[Path, typer.Argument(help="CATEGORY/OBJECT.stl, or ShapeNetCore's layout.")],
+    json: Json = None,
 ) -> None:
     """Load every object of a folder once: how many can be used, how near, and why others cannot.
 
@@ -66,17 +67,22 @@ def check(
             from tactile_rt.sim_backend.objects.object_sets import open_objects
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
-    found = open_objects(folder)
+    opened = open_objects(folder)
     console = Console(stderr=True)
-    with progress_bar(console, "loading", total=len(found.names), counted=True) as update:
-        report = found.check(lambda name: update(advance=1))
-    table = Table("kind", "objects", "usable", "worst, mm of 40", box=None, header_style="bold")
-    for kind in dict.fromkeys(found.categories.values()):
-        names = [name for name in found.names if found.categories[name] == kind]
+    with progress_bar(console, "loading", total=len(opened.names), counted=True) as update:
+        report = opened.check(lambda name: update(advance=1))
+    found = []
+    for kind in dict.fromkeys(opened.categories.values()):
+        names = [name for name in opened.names if opened.categories[name] == kind]
         errors = [report.surface_error[n] for n in names if n in report.surface_error]
-        worst = f"{SIZE_MM * max(errors):.2f}" if errors else "-"
-        table.add_row(escape(kind), str(len(names)), str(len(errors)), worst)
-    Console().print(table)
+        worst = SIZE_MM * max(errors) if errors else None
+        found.append(
+            {"kind": kind, "objects": len(names), "usable": len(errors), "worst_mm": worst}
+        )
+    headings = {
+        "kind": "kind", "objects": "objects", "usable": "usable", "worst_mm": "worst, mm of 40",
+    }  # fmt: skip
+    show_table(found, headings, json)
     for why in report.skipped.values():
         console.print(escape(why), soft_wrap=True, highlight=False)
     raise typer.Exit(1 if report.skipped else 0)

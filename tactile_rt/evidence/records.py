@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["Record", "show", "write"]
+__all__ = ["Record", "as_table", "show", "write"]
 
 COMPARISONS = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
 
@@ -43,8 +43,8 @@ class Record:
         return bool(COMPARISONS[sign](self.value, float(limit)))
 
 
-def show(records: list[Record], console: Console) -> None:
-    """Print records as a table, each with how it was measured on the line below."""
+def as_table(records: list[Record]) -> Table:
+    """Records as a table to print, each with how it was measured on the line below."""
     table = Table("figure", "value", "bar", "met", leading=1)
     table.columns[0].overflow = "fold"  # a name is one long word
     for column in table.columns[1:]:
@@ -54,7 +54,12 @@ def show(records: list[Record], console: Console) -> None:
         how = "; ".join(part for part in (r.anchor, r.how) if part)
         figure = f"[bold]{escape(r.name)}[/]\n[dim]{escape(how)}[/]"
         table.add_row(figure, f"{r.value:.4g} {r.unit}", r.bar, marks[r.met])
-    console.print(table)
+    return table
+
+
+def show(records: list[Record], console: Console) -> None:
+    """Print records as a table."""
+    console.print(as_table(records))
 
 
 def write(records: list[Record], path: Path) -> None:

@@ -49,14 +49,13 @@ def project(device, tmp_path: Path, monkeypatch) -> Project:
     return Project(Path("whiskers"))
 
 
-def test_every_array_that_has_a_name_is_listed(call, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("COLUMNS", "160")
+def test_every_array_that_has_a_name_is_listed(call) -> None:
     code, out, err = call("array", "list")
     assert (code, err) == (0, "")
-    cells = [line.strip("│").split("│") for line in out.splitlines() if line[0] == "│"]
-    rows = {name.strip(): tuple(map(str.strip, rest)) for name, *rest in cells}
+    cells = [re.split(r"\s{2,}", line.strip()) for line in out.splitlines()[1:]]
+    rows = {name: tuple(rest) for name, *rest in cells}
     assert list(rows) == [*SPECIES, *ROBOTS]
-    assert rows["hx711_whisker"] == ("9", "bridge0 bridge1 (V)", "80", "codec=hx711_whisker")
+    assert rows["hx711_whisker"] == ("9", "bridge0, bridge1", "V", "80", "codec=hx711_whisker")
 
 
 def page_commands() -> list[list[str]]:

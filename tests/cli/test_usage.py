@@ -1,0 +1,108 @@
+"""What the command line says to words that it does not know, and how its tables print."""
+
+import json
+import os
+import pty
+import re
+import subprocess
+import sys
+from contextlib import suppress
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from tactile_rt.cli.tables import print_table
+from tactile_rt.drivers.codec import CODECS
+
+CALL = "import sys; sys.argv[0] = 'tactile-rt'; from tactile_rt.cli import main; main()"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("runn", "No such command 'runn'"),
+        ("align nosuch", "No such command 'nosuch'; see tactile-rt align --help"),
+        ("run --secods 3", "No such option: --secods"),
+        ("hz", "Missing argument"),
+        ("echo a b", "unexpected extra argument"),
+        ("run --seconds x", "Invalid value for '--seconds'"),
+        ("run --seconds", "requires an argument"),
+        ("train set run --batch 1.5", "Invalid value for '--batch'"),
+    ],
+)
+def test_misuse_is_one_line_that_says_where_to_read(refused, words, said):
+    line = refused(*words.split())
+    assert said in line
+    assert "; see tactile-rt" in line and line.endswith("--help\n")
+
+
+def test_misuse_of_the_gate_is_not_an_undecided_test(call):
+    code, out, err = call("align", "gate", "--nosuch")
+    assert (code, out, err.count("\n")) == (3, "", 1)
+
+
+def test_no_words_at_all_are_answered_by_the_help(call):
+    code, out, err = call()
+    assert code == 2
+    assert "Usage: tactile-rt" in out + err
+
+
+def test_codecs_are_a_line_each_in_a_pipe(call):
+    code, out, _ = call("codecs")
+    assert code == 0
+    heading, *lines = out.splitlines()
+    assert heading.split() == ["codec", "wire", "device"]
+    assert sorted(tuple(line.split()[1::-1]) for line in lines) == sorted(CODECS)
+    assert "…" not in out
+
+
+def test_of_one_codec_all_is_told(call):
+    code, out, _ = call("codecs", "xela")
+    assert code == 0
+    assert re.search(r"^options over can: .*rate_hz", out, re.MULTILINE)
+    assert "cannot detect: " in out
+
+
+def test_a_table_as_json_is_all_of_it_and_nothing_else(call, tmp_path):
+    code, out, _ = call("codecs", "--json", "-")
+    records = json.loads(out)
+    assert code == 0
+    assert {(one["wire"], one["codec"]) for one in records} == set(CODECS)
+    assert call("codecs", "--json", tmp_path / "codecs.json")[0] == 0
+    assert json.loads((tmp_path / "codecs.json").read_text()) == records
+
+
+def test_json_into_no_folder_is_one_line(call, tmp_path):
+    code, out, err = call("codecs", "--json", tmp_path / "none" / "x.json")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+
+
+def test_a_terminal_too_narrow_for_a_table_shows_a_fact_a_line():
+    master, slave = pty.openpty()
+    environment = {**os.environ, "COLUMNS": "24", "TERM": "xterm"}
+    with subprocess.Popen(
+        [sys.executable, "-c", CALL, "codecs"],
+        stdout=slave, stderr=slave, stdin=slave, env=environment,
+    ) as child:  # fmt: skip
+        os.close(slave)
+        said = b""
+        with suppress(OSError):  # what Linux says when the other end has closed
+            while part := os.read(master, 4096):
+                said += part
+    os.close(master)
+    assert child.returncode == 0
+    plain = re.sub(r"\x1b\[[0-9;]*m", "", said.decode()).replace("\r", "")
+    assert "codec: ft300\nwire: serial\ndevice: " in plain
+
+
+@pytest.mark.parametrize("width", [20, 40, 200])
+def test_no_word_of_a_table_is_lost_at_any_width(width, capsys):
+    table = Table("a", "b", box=None)
+    words = [f"word{i}" for i in range(12)]
+    table.add_row(" ".join(words[:6]), " ".join(words[6:]))
+    for terminal in (True, False):
+        print_table(table, Console(width=width, force_terminal=terminal))
+        out = capsys.readouterr().out
+        assert all(word in out for word in words)
+        assert "…" not in out
