@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from tactile_rt.models.datasets import SweepSet, frame_of
-from tactile_rt.models.ead import EADConfig
+from tactile_rt.models.ead_config import EADConfig
+from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.stream import ArraySpec, ConfigError, RecordingError, SpecMismatch
 from tactile_rt.sweep_set import (
     OUTLIERS,
@@ -19,7 +20,15 @@ from tactile_rt.sweep_set import (
     object_path,
 )
 
-__all__ = ["check_array", "check_labelled", "check_sets", "check_split", "trained_on"]
+__all__ = [
+    "check_array",
+    "check_labelled",
+    "check_sets",
+    "check_split",
+    "manifests_of",
+    "probed_on",
+    "trained_on",
+]
 
 
 def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManifest) -> None:
@@ -78,6 +87,56 @@ def trained_on(
             "it was trained on by --data"
         )
     return folders
+
+
+def manifests_of(config: TrainingConfig) -> tuple[list[SweepManifest], SweepManifest]:
+    """What the sets of a training configuration are, and all of them as one.
+
+    Raises:
+        ConfigError: the configuration names no network, its sets cannot be joined, or one has no
+            labels to learn from.
+        RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
+    """
+    folders = [Path(folder) for folder in (config.data, *config.also)]
+    manifests = [SweepManifest.read(folder) for folder in folders]
+    whole = join_manifests(manifests)
+    config.network(len(whole.categories), frame_of(whole))
+    for folder, manifest in zip(folders, manifests, strict=True):
+        if config.objective == "supervised":
+            check_labelled(folder, manifest)
+        check_split(folder, manifest)
+    check_split(folders[0], whole)
+    return manifests, whole
+
+
+def probed_on(
+    checkpoint: Path, saved: Mapping[str, Any], folder: Path, data: str = ""
+) -> tuple[Path, SweepManifest]:
+    """The sweep set that a checkpoint is probed on.
+
+    Args:
+        checkpoint: for messages.
+        saved: what is in it.
+        folder: where the probe is to go.
+        data: the set; empty: the first of those that it was trained on.
+
+    Raises:
+        RecordingError: it is not there, or no sweep set.
+        SpecMismatch: it is of another array.
+        ConfigError: it has no labels; or the folder is that of a trained network, which the probe
+            would take the place of.
+    """
+    best = folder / "best.pt"
+    if (folder / "config.json").exists() or (best.exists() and best.samefile(checkpoint)):
+        raise ConfigError(
+            f"{folder} holds a training run, whose best.pt the probe would replace: choose another "
+            "folder"
+        )
+    path = Path(data or saved["config"]["data"])
+    manifest = SweepManifest.read(path)
+    check_array(checkpoint, saved, manifest)
+    check_labelled(path, manifest)
+    return path, manifest
 
 
 def check_labelled(folder: Path, manifest: SweepManifest) -> None:

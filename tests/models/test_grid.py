@@ -14,18 +14,18 @@ pytest.importorskip("lightning")
 pytest.importorskip("matplotlib")
 
 from tactile_rt.models.grid import pool, results
-from tactile_rt.models.grid.picture import draw_curves, draw_grid
-from tactile_rt.models.grid.plan import Growth, Task, read_grid, shipped_grids
-from tactile_rt.models.grid.pool import run_grid
-from tactile_rt.models.grid.results import gather, put_into, table, write_results
-from tactile_rt.models.grid.work import (
+from tactile_rt.models.grid.outcomes import (
     Outcome,
     Point,
-    Workbench,
     outcome_path,
     read_outcome,
     settings_of,
 )
+from tactile_rt.models.grid.picture import draw_curves, draw_grid
+from tactile_rt.models.grid.plan import Growth, Task, read_grid, shipped_grids
+from tactile_rt.models.grid.pool import run_grid
+from tactile_rt.models.grid.results import gather, put_into, table, write_results
+from tactile_rt.models.grid.work import Workbench
 from tactile_rt.stream import ArraySpec, ConfigError, ModelError, RecordingError
 from tactile_rt.sweep_set import SweepManifest, write_object
 

@@ -16,8 +16,8 @@ from typing import Any
 
 import msgspec
 
-from tactile_rt.models.ead import EADConfig
-from tactile_rt.models.training import TrainingConfig
+from tactile_rt.models.ead_config import EADConfig
+from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.settings import convert, make_node, parse_toml, read_toml
 from tactile_rt.stream import ConfigError
 

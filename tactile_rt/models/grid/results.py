@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tactile_rt.files import write_whole
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import Interval, accuracy
+from tactile_rt.models.grid.outcomes import SUBSET, Outcome, Point, read_outcome
 from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid, Growth
-from tactile_rt.models.grid.work import SUBSET, Outcome, Point, read_outcome
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Answer", "GridResults", "Row", "gather", "put_into", "table", "write_results"]

@@ -1,27 +1,32 @@
-"""What to train and how: one frozen dataclass, the whole of a run's `config.json`."""
+"""What to train and how, the whole of a run's `config.json`; and how to probe what was trained.
+
+Needs no torch, so that what cannot be is refused before it is loaded.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite
 
-from tactile_rt.models.augmentation import AUGMENTATIONS
-from tactile_rt.models.ead import EADConfig
+from tactile_rt.models.ead_config import READOUTS, EADConfig
 from tactile_rt.models.encoders import MOUSE_FRAME
 from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.stream import ConfigError
 
 __all__ = [
+    "AUGMENTATIONS",
     "LOSSES",
     "OBJECTIVES",
     "OPTIMIZERS",
     "PRECISIONS",
     "SCHEDULES",
     "WINDOWS",
+    "ProbeConfig",
     "Progress",
     "TrainingConfig",
 ]
 
 OBJECTIVES = ("supervised", "simclr", "simsiam", "autoencoder")
+AUGMENTATIONS = ("none", "tactile", "tactile-paper", "image", "image-paper", "image-paper-weak")
 LOSSES = ("anytime", "last")
 OPTIMIZERS = ("sgd", "adam", "adamw", "lars", "lars-paper")
 SCHEDULES = ("step", "constant", "cosine", "cosine-annealing", "one-cycle")
@@ -176,6 +181,39 @@ class TrainingConfig:
             norm_epsilon=self.norm_epsilon,
             preprocessing=self.preprocessing,
         )
+
+
+@dataclass(frozen=True)
+class ProbeConfig:
+    """The paper's probe, but for `standardise`.
+
+    Attributes:
+        data: The folder of the sweep set; empty takes the one that the network was trained on.
+        epochs, batch, learning_rate, momentum: Settings of stochastic gradient descent.
+        drop_epochs: The number of epochs between tenfold drops of the rate (StepLR).
+        standardise: Whether to fit on features of zero mean and unit variance, folded into the
+            layer afterwards; the paper does not, and features that are small then hardly train.
+        readout: The steps to fit on: "last" takes the last step (the paper), "mean" the mean of all
+            steps that can know anything, which is the only fair one for a network without memory.
+        seed: The seed of the layer, the windows and their order.
+    """
+
+    data: str = ""
+    epochs: int = 100
+    batch: int = 256
+    learning_rate: float = 0.1
+    momentum: float = 0.9
+    drop_epochs: int = 30
+    standardise: bool = True
+    readout: str = "last"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.readout not in READOUTS:
+            raise ConfigError(f"readout is {self.readout!r}, not one of {', '.join(READOUTS)}")
+        for name in ("epochs", "batch", "learning_rate", "drop_epochs"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
 
 
 @dataclass
