@@ -44,7 +44,10 @@ def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
     local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     if (config.batch < 2 * size and config.objective != "supervised") or config.batch < size:
         raise ConfigError(f"a batch of {config.batch} is too small to be shared by {size} devices")
-    logging.getLogger("lightning.fabric").setLevel(logging.WARNING)  # a run says enough itself
+    for name in ("lightning.fabric", "lightning.pytorch"):  # a run says enough itself
+        logging.getLogger(name).setLevel(logging.WARNING)
+    # Of kernels of 1 x 1, whose numbers lie alike whichever strides they are told to have.
+    warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
     fabric = Fabric(
         accelerator=device,
         devices=local,
