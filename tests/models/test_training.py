@@ -418,6 +418,7 @@ def child(tiny, folder, *arguments, torchrun=0):
         timeout=300,
     )
     assert done.returncode == 0, done.stderr[-3000:]
+    assert not (torchrun and done.stderr), "several processes say no more than one"
     return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
 
 
