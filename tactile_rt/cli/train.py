@@ -71,7 +71,7 @@ def train(
 ) -> None:
     """Train an Encoder-Attender-Decoder network on a sweep set."""
     from tactile_rt.models.checkpoint_files import network_of
-    from tactile_rt.models.data_checks import manifests_of
+    from tactile_rt.models.training.config import manifests_of
     from tactile_rt.models.training.recipes import read_recipe
 
     asked = {

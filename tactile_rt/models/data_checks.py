@@ -9,7 +9,6 @@ import numpy as np
 
 from tactile_rt.models.datasets import SweepSet, frame_of
 from tactile_rt.models.ead_config import EADConfig
-from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.stream import ArraySpec, ConfigError, RecordingError, SpecMismatch
 from tactile_rt.sweep_set import (
     OUTLIERS,
@@ -25,7 +24,6 @@ __all__ = [
     "check_labelled",
     "check_sets",
     "check_split",
-    "manifests_of",
     "probed_on",
     "trained_on",
 ]
@@ -87,26 +85,6 @@ def trained_on(
             "it was trained on by --data"
         )
     return folders
-
-
-def manifests_of(config: TrainingConfig) -> tuple[list[SweepManifest], SweepManifest]:
-    """What the sets of a training configuration are, and all of them as one.
-
-    Raises:
-        ConfigError: the configuration names no network, its sets cannot be joined, or one has no
-            labels to learn from.
-        RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
-    """
-    folders = [Path(folder) for folder in (config.data, *config.also)]
-    manifests = [SweepManifest.read(folder) for folder in folders]
-    whole = join_manifests(manifests)
-    config.network(len(whole.categories), frame_of(whole))
-    for folder, manifest in zip(folders, manifests, strict=True):
-        if config.objective == "supervised":
-            check_labelled(folder, manifest)
-        check_split(folder, manifest)
-    check_split(folders[0], whole)
-    return manifests, whole
 
 
 def probed_on(

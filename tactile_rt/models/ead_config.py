@@ -3,7 +3,6 @@
 import math
 from dataclasses import dataclass
 
-from tactile_rt.models.encoders import MOUSE_FRAME
 from tactile_rt.stream import ConfigError
 
 __all__ = [
@@ -11,6 +10,7 @@ __all__ = [
     "DECODERS",
     "ENCODERS",
     "MAX_STEPS",
+    "MOUSE_FRAME",
     "PREPROCESSINGS",
     "READOUTS",
     "EADConfig",
@@ -36,6 +36,7 @@ DECODERS = ("linear", "mlp", "mlp-all")
 READOUTS = ("last", "mean")
 PREPROCESSINGS = ("log", "paper")
 MAX_STEPS = 32  # of an episode: the GPT has positions for no more
+MOUSE_FRAME = (30, 5, 7)  # five sub-steps of six loads, on the grid of a mouse's whiskers
 WIDTH_UNIT = 32  # every channel count is a multiple of this at width 1
 WIDEST = 4  # sixteen times the paper's parameters, a billion
 

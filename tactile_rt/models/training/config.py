@@ -6,11 +6,14 @@ Needs no torch, so that what cannot be is refused before it is loaded.
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite
+from pathlib import Path
 
-from tactile_rt.models.ead_config import READOUTS, EADConfig
-from tactile_rt.models.encoders import MOUSE_FRAME
+from tactile_rt.models.data_checks import check_labelled, check_split
+from tactile_rt.models.datasets import frame_of
+from tactile_rt.models.ead_config import MOUSE_FRAME, READOUTS, EADConfig
 from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.stream import ConfigError
+from tactile_rt.sweep_set import SweepManifest, join_manifests
 
 __all__ = [
     "AUGMENTATIONS",
@@ -23,6 +26,7 @@ __all__ = [
     "ProbeConfig",
     "Progress",
     "TrainingConfig",
+    "manifests_of",
 ]
 
 OBJECTIVES = ("supervised", "simclr", "simsiam", "autoencoder")
@@ -181,6 +185,26 @@ class TrainingConfig:
             norm_epsilon=self.norm_epsilon,
             preprocessing=self.preprocessing,
         )
+
+
+def manifests_of(config: TrainingConfig) -> tuple[list[SweepManifest], SweepManifest]:
+    """What the sets of a training configuration are, and all of them as one.
+
+    Raises:
+        ConfigError: the configuration names no network, its sets cannot be joined, or one has no
+            labels to learn from.
+        RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
+    """
+    folders = [Path(folder) for folder in (config.data, *config.also)]
+    manifests = [SweepManifest.read(folder) for folder in folders]
+    whole = join_manifests(manifests)
+    config.network(len(whole.categories), frame_of(whole))
+    for folder, manifest in zip(folders, manifests, strict=True):
+        if config.objective == "supervised":
+            check_labelled(folder, manifest)
+        check_split(folder, manifest)
+    check_split(folders[0], whole)
+    return manifests, whole
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from tactile_rt.locks import alone_in
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoint_files import reason
 from tactile_rt.models.checkpoints import TactileClassifier, begin_from, save_whole
-from tactile_rt.models.data_checks import check_sets, manifests_of
+from tactile_rt.models.data_checks import check_sets
 from tactile_rt.models.datasets import (
     SweepSet,
     TrainingBatches,
@@ -36,7 +36,7 @@ from tactile_rt.models.datasets import (
 )
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.objectives import Autoencoder, Objective, SimCLR, SimSiam, Supervised
-from tactile_rt.models.training.config import Progress, TrainingConfig
+from tactile_rt.models.training.config import Progress, TrainingConfig, manifests_of
 from tactile_rt.models.training.devices import is_first, launched
 from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
 from tactile_rt.models.training.logs import Board, log_epoch
