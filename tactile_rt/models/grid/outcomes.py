@@ -14,7 +14,7 @@ from tactile_rt.stream import ConfigError
 __all__ = [
     "SUBSET",
     "Outcome",
-    "Point",
+    "Training",
     "outcome_path",
     "read_outcome",
     "settings_of",
@@ -24,7 +24,7 @@ __all__ = [
 SUBSET, OUTCOMES = "sweeps", "outcomes"  # folders of a grid
 
 
-class Point(msgspec.Struct, frozen=True):
+class Training(msgspec.Struct, frozen=True):
     """One training and what the validation split says of it.
 
     Attributes:
@@ -65,9 +65,9 @@ class Outcome(msgspec.Struct, frozen=True):
     noisy: str = ""
     parameters: int = 0
     seconds: float = 0.0
-    trials: tuple[Point, ...] = ()
-    growth: tuple[Point, ...] = ()
-    chosen: Point | None = None
+    trials: tuple[Training, ...] = ()
+    growth: tuple[Training, ...] = ()
+    chosen: Training | None = None
     failed: str = ""
 
     def right(self, which: str = "top1") -> NDArray[np.bool_]:

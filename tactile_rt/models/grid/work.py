@@ -25,7 +25,7 @@ from tactile_rt.models.evaluation import Step, hits
 from tactile_rt.models.grid.outcomes import (
     SUBSET,
     Outcome,
-    Point,
+    Training,
     outcome_path,
     read_outcome,
     settings_of,
@@ -114,21 +114,23 @@ class Workbench:
             msgspec.structs.replace(found, chosen=chosen, seconds=chosen.seconds), run / "best.pt"
         )
 
-    def _search(self, task: Task, report: Callable[..., None]) -> tuple[Point, ...]:
+    def _search(self, task: Task, report: Callable[..., None]) -> tuple[Training, ...]:
         """The trials: every rate with the first warm-up, then the other warm-ups with the best."""
         search = self.grid.search
 
-        def of(rate: float, warmup: float) -> Point:
-            return self._train(task, Point(rate, warmup, search.updates, 0.0, 0.0), report)
+        def of(rate: float, warmup: float) -> Training:
+            return self._train(task, Training(rate, warmup, search.updates, 0.0, 0.0), report)
 
         rates = [of(rate, search.warmup[0]) for rate in search.learning_rate]
         best = max(rates, key=_score).learning_rate
         return (*rates, *(of(best, warmup) for warmup in search.warmup[1:]))
 
-    def _grow(self, task: Task, best: Point, report: Callable[..., None]) -> tuple[Point, ...]:
+    def _grow(
+        self, task: Task, best: Training, report: Callable[..., None]
+    ) -> tuple[Training, ...]:
         """Trainings of twice as many updates each, until one gains too little."""
         growth = self.grid.growth
-        points: list[Point] = []
+        points: list[Training] = []
         updates, before = growth.first, -inf
         while updates <= growth.most:
             at = msgspec.structs.replace(best, updates=updates)
@@ -138,11 +140,11 @@ class Workbench:
             updates, before = 2 * updates, points[-1].score
         return tuple(points)
 
-    def _train(self, task: Task, at: Point, report: Callable[..., None]) -> Point:
+    def _train(self, task: Task, at: Training, report: Callable[..., None]) -> Training:
         """One training, unless it is there; of a diverged one the score is 0."""
         run = self._run(task, at)
         if (run / POINT).exists():
-            return msgspec.json.decode((run / POINT).read_bytes(), type=Point)
+            return msgspec.json.decode((run / POINT).read_bytes(), type=Training)
         chosen: dict[str, Any] = {
             "learning_rate": at.learning_rate, "warmup": at.warmup, "updates": at.updates,
         }  # fmt: skip
@@ -180,7 +182,7 @@ class Workbench:
             path.unlink()
         return done
 
-    def _run(self, task: Task, at: Point) -> Path:
+    def _run(self, task: Task, at: Training) -> Path:
         """The folder of one training."""
         name = f"rate{at.learning_rate:g}_warmup{at.warmup:g}_updates{at.updates}"
         return self.folder / RUNS / task.slug / name
@@ -249,7 +251,7 @@ class Workbench:
         return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
 
 
-def _score(point: Point) -> float:
+def _score(point: Training) -> float:
     return point.score
 
 
