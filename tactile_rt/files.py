@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-__all__ = ["open_regular", "sync_folder", "whole_folder", "write_whole"]
+__all__ = ["open_regular", "replaced", "sync_folder", "whole_folder", "write_whole"]
 
 
 def open_regular(path: Path) -> BinaryIO:
@@ -68,6 +68,30 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
         os.replace(name, path)
     except BaseException:
         os.unlink(name)
+        raise
+
+
+@contextmanager
+def replaced(path: Path) -> Iterator[BinaryIO]:
+    """A file to fill that takes its name when the block ends, and is on the medium by then.
+
+    Until then it is ``STEM.partial`` beside it, so that a process that was killed leaves one at
+    most; the folder must be one's own (`locks.alone_in`). If the block fails, nothing has changed.
+
+    Raises:
+        OSError: naming `path`: the medium is full, or failed.
+    """
+    partial = path.with_suffix(".partial")
+    try:
+        with partial.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, path)
+    except BaseException as error:
+        partial.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.errno:
+            raise OSError(error.errno, os.strerror(error.errno), str(path)) from None
         raise
 
 

@@ -40,6 +40,7 @@ TABLES = {
     "tactile_rt.drivers.codec",
     "tactile_rt.models",
     "tactile_rt.models.ead",
+    "tactile_rt.models.training",
     "tactile_rt.sources.opening",
 }
 ROOMS = sorted({m.room for m in product()} - {""})

@@ -101,7 +101,7 @@ def score_models(
     given = _performances(performance, len(models))
     with _train():
         from tactile_rt.models.alignment.benchmark_file import load_benchmark
-        from tactile_rt.models.alignment.loading import load_layers, load_untrained
+        from tactile_rt.models.alignment.loading import check_models, load_layers, load_untrained
         from tactile_rt.models.alignment.report import write_page
         from tactile_rt.models.alignment.results import (
             ModelResult,
@@ -112,6 +112,7 @@ def score_models(
         from tactile_rt.models.alignment.stimuli_input import read_stimuli
 
         felt, frozen = read_stimuli(stimuli), load_benchmark(benchmark)
+        check_models(models)
         done: list[ModelResult] = []
         with progress_bar(Console(stderr=True), "scoring", len(models)) as update:
             for path, told in zip(models, given, strict=True):
@@ -194,11 +195,14 @@ def decode_stimuli(
     """Decode shape and distance of the stimuli from every layer, with permutation chance."""
     check_output(json)
     with _train():
+        from tactile_rt.models.alignment.benchmark_file import load_benchmark
         from tactile_rt.models.alignment.decoding import decode, decode_paper, decode_rdm
-        from tactile_rt.models.alignment.loading import load_layers
+        from tactile_rt.models.alignment.loading import check_models, load_layers
         from tactile_rt.models.alignment.stimuli_input import read_stimuli
 
         felt = read_stimuli(stimuli)
+        targets = load_benchmark(benchmark).targets if benchmark else ()
+        check_models(models)
         rows: list[tuple[str, str, Any]] = []
 
         def add(name: str, patterns: Any) -> None:
@@ -211,11 +215,8 @@ def decode_stimuli(
             layers, _ = load_layers(path, felt)
             for layer, patterns in layers.patterns.items():
                 add(f"{layers.name}: {layer}" if len(models) > 1 else layer, patterns)
-    if benchmark:
-        from tactile_rt.models.alignment.benchmark_file import load_benchmark
-
-        for target in load_benchmark(benchmark).targets:
-            rows.append((target.name, "", decode_rdm(target.chosen.rdm)))
+    for target in targets:
+        rows.append((target.name, "", decode_rdm(target.chosen.rdm)))
     _show_decoded(rows)
     if json:
         _write(json, [{"name": n, "variant": v or "balanced", **_plain(d)} for n, v, d in rows])
@@ -238,12 +239,15 @@ def _gate(
         from tactile_rt.models.alignment.benchmark_file import load_benchmark
         from tactile_rt.models.alignment.fidelity import export_layers, fidelity_check
         from tactile_rt.models.alignment.gate import Check, exit_code, neural_checks
-        from tactile_rt.models.alignment.loading import load_layers
+        from tactile_rt.models.alignment.loading import check_models, load_layers
         from tactile_rt.models.alignment.results import baseline_of
         from tactile_rt.models.alignment.scoring import score
         from tactile_rt.models.alignment.stimuli_input import read_stimuli
 
         felt = read_stimuli(stimuli)
+        frozen = load_benchmark(benchmark) if benchmark else None
+        before = baseline_of(baseline, frozen) if baseline and frozen else None
+        check_models([model, *([reference] if reference else [])])
         checks: list[Check] = []
         rows: list[Any] = []
         ours: Layers | None = None
@@ -253,9 +257,7 @@ def _gate(
             check, found = fidelity_check(original, ours)
             checks.append(check)
             rows += found
-        if benchmark is not None:
-            frozen = load_benchmark(benchmark)
-            before = baseline_of(baseline, frozen) if baseline else None
+        if frozen is not None:
             ours = ours or load_layers(model, felt)[0]
             checks = [*neural_checks(score(frozen, ours.patterns), frozen, before), *checks]
     code = exit_code(checks)

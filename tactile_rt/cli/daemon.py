@@ -31,8 +31,8 @@ app.add_typer(config, name="config")
 
 def serve(file: Path, sets: list[str], seconds: float | None) -> None:
     """Run the daemon; leaves the process with its exit code."""
-    from tactile_rt.daemon.lock import AlreadyRunning
     from tactile_rt.daemon.process import ExitCode, leave, run_daemon
+    from tactile_rt.locks import AlreadyRunning
 
     try:
         leave(run_daemon(file, sets, seconds))

@@ -28,13 +28,17 @@ def evaluate(
 ) -> None:
     """Measure a model on the test objects of a sweep set: accuracy, fusion, calibration, noise
     and what else goes wrong with a sensor."""
+    from tactile_rt.sweep_set import SweepManifest
+
+    check_output(json)
+    for folder in filter(None, (data, accurate)):
+        SweepManifest.read(folder)
     try:
         from tactile_rt.evidence.classification import evaluate_model
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     from tactile_rt.evidence.records import as_table, write
 
-    check_output(json)
     console = Console(stderr=True)
     with console.status("evaluating"):
         records = evaluate_model(model, data, accurate, svm, pictures, quick)

@@ -24,16 +24,20 @@ def grid(
     Killed at any time, it goes on where it was. FOLDER gets results.json, results.csv, curves.csv,
     task_performance.png and learning_curves.png.
     """
-    try:
-        from tactile_rt.models.grid.picture import draw_curves, draw_grid
-        from tactile_rt.models.grid.plan import read_grid
-        from tactile_rt.models.grid.pool import run_grid
-        from tactile_rt.models.grid.results import gather, put_into, table, write_results
-        from tactile_rt.models.grid.work import Outcome
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
+    from tactile_rt.models.grid.outcomes import Outcome, waiting_tasks
+    from tactile_rt.models.grid.plan import read_grid
+    from tactile_rt.sweep_set import SweepManifest
+
     check_output(report)
     wanted = read_grid(plan)
+    if report is None and waiting_tasks(wanted, folder):
+        SweepManifest.read(Path(wanted.data))
+    try:
+        from tactile_rt.models.grid.picture import draw_curves, draw_grid
+        from tactile_rt.models.grid.pool import run_grid
+        from tactile_rt.models.grid.results import gather, put_into, table, write_results
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
     console = Console(stderr=True)
 
     def conclude() -> None:

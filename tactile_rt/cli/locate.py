@@ -28,6 +28,10 @@ def train(
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
 ) -> None:
     """Train the contact network on the simulator's own contacts."""
+    from tactile_rt.sweep_set import SweepManifest
+
+    check_output(checkpoint)
+    SweepManifest.read(data)
     try:
         import torch
 
@@ -35,7 +39,6 @@ def train(
         from tactile_rt.models.datasets import SweepSet
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
-    check_output(checkpoint)
     torch.set_num_threads(threads)
     console = Console(stderr=True)
     sets = [SweepSet.read(data, split) for split in ("train", "validation")]

@@ -12,7 +12,7 @@ from tactile_rt.cli.app import app, needs, progress_bar
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
-    from tactile_rt.models.training import Progress
+    from tactile_rt.models.training.config import Progress
 
 WAITING = 0.1  # share of an epoch: less says nothing that one could do something about
 
@@ -70,13 +70,10 @@ def train(
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
 ) -> None:
     """Train an Encoder-Attender-Decoder network on a sweep set."""
-    try:
-        import torch
+    from tactile_rt.models.checkpoint_files import network_of
+    from tactile_rt.models.training.config import manifests_of
+    from tactile_rt.models.training.recipes import read_recipe
 
-        from tactile_rt.models import training
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
-    torch.set_num_threads(threads)
     asked = {
         "encoder": encoder,
         "graph": None if graph is None else _text(graph),
@@ -99,13 +96,21 @@ def train(
     if also:
         given["also"] = tuple(map(str, also))
     if begin is not None:
-        given = {**training.network_of(begin), **given, "begin": str(begin)}
-    config = training.read_recipe(recipe, str(data), **given)
+        given = {**network_of(begin), **given, "begin": str(begin)}
+    config = read_recipe(recipe, str(data), **given)
+    manifests_of(config)  # what cannot be is refused before torch has taken its seconds
+    try:
+        import torch
+
+        from tactile_rt.models import training
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    torch.set_num_threads(threads)
     # Under torchrun every process has the same to say.
     console = Console(stderr=True, quiet=os.environ.get("RANK", "0") != "0")
     with progress_bar(console, "finding onsets") as update:
 
-        def show(at: "training.Progress") -> None:
+        def show(at: "Progress") -> None:
             update(
                 total=at.updates,
                 completed=at.update,
@@ -145,10 +150,8 @@ def _text(path: Path) -> str:
 @app.command()
 def recipes() -> None:
     """List the training recipes that ship."""
-    try:
-        from tactile_rt.models.training.recipes import load_recipe, shipped_recipes
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
+    from tactile_rt.models.training.recipes import load_recipe, shipped_recipes
+
     table = Table(box=None, pad_edge=False)
     for column in ("recipe", "what", "tried"):
         table.add_column(column, no_wrap=column == "recipe")
@@ -171,24 +174,33 @@ def probe(
     standardise: Annotated[
         bool, typer.Option(help="Fit on standardised features; the paper did not.")
     ] = True,
+    readout: Annotated[
+        str, typer.Option(help="last: the last step (the paper); mean: the mean of all steps.")
+    ] = "last",
     seed: Annotated[int, typer.Option(help="Of the layer and the windows.")] = 0,
 ) -> None:
     """Fit a linear layer on a frozen network's features: how much of the category do they hold?"""
-    try:
-        from tactile_rt.models import training
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
-    config = training.ProbeConfig(
+    from tactile_rt.models.checkpoint_files import describe_checkpoint
+    from tactile_rt.models.data_checks import probed_on
+    from tactile_rt.models.training.config import ProbeConfig
+
+    config = ProbeConfig(
         data=str(data or ""),
         epochs=epochs,
         learning_rate=learning_rate,
         standardise=standardise,
+        readout=readout,
         seed=seed,
     )
+    probed_on(checkpoint, describe_checkpoint(checkpoint), folder, config.data)
+    try:
+        from tactile_rt.models.training.probing import probe as fit
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
     console = Console(stderr=True)
     with console.status("probing"):
-        shown: list[training.Progress] = []
-        best = training.probe(checkpoint, folder, config, shown.append)
+        shown: list[Progress] = []
+        best = fit(checkpoint, folder, config, shown.append)
     m = shown[-1].metrics
     console.print(
         f"{best}: validation top-1 {100 * m['validation_top1']:.1f} % clean, "
@@ -216,17 +228,24 @@ def export(
     ] = None,
 ) -> None:
     """Export a trained network as a streaming ONNX step, with everything needed to run it."""
-    try:
-        from tactile_rt.export.precision import PRECISIONS
-        from tactile_rt.export.release import release
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
+    from tactile_rt.models.checkpoint_files import describe_checkpoint
+    from tactile_rt.models.data_checks import trained_on
+
     if model.is_dir():
         raise ConfigError(f"{model} is a folder: name a file to write")
+    trained_on(checkpoint, describe_checkpoint(checkpoint), data or ())
+    try:
+        from tactile_rt.export.precision import PRECISIONS
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
     if precision not in PRECISIONS:
         raise ConfigError(f"--precision is {precision!r}, not one of {', '.join(PRECISIONS)}")
     if kind not in ("step", "window"):
         raise ConfigError(f"--kind is {kind!r}, not one of step, window")
+    try:
+        from tactile_rt.export.release import release
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
     console = Console(stderr=True)
     with console.status("calibrating, exporting and checking parity"):
         card = release(

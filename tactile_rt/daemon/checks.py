@@ -15,8 +15,8 @@ from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.daemon.config import Config, ModelConfig, SourceConfig, is_loopback
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.loading import Loaded
-from tactile_rt.daemon.lock import device_keys
 from tactile_rt.daemon.service_folders import MADE
+from tactile_rt.locks import device_keys
 from tactile_rt.settings import no_such
 from tactile_rt.sources.opening import check_source
 from tactile_rt.stream import ArraySpec, SpecMismatch, TactileError

@@ -17,13 +17,13 @@ from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Control, Event, Opened
 from tactile_rt.daemon.loading import Loaded
-from tactile_rt.daemon.lock import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
 from tactile_rt.daemon.source_part import SourcePart
 from tactile_rt.daemon.troubles import troubles
 from tactile_rt.daemon.turns import Turns
+from tactile_rt.locks import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.version import VERSION
 
 __all__ = ["Daemon"]

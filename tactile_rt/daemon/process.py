@@ -77,7 +77,7 @@ def run_daemon(path: Path, sets: Sequence[str] = (), seconds: float | None = Non
         from tactile_rt.daemon.checks import check_config
         from tactile_rt.daemon.daemon import Daemon
         from tactile_rt.daemon.loading import load_config
-        from tactile_rt.daemon.lock import Locks
+        from tactile_rt.locks import Locks
 
         loaded = load_config(path, sets)
         check_config(loaded)

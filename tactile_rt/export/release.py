@@ -17,7 +17,7 @@ from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.export.precision import Precision
 from tactile_rt.export.promises import fitted_rules
-from tactile_rt.models.checkpoints import NETWORK
+from tactile_rt.models.checkpoint_files import NETWORK
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
 from tactile_rt.models.evaluation import Step, among, hits, predict, run_windows

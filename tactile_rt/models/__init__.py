@@ -7,12 +7,18 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tactile_rt.models.ead import EAD, EADConfig, count_parameters
+    from tactile_rt.models.ead import EAD, count_parameters
+    from tactile_rt.models.ead_config import EADConfig
     from tactile_rt.models.inputs import InputStage
 
 __all__ = ["EAD", "EADConfig", "InputStage", "count_parameters"]
 
-_HOMES = {"EAD": "ead", "EADConfig": "ead", "InputStage": "inputs", "count_parameters": "ead"}
+_HOMES = {
+    "EAD": "ead",
+    "EADConfig": "ead_config",
+    "InputStage": "inputs",
+    "count_parameters": "ead",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -29,7 +29,6 @@ from tactile_rt.models.array_symmetries import Symmetry, compose, symmetries
 from tactile_rt.stream import ArraySpec, ConfigError
 
 __all__ = [
-    "AUGMENTATIONS",
     "Augmentation",
     "as_published",
     "build",
@@ -38,7 +37,6 @@ __all__ = [
     "tactile_paper",
 ]
 
-AUGMENTATIONS = ("none", "tactile", "tactile-paper", "image", "image-paper", "image-paper-weak")
 HALF = 0.5
 JITTER, JITTER_CHANCE, GREY_CHANCE, NOISE = 0.8, 0.8, 0.2, 0.1  # SimCLR's, and a noise of the log
 BLUR = (1.0, 2.0, 1.0)
@@ -66,7 +64,7 @@ def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
     """An augmentation by name.
 
     Args:
-        name: one of `AUGMENTATIONS`.
+        name: one of `training.config.AUGMENTATIONS`.
         spec: the array.
         masking: share of steps that are blanked, too.
 

@@ -1,6 +1,5 @@
 """What is trained and shipped as one, and its checkpoints."""
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -11,10 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from tactile_rt.files import replaced
+from tactile_rt.models.checkpoint_files import describe_checkpoint, no_checkpoint
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.inputs import InputStage, paper_units
 from tactile_rt.sensor_spec import ChannelLimits, channel_limits
-from tactile_rt.stream import ArraySpec, ConfigError, ModelError, SpecMismatch
+from tactile_rt.stream import ArraySpec, ConfigError, SpecMismatch
 from tactile_rt.timing import Timing
 
 __all__ = [
@@ -22,19 +23,10 @@ __all__ = [
     "begin_from",
     "labels_of_checkpoint",
     "load_checkpoint",
-    "network_of",
-    "reason",
     "run_on",
     "save_whole",
     "untrained",
 ]
-
-
-# of a network's configuration, what a training configuration says
-NETWORK = (
-    "encoder", "attender", "decoder", "width", "readout", "dropout", "graph", "norm_epsilon",
-    "preprocessing",
-)  # fmt: skip
 
 
 class TactileClassifier(nn.Module):
@@ -119,16 +111,13 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
     Raises:
         ModelError: not there, or not such a checkpoint.
     """
+    describe_checkpoint(path)
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
         model = untrained(saved)
         model.load_state_dict(saved["model"])
-    except FileNotFoundError:
-        raise ModelError(f"no checkpoint {path}") from None
     except Exception as error:  # torch raises many unrelated types for a damaged file
-        raise ModelError(
-            f"{path} is not a checkpoint of `tactile-rt train`: {reason(error)}"
-        ) from None
+        raise no_checkpoint(path, error) from None
     return model.eval(), saved
 
 
@@ -138,16 +127,6 @@ def labels_of_checkpoint(saved: dict[str, Any]) -> tuple[str, ...]:
     An early checkpoint has only how many they are: of that, none.
     """
     return (*saved.get("categories", ()), *saved.get("refusals", ()))
-
-
-def network_of(path: Path) -> dict[str, Any]:
-    """What a training configuration says of the network of a checkpoint.
-
-    Raises:
-        ModelError: as `load_checkpoint`.
-    """
-    network = load_checkpoint(path)[1]["network"]
-    return {key: value for key, value in network.items() if key in NETWORK}
 
 
 def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> None:
@@ -192,16 +171,14 @@ def untrained(saved: dict[str, Any]) -> TactileClassifier:
     return TactileClassifier(spec, EADConfig(**saved["network"]), limits)
 
 
-def reason(error: Exception) -> str:
-    """An error in one line."""
-    return str(error).splitlines()[0] if str(error) else type(error).__name__
-
-
 def save_whole(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint whole or not at all, also if the machine stops a moment later."""
-    partial = path.with_suffix(".partial")
-    with partial.open("wb") as file:
-        torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, path)
+    """Write a checkpoint whole or not at all, also if the machine stops a moment later.
+
+    Raises:
+        OSError: the medium is full, or failed.
+    """
+    with replaced(path) as file:
+        try:
+            torch.save(state, file)
+        except RuntimeError as error:  # what torch says once the file has said what is wrong
+            raise (error.__context__ if isinstance(error.__context__, OSError) else error) from None

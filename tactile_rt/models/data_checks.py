@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tactile_rt.models.datasets import SweepSet, frame_of
-from tactile_rt.models.ead import EADConfig
+from tactile_rt.models.ead_config import EADConfig
 from tactile_rt.stream import ArraySpec, ConfigError, RecordingError, SpecMismatch
 from tactile_rt.sweep_set import (
     OUTLIERS,
@@ -19,7 +19,14 @@ from tactile_rt.sweep_set import (
     object_path,
 )
 
-__all__ = ["check_array", "check_labelled", "check_sets", "check_split", "trained_on"]
+__all__ = [
+    "check_array",
+    "check_labelled",
+    "check_sets",
+    "check_split",
+    "probed_on",
+    "trained_on",
+]
 
 
 def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManifest) -> None:
@@ -78,6 +85,36 @@ def trained_on(
             "it was trained on by --data"
         )
     return folders
+
+
+def probed_on(
+    checkpoint: Path, saved: Mapping[str, Any], folder: Path, data: str = ""
+) -> tuple[Path, SweepManifest]:
+    """The sweep set that a checkpoint is probed on.
+
+    Args:
+        checkpoint: for messages.
+        saved: what is in it.
+        folder: where the probe is to go.
+        data: the set; empty: the first of those that it was trained on.
+
+    Raises:
+        RecordingError: it is not there, or no sweep set.
+        SpecMismatch: it is of another array.
+        ConfigError: it has no labels; or the folder is that of a trained network, which the probe
+            would take the place of.
+    """
+    best = folder / "best.pt"
+    if (folder / "config.json").exists() or (best.exists() and best.samefile(checkpoint)):
+        raise ConfigError(
+            f"{folder} holds a training run, whose best.pt the probe would replace: choose another "
+            "folder"
+        )
+    path = Path(data or saved["config"]["data"])
+    manifest = SweepManifest.read(path)
+    check_array(checkpoint, saved, manifest)
+    check_labelled(path, manifest)
+    return path, manifest
 
 
 def check_labelled(folder: Path, manifest: SweepManifest) -> None:

@@ -4,16 +4,16 @@ A window is what the classifier would feed the network: it starts where `Contact
 onset on the noisy signal, and carries the tare that the detector had measured by then.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.models.implausible import IMPLAUSIBLE, implausible
@@ -22,6 +22,9 @@ from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.stream import ConfigError
 from tactile_rt.sweep_set import FAULTS, SweepManifest, Sweeps, join_manifests, read_sweeps
 from tactile_rt.timing import MOUSE, Timing
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 __all__ = [
     "JITTER",
@@ -70,7 +73,7 @@ class SweepSet:
     window: str = "onset"
 
     @classmethod
-    def read(cls, folder: Path, split: str) -> "SweepSet":
+    def read(cls, folder: Path, split: str) -> SweepSet:
         """Read a split.
 
         Raises:
@@ -101,7 +104,7 @@ class SweepSet:
         none = np.zeros(len(self.sweeps), dtype=np.bool_)
         return none if self.sweeps.recorded is None else self.sweeps.recorded
 
-    def __getitem__(self, at: slice | NDArray[Any]) -> "SweepSet":
+    def __getitem__(self, at: slice | NDArray[Any]) -> SweepSet:
         """Some of the sweeps."""
         return replace(self, sweeps=self.sweeps[at])
 
@@ -292,6 +295,8 @@ class TrainingBatches:
     def _draw(
         self, at: NDArray[np.int64], rng: np.random.Generator, severity: float
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        import torch  # here: sets are read and checked without
+
         data, n = self._data, len(at)
         elements, channels = data.manifest.spec.shape
         faults = self._faults

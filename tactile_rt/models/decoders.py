@@ -13,11 +13,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.models.ead_config import DECODERS
 from tactile_rt.stream import ConfigError
 
 __all__ = ["DECODERS", "HIDDEN", "LinearDecoder", "MLPAllDecoder", "MLPDecoder", "make"]
 
-DECODERS = ("linear", "mlp", "mlp-all")
 HIDDEN = (1024, 512)  # at width 1
 
 

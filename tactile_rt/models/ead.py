@@ -12,8 +12,6 @@ for streaming, and gives the same logits. The logits of a step use no later fram
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
 
@@ -22,9 +20,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tactile_rt.models import attenders, decoders
-from tactile_rt.models.encoders import MOUSE_FRAME
-from tactile_rt.models.encoders.cells import CELLS, Cell
-from tactile_rt.models.inputs import PREPROCESSINGS
+from tactile_rt.models.ead_config import ATTENDERS, DECODERS, ENCODERS, READOUTS, EADConfig
+from tactile_rt.models.encoders.cells import Cell
 from tactile_rt.stream import ConfigError
 
 __all__ = [
@@ -37,74 +34,7 @@ __all__ = [
     "count_parameters",
 ]
 
-# name: (module in `encoders`, class), imported when a network needs it
-ENCODERS: dict[str, tuple[str, str]] = {
-    **{f"zhuang-{cell}": ("zhuang", "ZhuangEncoder") for cell in CELLS},
-    "resnet18": ("resnet", "ResNet18Encoder"),
-    "s4": ("s4", "S4Encoder"),
-    "mamba": ("mamba", "MambaEncoder"),
-    "gru": ("gru", "GRUEncoder"),
-    "graph": ("graph_encoder", "GraphEncoder"),
-}
-ATTENDERS = ("gpt", "mamba", "none")
-DECODERS = decoders.DECODERS
-READOUTS = ("last", "mean")
-WIDTH_UNIT = 32  # every channel count is a multiple of this at width 1
-WIDEST = 4  # sixteen times the paper's parameters, a billion
 GPT_OF_RESNET = 256  # the paper's GPT is narrower than its features there, and only there
-
-
-@dataclass(frozen=True)
-class EADConfig:
-    """Which network. The defaults are the paper's Intersection-LN + GPT, 63.8 M parameters.
-
-    Raises:
-        ConfigError: a field that names or measures nothing possible.
-    """
-
-    classes: int
-    encoder: str = "zhuang-intersection-ln"
-    attender: str = "gpt"
-    decoder: str = "linear"
-    width: float = 1.0  # scales every channel count; the GPT's heads and layers stay
-    # "last": a step's own logits (the paper). "mean": their running mean since the first frame
-    # could count, for a decision at any time.
-    readout: str = "last"
-    dropout: float = 0.1
-    max_steps: int = 22  # an episode; the GPT's positions end here
-    graph: str = ""  # of encoder "graph": the text of a TOML file, see `encoders.graph_files`
-    frame: tuple[int, int, int] = MOUSE_FRAME  # channels, rows and columns of what it reads
-    norm_epsilon: float = 0.0  # of the cells' layer norms; 0: each cell's own, see `cells`
-    preprocessing: str = "log"  # of the input stage, see `inputs`
-
-    def __post_init__(self) -> None:
-        for field, known in (
-            ("encoder", tuple(ENCODERS)),
-            ("attender", ATTENDERS),
-            ("decoder", DECODERS),
-            ("readout", READOUTS),
-            ("preprocessing", PREPROCESSINGS),
-        ):
-            if (value := getattr(self, field)) not in known:
-                raise ConfigError(f"{field} is {value!r}, not one of {', '.join(known)}")
-        if self.classes < 1:
-            raise ConfigError(f"classes is {self.classes}, must be at least 1")
-        if not 0 < self.width <= WIDEST or self.width * WIDTH_UNIT % 1:
-            raise ConfigError(
-                f"width is {self.width}, must be a positive multiple of 1/{WIDTH_UNIT}, "
-                f"at most {WIDEST}"
-            )
-        if not 0 <= self.norm_epsilon < math.inf:
-            raise ConfigError(f"norm_epsilon is {self.norm_epsilon}, must be 0 or more")
-        if not 0 <= self.dropout < 1:
-            raise ConfigError(f"dropout is {self.dropout}, must be in [0, 1)")
-        if not 1 <= self.max_steps <= attenders.MAX_STEPS:
-            raise ConfigError(f"max_steps is {self.max_steps}, must be 1 to {attenders.MAX_STEPS}")
-        object.__setattr__(self, "frame", tuple(self.frame))  # a list, from JSON
-        if len(self.frame) != 3 or min(self.frame) < 1:
-            raise ConfigError(f"frame is {self.frame}, must be channels, rows and columns")
-        if bool(self.graph) != (self.encoder == "graph"):
-            raise ConfigError("graph must be given with encoder 'graph', and only then")
 
 
 class EAD(nn.Module):

@@ -21,7 +21,6 @@ from torch.nn import functional as F
 
 from tactile_rt.stream import ArraySpec, ConfigError
 
-PREPROCESSINGS = ("log", "paper")
 PAPER_UNITS = {"N": 1e-3, "N m": 1e-6}  # mN and uN m
 PAPER_CLIP = 1000.0  # of these units
 NOISE_FLOOR = 3.0  # standard deviations of the noise that count as silence
@@ -36,7 +35,7 @@ class InputStage(nn.Module):
         clip: per channel, the largest magnitude that is believed (channel,), SI.
         scale: per channel, the floor of the logarithm's scale (channel,), SI; without a logarithm,
             the unit.
-        preprocessing: one of `PREPROCESSINGS`.
+        preprocessing: one of `ead_config.PREPROCESSINGS`.
 
     Raises:
         ConfigError: clip and scale of unlike lengths or not positive, two elements in one place,

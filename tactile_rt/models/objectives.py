@@ -19,6 +19,7 @@ At width 1 the heads and losses are those of the paper's code (neuroagents-lab,
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Generator, Tensor, nn
@@ -183,9 +184,24 @@ def _of_all_devices(rows: Tensor) -> Tensor:
     """The rows of every device's share of the batch: more negatives than one's own."""
     if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
         return rows
-    from torch.distributed.nn.functional import all_gather  # keeps the gradient
+    gathered: Tensor = _Gathered.apply(rows)  # type: ignore[no-untyped-call]
+    return gathered
 
-    return torch.cat(all_gather(rows))
+
+class _Gathered(torch.autograd.Function):
+    """Every device's rows, of which each learns from the losses of all."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor) -> Tensor:
+        parts = [torch.empty_like(rows) for _ in range(torch.distributed.get_world_size())]
+        torch.distributed.all_gather(parts, rows.contiguous())
+        return torch.cat(parts)
+
+    @staticmethod
+    def backward(ctx: Any, slope: Tensor) -> Tensor:
+        total = slope.clone(memory_format=torch.contiguous_format)
+        torch.distributed.all_reduce(total)
+        return total.chunk(torch.distributed.get_world_size())[torch.distributed.get_rank()]
 
 
 class SimSiam(Objective):

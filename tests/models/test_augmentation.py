@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from tactile_rt.calibration.mirroring import Mirror
-from tactile_rt.models import augmentation
 from tactile_rt.models.array_symmetries import compose, symmetries
 from tactile_rt.models.augmentation import Tactile, build, image, mask_steps, tactile_paper
+from tactile_rt.models.training.config import AUGMENTATIONS
 from tactile_rt.stream import ConfigError
 from tests.helpers.tiny_sweeps import tiny_array
 
@@ -240,7 +240,7 @@ def test_three_quarters_of_the_steps_are_masked():
     assert len({tuple(row) for row in masked.tolist()}) > 4
 
 
-@pytest.mark.parametrize("name", augmentation.AUGMENTATIONS)
+@pytest.mark.parametrize("name", AUGMENTATIONS)
 @pytest.mark.parametrize("masking", [0.0, 0.5])
 def test_every_augmentation_can_be_built(name, masking):
     made = build(name, SPEC, masking)

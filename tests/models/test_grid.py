@@ -14,18 +14,18 @@ pytest.importorskip("lightning")
 pytest.importorskip("matplotlib")
 
 from tactile_rt.models.grid import pool, results
-from tactile_rt.models.grid.picture import draw_curves, draw_grid
-from tactile_rt.models.grid.plan import Growth, Task, read_grid, shipped_grids
-from tactile_rt.models.grid.pool import run_grid
-from tactile_rt.models.grid.results import gather, put_into, table, write_results
-from tactile_rt.models.grid.work import (
+from tactile_rt.models.grid.outcomes import (
     Outcome,
-    Point,
-    Workbench,
+    Training,
     outcome_path,
     read_outcome,
     settings_of,
 )
+from tactile_rt.models.grid.picture import draw_curves, draw_grid
+from tactile_rt.models.grid.plan import Growth, Task, read_grid, shipped_grids
+from tactile_rt.models.grid.pool import run_grid
+from tactile_rt.models.grid.results import gather, put_into, table, write_results
+from tactile_rt.models.grid.work import Workbench
 from tactile_rt.stream import ArraySpec, ConfigError, ModelError, RecordingError
 from tactile_rt.sweep_set import SweepManifest, write_object
 
@@ -288,7 +288,7 @@ def test_the_longest_training_is_not_longer_than_it_helps(
         bench, "_train", lambda task, at, report: replace(at, score=scores[at.updates])
     )
     replace = msgspec.structs.replace
-    points = bench._grow(grid.tasks()[1], Point(1e-3, 0.1, 2, 0.0, 0.0), print)
+    points = bench._grow(grid.tasks()[1], Training(1e-3, 0.1, 2, 0.0, 0.0), print)
     assert [p.updates for p in points] == [10, 20, 40], "0.005 more is not worth going on"
 
 

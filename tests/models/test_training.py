@@ -335,7 +335,7 @@ def test_a_run_that_diverges_says_so(tiny, tmp_path):
 
 
 def test_tensorboard_is_asked_for_by_name(tiny, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    monkeypatch.setitem(sys.modules, "tensorboard.summary.writer.record_writer", None)
     config = TrainingConfig(tiny, **SMALL, updates=1)
     with pytest.raises(ConfigError, match="pip install tensorboard"):
         train(config, tmp_path / "run", tensorboard=True)
@@ -418,6 +418,7 @@ def child(tiny, folder, *arguments, torchrun=0):
         timeout=300,
     )
     assert done.returncode == 0, done.stderr[-3000:]
+    assert not (torchrun and done.stderr), "several processes say no more than one"
     return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
 
 

@@ -72,7 +72,8 @@ def shared(data: str, folder: Path, objective: str) -> None:
     train(config, folder)
     state = made[0].state_dict()
     found = hashlib.sha256(b"".join(t.numpy().tobytes() for t in state.values())).hexdigest()
-    devices = torch.distributed.get_world_size()
+    assert not torch.distributed.is_initialized()
+    devices = int(os.environ["WORLD_SIZE"])
     sys.stdout.write(json.dumps({"digest": found, "devices": devices}) + "\n")
     sys.stdout.flush()
 

@@ -1,16 +1,32 @@
 """Layers of any model file: a checkpoint, a step ONNX or a window ONNX."""
 
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
+from tactile_rt.classifier.model_file import read_model
 from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
+from tactile_rt.models.checkpoint_files import describe_checkpoint
 from tactile_rt.stream import ConfigError
 
-__all__ = ["load_layers", "load_untrained"]
+__all__ = ["check_models", "load_layers", "load_untrained"]
 
 CHECKPOINT = ".pt"
 FIGURES = re.compile(r"(test_|validation_)?top1")
+
+
+def check_models(paths: Iterable[Path]) -> None:
+    """Refuse what is no model file before the first is scored, and before torch is loaded.
+
+    Raises:
+        ModelError: one is not such a file.
+    """
+    for path in paths:
+        if path.suffix == CHECKPOINT:
+            describe_checkpoint(path)
+        else:
+            read_model(path, None)
 
 
 def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float, str] | None]:

@@ -8,12 +8,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.models.ead_config import MAX_STEPS
+
 __all__ = ["BLOCK", "GPT", "HEADS", "LAYERS", "MAX_STEPS", "TOKENS", "TransformerBlock"]
 
 HEADS = 4
 LAYERS = 8
-BLOCK = 65  # positions the table has; two tokens a step, so 32 steps
-MAX_STEPS = BLOCK // 2
+BLOCK = 2 * MAX_STEPS + 1  # positions the table has: two tokens a step, and the paper's one more
 TOKENS = 2  # a step's observation, then the action token
 
 

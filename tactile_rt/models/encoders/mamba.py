@@ -7,7 +7,7 @@ from math import prod
 from torch import Tensor, nn
 
 from tactile_rt.models.attenders.mamba import MambaStack
-from tactile_rt.models.encoders import MOUSE_FRAME
+from tactile_rt.models.ead_config import MOUSE_FRAME
 from tactile_rt.models.encoders.gru import FEATURES
 
 __all__ = ["MambaEncoder"]

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.models.encoders import MOUSE_FRAME
+from tactile_rt.models.ead_config import MOUSE_FRAME
 from tactile_rt.stream import ConfigError
 
 __all__ = ["FoldedResNet18", "ResNet18Encoder"]

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.models.encoders import MOUSE_FRAME
+from tactile_rt.models.ead_config import MOUSE_FRAME
 from tactile_rt.models.encoders.gru import FEATURES
 
 __all__ = ["FoldedS4", "S4Block", "S4Encoder", "hippo_legs", "kernels"]

@@ -6,7 +6,7 @@ from typing import Any
 
 from torch import nn
 
-from tactile_rt.models.encoders import MOUSE_FRAME
+from tactile_rt.models.ead_config import MOUSE_FRAME
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 

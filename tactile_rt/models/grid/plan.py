@@ -16,8 +16,8 @@ from typing import Any
 
 import msgspec
 
-from tactile_rt.models.ead import EADConfig
-from tactile_rt.models.training import TrainingConfig
+from tactile_rt.models.ead_config import EADConfig
+from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.settings import convert, make_node, parse_toml, read_toml
 from tactile_rt.stream import ConfigError
 
@@ -133,7 +133,7 @@ class Pair(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Two cells to compare, by name; "svm" and "random NETWORK" are names too.
 
     Attributes:
-        better, than: The names.
+        better, than: The names of the cell that is asked about and of the one it is held against.
     """
 
     better: str
@@ -180,7 +180,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         width: The width of every network that has none of its own.
         batch: The number of sweeps per update.
         search: The trials of every cell.
-        growth: How long every cell is trained.
+        growth: The lengths of training that are tried for every cell.
         seeds: The number of seeds; all cells are trained with the first before any with the second.
         sweeps: The number of sweeps of each object that are used, by split.
         supervised, self_supervised: Fields of `TrainingConfig` for cells of either kind.

@@ -13,8 +13,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from tactile_rt.locks import alone_in
+from tactile_rt.models.grid.outcomes import SUBSET, Outcome, waiting_tasks
 from tactile_rt.models.grid.plan import Grid, SweepCounts, Task
-from tactile_rt.models.grid.work import SUBSET, Outcome, Workbench, read_outcome
+from tactile_rt.models.grid.work import Workbench
 from tactile_rt.stream import TactileError
 from tactile_rt.sweep_set import (
     SET_VERSION,
@@ -47,12 +49,19 @@ def run_grid(
         report: called with each outcome as it comes, and how many of all there are.
 
     Raises:
-        ConfigError: the folder holds outcomes of another grid.
+        ConfigError: the folder holds outcomes of another grid, or another process works in it.
         RecordingError: the sweep set cannot be read.
     """
+    with alone_in(folder):
+        _run(grid, folder, processes, report)
+
+
+def _run(
+    grid: Grid, folder: Path, processes: int, report: Callable[[Outcome, int, int], None]
+) -> None:
     tasks = grid.tasks()
     folder.mkdir(parents=True, exist_ok=True)
-    waiting = [task for task in tasks if read_outcome(grid, folder, task) is None]
+    waiting = waiting_tasks(grid, folder)
     if not waiting:
         return
     write_subset(Path(grid.data), folder / SUBSET, grid.sweeps)

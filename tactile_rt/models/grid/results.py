@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from tactile_rt.files import write_whole
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import Interval, accuracy
+from tactile_rt.models.grid.outcomes import SUBSET, Outcome, Training, read_outcome
 from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid, Growth
-from tactile_rt.models.grid.work import SUBSET, Outcome, Point, read_outcome
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Answer", "GridResults", "Row", "gather", "put_into", "table", "write_results"]
@@ -52,8 +52,8 @@ class Row:
     parameters: int = 0
     seconds: float = 0.0
     share: float = 1.0
-    chosen: Point | None = None
-    growth: tuple[Point, ...] = ()
+    chosen: Training | None = None
+    growth: tuple[Training, ...] = ()
     flat: bool = False
     failed: str = ""
 

@@ -22,124 +22,33 @@ from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.ead import count_parameters
 from tactile_rt.models.evaluation import Step, hits
+from tactile_rt.models.grid.outcomes import (
+    SUBSET,
+    Outcome,
+    Training,
+    outcome_path,
+    read_outcome,
+    settings_of,
+)
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.models.svm import fit_svm
 from tactile_rt.models.training import (
     ProbeConfig,
     Progress,
-    TrainingConfig,
     initialise,
     probe,
     train,
 )
-from tactile_rt.stream import ConfigError, ModelError
+from tactile_rt.stream import ModelError
 from tactile_rt.sweep_set import SweepManifest
 
-__all__ = ["Outcome", "Point", "Workbench", "outcome_path", "read_outcome", "settings_of"]
+__all__ = ["Workbench"]
 
 BATCH = 128
 RATED = Disturbance(noise=1.0)
-SUBSET = "sweeps"  # folders of a grid
-RUNS, OUTCOMES = "runs", "outcomes"
+RUNS = "runs"  # a folder of a grid
 POINT = "point.json"
-
-
-class Point(msgspec.Struct, frozen=True):
-    """One training and what the validation split says of it.
-
-    Attributes:
-        learning_rate, warmup, updates: The settings of the training, as in `TrainingConfig`.
-        score: Top-1 of the validation split, 0 to 1, the mean of clean and noisy; of a
-            self-supervised network by its probe. 0 if it diverged.
-        seconds: The CPU time of its updates, and of what it was validated by, s.
-    """
-
-    learning_rate: float
-    warmup: float
-    updates: int
-    score: float
-    seconds: float
-
-
-class Outcome(msgspec.Struct, frozen=True):
-    """What a task found.
-
-    Attributes:
-        name, seed: Name and seed of the task.
-        key: The settings that the outcome depends on, as JSON; another key is another experiment.
-        top1, top5, noisy: Hits as text, a 0 or 1 per test sweep: right, among the first five, right
-            at the rated noise.
-        parameters: The number of parameters of encoder, attender and decoder.
-        seconds: The CPU time of the training that was scored, s.
-        trials: The trials that chose rate and warm-up; of the first seed alone.
-        growth: The trainings with more and more updates; of the first seed alone.
-        chosen: The training that was scored.
-        failed: The reason why there is no figure; empty if there is one.
-    """
-
-    name: str
-    seed: int
-    key: str
-    top1: str = ""
-    top5: str = ""
-    noisy: str = ""
-    parameters: int = 0
-    seconds: float = 0.0
-    trials: tuple[Point, ...] = ()
-    growth: tuple[Point, ...] = ()
-    chosen: Point | None = None
-    failed: str = ""
-
-    def right(self, which: str = "top1") -> NDArray[np.bool_]:
-        """(sweep,) of `top1`, `top5` or `noisy`."""
-        right: NDArray[np.bool_] = np.array(list(getattr(self, which)), dtype=np.str_) == "1"
-        return right
-
-
-def outcome_path(folder: Path, task: Task) -> Path:
-    """Where a grid's folder keeps a task's outcome."""
-    return folder / OUTCOMES / f"{task.slug}.json"
-
-
-def read_outcome(grid: Grid, folder: Path, task: Task) -> Outcome | None:
-    """What a task found, if it is done.
-
-    Raises:
-        ConfigError: it was done with other settings.
-    """
-    path = outcome_path(folder, task)
-    if not path.exists():
-        return None
-    try:
-        found = msgspec.json.decode(path.read_bytes(), type=Outcome)
-    except msgspec.MsgspecError as error:
-        raise ConfigError(f"{path} is damaged ({error}): delete it to do it again") from None
-    if found.key != settings_of(grid, folder, task):
-        raise ConfigError(
-            f"{folder} holds {task.name!r} trained with other settings: choose another folder, or "
-            f"delete {path} to train it again"
-        )
-    return found
-
-
-def settings_of(grid: Grid, folder: Path, task: Task) -> str:
-    """Everything that an outcome depends on, as JSON."""
-    settings: dict[str, Any] = {"sweeps": msgspec.to_builtins(grid.sweeps), "data": grid.data}
-    if task.cell is not None:
-        config, usual = (
-            msgspec.to_builtins(one) for one in (grid.config(task, Path()), TrainingConfig(""))
-        )
-        if task.random:  # trained for no update at all
-            config = {k: config[k] for k in ("encoder", "attender", "width", "seed")}
-        else:
-            # A key that was thought of later leaves what was done before as it is.
-            config = {k: v for k, v in config.items() if v != usual[k]}
-            settings |= {"search": grid.search, "growth": grid.growth, "cell": task.cell}
-        settings |= {"config": config}
-        if task.random or task.cell.objective != SUPERVISED:
-            settings |= {"probe": grid.probe}
-    return msgspec.json.encode(settings, order="sorted").decode()
 
 
 class Workbench:
@@ -205,21 +114,23 @@ class Workbench:
             msgspec.structs.replace(found, chosen=chosen, seconds=chosen.seconds), run / "best.pt"
         )
 
-    def _search(self, task: Task, report: Callable[..., None]) -> tuple[Point, ...]:
+    def _search(self, task: Task, report: Callable[..., None]) -> tuple[Training, ...]:
         """The trials: every rate with the first warm-up, then the other warm-ups with the best."""
         search = self.grid.search
 
-        def of(rate: float, warmup: float) -> Point:
-            return self._train(task, Point(rate, warmup, search.updates, 0.0, 0.0), report)
+        def of(rate: float, warmup: float) -> Training:
+            return self._train(task, Training(rate, warmup, search.updates, 0.0, 0.0), report)
 
         rates = [of(rate, search.warmup[0]) for rate in search.learning_rate]
         best = max(rates, key=_score).learning_rate
         return (*rates, *(of(best, warmup) for warmup in search.warmup[1:]))
 
-    def _grow(self, task: Task, best: Point, report: Callable[..., None]) -> tuple[Point, ...]:
+    def _grow(
+        self, task: Task, best: Training, report: Callable[..., None]
+    ) -> tuple[Training, ...]:
         """Trainings of twice as many updates each, until one gains too little."""
         growth = self.grid.growth
-        points: list[Point] = []
+        points: list[Training] = []
         updates, before = growth.first, -inf
         while updates <= growth.most:
             at = msgspec.structs.replace(best, updates=updates)
@@ -229,11 +140,11 @@ class Workbench:
             updates, before = 2 * updates, points[-1].score
         return tuple(points)
 
-    def _train(self, task: Task, at: Point, report: Callable[..., None]) -> Point:
+    def _train(self, task: Task, at: Training, report: Callable[..., None]) -> Training:
         """One training, unless it is there; of a diverged one the score is 0."""
         run = self._run(task, at)
         if (run / POINT).exists():
-            return msgspec.json.decode((run / POINT).read_bytes(), type=Point)
+            return msgspec.json.decode((run / POINT).read_bytes(), type=Training)
         chosen: dict[str, Any] = {
             "learning_rate": at.learning_rate, "warmup": at.warmup, "updates": at.updates,
         }  # fmt: skip
@@ -271,7 +182,7 @@ class Workbench:
             path.unlink()
         return done
 
-    def _run(self, task: Task, at: Point) -> Path:
+    def _run(self, task: Task, at: Training) -> Path:
         """The folder of one training."""
         name = f"rate{at.learning_rate:g}_warmup{at.warmup:g}_updates{at.updates}"
         return self.folder / RUNS / task.slug / name
@@ -340,7 +251,7 @@ class Workbench:
         return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
 
 
-def _score(point: Point) -> float:
+def _score(point: Training) -> float:
     return point.score
 
 

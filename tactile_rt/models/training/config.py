@@ -1,27 +1,36 @@
-"""What to train and how: one frozen dataclass, the whole of a run's `config.json`."""
+"""What to train and how, the whole of a run's `config.json`; and how to probe what was trained.
+
+Needs no torch, so that what cannot be is refused before it is loaded.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite
+from pathlib import Path
 
-from tactile_rt.models.augmentation import AUGMENTATIONS
-from tactile_rt.models.ead import EADConfig
-from tactile_rt.models.encoders import MOUSE_FRAME
+from tactile_rt.models.data_checks import check_labelled, check_split
+from tactile_rt.models.datasets import frame_of
+from tactile_rt.models.ead_config import MOUSE_FRAME, READOUTS, EADConfig
 from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.stream import ConfigError
+from tactile_rt.sweep_set import SweepManifest, join_manifests
 
 __all__ = [
+    "AUGMENTATIONS",
     "LOSSES",
     "OBJECTIVES",
     "OPTIMIZERS",
     "PRECISIONS",
     "SCHEDULES",
     "WINDOWS",
+    "ProbeConfig",
     "Progress",
     "TrainingConfig",
+    "manifests_of",
 ]
 
 OBJECTIVES = ("supervised", "simclr", "simsiam", "autoencoder")
+AUGMENTATIONS = ("none", "tactile", "tactile-paper", "image", "image-paper", "image-paper-weak")
 LOSSES = ("anytime", "last")
 OPTIMIZERS = ("sgd", "adam", "adamw", "lars", "lars-paper")
 SCHEDULES = ("step", "constant", "cosine", "cosine-annealing", "one-cycle")
@@ -176,6 +185,59 @@ class TrainingConfig:
             norm_epsilon=self.norm_epsilon,
             preprocessing=self.preprocessing,
         )
+
+
+def manifests_of(config: TrainingConfig) -> tuple[list[SweepManifest], SweepManifest]:
+    """What the sets of a training configuration are, and all of them as one.
+
+    Raises:
+        ConfigError: the configuration names no network, its sets cannot be joined, or one has no
+            labels to learn from.
+        RecordingError: one is not there, is no sweep set, or is split in a way that cannot be.
+    """
+    folders = [Path(folder) for folder in (config.data, *config.also)]
+    manifests = [SweepManifest.read(folder) for folder in folders]
+    whole = join_manifests(manifests)
+    config.network(len(whole.categories), frame_of(whole))
+    for folder, manifest in zip(folders, manifests, strict=True):
+        if config.objective == "supervised":
+            check_labelled(folder, manifest)
+        check_split(folder, manifest)
+    check_split(folders[0], whole)
+    return manifests, whole
+
+
+@dataclass(frozen=True)
+class ProbeConfig:
+    """The paper's probe, but for `standardise`.
+
+    Attributes:
+        data: The folder of the sweep set; empty takes the one that the network was trained on.
+        epochs, batch, learning_rate, momentum: Settings of stochastic gradient descent.
+        drop_epochs: The number of epochs between tenfold drops of the rate (StepLR).
+        standardise: Whether to fit on features of zero mean and unit variance, folded into the
+            layer afterwards; the paper does not, and features that are small then hardly train.
+        readout: The steps to fit on: "last" takes the last step (the paper), "mean" the mean of all
+            steps that can know anything, which is the only fair one for a network without memory.
+        seed: The seed of the layer, the windows and their order.
+    """
+
+    data: str = ""
+    epochs: int = 100
+    batch: int = 256
+    learning_rate: float = 0.1
+    momentum: float = 0.9
+    drop_epochs: int = 30
+    standardise: bool = True
+    readout: str = "last"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.readout not in READOUTS:
+            raise ConfigError(f"readout is {self.readout!r}, not one of {', '.join(READOUTS)}")
+        for name in ("epochs", "batch", "learning_rate", "drop_epochs"):
+            if not 0 < getattr(self, name) < float("inf"):
+                raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
 
 
 @dataclass

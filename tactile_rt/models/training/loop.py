@@ -6,11 +6,9 @@ that was not. Under torchrun every process has a share of each batch:
     torchrun --nproc-per-node 2 --no-python tactile-rt train data/default24 runs/mine
 """
 
-import os
 import time
-import warnings
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import islice
 from math import ceil, inf
@@ -23,9 +21,11 @@ import torch
 from torch.optim.lr_scheduler import LRScheduler
 
 from tactile_rt.files import write_whole
+from tactile_rt.locks import alone_in
 from tactile_rt.models.augmentation import build
-from tactile_rt.models.checkpoints import TactileClassifier, begin_from, reason, save_whole
-from tactile_rt.models.data_checks import check_labelled, check_sets, check_split
+from tactile_rt.models.checkpoint_files import reason
+from tactile_rt.models.checkpoints import TactileClassifier, begin_from, save_whole
+from tactile_rt.models.data_checks import check_sets
 from tactile_rt.models.datasets import (
     SweepSet,
     TrainingBatches,
@@ -36,13 +36,14 @@ from tactile_rt.models.datasets import (
 )
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.objectives import Autoencoder, Objective, SimCLR, SimSiam, Supervised
-from tactile_rt.models.training.config import Progress, TrainingConfig
+from tactile_rt.models.training.config import Progress, TrainingConfig, manifests_of
+from tactile_rt.models.training.devices import is_first, launched
 from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
 from tactile_rt.models.training.logs import Board, log_epoch
 from tactile_rt.models.training.optimizers import build_optimizer, build_schedule
 from tactile_rt.models.training.validation import Validation
 from tactile_rt.stream import ConfigError, ModelError
-from tactile_rt.sweep_set import OUTLIERS, SweepManifest, join_manifests
+from tactile_rt.sweep_set import OUTLIERS
 
 if TYPE_CHECKING:
     from lightning.fabric import Fabric
@@ -74,18 +75,33 @@ def train(
         splits: what `read_splits` gives, where many runs share it.
 
     Raises:
-        ConfigError: the folder holds a run of another configuration, or the configuration cannot
-            be trained.
+        ConfigError: the folder holds a run of another configuration, another process trains in it,
+            or the configuration cannot be trained.
         RecordingError: the sweep set is missing, unfinished, damaged or unfit.
         ModelError: `last.pt` is damaged, or the training diverged.
+        OSError: the medium is full, or failed; the last checkpoint is as it was.
     """
-    fabric = _launched(config, device)
+    with (
+        alone_in(folder) if is_first() else nullcontext(),
+        launched(config, device) as fabric,
+        closing(Board(folder, tensorboard and fabric.is_global_zero)) as board,
+    ):
+        return _train(fabric, config, folder, report, board, splits)
+
+
+def _train(
+    fabric: "Fabric",
+    config: TrainingConfig,
+    folder: Path,
+    report: Report,
+    board: Board,
+    splits: Splits | None,
+) -> Path:
     torch.manual_seed(config.seed)
     training, validating = (drawn_as(one, asdict(config)) for one in splits or read_splits(config))
     objective = build_objective(config, training)
     if config.begin:
         begin_from(objective.model, Path(config.begin), labels_of(training))
-    board = Board(folder, tensorboard and fabric.is_global_zero)
     if fabric.is_global_zero:
         _begin_run(config, folder)
 
@@ -160,7 +176,6 @@ def train(
             save_whole(folder / "last.pt", run.state())
         shown = {**metrics, "waiting": feed.waited / metrics["seconds"]}
         report(Progress(epoch + 1, run.epochs, run.done, run.updates, metrics["loss"], shown))
-    board.close()
     fabric.barrier()
     return folder / "best.pt"
 
@@ -190,15 +205,7 @@ def read_splits(config: TrainingConfig) -> tuple[SweepSet, SweepSet]:
         RecordingError: a set is missing, unfinished, damaged or unfit.
     """
     folders = [Path(folder) for folder in (config.data, *config.also)]
-    manifests = [SweepManifest.read(folder) for folder in folders]
-    whole = join_manifests(manifests)
-    # a slip of the pen is told before a set is read
-    config.network(len(whole.categories), frame_of(whole))
-    for folder, manifest in zip(folders, manifests, strict=True):
-        if config.objective == "supervised":
-            check_labelled(folder, manifest)
-        check_split(folder, manifest)
-    check_split(folders[0], whole)
+    manifests, whole = manifests_of(config)
     training, validating = [], []
     for folder, manifest in zip(folders, manifests, strict=True):
         names = ["train", *([OUTLIERS] if manifest.split.get(OUTLIERS) else [])]
@@ -282,28 +289,6 @@ class _Run:
             raise ModelError(
                 f"{last} is damaged ({reason(error)}): delete it to begin the run anew"
             ) from None
-
-
-def _launched(config: TrainingConfig, device: str) -> "Fabric":
-    # Imported here: seconds that whoever only loads a checkpoint need not spend.
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from lightning.fabric import Fabric
-        from lightning.fabric.strategies.ddp import DDPStrategy
-
-    size = int(os.environ.get("WORLD_SIZE", "1"))
-    local = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    if (config.batch < 2 * size and config.objective != "supervised") or config.batch < size:
-        raise ConfigError(f"a batch of {config.batch} is too small to be shared by {size} devices")
-    fabric = Fabric(
-        accelerator=device,
-        devices=local,
-        num_nodes=size // local,
-        # Some layers of some networks (a position never reached) have no part in a window.
-        strategy=DDPStrategy(find_unused_parameters=True) if size > 1 else "auto",
-    )
-    fabric.launch()
-    return fabric
 
 
 def _mean(fabric: "Fabric", losses: list[float]) -> float:

@@ -5,7 +5,7 @@ seconds. (The published probe left dropout and batch norm in training mode.)
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import msgspec
@@ -13,8 +13,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.locks import alone_in
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
-from tactile_rt.models.data_checks import check_array, check_labelled, check_sets, check_split
+from tactile_rt.models.data_checks import check_sets, check_split, probed_on
 from tactile_rt.models.datasets import (
     JITTER,
     SweepSet,
@@ -23,49 +24,14 @@ from tactile_rt.models.datasets import (
     of_categories,
     windows,
 )
-from tactile_rt.models.ead import READOUTS
 from tactile_rt.models.evaluation import hits, predict
-from tactile_rt.models.training.config import Progress
+from tactile_rt.models.training.config import ProbeConfig, Progress
 from tactile_rt.models.training.logs import log_epoch
 from tactile_rt.stream import ConfigError
-from tactile_rt.sweep_set import SweepManifest
 
-__all__ = ["ProbeConfig", "linear_probe", "probe"]
+__all__ = ["linear_probe", "probe"]
 
 WINDOWS = 32  # at a time, through the frozen network
-
-
-@dataclass(frozen=True)
-class ProbeConfig:
-    """The paper's probe, but for `standardise`.
-
-    Attributes:
-        data: The folder of the sweep set; empty takes the one that the network was trained on.
-        epochs, batch, learning_rate, momentum: Settings of stochastic gradient descent.
-        drop_epochs: The number of epochs between tenfold drops of the rate (StepLR).
-        standardise: Whether to fit on features of zero mean and unit variance, folded into the
-            layer afterwards; the paper does not, and features that are small then hardly train.
-        readout: The steps to fit on: "last" takes the last step (the paper), "mean" the mean of all
-            steps that can know anything, which is the only fair one for a network without memory.
-        seed: The seed of the layer, the windows and their order.
-    """
-
-    data: str = ""
-    epochs: int = 100
-    batch: int = 256
-    learning_rate: float = 0.1
-    momentum: float = 0.9
-    drop_epochs: int = 30
-    standardise: bool = True
-    readout: str = "last"
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.readout not in READOUTS:
-            raise ConfigError(f"readout is {self.readout!r}, not one of {', '.join(READOUTS)}")
-        for name in ("epochs", "batch", "learning_rate", "drop_epochs"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
 
 
 def probe(
@@ -89,14 +55,22 @@ def probe(
     Raises:
         ModelError: no checkpoint.
         SpecMismatch: the set is of another array.
-        RecordingError, ConfigError: the set cannot be used, as in `train`.
+        RecordingError, ConfigError: the set cannot be used, as in `train`; the folder is that of a
+            training run, or another process writes into it.
     """
-    config = config or ProbeConfig()
+    with alone_in(folder):
+        return _probe(checkpoint, folder, config or ProbeConfig(), report, splits)
+
+
+def _probe(
+    checkpoint: Path,
+    folder: Path,
+    config: ProbeConfig,
+    report: Callable[[Progress], None],
+    splits: tuple[SweepSet, SweepSet] | None,
+) -> Path:
     trained, saved = load_checkpoint(checkpoint)
-    path = Path(config.data or saved["config"]["data"])  # of several sets the first
-    manifest = SweepManifest.read(path)
-    check_array(checkpoint, saved, manifest)
-    check_labelled(path, manifest)
+    path, manifest = probed_on(checkpoint, saved, folder, config.data)
     if splits is None:
         check_split(path, manifest)
         splits = SweepSet.read(path, "train"), SweepSet.read(path, "validation")

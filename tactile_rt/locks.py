@@ -1,4 +1,4 @@
-"""One daemon per configuration and per device: a second one is refused, by the first one's pid.
+"""One process per configuration, device and folder: a second is refused, by the first one's pid.
 
 A lock is a name in the kernel's abstract namespace of Unix sockets (unix(7)), which ends with the
 process that has it. No file is written, so that neither the environment, nor a read-only system,
@@ -11,12 +11,14 @@ import os
 import socket
 import struct
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from tactile_rt.stream import TactileError
+from tactile_rt.stream import ConfigError, TactileError
 
-__all__ = ["AlreadyRunning", "Locks", "device_keys", "lock_keys"]
+__all__ = ["AlreadyRunning", "Locks", "alone_in", "device_keys", "lock_keys"]
 
 DEVICES = ("serial", "can")
 TRIES = 20  # at a name whose holder does not answer: it has just begun, or has just ended
@@ -49,6 +51,27 @@ def device_keys(urls: list[str]) -> list[str]:
     return list(dict.fromkeys(keys))
 
 
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Have a folder to oneself while the block runs; by all its names, and before it is there.
+
+    Only processes of one computer see each other.
+
+    Raises:
+        ConfigError: another process has it.
+        TactileError: as `Locks.hold`.
+    """
+    locks = Locks()
+    try:
+        locks.hold([f"folder {os.path.realpath(folder)}"])
+    except AlreadyRunning as error:
+        raise ConfigError(f"{error}: wait until it has ended, or choose another folder") from None
+    try:
+        yield
+    finally:
+        locks.close()
+
+
 class Locks:
     """Locks that the process holds until it ends, however it ends."""
 
@@ -60,7 +83,7 @@ class Locks:
 
         Raises:
             AlreadyRunning: another process has one; what was held is still held.
-        TactileError: the kernel gives none, which is so where Unix sockets are forbidden.
+            TactileError: the kernel gives none, which is so where Unix sockets are forbidden.
         """
         got: dict[str, socket.socket] = {}
         try:

@@ -1,0 +1,121 @@
+"""What cannot be is refused before torch is loaded: its seconds are for those who train."""
+
+import json
+import resource
+import subprocess
+import sys
+
+import pytest
+
+from tests.helpers.tiny_sweeps import write_tiny_set
+
+torch = pytest.importorskip("torch")
+for module in ("lightning", "onnx", "matplotlib"):
+    pytest.importorskip(module)
+
+from tactile_rt.models.training import TrainingConfig, train  # noqa: E402
+
+# Commands of JSON lines, in one process; of each what it said, and what it had loaded.
+CHILD = """
+import contextlib, io, json, sys
+from tactile_rt.cli import main
+for line in sys.stdin:
+    sys.argv = ["tactile-rt", *json.loads(line)]
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            main()
+    except SystemExit as end:
+        loaded = [m for m in ("torch", "lightning", "sklearn", "matplotlib") if m in sys.modules]
+        print(json.dumps([end.code, said.getvalue(), loaded]))
+"""
+MOST_S = 1.2  # of CPU time, on a machine that is busy; it takes 0.3, and with torch 2 to 6
+
+
+def children(commands):
+    lines = "".join(json.dumps([str(word) for word in one]) + "\n" for one in commands)
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD], input=lines, capture_output=True, text=True, timeout=120
+    )
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert not done.stderr
+    used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return [json.loads(line) for line in done.stdout.splitlines()], used
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A sweep set, a run of it, and files that are something else."""
+    folder = tmp_path_factory.mktemp("early")
+    write_tiny_set(folder / "set")
+    small = {"encoder": "gru", "width": 1 / 32, "batch": 6, "updates": 1}
+    train(TrainingConfig(str(folder / "set"), **small), folder / "run")
+    for name in ("junk.pt", "junk.onnx", "junk.json", "junk.npz"):
+        (folder / name).write_text("junk\n")
+    (folder / "plan.toml").write_text(f'data = "{folder}/none"\n[[cell]]\nencoder = "gru"\n')
+    moved = torch.load(folder / "run" / "best.pt")
+    moved["config"]["data"] = str(folder / "moved")
+    torch.save(moved, folder / "moved.pt")
+    return folder
+
+
+def test_what_cannot_be_is_refused_before_torch_is_loaded(made):
+    out, best, data = made / "out", made / "run" / "best.pt", made / "set"
+    no_set, no_checkpoint = "is not a sweep set", "is not a checkpoint of `tactile-rt train`"
+    cases = [
+        (("train", made / "none", out), f"{made}/none {no_set}"),
+        (("train", best, out), f"best.pt {no_set}"),
+        (("train", data, out, "--also", made / "none"), f"{made}/none {no_set}"),
+        (("train", data, out, "--recipe", "defualt"), "no recipe 'defualt'; did you mean default"),
+        (("train", data, out, "--recipe", made / "none.toml"), "none.toml: no such file"),
+        (("train", data, out, "--encoder", "grru"), "encoder is 'grru', not one of"),
+        (("train", data, out, "--augmentation", "mixup"), "augmentation is 'mixup'"),
+        (("train", data, out, "--from", made / "none.pt"), f"no checkpoint {made}/none.pt"),
+        (("train", data, out, "--from", made / "run" / "last.pt"), no_checkpoint),
+        (("probe", made / "none.pt", out), "no checkpoint"),
+        (("probe", made / "junk.pt", out), no_checkpoint),
+        (("probe", best, made / "run"), "holds a training run"),
+        (("probe", best, out, "--readout", "all"), "readout is 'all', not one of last, mean"),
+        (("probe", best, out, "--data", made / "none"), no_set),
+        (("export", made / "none.pt", out / "a.onnx"), "no checkpoint"),
+        (("export", made / "junk.pt", out / "a.onnx"), no_checkpoint),
+        (("export", best, made), "is a folder"),
+        (("export", best, out / "a.onnx", "--precision", "fp8"), "--precision is 'fp8'"),
+        (("export", best, out / "a.onnx", "--kind", "epoch"), "--kind is 'epoch'"),
+        (("export", made / "moved.pt", out / "a.onnx"), "is not here: name it by --data"),
+        (("eval", made / "none.onnx", data), "no model file"),
+        (("eval", made / "junk.onnx", data), "is not a readable ONNX model"),
+        (("eval", made / "junk.onnx", made / "none"), no_set),
+        (("eval", made / "junk.onnx", data, "--accurate", made / "none"), no_set),
+        (("grid", "wide42", out), "no grid wide42: name a TOML file, or one of"),
+        (("grid", made / "plan.toml", out), f"{made}/none {no_set}"),
+        (("grid", made / "junk.pt", out), "junk.pt:1: not TOML"),
+        (("align", "score", best, "--benchmark", made / "none.json"), "none.json: cannot be read"),
+        (("align", "score", best, "--benchmark", made / "junk.json"), "junk.json"),
+        (("align", "decode", best, made / "junk.pt"), no_checkpoint),
+        (("align", "decode", best, "--benchmark", made / "junk.json"), "junk.json"),
+        (("align", "decode", best, "--stimuli", made / "junk.npz"), "is no model input"),
+        (("align", "decode", made / "junk.onnx"), "is not a readable ONNX model"),
+        (("align", "report", made / "junk.json", "--out", made / "a.html"), "junk.json"),
+        (("align", "gate", made / "junk.pt", "--reference", best), no_checkpoint),
+        (("align", "gate", best, "--reference", made / "none.pt"), "no checkpoint"),
+        (("align", "gate", best, "--benchmark", made / "junk.json"), "junk.json"),
+        (("locate", "train", made / "none", out), no_set),
+    ]
+    found, _ = children(command for command, _ in cases)
+    assert len(found) == len(cases)
+    for (command, expected), (code, said, loaded) in zip(cases, found, strict=True):
+        assert expected in said, command
+        assert (said.count("\n"), loaded) == (1, []), command
+        assert code == (3 if "gate" in command else 2), command
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "command", [("train", "none", "run"), ("export", "none.pt", "a.onnx"), ("eval", "a.onnx", "no")]
+)
+def test_a_refusal_takes_little_time(command):
+    ((code, _, _),), used = children([command])
+    assert code == 2
+    assert used < MOST_S
