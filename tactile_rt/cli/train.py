@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from tactile_rt.cli.app import app, needs, progress_bar
+from tactile_rt.cli.tables import Json, show_table
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -148,18 +148,16 @@ def _text(path: Path) -> str:
 
 
 @app.command()
-def recipes() -> None:
-    """List the training recipes that ship."""
+def recipes(json: Json = None) -> None:
+    """List the training recipes that ship, and the values that each was chosen from."""
     from tactile_rt.models.training.recipes import load_recipe, shipped_recipes
 
-    table = Table(box=None, pad_edge=False)
-    for column in ("recipe", "what", "tried"):
-        table.add_column(column, no_wrap=column == "recipe")
+    found: list[dict[str, Any]] = []
     for name in shipped_recipes():
         recipe = load_recipe(name)
         tried = (f"{key} {', '.join(map(str, v))}" for key, v in recipe.search.items())
-        table.add_row(name, recipe.about, "; ".join(tried))
-    Console().print(table)
+        found.append({"recipe": name, "about": recipe.about, "tried": "; ".join(tried)})
+    show_table(found, {"recipe": "recipe", "about": "what", "tried": "tried"}, json)
 
 
 @app.command()
