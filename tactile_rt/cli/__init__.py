@@ -31,6 +31,7 @@ def main() -> None:
         evaluate,
         grid,
         hil,
+        importing,
         label,
         locate,
         model,

@@ -1,0 +1,183 @@
+"""A log of a line, decoded by a codec into a recording that holds the packets, too.
+
+Packets that carry the time at which they came are decoded as they were live. Where the log has no
+times, the device's own clock dates the samples; a device without one is taken to have sent at its
+nominal rate, and what its counter or its damaged frames tell of lost samples takes time, too.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from tactile_rt.classifier.array_file import read_array
+from tactile_rt.drivers.clocks import DeviceTime, Stamper
+from tactile_rt.drivers.codec import Codec, Command, Samples, codec_class
+from tactile_rt.drivers.logs import LineLog
+from tactile_rt.drivers.opening import make_codec
+from tactile_rt.files import write_whole
+from tactile_rt.recording.description import SUMMARY, Description
+from tactile_rt.recording.importing.account import Import, clock_of
+from tactile_rt.recording.layout import SAMPLES, WIRE, encode_packet, encode_samples
+from tactile_rt.recording.writer import McapFile
+from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, RecordingError, SourceStats
+
+__all__ = ["import_wire"]
+
+AHEAD = 4096  # packets in which a device may describe itself before samples must come
+
+
+def import_wire(
+    log: LineLog, output: Path, fields: Mapping[str, str], rate_hz: float = 0.0
+) -> Import:
+    """Decode a log, and write samples and packets as a recording.
+
+    Args:
+        log: what was logged.
+        output: the recording; it is there whole or not at all.
+        fields: ``codec`` and its options, as in a URL, also ``array``.
+        rate_hz: rate of the samples, Hz; 0 for the codec's.
+
+    Raises:
+        ConfigError: no such codec or option, or a device that describes itself did not.
+        RecordingError: there is no whole sample.
+        OSError: a file cannot be read or written.
+    """
+    codec, about = _prepared(log, fields, rate_hz)
+    account, stats = Import(), SourceStats()
+
+    def fill(file: BinaryIO) -> None:
+        decoded = _Decoded(log, codec, about, stats)
+        made = McapFile(file, decoded.about)
+        made.add(WIRE, encode_packet(None, about.wire), 0)
+        first = last = packets = 0
+        for packet, t_ns, chunk in decoded:
+            made.add(WIRE, encode_packet(packet, about.wire), t_ns)
+            packets += 1
+            if chunk is None:
+                continue
+            own = decoded.about.clock == "device"
+            made.add(SAMPLES, encode_samples(chunk), t_ns if own else int(chunk.t_ns[-1]))
+            first = first if account.samples else int(chunk.t_ns[0])
+            last = int(chunk.t_ns[-1])
+            account.samples += len(chunk)
+        if not account.samples:
+            raise RecordingError(f"{log.path}: {_why_none(log, codec, str(fields['codec']))}")
+        made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
+        made.finish()
+        account.seconds = (last - first) / NS_PER_S
+        account.rate_hz = decoded.about.spec.rate_hz
+
+    write_whole(output, fill)
+    account.intact, account.corrupt = codec.stats.intact, codec.stats.corrupt
+    account.missing, account.notes = stats.missing, list(log.notes)
+    if codec.stats.incomplete:
+        account.notes.append(f"{codec.stats.incomplete} samples lack a part")
+    if stats.duplicates:
+        account.notes.append(f"{stats.duplicates} samples came twice")
+    return account
+
+
+def _prepared(
+    log: LineLog, fields: Mapping[str, str], rate_hz: float
+) -> tuple[Codec[Any], Description]:
+    """The codec, and the description of the recording but for what the packets tell."""
+    own = dict(fields)
+    name, array = own.pop("codec", ""), own.pop("array", "")
+    if not name:
+        raise ConfigError("--as needs codec=NAME, see `tactile-rt codecs`")
+    if rate_hz and "rate_hz" in codec_class(log.wire, name).Options.__dataclass_fields__:
+        own.setdefault("rate_hz", f"{rate_hz:g}")
+    codec = make_codec(log.wire, name, own)
+    written = {k: str(Path(v).resolve()) if k == "mapping" else v for k, v in own.items()}
+    if array and codec.spec is None:
+        codec.spec = read_array(Path(array))
+        written["array"] = codec.spec.to_json()
+    elif array:
+        raise ConfigError(f"array= is for devices that are asked what they are, not for {name}")
+    if rate_hz and codec.spec is not None and codec.spec.rate_hz != rate_hz:
+        codec.spec = replace(codec.spec, rate_hz=rate_hz)
+    about = Description(
+        codec.spec,  # type: ignore[arg-type]  # until the packets tell
+        0, f"{log.path.name}", log.wire, name, written,
+        session={"imported": log.path.name, "form": log.form},
+    )  # fmt: skip
+    return codec, about
+
+
+class _Decoded:
+    """(packet, when it came, the samples that it completes) of a log, one after the other.
+
+    Raises:
+        ConfigError: the device did not describe itself.
+    """
+
+    def __init__(
+        self, log: LineLog, codec: Codec[Any], about: Description, stats: SourceStats
+    ) -> None:
+        self._codec, self._now, self._count = codec, 0, None
+        codec.commands(Command.START)  # some note what they have asked for
+        packets = log.packets()
+        waiting: list[tuple[Any, int | None, Samples | None]] = []
+        for packet, t_ns in packets:
+            waiting.append((packet, t_ns, codec.feed(packet, t_ns or 0)))
+            if codec.spec is not None or len(waiting) > AHEAD:
+                break
+        if codec.spec is None:
+            why = _why_none(log, codec, about.codec)
+            if codec.stats.intact:
+                why = (
+                    f"{codec.stats.intact} whole {about.codec} frames, and none describes the "
+                    "array: give array=FILE.json in --as, as `tactile-rt describe` writes it"
+                )
+            raise ConfigError(f"{log.path}: {why}")
+        self._packets: Iterator[tuple[Any, int | None, Samples | None]] = chain(
+            waiting, ((p, t, codec.feed(p, t or 0)) for p, t in packets)
+        )
+        self._stamped = bool(waiting) and waiting[0][1] is not None
+        self._zero = clock_of(waiting[0][1] or 0) if self._stamped else 0
+        self._stamper = Stamper(codec, codec.spec, stats)
+        own_clock = not self._stamped and codec.tick_ns is not None
+        if own_clock and codec.tick_ns is not None:
+            self._stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
+        self._period_ns = NS_PER_S / codec.spec.rate_hz
+        self._passed = 0.0  # periods, where the log has no times
+        self.about = replace(
+            about, spec=codec.spec, utc_offset_ns=self._zero,
+            clock="device" if own_clock else "host",
+        )  # fmt: skip
+
+    def __iter__(self) -> Iterator[tuple[Any, int, Chunk | None]]:
+        for packet, t_ns, samples in self._packets:
+            if t_ns is not None:
+                self._now = max(self._now, t_ns - self._zero)
+            if samples is None:
+                yield packet, self._now, None
+                continue
+            if not self._stamped:
+                self._passed += self._periods(samples)
+                self._now = max(self._now + 1, round(self._passed * self._period_ns))
+            samples.arrived_ns[:] = self._now
+            yield packet, self._now, self._stamper.chunk(samples)
+
+    def _periods(self, samples: Samples) -> int:
+        """How many periods these samples took, with those that were lost before them."""
+        n = len(samples)
+        bits, before = self._codec.count_bits, self._count
+        if samples.count is None or bits is None:
+            return n + int(samples.damaged.sum())
+        self._count = int(samples.count[-1])
+        if before is None:
+            return n
+        ahead = (self._count - before) % (1 << bits)
+        return ahead if n <= ahead <= 1 << (bits - 1) else n
+
+
+def _why_none(log: LineLog, codec: Codec[Any], name: str) -> str:
+    stats = codec.stats
+    guess = codec.complaint or (
+        f"{stats.intact} intact and {stats.corrupt} damaged frames, {stats.skipped} "
+        f"{'bytes' if codec.wire == 'serial' else 'frames'} beside them"
+    )
+    return f"no whole {name} sample ({guess}); `tactile-rt sniff {log.path}` tells what fits"
