@@ -7,11 +7,10 @@ The time is that of the header, where there is one that is set, else that of the
 
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -20,18 +19,16 @@ from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.files import open_regular
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.account import Import, clock_of, write_chunks
+from tactile_rt.recording.importing.bag_reading import ROS1, OpenBag, open_bag
 from tactile_rt.recording.importing.table import Table, import_table, shown_names
 from tactile_rt.recording.layout import decode_samples
+from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC
 from tactile_rt.settings import nearest
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError, concatenate
 
-if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
-
 __all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag"]
 
-ROS1: Final = b"#ROSBAG V"
 SQLITE: Final = b"SQLite format 3\0"
 SAMPLES: Final = "tactile_rt/msg/Samples"
 MOST: Final = 4096  # fields of a message that are columns
@@ -89,14 +86,14 @@ def bag_topics(path: Path) -> list[BagTopic]:
         RecordingError: the bag is damaged.
     """
     found = []
-    with _opened(path) as reader:
-        for name, topic in reader.topics.items():
-            if not topic.msgcount:
+    with open_bag(path) as bag:
+        for name, kind in sorted(bag.types.items()):
+            if not bag.counts[name]:
                 continue
             columns = ""
-            for _, _, message in islice(_messages(path, reader, name), 1):
-                columns = _columns_of(topic.msgtype or "", message)
-            found.append(BagTopic(name, topic.msgtype or "", topic.msgcount, columns))
+            for message in islice(_whole(bag, name), 1):
+                columns = _columns_of(kind, message)
+            found.append(BagTopic(name, kind, bag.counts[name], columns))
     return found
 
 
@@ -124,21 +121,24 @@ def import_bag(
         RecordingError: the bag is damaged, or holds no sample.
         OSError: a file cannot be read or written.
     """
-    topics = bag_topics(path)
-    chosen = _chosen(path, topics, topic, columns)
-    with _opened(path) as reader:
+    if path.is_file() and path.suffix == ".mcap" and _is_ours(path):
+        raise ConfigError(f"{path} is a recording already: `tactile-rt replay` and run take it")
+    chosen = _chosen(path, bag_topics(path), topic, columns)
+    with open_bag(path) as bag:
         if chosen.type == SAMPLES and not columns:
-            return _own(path, reader, chosen, output, array)
+            return _own(path, bag, chosen, output, array)
         if array:
             raise ConfigError(f"--array is for samples of ours, not for {chosen.type}")
-        paths = _paths(path, reader, chosen)
+        paths = _paths(bag, chosen)
+        if not paths:
+            raise RecordingError(f"{path}: no message of {chosen.name} is whole and holds a number")
         words = columns or chosen.columns
         if not words:
             raise ConfigError(
                 f"{path}: {chosen.name} has {chosen.type}: say with --columns what is what, e.g. "
                 f"{paths[-1] if paths else 'data'}=S.value; its fields are {shown_names(paths)}"
             )
-        return import_table(_table(path, reader, chosen, paths), output, words, rate_hz)
+        return import_table(_table(path, bag, chosen, paths), output, words, rate_hz)
 
 
 def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> BagTopic:
@@ -155,36 +155,11 @@ def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> Bag
     raise ConfigError(f"{path} has the topics {told}: {what}")
 
 
-@contextmanager
-def _opened(path: Path) -> Iterator["AnyReader"]:
+def _is_ours(path: Path) -> bool:
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
-        from rosbags.typesys import Stores, get_typestore
-    except ModuleNotFoundError as error:
-        missing = (error.name or "rosbags").partition(".")[0]
-        raise ConfigError(
-            f"bags need {missing}, which is not installed: pip install 'tactile-rt[import]'"
-        ) from None
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
-            yield reader
-    except AnyReaderError as error:
-        why = " ".join(str(error).split())
-        raise RecordingError(f"{path} cannot be read as a bag: {why}") from None
-
-
-def _messages(path: Path, reader: "AnyReader", topic: str) -> Iterator[tuple[int, bytes, Any]]:
-    """(time in the bag in ns, bytes, message) of a topic.
-
-    Raises:
-        RecordingError: the bag is damaged.
-    """
-    which = [c for c in reader.connections if c.topic == topic]
-    try:
-        for connection, t_ns, raw in reader.messages(connections=which):
-            yield t_ns, raw, reader.deserialize(raw, connection.msgtype)
-    except (TypeError, ValueError, KeyError, AssertionError, IndexError) as error:
-        raise RecordingError(f"{path} is damaged: {' '.join(str(error).split())}") from None
+        return bool(Recording(path).description)
+    except (RecordingError, ConfigError):
+        return False
 
 
 def _frame_of(message: Any) -> str:
@@ -209,11 +184,14 @@ def _columns_of(kind: str, message: Any) -> str:
     )
 
 
-def _paths(path: Path, reader: "AnyReader", topic: BagTopic) -> list[str]:
+def _paths(bag: OpenBag, topic: BagTopic) -> list[str]:
     """The paths of the numbers in a message, by the first one."""
-    for _, _, message in _messages(path, reader, topic.name):
-        return list(islice(_leaves(message, ""), MOST))
-    return []
+    return [leaf for message in islice(_whole(bag, topic.name), 1)
+            for leaf in islice(_leaves(message, ""), MOST)]  # fmt: skip
+
+
+def _whole(bag: OpenBag, topic: str) -> Iterator[Any]:
+    return (message for _, _, message in bag.messages(topic) if message is not None)
 
 
 def _leaves(value: Any, at: str) -> Iterator[str]:
@@ -228,16 +206,16 @@ def _leaves(value: Any, at: str) -> Iterator[str]:
         yield at
 
 
-def _table(path: Path, reader: "AnyReader", topic: BagTopic, paths: list[str]) -> Table:
+def _table(path: Path, bag: OpenBag, topic: BagTopic, paths: list[str]) -> Table:
     steps = [[int(s) if s.isdecimal() else s for s in p.split(".")] for p in paths]
-    table = Table(path, tuple(paths), (), times_ns=[])
+    table = Table(path, tuple(paths), (), times_ns=[], notes=bag.notes)
 
     def rows() -> Iterator[Sequence[Any]]:
         times = table.times_ns
         assert times is not None
-        for t_ns, _, message in _messages(path, reader, topic.name):
+        for t_ns, _, message in bag.messages(topic.name):
             times[:] = [_stamp(message) or t_ns]
-            yield _row(message, steps)
+            yield () if message is None else _row(message, steps)
 
     table.rows = rows()
     return table
@@ -263,13 +241,16 @@ def _stamp(message: Any) -> int:
 
 
 def _own(
-    path: Path, reader: "AnyReader", topic: BagTopic, output: Path, array: str
+    path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str
 ) -> Import:
     """Samples of ours in a bag of others: bit for bit."""
-    account, told = Import(), read_array(Path(array)) if array else None
+    account, told = Import(notes=bag.notes), read_array(Path(array)) if array else None
     chunks: list[Chunk] = []
     offset = 0
-    for t_ns, raw, message in _messages(path, reader, topic.name):
+    for t_ns, raw, message in bag.messages(topic.name):
+        if message is None:
+            account.corrupt += 1
+            continue
         shape = int(message.elements), int(message.channels)
         if told is not None and shape != told.shape:
             raise ConfigError(

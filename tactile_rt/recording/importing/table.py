@@ -36,7 +36,9 @@ from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, Recording
 __all__ = ["Table", "import_table", "place_columns", "shown_names"]
 
 NS: Final = {"s": NS_PER_S, "iso": NS_PER_S, "ms": 10**6, "us": 1000, "ns": 1}
+GAP: Final = 10  # typical steps: what is longer is no period
 BLOCK: Final = 1024  # rows that are kept as Python's numbers
+BESIDE: Final = ("header.", "layout.", "field.header.")  # of a message, besides what it tells
 SHOWN: Final = 600  # characters of the names that a message tells
 _DECIMAL: Final = re.compile(r"([+-]?)(\d+)(?:\.(\d*))?")
 
@@ -106,7 +108,7 @@ def place_columns(
                 )
             raise ConfigError(f"{where}: no column {label!r}; {nearest(label, names)}")
         places.append(len(names) - 1 - found)
-    left = [n for k, n in enumerate(names) if k not in places]
+    left = [n for k, n in enumerate(names) if k not in places and not n.startswith(BESIDE)]
     return places, [f"left out: {shown_names(left)}"] if left else []
 
 
@@ -303,20 +305,15 @@ def _strictly(
     if not len(forward):
         raise ConfigError("all lines have one time: is its column another? or give --rate")
     stretches = int((steps < 0).sum())
-    # a coarse clock: several rows at a time, so the median says nothing
-    repeats = float((steps == 0).mean())
-    typical = float(np.median(forward))
-    period = float(np.mean(forward[forward <= 10 * typical])) * len(forward) / (
-        len(forward) + int((steps == 0).sum())
-    ) if repeats > 0.01 else typical  # fmt: skip
+    repeats = int((steps == 0).sum())  # a coarse clock: several rows at a time
+    usual = forward[forward <= GAP * np.median(forward)]
+    period = float(usual.sum()) / (len(usual) + repeats)
     if stretches:
         account.notes.append(f"times go back {stretches} times: there they go on a period later")
         jump = np.where(steps < 0, round(period) - steps, 0)
         times = times + np.concatenate([[0], np.cumsum(jump)])
     if repeats:
-        account.notes.append(
-            f"{int((np.diff(times) == 0).sum())} lines have the time of the one before: spread"
-        )
+        account.notes.append(f"{repeats} lines have the time of the one before: spread evenly")
         times = _spread(times, period)
     rate = NS_PER_S / period
     return times, float(f"{rate:.6g}")
