@@ -40,6 +40,7 @@ def main() -> None:
         record,
         replay,
         run,
+        sniff,
         sweep,
         teach,
         top,

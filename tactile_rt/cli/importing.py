@@ -76,7 +76,7 @@ def import_file(
             raise ConfigError("give --as, for what a device spoke, or --columns, for a table")
         elif decoded_as:
             packets = read_log(log, form, bus)
-            made = import_wire(packets, output, _fields(decoded_as), rate)
+            made = import_wire(packets, output, codec_fields(decoded_as, "--as"), rate)
         elif columns:
             table = read_table(log, csv_form(log, delimiter, decimal, skip, lines))
             made = import_table(table, output, columns, rate)
@@ -90,14 +90,14 @@ def import_file(
     typer.echo(f"{output}: {made.line()}")
 
 
-def _fields(text: str) -> dict[str, str]:
+def codec_fields(text: str, option: str) -> dict[str, str]:
     """The options of ``codec=NAME&OPTION=VALUE``, written as in a URL.
 
     Raises:
-        ConfigError: one is given twice, or has no value.
+        ConfigError: one is given twice, or no codec.
     """
     pairs = parse_qsl(text.replace("+", "%2B"), keep_blank_values=True)
     fields = dict(pairs)
-    if len(fields) < len(pairs) or "codec" not in fields:
-        raise ConfigError(f"--as is codec=NAME&OPTION=VALUE..., each once, not {text!r}")
+    if len(fields) < len(pairs) or not fields.get("codec"):
+        raise ConfigError(f"{option} is codec=NAME&OPTION=VALUE..., each once, not {text!r}")
     return fields

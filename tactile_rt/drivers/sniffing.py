@@ -20,7 +20,16 @@ from tactile_rt.drivers.codec import CODECS, CanFrame, Codec, codec_class
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.stream import ConfigError
 
-__all__ = ["LOOK_BYTES", "Fit", "frame_hint", "sniff_bytes", "sniff_frames"]
+__all__ = [
+    "LOOK_BYTES",
+    "LOOK_FRAMES",
+    "NEEDS_A_FILE",
+    "Fit",
+    "Tried",
+    "frame_hint",
+    "sniff_bytes",
+    "sniff_frames",
+]
 
 LOOK_BYTES: Final = 65_536
 LOOK_FRAMES: Final = 20_000

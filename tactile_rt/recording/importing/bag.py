@@ -27,10 +27,10 @@ from tactile_rt.recording.records import MAGIC
 from tactile_rt.settings import nearest
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError, concatenate
 
-__all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag"]
+__all__ = ["OURS", "BagTopic", "bag_topics", "import_bag", "is_bag"]
 
 SQLITE: Final = b"SQLite format 3\0"
-SAMPLES: Final = "tactile_rt/msg/Samples"
+OURS: Final = "tactile_rt/msg/Samples"
 MOST: Final = 4096  # fields of a message that are columns
 # What messages are of: columns by the end of the type's name, with {} for the frame's name.
 KNOWN: Final = {
@@ -125,7 +125,7 @@ def import_bag(
         raise ConfigError(f"{path} is a recording already: `tactile-rt replay` and run take it")
     chosen = _chosen(path, bag_topics(path), topic, columns)
     with open_bag(path) as bag:
-        if chosen.type == SAMPLES and not columns:
+        if chosen.type == OURS and not columns:
             return _own(path, bag, chosen, output, array)
         if array:
             raise ConfigError(f"--array is for samples of ours, not for {chosen.type}")
@@ -147,7 +147,7 @@ def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> Bag
             if one.name in (topic, f"/{topic}"):
                 return one
         raise ConfigError(f"{path}: no topic {topic!r}; {nearest(topic, [t.name for t in topics])}")
-    fitting = topics if columns else [t for t in topics if t.columns or t.type == SAMPLES]
+    fitting = topics if columns else [t for t in topics if t.columns or t.type == OURS]
     if len(fitting) == 1:
         return fitting[0]
     told = ", ".join(f"{t.name} ({t.type})" for t in fitting or topics) or "none"
