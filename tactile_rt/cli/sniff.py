@@ -109,12 +109,19 @@ def _sniff_port(
 
         for codec, data in ask_devices("serial", connect, seconds):
             found += [(fit, codec.baud) for fit in sniff_bytes(data, further)]
-    found.sort(key=lambda one: (one[0].proof, one[0].explained, one[0].intact), reverse=True)
+    found.sort(
+        key=lambda one: (
+            one[0].explained * (1 + one[0].proof), one[1] == _usual_baud(one[0]), one[0].intact
+        ),
+        reverse=True,
+    )  # fmt: skip
     url = f"serial://{port}" if "://" not in port else f"serial:{port}"
     if found:
         _show([fit for fit, _ in found], [str(baud) for _, baud in found])
         fit, baud = found[0]
-        _run(url, fit, {} if _usual_baud(fit) in (baud, 0) else {"baud": str(baud)})
+        # what USB brings is the same at every speed
+        usual = any(b == _usual_baud(fit) for one, b in found if one.codec == fit.codec)
+        _run(url, fit, {} if usual else {"baud": str(baud)})
         return
     proposed = [(n, baud, words) for baud, data in texts for words, n in _of_lines(data)]
     if proposed:
@@ -161,11 +168,11 @@ def _run(url: str, fit: "Fit", further: dict[str, str]) -> None:
 
 
 def _usual_baud(fit: "Fit") -> int:
-    """The baud rate that its codec has by default; 0: it has none that means anything."""
+    """The baud rate that its codec has by default."""
     from tactile_rt.drivers.opening import make_codec
 
     codec: Any = make_codec("serial", fit.codec, dict(fit.options))
-    return 0 if codec.usb else int(codec.baud)
+    return int(codec.baud)
 
 
 # files

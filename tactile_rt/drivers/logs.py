@@ -26,7 +26,7 @@ __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 SERIAL_FORMS: Final = ("raw", "dump", "hex")
 CAN_FORMS: Final = ("candump", "dump-can", "asc", "blf", "trc")
 FORMS: Final = (*SERIAL_FORMS, *CAN_FORMS)
-PIECE: Final = 256  # bytes of a packet where the log says nothing of packets
+PIECE: Final = 256
 HEAD: Final = 16_384  # bytes that tell the form
 MOSTLY: Final = 0.8  # of the lines at the beginning are of the form
 UTC_FROM_S: Final = 1e8  # a time that is larger counts from 1970
@@ -72,12 +72,14 @@ class LineLog:
         path: Path of the file.
         form: Form of the log, one of `FORMS`.
         wire: What was logged: ``serial`` or ``can``.
+        piece: Bytes of a packet where the log says nothing of packets.
         notes: What could not be read, a sentence each; complete once all packets were read.
     """
 
     def __init__(self, path: Path, form: str, bus: str = "") -> None:
         self.path, self.form, self._bus = path, form, bus
         self.wire = "can" if form in CAN_FORMS else "serial"
+        self.piece = PIECE
         self.notes: list[str] = []
 
     def packets(self) -> Iterator[Timed]:
@@ -110,7 +112,7 @@ class LineLog:
     # bytes and text
 
     def _raw(self, file: LogFile) -> Iterator[Timed]:
-        while piece := file.read(PIECE):
+        while piece := file.read(self.piece):
             yield piece, None
 
     def _text(self, file: LogFile) -> Iterator[Timed]:

@@ -42,7 +42,7 @@ _QUANTITY: Final = (  # (name, channel, unit if it says so itself)
     (re.compile(r"(?:^|[\W_])(?:temp|temperature)(?:$|[\W_])", re.I), "temperature", ""),
     (re.compile(r"(?:^|[\W_])()(?<=[\W_])([xyz])(?:$|[\W_])", re.I), "{}", ""),
     (re.compile(r"(?:^|[\W_])(?:pressure|press)(?:$|[\W_])", re.I), "pressure", ""),
-    (re.compile(r"(?<=\d)([xyz])$", re.I), "{}", ""),
+    (re.compile(r"(?:^|(?<=\d))([xyz])$", re.I), "{}", ""),
     (re.compile(r"^([xyz])(?=\d+$)", re.I), "{}", ""),
 )  # fmt: skip
 _ALIASES: Final = {

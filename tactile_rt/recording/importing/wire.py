@@ -25,6 +25,7 @@ from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, RecordingError, Sour
 
 __all__ = ["import_wire"]
 
+PROBED, SHORTEST = 16_384, 8  # bytes
 AHEAD = 4096  # packets in which a device may describe itself before samples must come
 
 
@@ -45,6 +46,8 @@ def import_wire(
         OSError: a file cannot be read or written.
     """
     codec, about = _prepared(log, fields, rate_hz)
+    if log.form == "raw":
+        log.piece = _bytes_of_a_sample(log, make_codec(log.wire, about.codec, _own(fields)))
     account, stats = Import(), SourceStats()
 
     def fill(file: BinaryIO) -> None:
@@ -83,8 +86,7 @@ def _prepared(
     log: LineLog, fields: Mapping[str, str], rate_hz: float
 ) -> tuple[Codec[Any], Description]:
     """The codec, and the description of the recording but for what the packets tell."""
-    own = dict(fields)
-    name, array = own.pop("codec", ""), own.pop("array", "")
+    own, name, array = _own(fields), fields.get("codec", ""), fields.get("array", "")
     if not name:
         raise ConfigError("--as needs codec=NAME, see `tactile-rt codecs`")
     if rate_hz and "rate_hz" in codec_class(log.wire, name).Options.__dataclass_fields__:
@@ -104,6 +106,22 @@ def _prepared(
         session={"imported": log.path.name, "form": log.form},
     )  # fmt: skip
     return codec, about
+
+
+def _own(fields: Mapping[str, str]) -> dict[str, str]:
+    """The options of the codec alone."""
+    return {k: v for k, v in fields.items() if k not in ("codec", "array")}
+
+
+def _bytes_of_a_sample(log: LineLog, codec: Codec[Any]) -> int:
+    """How many bytes one takes: of so many a packet is made, that each has a time of its own."""
+    size = frames = 0
+    for packet, _ in log.packets():
+        codec.feed(packet, 0)
+        size, frames = size + len(packet), codec.stats.intact
+        if size >= PROBED:
+            break
+    return max(SHORTEST, size // max(1, frames))
 
 
 class _Decoded:
