@@ -82,6 +82,8 @@ def csv_form(
                 quoted = any(_COMMA.fullmatch(c) for x in head for c in _cells(x, one, False))
                 if not quoted:
                     continue
+            if not comma and not decimal and one == " " and all(map(_between_digits, head)):
+                continue  # 5,01 -7 0,25
             found = _tried(head, one, comma)
             if found is not None and (best is None or found[0] > best[0] + 1e-9):
                 best = found
@@ -161,6 +163,13 @@ def _is_number(cell: str) -> bool:
     return (found is not None and found == found) or (
         ":" in plain and in_seconds(plain) != plain
     )
+
+
+def _between_digits(line: str) -> bool:
+    """Whether a line has commas, all of them in numbers, and spaces between these."""
+    words = line.split()
+    cut = [w for w in words if "," in w]
+    return len(words) > 1 and bool(cut) and all(map(_COMMA.fullmatch, cut))
 
 
 def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm] | None:
