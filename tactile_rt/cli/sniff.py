@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 NOTHING = 1  # exit code: nothing fits
 SHOWN = 6  # fits
-UNKNOWN_RATE_HZ = 100
+GUESSED_HZ = 100  # where nothing tells the time
 
 
 @app.command()
@@ -54,7 +54,9 @@ def sniff(
     from tactile_rt.cli.importing import codec_fields
 
     tried = [codec_fields(text, "--try") for text in further or []]
-    candidates = [(f["codec"], {k: v for k, v in f.items() if k != "codec"}) for f in tried]
+    candidates: list[Tried] = [
+        (f["codec"], {k: v for k, v in f.items() if k != "codec"}) for f in tried
+    ]
     path = Path(target.removeprefix("serial://").removeprefix("serial:"))
     with starting(), leaving(None):
         if target.startswith("can:"):
@@ -91,6 +93,7 @@ def _sniff_port(
     from tactile_rt.drivers.links import SerialLink
     from tactile_rt.drivers.listening import ask_devices, hear_port, line_speeds
     from tactile_rt.drivers.sniffing import sniff_bytes
+    from tactile_rt.recording.importing.proposing import line_columns
 
     speeds = [(b, "N") for b in bauds] if bauds else line_speeds()
     found: list[tuple[Fit, int]] = []
@@ -107,8 +110,12 @@ def _sniff_port(
         def connect(codec: Any) -> SerialLink:
             return SerialLink(port, codec.baud, codec.parity, dtr)
 
-        for codec, data in ask_devices("serial", connect, seconds):
-            found += [(fit, codec.baud) for fit in sniff_bytes(data, further)]
+        for fit in (
+            fit
+            for _, data in ask_devices("serial", connect, seconds)
+            for fit in sniff_bytes(data, further)
+        ):
+            found.append((fit, _usual_baud(fit)))
     found.sort(
         key=lambda one: (
             one[0].explained * (1 + one[0].proof), one[1] == _usual_baud(one[0]), one[0].intact
@@ -123,7 +130,9 @@ def _sniff_port(
         usual = any(b == _usual_baud(fit) for one, b in found if one.codec == fit.codec)
         _run(url, fit, {} if usual else {"baud": str(baud)})
         return
-    proposed = [(n, baud, words) for baud, data in texts for words, n in _of_lines(data)]
+    proposed = [
+        (told[1], baud, told[0]) for baud, data in texts if (told := line_columns(data)) is not None
+    ]
     if proposed:
         n, baud, columns = max(proposed)
         typer.echo(f"{n} lines at {baud} bit/s are samples: names and units are for you to say")
@@ -212,7 +221,7 @@ def _sniff_file(path: Path, further: "list[Tried]") -> None:
     if fits:
         _show(fits)
         _import(path, fits[0])
-    elif not (log.form == "raw" and (_sniff_table(path) or _sniff_lines(path, bytes(data)))):
+    elif log.form != "raw" or not _sniff_text(path, bytes(data)):
         _nothing(f"nothing fits {path}", _hint(bytes(data)))
 
 
@@ -233,89 +242,25 @@ def _import(path: Path, fit: "Fit") -> None:
     typer.echo(f"tactile-rt import {shlex.quote(str(path))} --as {told}")
 
 
-def _sniff_table(path: Path) -> bool:
-    """Propose the columns of a table; whether it is one."""
-    from itertools import islice
+def _sniff_text(path: Path, data: bytes) -> bool:
+    """Propose the columns of a table, or of what a board prints; whether there are any."""
+    from tactile_rt.recording.importing.proposing import propose_columns
 
-    from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
-    from tactile_rt.drivers.codecs.column_guess import LOOKED_AT, guess_columns
-    from tactile_rt.drivers.codecs.column_words import compress_columns
-    from tactile_rt.recording.importing.csv import csv_form, read_table
-
-    try:
-        form = csv_form(path)
-    except RecordingError:
+    proposed = propose_columns(path, data)
+    if proposed is None:
         return False
-    table = read_table(path, form)
-    rows = [r for r in islice(table.rows, LOOKED_AT) if len(r) == form.width]
-    cells = [[number(in_seconds(c.strip())) for c in row] for row in rows]
-    numeric = sum(c is not None for row in cells for c in row)
-    timed_by_space = form.delimiter == " "
-    if len(rows) < 3 or 2 * numeric < sum(map(len, cells)) or (timed_by_space and form.width < 2):
-        return False
-    dated = {
-        k for k in range(form.width)
-        if rows and all(":" in r[k] and in_seconds(r[k]) != r[k] for r in rows[:20])
-    }  # fmt: skip
-    if timed_by_space and not form.names:
-        return False  # what a board prints: words and dates between the numbers, too
-    words, timed = guess_columns(form.names, cells, dated)
-    if not any("." in w for w in words if not w.startswith("time")):
-        return False
-    told = words
-    if form.names:
-        told = [f"{n}={w}" for n, w in zip(form.names, words, strict=True) if w != "-"]
-    typer.echo(f"{path}: a table of {form.width} columns: names and units are for you to say")
-    _import_table(path, compress_columns(told), timed)
-    return True
-
-
-def _sniff_lines(path: Path, data: bytes) -> bool:
-    """Propose columns for what a board prints; whether there are any."""
-    from tactile_rt.recording.importing.csv import csv_form
-
-    for columns, n in _of_lines(data):
-        typer.echo(f"{n} lines are samples: names and units are for you to say")
-        try:
-            csv_form(path)
-        except RecordingError:
-            columns_by_place = False
-        else:
-            columns_by_place = "=" not in columns
-        if columns_by_place:
-            _import_table(path, columns, "time" in columns)
-        else:
-            fields = _query({"codec": "ascii_line", "columns": columns})
-            typer.echo(f"tactile-rt import {shlex.quote(str(path))} --as {shlex.quote(fields)}")
+    typer.echo(f"{proposed.said}: names and units are for you to say")
+    quoted = shlex.quote(str(path))
+    if not proposed.table:
+        fields = _query({"codec": "ascii_line", "columns": proposed.columns})
+        typer.echo(f"tactile-rt import {quoted} --as {shlex.quote(fields)}")
         return True
-    return False
-
-
-def _import_table(path: Path, columns: str, timed: bool) -> None:
     rate = ""
-    if not timed:
-        typer.echo(f"no column is a time: --rate says how many samples a second came, {UNKNOWN_RATE_HZ} is a guess")
-        rate = f" --rate {UNKNOWN_RATE_HZ}"
-    typer.echo(f"tactile-rt import {shlex.quote(str(path))} --columns {shlex.quote(columns)}{rate}")
-
-
-def _of_lines(data: bytes) -> "list[tuple[str, int]]":
-    """Columns of lines of text, and how many are samples by them."""
-    from tactile_rt.drivers.codecs.column_guess import guess_line_columns
-    from tactile_rt.drivers.codecs.column_words import compress_columns
-    from tactile_rt.drivers.opening import make_codec
-
-    guess = guess_line_columns(data)
-    if guess is None:
-        return []
-    columns = compress_columns(guess[0])
-    try:
-        codec = make_codec("serial", "ascii_line", {"columns": columns})
-    except ConfigError:
-        return []
-    codec.feed(data, 0)
-    enough = codec.stats.intact >= 3 and codec.stats.corrupt <= codec.stats.intact
-    return [(columns, codec.stats.intact)] if enough else []
+    if not proposed.timed:
+        typer.echo(f"no column is a time: --rate says how many came in a second, not {GUESSED_HZ}")
+        rate = f" --rate {GUESSED_HZ}"
+    typer.echo(f"tactile-rt import {quoted} --columns {shlex.quote(proposed.columns)}{rate}")
+    return True
 
 
 def _sniff_bag(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, Final
 
 from tactile_rt.drivers.codec import CODECS, CanFrame, Codec, Command, codec_class
@@ -126,7 +127,7 @@ def ask_devices(
                 lambda codec=codec: connect(codec), codec,  # type: ignore[misc]
                 DeviceOptions(name, start_s=START_S, reconnect=False), name,
             ) as source:  # fmt: skip
-                source.tap(lambda packet, _: heard.append(packet))
+                source.tap(partial(_keep, heard))
                 end = time.monotonic() + seconds
                 while (left := end - time.monotonic()) > 0:
                     source.read(left)
@@ -135,6 +136,10 @@ def ask_devices(
         packets = [p for p in heard if p is not None]
         whole: Any = b"".join(packets) if wire == "serial" else [f for p in packets for f in p]
         yield codec, whole
+
+
+def _keep(heard: list[Any], packet: Any, t_ns: int) -> None:
+    heard.append(packet)
 
 
 def _plain(wire: str) -> Codec[Any]:

@@ -1,14 +1,13 @@
 """What somebody kept of a line: bytes, hexadecimal text, or a log of a CAN bus, as packets again.
 
-    log = read_log(Path("can.log"))        # candump, asc, blf, trc; raw bytes, `tactile-rt dump`, hex
-    for packet, t_ns in log.packets(): ...   # t_ns is None where the log has no times
+    log = read_log(Path("can.log"))       # candump, asc, blf, trc; bytes, `tactile-rt dump`, hex
+    for packet, t_ns in log.packets(): ...  # t_ns is None where the log has no times
 
 Which form a file has is told by how it begins, whatever its name; gzip is unpacked. Logs end
 anywhere and hold lines that are none: what can be read is, and `notes` say what could not.
 """
 
 import logging
-import re
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -17,7 +16,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.drivers.codecs.ascii_text import in_seconds
+from tactile_rt.drivers.log_lines import of_candump, of_dump, of_dump_can, of_hex
 from tactile_rt.files import open_regular
 from tactile_rt.stream import NS_PER_S, ConfigError
 
@@ -29,30 +28,8 @@ FORMS: Final = (*SERIAL_FORMS, *CAN_FORMS)
 PIECE: Final = 256
 HEAD: Final = 16_384  # bytes that tell the form
 MOSTLY: Final = 0.8  # of the lines at the beginning are of the form
-UTC_FROM_S: Final = 1e8  # a time that is larger counts from 1970
 BLF: Final = b"LOGG"
 GZIP: Final = b"\x1f\x8b"
-
-_CANDUMP: Final = re.compile(
-    r"\s*(?:\((?P<t>[^)]*)\)\s*)?(?P<bus>[A-Za-z]\w*)\s+(?:[TR]X\s+\S+\s+\S+\s+)?"
-    r"(?:(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
-    r"(?:#(?P<fd>#[0-9A-Fa-f])?(?P<rtr>[Rr]\d?)?(?P<hex>(?:[0-9A-Fa-f]{2}\.?)*)(?:\s+[TR])?"
-    r"|\s+\[(?P<n>\d+)\](?P<spaced>(?:\s+[0-9A-Fa-f]{2})*|\s+remote request)(?:\s+'.*')?)"
-    r"|(?P<error>[0-9A-Fa-f]{8}\s+\[\d+\].*ERRORFRAME.*))\s*"
-)
-_DUMP: Final = re.compile(r" *(?P<t>\d+\.\d{3}) ms  (?P<hex>[0-9a-f]{2}(?: [0-9a-f]{2}){0,15}) *  .*")
-_DUMP_CAN: Final = re.compile(
-    r" *(?P<t>\d+\.\d{3}) ms  (?P<id>[0-9A-F]{3}|[0-9A-F]{8}) (?P<kind>[RF ]) \[(?P<n>\d+)\]"
-    r" ?(?P<hex>(?:[0-9a-f]{2} ?)*)"
-)
-# xxd, hexdump -C, and bytes in hex with or without a time before them
-_XXD: Final = re.compile(r"[0-9a-fA-F]{7,16}:? +(?P<hex>(?:[0-9a-fA-F]{2,8} {1,2})*[0-9a-fA-F]{2,8})"
-                         r"(?:  .*| \|.*)?")  # fmt: skip
-_HEX: Final = re.compile(
-    r"\s*(?:\[?(?P<t>\d+\.\d+)\]?(?:\s*s)?[\s,:;]+)?"
-    r"(?P<hex>(?:0x)?[0-9a-fA-F]{2}(?:[\s,]+(?:0x)?[0-9a-fA-F]{2})*|(?:[0-9a-fA-F]{2}){8,})\s*,?\s*"
-)
-_ERROR, _EXTENDED = 1 << 29, 0x1FFFFFFF
 
 Timed = tuple[Any, int | None]  # a packet, and when it came, ns
 
@@ -117,7 +94,7 @@ class LineLog:
 
     def _text(self, file: LogFile) -> Iterator[Timed]:
         parse = {
-            "candump": _of_candump, "dump-can": _of_dump_can, "dump": _of_dump, "hex": _of_hex,
+            "candump": of_candump, "dump-can": of_dump_can, "dump": of_dump, "hex": of_hex,
         }[self.form]  # fmt: skip
         others, errors, buses = 0, 0, Counter[str]()
         with TextIOWrapper(file, "utf-8", "replace") as lines:
@@ -296,76 +273,12 @@ def _form(path: Path) -> str:
     begins = [x.strip().lower() for x in lines[:6]]
     if any(x.startswith("date ") for x in begins) and any(x.startswith("base ") for x in begins):
         return "asc"
-    for form, parse in (("dump", _of_dump), ("dump-can", _of_dump_can), ("candump", _of_candump)):
+    for form, parse in (("dump", of_dump), ("dump-can", of_dump_can), ("candump", of_candump)):
         if sum(parse(x) is not None for x in lines) >= MOSTLY * len(lines):
             return form
     # A table of numbers of two digits is hexadecimal, too: only letters tell that it is bytes.
-    hexes = [_of_hex(x) for x in lines]
+    hexes = [of_hex(x) for x in lines]
     right = sum(x is not None for x in hexes) >= MOSTLY * len(lines)
     data = b"".join(found[1] or b"" for found in hexes if found is not None)
     letters = sum(b & 15 > 9 or b > 0x9F for b in data)
     return "hex" if right and len(data) >= 16 and letters > len(data) / 16 else "raw"
-
-
-Found = tuple[str, Any, int | None] | None  # bus, packet (None: an error frame), when, ns
-
-
-def _of_candump(line: str) -> Found:
-    found = _CANDUMP.fullmatch(line)
-    if found is None:
-        return None
-    if found["error"]:
-        return found["bus"], None, None
-    t_ns = _time(found["t"]) if found["t"] else None
-    number = int(found["id"], 16)
-    extended = len(found["id"]) == 8
-    if extended and number & _ERROR:
-        return found["bus"], None, None
-    fd = found["fd"] is not None
-    remote = found["rtr"] is not None or (found["spaced"] or "").strip() == "remote request"
-    text = "" if remote else found["hex"] or found["spaced"] or ""
-    data = bytes.fromhex(text.replace(".", ""))
-    if len(data) > 64 or (found["n"] and not remote and int(found["n"]) != len(data)):
-        return None
-    fd = fd or len(data) > 8
-    return found["bus"], [CanFrame(number & _EXTENDED, data, extended, fd, remote)], t_ns
-
-
-def _of_dump(line: str) -> Found:
-    found = _DUMP.fullmatch(line)
-    if found is None:
-        return None
-    return "", bytes.fromhex(found["hex"]), _time(found["t"], NS_PER_S // 1000)
-
-
-def _of_dump_can(line: str) -> Found:
-    found = _DUMP_CAN.fullmatch(line)
-    if found is None:
-        return None
-    kind, data = found["kind"], bytes.fromhex(found["hex"])
-    frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, kind == "F", kind == "R")
-    return "", [frame], _time(found["t"], NS_PER_S // 1000)
-
-
-def _of_hex(line: str) -> Found:
-    found = _HEX.fullmatch(line) or _XXD.fullmatch(line)
-    if found is None:
-        return None
-    t_ns = _time(found["t"]) if "t" in found.re.groupindex and found["t"] else None
-    try:
-        return "", bytes.fromhex(found["hex"].replace("0x", "").replace(",", " ")), t_ns
-    except ValueError:
-        return None
-
-
-def _time(text: str, unit_ns: int = NS_PER_S) -> int | None:
-    """A time in ns: whole and parts exactly, or a date."""
-    plain = text.strip()
-    if "-" in plain or ":" in plain:
-        plain = in_seconds(plain)
-    whole, _, part = plain.partition(".")
-    if not (whole.isdecimal() and (part.isdecimal() or not part)):
-        return None
-    return int(whole) * unit_ns + int(part or 0) * unit_ns // 10 ** len(part)
-
-

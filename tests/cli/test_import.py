@@ -11,7 +11,9 @@ from tactile_rt.recording import Recording
 def raw(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     packets = wire_of(make_codec("serial", "bota", {}))
-    (tmp_path / "raw.bin").write_bytes(b"".join(packets[:20]) + b"\xaa" * 9 + b"".join(packets[20:]))
+    (tmp_path / "raw.bin").write_bytes(
+        b"".join(packets[:20]) + b"\xaa" * 9 + b"".join(packets[20:])
+    )
     return tmp_path / "raw.bin"
 
 
@@ -32,7 +34,9 @@ def test_what_is_there_is_replaced_only_if_forced(call, refused, raw):
 def test_half_a_log_has_a_note(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     frames = [f for p in wire_of(make_codec("can", "aft200", {})) for f in p]
-    text = "".join(f"({k / 2000:.6f}) can0 {f.id:03X}#{f.data.hex()}\n" for k, f in enumerate(frames))
+    text = "".join(
+        f"({k / 2000:.6f}) can0 {f.id:03X}#{f.data.hex()}\n" for k, f in enumerate(frames)
+    )
     (tmp_path / "can.log").write_text(text[:-4])
     code, said, told = call("import", "can.log", "out.mcap", "--as", "codec=aft200")
     assert code == 0 and "39 samples in, 79 intact" in said

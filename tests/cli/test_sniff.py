@@ -84,7 +84,7 @@ def test_the_command_for_a_file_imports_it(call, here, name):
         b"".join(b"12:00:%02d INFO worker %d has started\n" % (k % 60, k) for k in range(60)),
     ],
 )  # fmt: skip
-def test_nothing_fits_and_is_said_so(call, here, data):
+def test_nothing_fits_and_it_says_so(call, here, data):
     (here / "file.log").write_bytes(data)
     code, said, _ = call("sniff", "file.log")
     assert code == 1 and said.startswith("nothing fits file.log")
@@ -108,7 +108,12 @@ def test_a_further_codec_is_tried(call, here):
     (here / "raw.bin").write_bytes(b"".join(b"\xa5\x5a%03d" % (k * 7 % 501) for k in range(99)))
     code, said, _ = call("sniff", "raw.bin", "--try", "codec=binary_frame&mapping=mine.toml")
     assert code == 0
-    assert next_command(said) == ["import", "raw.bin", "--as", "codec=binary_frame&mapping=mine.toml"]
+    assert next_command(said) == [
+        "import",
+        "raw.bin",
+        "--as",
+        "codec=binary_frame&mapping=mine.toml",
+    ]
     assert "--try is codec=NAME" in call("sniff", "raw.bin", "--try", "binary_frame")[2]
 
 

@@ -1,6 +1,7 @@
 """Logs that others wrote, as packets: whole, cut anywhere, packed, of several buses."""
 
 import gzip
+import itertools
 import random
 
 import can
@@ -41,7 +42,7 @@ def test_what_python_can_wrote_is_read(tmp_path, suffix):
     assert [frame for packet, _ in packets for frame in packet] == [
         CanFrame(m.arbitration_id, bytes(m.data), m.is_extended_id) for m in messages()
     ]
-    gaps = [b - a for (_, a), (_, b) in zip(packets, packets[1:], strict=False)]
+    gaps = [b - a for (_, a), (_, b) in itertools.pairwise(packets)]
     assert all(abs(gap - 10_000_000) < 300_000 for gap in gaps[: N - 1])
     assert abs(packets[0][1] - T0 * 1e9) < 1e6 and log.notes == []
 

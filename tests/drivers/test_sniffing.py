@@ -1,4 +1,4 @@
-"""Which codec bytes and frames speak: every one of them, emulated for a second, and what is none."""
+"""Which codec bytes and frames speak: each, emulated for a second, and what is none."""
 
 import random
 import time

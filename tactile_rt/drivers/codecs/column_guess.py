@@ -32,19 +32,24 @@ _COUNT: Final = re.compile(
     r"(?:.*[._ ])?(?:seq|count|counter|sample|samples|frame|frame_?id|index|idx|n|no|id|packet|#)",
     re.IGNORECASE,
 )
-_TIME_UNIT: Final = re.compile(r"(?:^|[_ ([/.]|millis|micros)(s|sec|secs|ms|us|µs|ns|nsec|nsecs)\W*$")
+_TIME_UNIT: Final = re.compile(
+    r"(?:^|[_ ([/.]|millis|micros)(s|sec|secs|ms|us|µs|ns|nsec|nsecs)\W*$"
+)
 _BRACKET: Final = re.compile(r"[\[(]([^\])]*)[\])]")
 _TAIL_UNIT: Final = re.compile(r"_(mN|uN|N|Nm|mNm|kPa|Pa|uT|mT|T|degC|mV|V|mm|um|pF)$")
-_QUANTITY: Final = (  # (name, channel, unit if it says so itself)
-    (re.compile(r"(?:^|[\W_])(?:f|force|forces)[\W_]*([xyz])(?:$|[\W_])", re.I), "f{}", "N"),
-    (re.compile(r"(?:^|[\W_])(?:t|m|torque|torques|moment|tau)[\W_]*([xyz])(?:$|[\W_])", re.I), "m{}", "Nm"),
-    (re.compile(r"(?:^|[\W_])(?:b|mag|magnetic|magnetic_field|field)[\W_]*([xyz])(?:$|[\W_])", re.I), "b{}", ""),
-    (re.compile(r"(?:^|[\W_])(?:temp|temperature)(?:$|[\W_])", re.I), "temperature", ""),
-    (re.compile(r"(?:^|[\W_])()(?<=[\W_])([xyz])(?:$|[\W_])", re.I), "{}", ""),
-    (re.compile(r"(?:^|[\W_])(?:pressure|press)(?:$|[\W_])", re.I), "pressure", ""),
-    (re.compile(r"(?:^|(?<=\d))([xyz])$", re.I), "{}", ""),
-    (re.compile(r"^([xyz])(?=\d+$)", re.I), "{}", ""),
-)  # fmt: skip
+_QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
+    (re.compile(pattern, re.IGNORECASE), channel, unit)
+    for pattern, channel, unit in (
+        (r"(?:^|[\W_])(?:f|force|forces)[\W_]*([xyz])(?:$|[\W_])", "f{}", "N"),
+        (r"(?:^|[\W_])(?:t|m|torques?|moment|tau)[\W_]*([xyz])(?:$|[\W_])", "m{}", "Nm"),
+        (r"(?:^|[\W_])(?:b|mag|magnetic(?:_field)?|field)[\W_]*([xyz])(?:$|[\W_])", "b{}", ""),
+        (r"(?:^|[\W_])(?:temp|temperature)(?:$|[\W_])", "temperature", ""),
+        (r"(?<=[\W_])([xyz])(?:$|[\W_])", "{}", ""),
+        (r"(?:^|[\W_])(?:pressure|press)(?:$|[\W_])", "pressure", ""),
+        (r"(?:^|(?<=\d))([xyz])$", "{}", ""),
+        (r"^([xyz])(?=\d+$)", "{}", ""),
+    )
+)
 _ALIASES: Final = {
     "n·m": "Nm", "n*m": "Nm", "n.m": "Nm", "n-m": "Nm", "nm": "Nm", "newton": "N", "newtons": "N",
     "°c": "degC", "c": "degC", "celsius": "degC", "µt": "uT", "μt": "uT", "utesla": "uT",
@@ -73,7 +78,9 @@ def guess_columns(
     count = _place_count(names, series, kinds)
     if count is not None:
         kinds[count] = "count"
-    for k, name in enumerate(names):  # times and counts beside those, and what never changes in a log
+    for k, name in enumerate(
+        names
+    ):  # times and counts beside those, and what never changes in a log
         if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _is_index(name, series[k])):
             kinds[k] = "-"
     measured = [k for k, kind in enumerate(kinds) if not kind]
@@ -288,6 +295,9 @@ def _by_names(
     """Element, channel and unit of each; those alone of which every element has all channels."""
     parsed = {k: _parsed(names[k]) for k in measured}
     known = {k: p for k, p in parsed.items() if p[1]}
+    loads = any(unit for _, _, unit in known.values())
+    if 2 * len(known) < len(parsed) and not loads:  # where something is, beside what it feels
+        known = {k: (e, "value", u) for k, (e, c, u) in parsed.items() if not c}
     chosen = known or {k: (e, "value", u) for k, (e, _, u) in parsed.items()}
     groups: dict[str, dict[str, int]] = {}
     for k, (element, channel, _) in chosen.items():
@@ -296,9 +306,7 @@ def _by_names(
     if not shapes:
         return {}
     best = max(shapes, key=lambda s: (len(s) * shapes[s], len(s)))
-    units = {
-        c: {chosen[g[c]][2] for g in groups.values() if frozenset(g) == best} for c in best
-    }
+    units = {c: {chosen[g[c]][2] for g in groups.values() if frozenset(g) == best} for c in best}
     words = {}
     for element, g in groups.items():
         if frozenset(g) != best:

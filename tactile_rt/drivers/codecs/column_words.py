@@ -1,12 +1,12 @@
 """Columns in words: a list of them, in which a group stands for many.
 
-    time:s,A0.fx,A0.fy                        three columns
-    T{0..15}.pressure                         sixteen: T0.pressure, T1.pressure, ...
-    (M{0..4}.bx:uT,M{0..4}.by:uT)             ten: M0.bx, M0.by, M1.bx, M1.by, ...
-    p{0..35}_x=T{0..35}.fx:N                  by names; ranges of a group go in step
-    c{00..15}=T{0..15}.raw                    c00, c01, ...
-    -{1..9}                                   nine of no interest
-    "Force, x"=A0.fx                          a name that holds a comma
+time:s,A0.fx,A0.fy                        three columns
+T{0..15}.pressure                         sixteen: T0.pressure, T1.pressure, ...
+(M{0..4}.bx:uT,M{0..4}.by:uT)             ten: M0.bx, M0.by, M1.bx, M1.by, ...
+p{0..35}_x=T{0..35}.fx:N                  by names; ranges of a group go in step
+c{00..15}=T{0..15}.raw                    c00, c01, ...
+-{1..9}                                   nine of no interest
+"Force, x"=A0.fx                          a name that holds a comma
 """
 
 import re

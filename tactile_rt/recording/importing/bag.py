@@ -198,7 +198,9 @@ def _leaves(value: Any, at: str) -> Iterator[str]:
     if is_dataclass(value):
         for field in fields(value):
             if field.name != "__msgtype__":
-                yield from _leaves(getattr(value, field.name), f"{at}.{field.name}" if at else field.name)
+                yield from _leaves(
+                    getattr(value, field.name), f"{at}.{field.name}" if at else field.name
+                )
     elif isinstance(value, np.ndarray | list | tuple):
         for k, one in enumerate(value):
             yield from _leaves(one, f"{at}.{k}")
@@ -240,9 +242,7 @@ def _stamp(message: Any) -> int:
     return 0 if stamp is None else int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
 
 
-def _own(
-    path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str
-) -> Import:
+def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str) -> Import:
     """Samples of ours in a bag of others: bit for bit."""
     account, told = Import(notes=bag.notes), read_array(Path(array)) if array else None
     chunks: list[Chunk] = []

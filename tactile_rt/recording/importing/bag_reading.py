@@ -221,9 +221,7 @@ def _read_ros1(file: BinaryIO, found: _Found) -> None:
         return
 
 
-def _take(
-    header: dict[bytes, bytes], data: bytes, topics: dict[bytes, str], found: _Found
-) -> None:
+def _take(header: dict[bytes, bytes], data: bytes, topics: dict[bytes, str], found: _Found) -> None:
     if header.get(b"op") == CONNECTION:
         told = _fields(data)
         topic = header[b"topic"].decode("utf-8", "replace")

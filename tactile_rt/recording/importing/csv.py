@@ -160,9 +160,7 @@ def _points(line: str) -> str:
 def _is_number(cell: str) -> bool:
     plain = cell.strip()
     found = number(plain)
-    return (found is not None and found == found) or (
-        ":" in plain and in_seconds(plain) != plain
-    )
+    return (found is not None and found == found) or (":" in plain and in_seconds(plain) != plain)
 
 
 def _between_digits(line: str) -> bool:

@@ -153,7 +153,7 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
         zero = clock_of(int(times[0]))
         t_ns, told = _strictly(times - zero, rate_hz, account)
         spec = replace(spec, rate_hz=rate_hz or told)
-    valid = np.isfinite(values).all(axis=2)
+    valid = np.logical_and.reduce(np.isfinite(values), axis=2)
     about = Description(
         spec, zero, table.path.name,
         session={"imported": table.path.name, "columns": columns},
@@ -170,9 +170,7 @@ class _Read:
     complaint: str
 
 
-def _read(
-    table: Table, columns: Sequence[Column], places: Sequence[int], spec: ArraySpec
-) -> _Read:
+def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: ArraySpec) -> _Read:
     at = {(c.element, c.channel): k for k, c in enumerate(columns)}
     order = [at[e, c] for e in spec.elements for c in spec.channels]
     scale = np.array([columns[k].scale for k in order])
@@ -268,7 +266,8 @@ def _time(cell: Any, column: Column) -> int:
             raise ValueError(f"{cell!r:.40} is no time")
         return round(value)
     part = found[3] or ""
-    ns = int(found[2]) * unit + int(part or 0) * unit // 10 ** len(part)
+    scale: int = 10 ** len(part)
+    ns = int(found[2]) * unit + int(part or 0) * unit // scale
     if ns >= 1 << 62:
         raise ValueError(f"{cell!r:.40} is no time")
     return -ns if found[1] == "-" else ns
@@ -326,6 +325,5 @@ def _spread(times: NDArray[np.int64], period: float) -> NDArray[np.int64]:
     room = np.diff(np.append(times[first], times[-1] + round(period * lengths[-1])))
     step = np.maximum(1.0, np.minimum(room / lengths, period))
     within = np.arange(len(times)) - np.repeat(first, lengths)
-    return times + np.floor(within * np.repeat(step, lengths)).astype(np.int64)
-
-
+    spread: NDArray[np.int64] = np.floor(within * np.repeat(step, lengths)).astype(np.int64)
+    return times + spread

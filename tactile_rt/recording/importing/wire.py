@@ -134,7 +134,8 @@ class _Decoded:
     def __init__(
         self, log: LineLog, codec: Codec[Any], about: Description, stats: SourceStats
     ) -> None:
-        self._codec, self._now, self._count = codec, 0, None
+        self._codec, self._now = codec, 0
+        self._count: int | None = None  # of the newest sample
         codec.commands(Command.START)  # some note what they have asked for
         packets = log.packets()
         waiting: list[tuple[Any, int | None, Samples | None]] = []

@@ -11,7 +11,9 @@ N = 40
 
 def lines(form: str) -> bytes:
     """Lines cut at both ends, in which t is a time in ms, and a, b are measured."""
-    text = "".join(form.format(k=k, t=10 * k, s=0.01 * k, a=k * k % 17, b=0.5 - k % 7) for k in range(N))
+    text = "".join(
+        form.format(k=k, t=10 * k, s=0.01 * k, a=k * k % 17, b=0.5 - k % 7) for k in range(N)
+    )
     return text.encode()[3:-3]
 
 
@@ -71,7 +73,7 @@ def guessed(names: list[str], first: list[float], step: list[float]) -> list[str
         (["t", "p0_x", "p1_x"], ["time:s", "p0.x:1", "p1.x:1"]),
         (["%time", "field.header.seq", "field.wrench.force.x"], ["time:s", "-", "S.fx:N"]),
         (["Time (s)", "Force X (mN)", "note"], ["time:s", "S.fx:mN", "-"]),
-        (["x", "taxel0", "taxel1"], ["S.x:1", "-", "-"]),
+        (["x", "taxel0", "taxel1"], ["-", "taxel0.value:1", "taxel1.value:1"]),
         (["a", "taxel0", "taxel1"], ["a.value:1", "taxel0.value:1", "taxel1.value:1"]),
     ],
 )

@@ -41,7 +41,9 @@ def test_what_is_wrong_is_told(text, why):
         expand_columns(text)
 
 
-WORD = st.from_regex(r"[A-Za-z][a-z_]{0,4}\d{0,3}(=[A-Z]\d{0,2}\.[a-z]{1,3}(:mN)?)?", fullmatch=True)
+WORD = st.from_regex(
+    r"[A-Za-z][a-z_]{0,4}\d{0,3}(=[A-Z]\d{0,2}\.[a-z]{1,3}(:mN)?)?", fullmatch=True
+)
 
 
 @given(st.lists(st.one_of(WORD, st.just("-")), min_size=1, max_size=12))

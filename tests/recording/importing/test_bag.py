@@ -104,7 +104,7 @@ def test_an_array_has_the_shape_of_its_layout_and_the_bags_times(tmp_path, form)
 
 @pytest.mark.parametrize("form", ["sqlite3", "mcap"])
 def test_samples_of_ours_come_back_bit_for_bit(tmp_path, form):
-    made, chunk, about = imported(bag(tmp_path, form), tmp_path / "o.mcap", topic="/ours")
+    _made, chunk, about = imported(bag(tmp_path, form), tmp_path / "o.mcap", topic="/ours")
     ours = concatenate(our_chunks())
     assert chunk.values.tobytes() == ours.values.tobytes()
     assert chunk.t_ns.tolist() == ours.t_ns.tolist() and chunk.seq.tolist() == ours.seq.tolist()

@@ -75,7 +75,9 @@ def test_a_decimal_comma_between_commas_is_quoted(tmp_path):
 
 @pytest.mark.parametrize("packed", [gzip.compress, lambda text: text])
 def test_gzip_and_utf16(tmp_path, packed):
-    text = ("t,x\n" + rows("{s:.2f},{a}\n")).encode("utf-16" if packed is not gzip.compress else "utf-8")
+    text = ("t,x\n" + rows("{s:.2f},{a}\n")).encode(
+        "utf-16" if packed is not gzip.compress else "utf-8"
+    )
     (tmp_path / "t.csv").write_bytes(packed(text))
     assert imported(tmp_path / "t.csv", "t=time:s,x=S.fx")[0].samples == N
 

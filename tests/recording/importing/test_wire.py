@@ -94,7 +94,7 @@ def test_one_that_has_not_is_told_what_it_is(tmp_path):
     codec = make_codec("serial", "native", {})
     codec.spec = synthetic_spec(5, 6, 1000.0)
     (tmp_path / "raw.bin").write_bytes(b"".join(wire_of(codec)))
-    with pytest.raises(ConfigError, match="none describes the array: give array=FILE.json"):
+    with pytest.raises(ConfigError, match=r"none describes the array: give array=FILE\.json"):
         imported(tmp_path / "raw.bin", tmp_path / "o.mcap", codec="native")
     (tmp_path / "array.json").write_text(codec.spec.to_json())
     array = str(tmp_path / "array.json")
