@@ -12,7 +12,7 @@ from tactile_rt.cli.app import app, leaving, starting
 from tactile_rt.stream import ConfigError, RecordingError
 
 if TYPE_CHECKING:
-    from tactile_rt.drivers.sniffing import Fit, Tried
+    from tactile_rt.drivers.sniffing import CodecFit, Tried
 
 NOTHING = 1  # exit code: nothing fits
 SHOWN = 6  # fits
@@ -96,7 +96,7 @@ def _sniff_port(
     from tactile_rt.recording.importing.proposing import line_columns
 
     speeds = [(b, "N") for b in bauds] if bauds else line_speeds()
-    found: list[tuple[Fit, int]] = []
+    found: list[tuple[CodecFit, int]] = []
     texts: list[tuple[int, bytes]] = []
     came = 0
     for baud, _, data in hear_port(port, seconds, speeds, dtr):
@@ -168,7 +168,7 @@ def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool) -> N
     _run(url, fits[0], {})
 
 
-def _run(url: str, fit: "Fit", further: dict[str, str]) -> None:
+def _run(url: str, fit: "CodecFit", further: dict[str, str]) -> None:
     fields = fit.fields | further
     if not fit.described:
         typer.echo("it has not described its array here; it does when it is started")
@@ -176,7 +176,7 @@ def _run(url: str, fit: "Fit", further: dict[str, str]) -> None:
     typer.echo(f"tactile-rt run --source {shlex.quote(f'{url}{sign}{_query(fields)}')}")
 
 
-def _usual_baud(fit: "Fit") -> int:
+def _usual_baud(fit: "CodecFit") -> int:
     """The baud rate that its codec has by default."""
     from tactile_rt.drivers.opening import make_codec
 
@@ -230,7 +230,7 @@ def _form(form: str) -> str:
             }.get(form, f"a CAN log ({form})")  # fmt: skip
 
 
-def _import(path: Path, fit: "Fit") -> None:
+def _import(path: Path, fit: "CodecFit") -> None:
     fields = fit.fields
     if not fit.described:
         typer.echo(
@@ -294,7 +294,7 @@ def _sniff_bag(path: Path) -> None:
 # what is said
 
 
-def _show(fits: "list[Fit]", speeds: list[str] | None = None) -> None:
+def _show(fits: "list[CodecFit]", speeds: list[str] | None = None) -> None:
     from rich.console import Console
     from rich.table import Table
 

@@ -24,7 +24,7 @@ __all__ = [
     "LOOK_BYTES",
     "LOOK_FRAMES",
     "NEEDS_A_FILE",
-    "Fit",
+    "CodecFit",
     "Tried",
     "frame_hint",
     "sniff_bytes",
@@ -49,7 +49,7 @@ Tried = tuple[str, Mapping[str, str]]  # codec, options
 
 
 @dataclass(frozen=True)
-class Fit:
+class CodecFit:
     """A codec that fits.
 
     Attributes:
@@ -82,7 +82,7 @@ class Fit:
         return {"codec": self.codec, **self.options}
 
 
-def sniff_bytes(data: bytes, further: Iterable[Tried] = ()) -> list[Fit]:
+def sniff_bytes(data: bytes, further: Iterable[Tried] = ()) -> list[CodecFit]:
     """The codecs that fit what came over a serial line, the best first; none where none does.
 
     Args:
@@ -110,7 +110,7 @@ def sniff_bytes(data: bytes, further: Iterable[Tried] = ()) -> list[Fit]:
     return _ranked(fits)
 
 
-def sniff_frames(frames: Sequence[CanFrame], further: Iterable[Tried] = ()) -> list[Fit]:
+def sniff_frames(frames: Sequence[CanFrame], further: Iterable[Tried] = ()) -> list[CodecFit]:
     """The codecs that fit frames of a CAN bus, the best first; none where none does.
 
     Args:
@@ -185,7 +185,7 @@ def _candidates(
 
 def _fed(
     wire: str, name: str, options: Mapping[str, str], packets: Sequence[Any], total: int
-) -> Fit:
+) -> CodecFit:
     codec: Codec[Any] = make_codec(wire, name, dict(options))
     samples, valid = 0, 0.0
     for packet in packets:
@@ -199,7 +199,7 @@ def _fed(
     if described and samples and (valid < COMPLETE * samples or whole < COMPLETE * samples):
         samples = 0
     silent = not described or bool(codec.complaint)  # there may be samples all the same
-    return Fit(
+    return CodecFit(
         wire, name, options, stats.intact, stats.corrupt, samples,
         max(0.0, 1.0 - stats.skipped / max(1, total)), described=described,
         likely=stats.intact >= LEAST and (samples >= LEAST - 1 or silent),
@@ -215,10 +215,10 @@ def _damaged(data: bytes) -> bytes:
     return hurt.tobytes()
 
 
-def _ranked(fits: list[Fit]) -> list[Fit]:
+def _ranked(fits: list[CodecFit]) -> list[CodecFit]:
     """The best first: what explains more, or as much with more proof, or with fewer options."""
 
-    def worth(fit: Fit) -> tuple[float, ...]:
+    def worth(fit: CodecFit) -> tuple[float, ...]:
         return (
             round(min(1.0, fit.explained) * (0.5 + 0.5 * fit.proof), 1),
             round(fit.explained, 2), -len(fit.options), fit.intact,

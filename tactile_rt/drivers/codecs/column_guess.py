@@ -1,4 +1,4 @@
-"""What may be in the columns of a table or of what a board prints, for a user to look at and change.
+"""What may be in the columns of a table, or of what a board prints, for a user to change.
 
 Names say most: ``Fx [N]``, ``wrench.force.x``, ``p0_x``, ``timestamp_ms``. What has none is told by
 how it goes: a number that goes up by one counts, one that goes up is a time, all else measures. No
@@ -25,7 +25,8 @@ MOSTLY: Final = 0.8  # of the lines are alike, of the cells are numbers
 Rows = Sequence[Sequence[float | None]]
 
 _TIME: Final = re.compile(
-    r"(?:%|.*[._ ])?(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed)"
+    r"(?:%|.*[._ ])?"
+    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed)"
     r"(?:[_ ]?(?:s|sec|ms|us|µs|ns|nsec))?", re.IGNORECASE,
 )  # fmt: skip
 _COUNT: Final = re.compile(

@@ -1,4 +1,4 @@
-"""Topics of ROS 1 and ROS 2 bags, by the `rosbags` library, without ROS.
+"""Topics of ROS 1 and ROS 2 bags, by the library rosbags, without ROS.
 
 A message is a row, its fields are columns by their paths (``wrench.force.x``, ``data.3``). Messages
 of known types need no more: wrenches, arrays of numbers, magnetic fields and the like, and our own.

@@ -1,4 +1,4 @@
-"""Bags opened: by the `rosbags` library where they are whole, else from their beginning on.
+"""Bags opened: by the library rosbags where they are whole, else from their beginning on.
 
 A bag that was cut short has no index, which every library reads first. Its records are still there
 one after the other: they are read until one is not whole.
