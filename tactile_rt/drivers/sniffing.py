@@ -61,7 +61,7 @@ class CodecFit:
         samples: Number of samples; of a device that has not described itself 0.
         explained: Part of the bytes, or of the bus's frames, that is of this device's frames.
         proof: Part of damaged frames that the codec notices, 0 to 1.
-        described: Whether it is known what array the samples are of.
+        described: Whether the array that the samples are of is known.
         likely: Whether there are frames and, of a device that has told all that it must, samples.
     """
 

@@ -57,8 +57,8 @@ class BagTopic:
 
     Attributes:
         name: Name of the topic.
-        type: Type of its messages.
-        messages: Number of messages.
+        type: Type of the topic's messages.
+        messages: Number of messages in the topic.
         columns: What each is a sample of, in the words of ``--columns``; empty where only a user
             can tell.
     """

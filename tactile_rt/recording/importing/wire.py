@@ -11,6 +11,8 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import numpy as np
+
 from tactile_rt.classifier.array_file import read_array
 from tactile_rt.drivers.clocks import DeviceTime, Stamper
 from tactile_rt.drivers.codec import Codec, Command, Samples, codec_class
@@ -67,6 +69,8 @@ def import_wire(
             account.samples += len(chunk)
         if not account.samples:
             raise RecordingError(f"{log.path}: {_why_none(log, codec, str(fields['codec']))}")
+        if log.wire == "serial" and decoded.unfinished:
+            account.notes.append(f"it ends with {decoded.unfinished} bytes of no whole sample")
         made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
         made.finish()
         account.seconds = (last - first) / NS_PER_S
@@ -74,7 +78,7 @@ def import_wire(
 
     write_whole(output, fill)
     account.intact, account.corrupt = codec.stats.intact, codec.stats.corrupt
-    account.missing, account.notes = stats.missing, list(log.notes)
+    account.missing, account.notes = stats.missing, [*log.notes, *account.notes]
     if codec.stats.incomplete:
         account.notes.append(f"{codec.stats.incomplete} samples lack a part")
     if stats.duplicates:
@@ -134,7 +138,7 @@ class _Decoded:
     def __init__(
         self, log: LineLog, codec: Codec[Any], about: Description, stats: SourceStats
     ) -> None:
-        self._codec, self._now = codec, 0
+        self._codec, self._now, self.unfinished = codec, 0, 0
         self._count: int | None = None  # of the newest sample
         codec.commands(Command.START)  # some note what they have asked for
         packets = log.packets()
@@ -151,9 +155,7 @@ class _Decoded:
                     "array: give array=FILE.json in --as, as `tactile-rt describe` writes it"
                 )
             raise ConfigError(f"{log.path}: {why}")
-        self._packets: Iterator[tuple[Any, int | None, Samples | None]] = chain(
-            waiting, ((p, t, codec.feed(p, t or 0)) for p, t in packets)
-        )
+        self._packets = chain(waiting, self._fed(packets))
         self._stamped = bool(waiting) and waiting[0][1] is not None
         self._zero = clock_of(waiting[0][1] or 0) if self._stamped else 0
         self._stamper = Stamper(codec, codec.spec, stats)
@@ -166,6 +168,32 @@ class _Decoded:
             about, spec=codec.spec, utc_offset_ns=self._zero,
             clock="device" if own_clock else "host",
         )  # fmt: skip
+
+    def _fed(
+        self, packets: Iterator[tuple[Any, int | None]]
+    ) -> Iterator[tuple[Any, int | None, Samples | None]]:
+        """Packets and what they complete; `unfinished` is what follows the last sample, bytes."""
+        packet, t_ns = next(packets, (None, None))
+        while packet is not None:
+            following, later = next(packets, (None, None))
+            if following is None and isinstance(packet, bytes):
+                yield packet, t_ns, self._fed_slowly(packet, t_ns or 0)
+            else:
+                samples = self._codec.feed(packet, t_ns or 0)
+                self.unfinished = 0 if samples is not None else self.unfinished + len(packet)
+                yield packet, t_ns, samples
+            packet, t_ns = following, later
+
+    def _fed_slowly(self, packet: bytes, t_ns: int) -> Samples | None:
+        """The last bytes of a log one by one, to see where the last sample ends."""
+        found = []
+        for k in range(len(packet)):
+            samples = self._codec.feed(packet[k : k + 1], t_ns)
+            self.unfinished += 1
+            if samples is not None:
+                found.append(samples)
+                self.unfinished = 0
+        return _joined(found) if found else None
 
     def __iter__(self) -> Iterator[tuple[Any, int, Chunk | None]]:
         for packet, t_ns, samples in self._packets:
@@ -191,6 +219,16 @@ class _Decoded:
             return n
         ahead = (self._count - before) % (1 << bits)
         return ahead if n <= ahead <= 1 << (bits - 1) else n
+
+
+def _joined(parts: list[Samples]) -> Samples:
+    """Samples of one codec as one."""
+    fields = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("values", "valid", "arrived_ns", "damaged", "count", "ticks", "status")
+        if getattr(parts[0], name) is not None
+    }
+    return Samples(**fields)
 
 
 def _why_none(log: LineLog, codec: Codec[Any], name: str) -> str:
