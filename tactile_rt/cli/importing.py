@@ -44,8 +44,9 @@ def import_file(
 
     Raw bytes, `tactile-rt dump` and other hexadecimal text, candump, asc,
     blf and trc are decoded --as a codec. Tables (CSV, what a board or
-    yarpdatadumper printed) need --columns. Of ROS 1 and ROS 2 bags (the extra "import") wrenches, arrays and our own messages need nothing more. gzip
-    is unpacked.
+    yarpdatadumper printed) need --columns. Of ROS 1 and ROS 2 bags (the
+    extra "import") wrenches, arrays and our own messages need nothing
+    more. gzip is unpacked.
     """
     from tactile_rt.recording.layout import need_mcap
 
