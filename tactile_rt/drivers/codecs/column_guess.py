@@ -30,7 +30,7 @@ _TIME: Final = re.compile(
     r"(?:[_ ]?(?:s|sec|ms|us|µs|ns|nsec))?", re.IGNORECASE,
 )  # fmt: skip
 _COUNT: Final = re.compile(
-    r"(?:.*[._ ])?(?:seq|count|counter|sample|samples|frame|frame_?id|index|idx|n|no|id|packet|#)",
+    r"(?:.*[._ ])?(?:seq|count|counter|sample|samples|frame|frame_?id|index|idx|n|no|id|packet|#)|column\.\d+|unnamed.*",
     re.IGNORECASE,
 )
 _TIME_UNIT: Final = re.compile(
@@ -41,9 +41,13 @@ _TAIL_UNIT: Final = re.compile(r"_(mN|uN|N|Nm|mNm|kPa|Pa|uT|mT|T|degC|mV|V|mm|um
 _QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
     (re.compile(pattern, re.IGNORECASE), channel, unit)
     for pattern, channel, unit in (
-        (r"(?:^|[\W_])(?:f|force|forces)[\W_]*([xyz])(?:$|[\W_])", "f{}", "N"),
-        (r"(?:^|[\W_])(?:t|m|torques?|moment|tau)[\W_]*([xyz])(?:$|[\W_])", "m{}", "Nm"),
-        (r"(?:^|[\W_])(?:b|mag|magnetic(?:_field)?|field)[\W_]*([xyz])(?:$|[\W_])", "b{}", ""),
+        (r"(?:^|[\W_])(?:f|force|forces)[\W_]*([xyz])(?:$|[\W_]|(?=\d))", "f{}", "N"),
+        (r"(?:^|[\W_])(?:t|m|torques?|moment|tau)[\W_]*([xyz])(?:$|[\W_]|(?=\d))", "m{}", "Nm"),
+        (
+            r"(?:^|[\W_])(?:b|mag|magnetic(?:_field)?|field)[\W_]*([xyz])(?:$|[\W_]|(?=\d))",
+            "b{}",
+            "",
+        ),
         (r"(?:^|[\W_])(?:temp|temperature)(?:$|[\W_])", "temperature", ""),
         (r"(?<=[\W_])([xyz])(?:$|[\W_])", "{}", ""),
         (r"(?:^|[\W_])(?:pressure|press)(?:$|[\W_])", "pressure", ""),
@@ -334,5 +338,6 @@ def _parsed(name: str) -> tuple[str, str, str]:
         rest = bare[: found.start()] + " " + bare[found.end() :]
         rest = re.sub(r"(?i)(?:^|\W)(?:field|wrench|data|msg)(?=\W|$)", " ", rest)
         element = _PLAIN.sub("_", rest).strip("_-") or "S"
+        element = f"S{element}" if element.isdecimal() else element
         return element, channel.format(axis), unit or usual
     return _PLAIN.sub("_", bare).strip("_-") or "S", "", unit

@@ -73,6 +73,7 @@ def guessed(names: list[str], first: list[float], step: list[float]) -> list[str
         (["t", "p0_x", "p1_x"], ["time:s", "p0.x:1", "p1.x:1"]),
         (["%time", "field.header.seq", "field.wrench.force.x"], ["time:s", "-", "S.fx:N"]),
         (["Time (s)", "Force X (mN)", "note"], ["time:s", "S.fx:mN", "-"]),
+        (["t", "bx0", "bx1"], ["time:s", "S0.bx:1", "S1.bx:1"]),
         (["x", "taxel0", "taxel1"], ["-", "taxel0.value:1", "taxel1.value:1"]),
         (["a", "taxel0", "taxel1"], ["a.value:1", "taxel0.value:1", "taxel1.value:1"]),
     ],
