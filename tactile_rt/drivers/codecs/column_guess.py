@@ -30,7 +30,8 @@ _TIME: Final = re.compile(
     r"(?:[_ ]?(?:s|sec|ms|us|µs|ns|nsec))?", re.IGNORECASE,
 )  # fmt: skip
 _COUNT: Final = re.compile(
-    r"(?:.*[._ ])?(?:seq|count|counter|sample|samples|frame|frame_?id|index|idx|n|no|id|packet|#)|column\.\d+|unnamed.*",
+    r"(?:.*[._ ])?(?:seq|count|counter|samples?|frame|frame_?id|index|idx|n|no|id|packet|#)"
+    r"|column\.\d+|unnamed.*",
     re.IGNORECASE,
 )
 _TIME_UNIT: Final = re.compile(
