@@ -10,7 +10,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 PYTEST := $(BIN)/python -m pytest
 PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test check check-export bench fuzz format clean
+.PHONY: demo test check check-export bench fuzz captures format clean
 
 demo: $(VENV)/.sim
 	$(BIN)/tactile-rt demo --sweeps 12
@@ -36,6 +36,9 @@ bench: $(VENV)/.dev
 fuzz: $(VENV)/.dev
 	$(BIN)/python -m bench.drivers.fuzzing
 
+captures: $(VENV)/.dev
+	$(BIN)/python -m bench.drivers.captures
+
 format: $(VENV)/.dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
@@ -50,5 +53,5 @@ $(VENV)/.sim: pyproject.toml $(PINS)
 
 $(VENV)/.dev: pyproject.toml $(PINS)
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) --editable '.[sim,train,view,dbc,record,publish,ui,test,dev]'
+	$(INSTALL) --editable '.[sim,train,view,dbc,record,import,publish,ui,test,dev]'
 	touch $@ $(VENV)/.sim

@@ -9,7 +9,7 @@ raises: what fails a check is counted in `stats`.
 
 import abc
 import difflib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib import import_module, metadata
@@ -225,6 +225,17 @@ class Codec(abc.ABC, Generic[Packet]):
         Returns:
             One packet per sample.
         """
+
+    @classmethod
+    def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
+        """Options that a device may have besides the defaults, of those that change its frames.
+
+        For whoever must find out what a device is.
+
+        Args:
+            identifiers: The CAN identifiers of 11 bits that there are.
+        """
+        return []
 
     def commands(self, command: Command) -> tuple[Step[Packet], ...]:
         """What to send to the device when this happens."""

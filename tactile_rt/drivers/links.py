@@ -73,7 +73,8 @@ class SerialLink(Link[bytes]):
 
         self.name = port
         # a pty forgets parity and then refuses to be opened with it again
-        if os.path.realpath(port).startswith("/dev/pts/"):
+        self._pty = os.path.realpath(port).startswith("/dev/pts/")
+        if self._pty:
             parity = "N"
         try:
             self._port: Any = serial.serial_for_url(
@@ -122,6 +123,20 @@ class SerialLink(Link[bytes]):
                 return bytes(data), time.monotonic_ns()
             if time.monotonic() >= end:
                 return None
+
+    def retune(self, baud: int, parity: str = "N") -> None:
+        """Go on at another speed, with what had come at the last one thrown away.
+
+        Raises:
+            SourceError: the port cannot have it, or is gone.
+        """
+        try:
+            self._port.baudrate = baud
+            if not self._pty:
+                self._port.parity = parity
+            self._port.reset_input_buffer()
+        except (OSError, ValueError, TypeError, AttributeError) as error:
+            raise SourceError(f"{self.name}: not at {baud} bit/s ({_reason(error)})") from None
 
     def send(self, packet: bytes) -> None:
         try:

@@ -1,7 +1,7 @@
 """Aidin Robotics AFT200-D80 force/torque sensor on CAN."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -65,6 +65,15 @@ class Aft200(CanCodec):
 
     Options = Aft200Options
     cannot_detect = "a lost sample: there is no counter, and forces and torques pair by order only"
+
+    @classmethod
+    def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
+        return [
+            {"force_id": f"{first:#x}"}
+            for first in identifiers
+            if first != Aft200Options.force_id and first + 1 in identifiers
+            if not {first - 1, first + 2} & set(identifiers)  # a longer row is of another device
+        ]
 
     def __init__(self, options: Aft200Options) -> None:
         self._options, self._first = options, options.force_id

@@ -6,6 +6,7 @@ floats, so where frames end is concluded from several frames at once (`endings`)
 """
 
 import struct
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
@@ -59,6 +60,10 @@ class AnySkin(DescribedFrame):
         "there is no counter and no checksum: lost and repeated frames leave no trace, and of "
         "changed bytes only a missing line end and impossible values are seen"
     )
+
+    @classmethod
+    def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
+        return [{"magnetometers": str(n)} for n in range(1, 17) if n != CHIPS]
 
     def __init__(self, options: AnySkinOptions) -> None:
         frame, n = shipped_frame("anyskin"), options.magnetometers

@@ -20,7 +20,7 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
     Column,
     LineMapping,
     array_of,
-    parse_column,
+    parse_columns,
     read_mapping,
 )
 from tactile_rt.drivers.codecs.ascii_text import Names, fields, number, quoted
@@ -90,13 +90,10 @@ class AsciiLine(SerialCodec):
         if options.mapping:
             mapping = read_mapping(options.mapping)
         else:
-            mapping = LineMapping(columns=tuple(w.strip() for w in options.columns.split(",")))
+            mapping = LineMapping(columns=(options.columns,))
         if options.rate_hz:
             mapping = msgspec.structs.replace(mapping, rate_hz=options.rate_hz)
-        prefix = f"{where}: columns" if options.mapping else where
-        columns = tuple(
-            parse_column(word, f"{prefix}[{i}]") for i, word in enumerate(mapping.columns)
-        )
+        columns = parse_columns(mapping.columns, f"{where}: columns" if options.mapping else where)
         spec = array_of(mapping, columns, where)
         super().__init__(spec)
         self._columns, self._width = columns, len(columns)

@@ -13,10 +13,13 @@ or, where names stand before the numbers, ``NAME=COLUMN``: ``X=M0.bx:uT``. Then 
 by their names, in whatever order they come and in as many lines, or in JSON: ``mag.x=M0.bx:uT`` is
 in an object, ``Raw.6=M0.bx`` the seventh number after a name.
 
+A word with a range stands for several columns, as `column_words` tells: ``T{0..15}.pressure``.
+
 SCALE is what a one on the wire stands for, in UNIT; what is stored is SI. Without UNIT it is SI.
 """
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -24,6 +27,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from tactile_rt.drivers.codecs.column_words import expand_columns
 from tactile_rt.settings import convert, read_toml
 from tactile_rt.stream import ArraySpec, ConfigError
 
@@ -35,6 +39,7 @@ __all__ = [
     "LineMapping",
     "array_of",
     "parse_column",
+    "parse_columns",
     "read_mapping",
 ]
 
@@ -206,6 +211,20 @@ def parse_column(word: str, where: str) -> Column:
     if unit and unit not in UNITS:
         raise ConfigError(f"{where}: unknown unit {unit!r}; there are {', '.join(UNITS)}")
     return Column.measured(element, channel, unit or "", _scale(scale, where))
+
+
+def parse_columns(words: Iterable[str], where: str) -> tuple[Column, ...]:
+    """The columns of a line, from its words; one with a range is several.
+
+    Args:
+        words: The columns as a user writes them.
+        where: The place where the words stand, for the message.
+
+    Raises:
+        ConfigError: as `parse_column` and `expand_columns`.
+    """
+    each = [word for text in words for word in expand_columns(text, where)]
+    return tuple(parse_column(word, f"{where}[{i}]") for i, word in enumerate(each))
 
 
 def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> ArraySpec:

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import msgspec
 
-__all__ = ["Names", "fields", "number", "quoted"]
+__all__ = ["Names", "fields", "in_seconds", "number", "quoted"]
 
 NAN: Final = float("nan")
 # What boards print in place of a number; ovf is Arduino's for what is over 4e9.
@@ -65,7 +65,7 @@ def fields(line: str, words_are_names: bool = False) -> list[str]:
         line: the line.
         words_are_names: whether a name may be several words, ``one reading: 5``.
     """
-    text = (_NAMES if words_are_names else _NAME).sub(" ", _ARROW.sub(" ", _in_seconds(line)))
+    text = (_NAMES if words_are_names else _NAME).sub(" ", _ARROW.sub(" ", in_seconds(line)))
     text = _NOTHING.sub("nan", text.rstrip().removesuffix(",").removesuffix(";"))
     words = _SEPARATORS.split(text.translate(_BRACKETS))
     return [w for w in words if w and w not in _SIGNS]
@@ -96,7 +96,7 @@ class Names:
                     for name, place in self._names.items()
                     if (value := _within(said, name.split("."))) is not ABSENT
                 }
-        text = _in_seconds(line)
+        text = in_seconds(line)
         return {
             place: _or_nan(found[1])
             for place, pattern in self._patterns.items()
@@ -123,7 +123,7 @@ def _within(said: Any, path: list[str]) -> Any:
 
 
 def _or_nan(value: Any) -> float:
-    if isinstance(value, str) and (dated := _in_seconds(value)) != value:
+    if isinstance(value, str) and (dated := in_seconds(value)) != value:
         value = dated
     found = number(value)
     return NAN if found is None else found
@@ -141,7 +141,7 @@ def _pattern(name: str) -> re.Pattern[str]:
     )
 
 
-def _in_seconds(line: str) -> str:
+def in_seconds(line: str) -> str:
     """The line with dates and times of day in seconds: since 1970 (UTC unless it says), or since
     midnight."""
     if ":" not in line:

@@ -2,7 +2,7 @@
 
 import struct
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
@@ -101,6 +101,14 @@ class AtiCan(CanCodec):
         "two neighbouring ones while requests are never all answered"
     )
 
+    @classmethod
+    def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
+        return [
+            {"base": f"{base:#x}"}
+            for base in sorted({i >> 4 for i in identifiers} - {AtiCanOptions.base})
+            if base <= 0x7F
+        ]
+
     def __init__(self, options: AtiCanOptions) -> None:
         self._options, self._base = options, options.base << 4
         super().__init__(six_axis("ati", options.rate_hz))
@@ -168,7 +176,9 @@ class AtiCan(CanCodec):
         if self._never_empty > NEVER_EMPTY:
             self._drop_first()
         if self._matrix is None:
+            self.complaint = "it has not told its matrix, which it does when it is started"
             return
+        self.complaint = ""
         batch.values.append(self._matrix @ (g0, g1, g2, g3, g4, g5))
         batch.valid.append((not status & INVALIDATING,))
         batch.status.append(status)

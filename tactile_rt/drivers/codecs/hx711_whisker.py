@@ -5,6 +5,7 @@ six bytes that end no possible reading, and by which frames are told apart.
 """
 
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
@@ -64,6 +65,10 @@ class Hx711Whisker(DescribedFrame):
         "there is no counter and no checksum: lost and repeated frames leave no trace, and of "
         "changed bytes only a damaged ending and voltages out of range are seen"
     )
+
+    @classmethod
+    def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
+        return [{"whiskers": str(n)} for n in range(1, 10) if n != Hx711WhiskerOptions.whiskers]
 
     def __init__(self, options: Hx711WhiskerOptions) -> None:
         frame, n = shipped_frame("hx711_whisker"), options.whiskers

@@ -1,6 +1,6 @@
 """The iCub's capacitive skin on CAN: triangles of twelve taxels, sixteen to a board."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
@@ -83,6 +83,16 @@ class IcubSkin(CanCodec):
         **{4 + i: f"taxel {i} of a triangle is stuck" for i in range(TAXELS)},
     }
     cannot_detect = "a lost sample: there is no counter"
+
+    @classmethod
+    def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
+        return [
+            {"board": str(board), "triangles": ",".join(map(str, there)), "firmware": firmware}
+            for firmware, first in CLASS.items()
+            for board in range(16)
+            if (there := [n for n in range(TRIANGLES) if (first | board << 4 | n) in identifiers])
+            if (firmware, board, len(there)) != ("new", IcubSkinOptions.board, TRIANGLES)
+        ]
 
     def __init__(self, options: IcubSkinOptions) -> None:
         self._options = options

@@ -16,7 +16,7 @@ be stopped.
 """
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -104,6 +104,17 @@ class NativeCan(CanCodec):
     status_bits = STATUS
     cannot_detect = "65,536 samples lost in succession look like none lost"
 
+    @classmethod
+    def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
+        return [
+            {"base": f"{first - HEADER:#x}"}
+            for first in identifiers
+            if first - HEADER != NativeCanOptions.base
+            and first >= HEADER
+            and first + PART - HEADER in identifiers
+            and first - HEADER <= 0x7FF - DESCRIPTION
+        ]
+
     def __init__(self, options: NativeCanOptions) -> None:
         super().__init__(None)
         self._base, self._fd = options.base, options.fd
@@ -137,8 +148,10 @@ class NativeCan(CanCodec):
             elif which == DESCRIPTION:
                 self._describe(data)
                 described = self._description()
-            else:
+            elif data[:1] == bytes((MessageType.ACK,)):
                 stats.intact += 1
+            else:
+                stats.skipped += 1
         return batch.take(self.spec.shape, t_ns) if self.spec else None
 
     def _describe(self, data: bytes) -> None:

@@ -11,7 +11,7 @@ alknemeyer/optoforce, shadow-robot/optoforce and RCPRG-ros-pkg/optoforce_can).
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final
 
@@ -192,6 +192,10 @@ class OptoForceSerial(SerialCodec):
         "places, pass it."
     )
 
+    @classmethod
+    def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
+        return [{"model": model} for model in SHAPES if model != OptoForceOptions.model]
+
     def __init__(self, options: OptoForceOptions) -> None:
         super().__init__(None)
         self._options = options
@@ -256,6 +260,16 @@ class OptoForceCan(CanCodec):
     count_bits = 16
     status_bits = OptoForceSerial.status_bits
     cannot_detect = OptoForceSerial.cannot_detect
+
+    @classmethod
+    def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
+        usual = OptoForceOptions.model, OptoForceCanOptions.device_id
+        return [
+            {"model": model, "device_id": f"{device:#x}"}
+            for model in SHAPES
+            for device in sorted(identifiers)
+            if (model, f"{device:#x}") != usual
+        ]
 
     def __init__(self, options: OptoForceCanOptions) -> None:
         super().__init__(None)

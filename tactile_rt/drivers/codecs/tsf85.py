@@ -10,7 +10,7 @@ Sources: facts of the public drivers that go back to Robotiq's tactile sensor in
 (UsbCommands, UsbSensorType and the scales of the motion sensor, +-2 g and +-250 deg/s).
 """
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from typing import Final
 
@@ -87,6 +87,10 @@ class Tsf85(SerialCodec):
         "Its checksum is not used: damage that leaves a packet's structure intact is taken for a "
         "measurement. Without a counter, lost samples show only in the time (whole ms)."
     )
+
+    @classmethod
+    def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
+        return [{"fingers": "1"}, {"times": "false"}, {"fingers": "1", "times": "false"}]
 
     def __init__(self, options: Tsf85Options) -> None:
         super().__init__(_spec(options))

@@ -1,7 +1,7 @@
 """XELA uSkin patches on CAN: 4 x 4 taxels of three axes, a frame per taxel."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -61,6 +61,15 @@ class Xela(CanCodec):
         "a lost sample: there is no counter; two neighbouring samples that lost complementary "
         "taxels come out as one"
     )
+
+    @classmethod
+    def variants(cls, identifiers: Collection[int] = ()) -> list[dict[str, str]]:
+        return [
+            {"first_id": f"{first:#x}"}
+            for first in identifiers
+            if first != XelaOptions.first_id
+            and all(first + k in identifiers for k in range(TAXELS))
+        ]
 
     def __init__(self, options: XelaOptions) -> None:
         self._first, self._board = options.first_id, options.board

@@ -1,0 +1,335 @@
+"""`tactile-rt sniff`: which codec, speed or columns fit a port, a bus, or a file."""
+
+import shlex
+import stat
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import quote, urlencode
+
+import typer
+
+from tactile_rt.cli.app import app, leaving, starting
+from tactile_rt.stream import ConfigError, RecordingError
+
+if TYPE_CHECKING:
+    from tactile_rt.drivers.sniffing import CodecFit, Tried
+
+NOTHING = 1  # exit code: nothing fits
+SHOWN = 6  # fits
+GUESSED_HZ = 100  # where nothing tells the time
+
+
+@app.command()
+def sniff(
+    target: Annotated[
+        str,
+        typer.Argument(help="A port, can:INTERFACE:CHANNEL, a log, a table or a bag."),
+    ],
+    seconds: Annotated[
+        float, typer.Option(min=0.05, max=60, help="How long to listen, at each baud rate.")
+    ] = 0.5,
+    baud: Annotated[
+        list[int] | None, typer.Option(help="The baud rates to try; may be repeated.")
+    ] = None,
+    further: Annotated[
+        list[str] | None,
+        typer.Option("--try", help="Try codec=NAME&OPTION=VALUE, too; may be repeated."),
+    ] = None,
+    ask: Annotated[
+        bool, typer.Option("--ask", help="Send what starts each device; without, only listen.")
+    ] = False,
+    dtr: Annotated[
+        bool, typer.Option("--dtr/--no-dtr", help="Assert DTR, at which many boards reset.")
+    ] = True,
+) -> None:
+    """Find out what a device speaks, from half a second of it.
+
+    Every codec, with the options that change its frames, is fed with what
+    comes, on a port at every baud rate that codecs name. Those that fit are
+    listed, the best first; of lines of text, columns are proposed. The last
+    line is the command to go on with. Exit code 1: nothing fits.
+
+    It only listens. A device that must be told to send is found with --ask.
+    """
+    from tactile_rt.cli.importing import codec_fields
+
+    tried = [codec_fields(text, "--try") for text in further or []]
+    candidates: list[Tried] = [
+        (f["codec"], {k: v for k, v in f.items() if k != "codec"}) for f in tried
+    ]
+    path = Path(target.removeprefix("serial://").removeprefix("serial:"))
+    with starting(), leaving(None):
+        if target.startswith("can:"):
+            _sniff_bus(target, seconds, candidates, ask)
+        elif target.startswith(("serial:", "socket:", "rfc2217:")) or _is_port(path):
+            port = str(path) if path.exists() else target.removeprefix("serial:")
+            _sniff_port(port, seconds, baud, candidates, ask, dtr)
+        elif path.exists():
+            _sniff_file(path, candidates)
+        else:
+            raise ConfigError(
+                f"{target} is no port, bus or file: `tactile-rt list` shows what is plugged in"
+            )
+
+
+def _is_port(path: Path) -> bool:
+    try:
+        return stat.S_ISCHR(path.stat().st_mode)
+    except OSError:
+        return False
+
+
+# lines
+
+
+def _sniff_port(
+    port: str,
+    seconds: float,
+    bauds: list[int] | None,
+    further: "list[Tried]",
+    ask: bool,
+    dtr: bool,
+) -> None:
+    from tactile_rt.drivers.links import SerialLink
+    from tactile_rt.drivers.listening import ask_devices, hear_port, line_speeds
+    from tactile_rt.drivers.sniffing import sniff_bytes
+    from tactile_rt.recording.importing.proposing import line_columns
+
+    speeds = [(b, "N") for b in bauds] if bauds else line_speeds()
+    found: list[tuple[CodecFit, int]] = []
+    texts: list[tuple[int, bytes]] = []
+    came = 0
+    for baud, _, data in hear_port(port, seconds, speeds, dtr):
+        came += len(data)
+        typer.echo(f"{baud} bit/s: {len(data)} bytes", err=True)
+        found += [(fit, baud) for fit in sniff_bytes(data, further)]
+        texts.append((baud, data))
+    if not found and ask:
+        typer.echo("asking for samples as each codec does", err=True)
+
+        def connect(codec: Any) -> SerialLink:
+            return SerialLink(port, codec.baud, codec.parity, dtr)
+
+        for fit in (
+            fit
+            for _, data in ask_devices("serial", connect, seconds)
+            for fit in sniff_bytes(data, further)
+        ):
+            found.append((fit, _usual_baud(fit)))
+    found.sort(
+        key=lambda one: (
+            one[0].explained * (1 + one[0].proof), one[1] == _usual_baud(one[0]), one[0].intact
+        ),
+        reverse=True,
+    )  # fmt: skip
+    url = f"serial://{port}" if "://" not in port else f"serial:{port}"
+    if found:
+        _show([fit for fit, _ in found], [str(baud) for _, baud in found])
+        fit, baud = found[0]
+        # what USB brings is the same at every speed
+        usual = any(b == _usual_baud(fit) for one, b in found if one.codec == fit.codec)
+        _run(url, fit, {} if usual else {"baud": str(baud)})
+        return
+    proposed = [
+        (told[1], baud, told[0]) for baud, data in texts if (told := line_columns(data)) is not None
+    ]
+    if proposed:
+        n, baud, columns = max(proposed)
+        typer.echo(f"{n} lines at {baud} bit/s are samples: names and units are for you to say")
+        fields = {"codec": "ascii_line", "columns": columns}
+        fields |= {} if baud == 115_200 else {"baud": str(baud)}
+        typer.echo(f"tactile-rt run --source {shlex.quote(f'{url}?{_query(fields)}')}")
+        return
+    if not came:
+        _nothing(f"nothing came from {port}", "" if ask else "try --ask: it may have to be started")
+    _nothing(f"nothing fits what came from {port}", _hint(max((d for _, d in texts), key=len)))
+
+
+def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool) -> None:
+    from tactile_rt.drivers.listening import ask_devices, hear_bus
+    from tactile_rt.drivers.opening import open_line
+    from tactile_rt.drivers.sniffing import sniff_frames
+
+    frames = hear_bus(url, seconds)
+    fits = sniff_frames(frames, further)
+    if not fits and ask:
+        typer.echo("asking for samples as each codec does", err=True)
+        for _, heard in ask_devices("can", lambda _: open_line(url), seconds):
+            fits += sniff_frames(heard, further)
+    if not fits:
+        if not frames:
+            _nothing(
+                f"nothing came from {url}",
+                "is the bit rate right?" + ("" if ask else " or try --ask: it may wait to be told"),
+            )
+        _show_identifiers(frames)
+        _nothing(f"no codec fits what came from {url}", "with a DBC file of it: codec=can-dbc")
+    _show(fits)
+    _run(url, fits[0], {})
+
+
+def _run(url: str, fit: "CodecFit", further: dict[str, str]) -> None:
+    fields = fit.fields | further
+    if not fit.described:
+        typer.echo("it has not described its array here; it does when it is started")
+    sign = "&" if "?" in url else "?"
+    typer.echo(f"tactile-rt run --source {shlex.quote(f'{url}{sign}{_query(fields)}')}")
+
+
+def _usual_baud(fit: "CodecFit") -> int:
+    """The baud rate that its codec has by default."""
+    from tactile_rt.drivers.opening import make_codec
+
+    codec: Any = make_codec("serial", fit.codec, dict(fit.options))
+    return int(codec.baud)
+
+
+# files
+
+
+def _sniff_file(path: Path, further: "list[Tried]") -> None:
+    from tactile_rt.drivers.logs import read_log
+    from tactile_rt.drivers.sniffing import LOOK_BYTES, LOOK_FRAMES, sniff_bytes, sniff_frames
+    from tactile_rt.recording.importing.bag import is_bag
+
+    if is_bag(path):
+        _sniff_bag(path)
+        return
+    if path.is_dir():
+        raise ConfigError(f"{path} is a folder, and no bag: name a file")
+    log = read_log(path)
+    typer.echo(f"{path}: {_form(log.form)}", err=True)
+    if log.wire == "can":
+        frames = []
+        for packet, _ in log.packets():
+            frames += packet
+            if len(frames) >= LOOK_FRAMES:
+                break
+        fits = sniff_frames(frames, further)
+        if not fits:
+            _show_identifiers(frames)
+            _nothing(f"no codec fits {path}", "with a DBC file of it: --as codec=can-dbc&mapping=")
+        _show(fits)
+        _import(path, fits[0])
+        return
+    data = bytearray()
+    for packet, _ in log.packets():
+        data += packet
+        if len(data) >= LOOK_BYTES:
+            break
+    fits = sniff_bytes(bytes(data), further)
+    if fits:
+        _show(fits)
+        _import(path, fits[0])
+    elif log.form != "raw" or not _sniff_text(path, bytes(data)):
+        _nothing(f"nothing fits {path}", _hint(bytes(data)))
+
+
+def _form(form: str) -> str:
+    return {"raw": "bytes as they are", "hex": "bytes in hexadecimal", "dump": "a dump of a line"
+            }.get(form, f"a CAN log ({form})")  # fmt: skip
+
+
+def _import(path: Path, fit: "CodecFit") -> None:
+    fields = fit.fields
+    if not fit.described:
+        typer.echo(
+            "it has not described its array here: array=FILE.json, as `tactile-rt describe` writes "
+            "it, says what it is"
+        )
+        fields["array"] = "FILE.json"
+    told = shlex.quote(_query(fields)) if len(fields) > 1 else _query(fields)
+    typer.echo(f"tactile-rt import {shlex.quote(str(path))} --as {told}")
+
+
+def _sniff_text(path: Path, data: bytes) -> bool:
+    """Propose the columns of a table, or of what a board prints; whether there are any."""
+    from tactile_rt.recording.importing.proposing import propose_columns
+
+    proposed = propose_columns(path, data)
+    if proposed is None:
+        return False
+    typer.echo(f"{proposed.said}: names and units are for you to say")
+    quoted = shlex.quote(str(path))
+    if not proposed.table:
+        fields = _query({"codec": "ascii_line", "columns": proposed.columns})
+        typer.echo(f"tactile-rt import {quoted} --as {shlex.quote(fields)}")
+        return True
+    rate = ""
+    if not proposed.timed:
+        typer.echo(f"no column is a time: --rate says how many came in a second, not {GUESSED_HZ}")
+        rate = f" --rate {GUESSED_HZ}"
+    typer.echo(f"tactile-rt import {quoted} --columns {shlex.quote(proposed.columns)}{rate}")
+    return True
+
+
+def _sniff_bag(path: Path) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    from tactile_rt.recording import Recording
+    from tactile_rt.recording.importing.bag import OURS, bag_topics
+
+    try:
+        about = Recording(path).description if path.suffix == ".mcap" else None
+    except (RecordingError, ConfigError):
+        about = None
+    if about is not None:
+        typer.echo(f"{path}: a recording of {about.spec.name}, {about.spec.rate_hz:g} Hz")
+        typer.echo(f"tactile-rt run --source {shlex.quote(f'replay:{path}')}")
+        return
+    topics = bag_topics(path)
+    table = Table("topic", "type", "messages", "columns", box=None, header_style="bold")
+    for topic in topics:
+        table.add_row(topic.name, topic.type, str(topic.messages), topic.columns)
+    Console(soft_wrap=True).print(table)
+    known = [t for t in topics if t.columns or t.type == OURS]
+    if not known:
+        _nothing(f"{path}: of no topic is known what is what", "`import` takes it with --columns")
+    best = max(known, key=lambda t: t.messages)
+    only = "" if len(known) == 1 else f" --topic {shlex.quote(best.name)}"
+    typer.echo(f"tactile-rt import {shlex.quote(str(path))}{only}")
+
+
+# what is said
+
+
+def _show(fits: "list[CodecFit]", speeds: list[str] | None = None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    names = ["codec", "options", *(["baud"] if speeds else []), "intact", "corrupt", "explains"]
+    table = Table(*names, "notices damage", box=None, header_style="bold")
+    for k, fit in enumerate(fits[:SHOWN]):
+        options = "&".join(f"{a}={b}" for a, b in fit.options.items())
+        table.add_row(
+            fit.codec, options, *([speeds[k]] if speeds else []), str(fit.intact),
+            str(fit.corrupt), f"{fit.explained:.0%}",
+            f"{fit.proof:.0%}" if fit.wire == "serial" else "by CAN",
+        )  # fmt: skip
+    Console(soft_wrap=True, width=None).print(table)
+
+
+def _show_identifiers(frames: "list[Any]") -> None:
+    from collections import Counter
+
+    counts = Counter((f.id, f.extended, len(f.data)) for f in frames)
+    for (number, extended, length), n in counts.most_common(12):
+        typer.echo(f"{number:0{8 if extended else 3}X}  {n} frames of {length} bytes")
+
+
+def _hint(data: bytes) -> str:
+    from tactile_rt.drivers.sniffing import frame_hint
+
+    hint = frame_hint(data)
+    return f"{hint}: describe one for codec=binary_frame" if hint else ""
+
+
+def _nothing(what: str, hint: str = "") -> None:
+    typer.echo(f"{what}{f': {hint}' if hint else ''}")
+    raise typer.Exit(NOTHING)
+
+
+def _query(fields: dict[str, str]) -> str:
+    # what the shell and a URL leave as it is stays readable
+    return urlencode(fields, quote_via=quote, safe=":*,.{}()[]/ -_")

@@ -1,0 +1,344 @@
+"""What may be in the columns of a table, or of what a board prints, for a user to change.
+
+Names say most: ``Fx [N]``, ``wrench.force.x``, ``p0_x``, ``timestamp_ms``. What has none is told by
+how it goes: a number that goes up by one counts, one that goes up is a time, all else measures. No
+unit is made up: a number of which nobody says what it is in keeps its own (1).
+"""
+
+import re
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.drivers.codecs.ascii_mapping import UNITS
+from tactile_rt.drivers.codecs.ascii_text import fields, in_seconds, number
+
+__all__ = ["guess_columns", "guess_line_columns"]
+
+LOOKED_AT: Final = 400  # lines
+LEAST: Final = 5
+MOSTLY: Final = 0.8  # of the lines are alike, of the cells are numbers
+Rows = Sequence[Sequence[float | None]]
+
+_TIME: Final = re.compile(
+    r"(?:%|.*[._ ])?"
+    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed)"
+    r"(?:[_ ]?(?:s|sec|ms|us|µs|ns|nsec))?", re.IGNORECASE,
+)  # fmt: skip
+_COUNT: Final = re.compile(
+    r"(?:.*[._ ])?(?:seq|count|counter|samples?|frame|frame_?id|index|idx|n|no|id|packet|#)"
+    r"|column\.\d+|unnamed.*",
+    re.IGNORECASE,
+)
+_TIME_UNIT: Final = re.compile(
+    r"(?:^|[_ ([/.]|millis|micros)(s|sec|secs|ms|us|µs|ns|nsec|nsecs)\W*$"
+)
+_BRACKET: Final = re.compile(r"[\[(]([^\])]*)[\])]")
+_TAIL_UNIT: Final = re.compile(r"_(mN|uN|N|Nm|mNm|kPa|Pa|uT|mT|T|degC|mV|V|mm|um|pF)$")
+_QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
+    (re.compile(pattern, re.IGNORECASE), channel, unit)
+    for pattern, channel, unit in (
+        (r"(?:^|[\W_])(?:f|force|forces)[\W_]*([xyz])(?:$|[\W_]|(?=\d))", "f{}", "N"),
+        (r"(?:^|[\W_])(?:t|m|torques?|moment|tau)[\W_]*([xyz])(?:$|[\W_]|(?=\d))", "m{}", "Nm"),
+        (
+            r"(?:^|[\W_])(?:b|mag|magnetic(?:_field)?|field)[\W_]*([xyz])(?:$|[\W_]|(?=\d))",
+            "b{}",
+            "",
+        ),
+        (r"(?:^|[\W_])(?:temp|temperature)(?:$|[\W_])", "temperature", ""),
+        (r"(?<=[\W_])([xyz])(?:$|[\W_])", "{}", ""),
+        (r"(?:^|[\W_])(?:pressure|press)(?:$|[\W_])", "pressure", ""),
+        (r"(?:^|(?<=\d))([xyz])$", "{}", ""),
+        (r"^([xyz])(?=\d+$)", "{}", ""),
+    )
+)
+_ALIASES: Final = {
+    "n·m": "Nm", "n*m": "Nm", "n.m": "Nm", "n-m": "Nm", "nm": "Nm", "newton": "N", "newtons": "N",
+    "°c": "degC", "c": "degC", "celsius": "degC", "µt": "uT", "μt": "uT", "utesla": "uT",
+    "kg": "kgf", "volt": "V", "volts": "V", "m/s^2": "m/s2", "m/s²": "m/s2", "n": "N",
+}  # fmt: skip
+_PLAIN: Final = re.compile(r"[^A-Za-z0-9_-]+")
+_LABELLED: Final = re.compile(r"([A-Za-z_][\w ()\[\]/°%]*?)\s*[:=\[]\s*([^\s,;|\]]+)")
+
+
+def guess_columns(
+    names: Sequence[str], rows: Rows, dated: Collection[int] = ()
+) -> tuple[list[str], bool]:
+    """A word for each column, as `ascii_mapping` has them, and whether one is a time.
+
+    Args:
+        names: what stands above the columns; empty without.
+        rows: cells of some rows, None for what is no number.
+        dated: which columns hold dates or times of day.
+    """
+    width = len(names) or max((len(r) for r in rows), default=0)
+    series = [_column(rows, k) for k in range(width)]
+    kinds: list[str] = ["" if s is not None else "-" for s in series]
+    time = _place_time(names, series, dated)
+    if time is not None:
+        kinds[time[0]] = time[1]
+    count = _place_count(names, series, kinds)
+    if count is not None:
+        kinds[count] = "count"
+    for k, name in enumerate(
+        names
+    ):  # times and counts beside those, and what never changes in a log
+        if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _is_index(name, series[k])):
+            kinds[k] = "-"
+    measured = [k for k, kind in enumerate(kinds) if not kind]
+    words = _by_names(names, series, measured) if names else _by_places(measured)
+    return [words.get(k, kinds[k] or "-") for k in range(width)], time is not None
+
+
+def guess_line_columns(data: bytes) -> tuple[list[str], int, int] | None:
+    """The columns of what a board prints: (words, lines that are samples, lines); None: there are
+    none. Words have names where numbers do.
+
+    Args:
+        data: what came, cut anywhere.
+    """
+    lines = data.decode("utf-8", "replace").replace("\r", "\n").split("\n")[1:-1]
+    lines = [x for x in lines if x.strip()][:LOOKED_AT]
+    if len(lines) < LEAST or _unprintable(lines):
+        return None
+    for guess in (_of_objects, _of_places, _of_labels):
+        if (found := guess(lines)) is not None:
+            return found
+    return None
+
+
+def _of_objects(lines: list[str]) -> tuple[list[str], int, int] | None:
+    """Lines of JSON."""
+    said = []
+    for line in lines:
+        if line.lstrip()[:1] != "{":
+            continue
+        try:
+            said.append(msgspec.json.decode(line))
+        except (msgspec.DecodeError, UnicodeEncodeError):
+            continue
+    if len(said) < MOSTLY * len(lines):
+        return None
+    each = [dict(_numbers(one, "")) for one in said]
+    return _named(each, len(lines))
+
+
+def _of_labels(lines: list[str]) -> tuple[list[str], int, int] | None:
+    """Numbers after their names, in one line or in several."""
+    each: list[dict[str, float]] = []
+    used = 0
+    for line in lines:
+        found: dict[str, float] = {}
+        covered = 0
+        for label in _LABELLED.finditer(in_seconds(line)):
+            value = number(label[2])
+            if value is not None:
+                found[label[1].strip()] = value
+                covered += len(label[0])
+        if 2 * covered < len(line.strip()):  # a log in words, which has a number here and there
+            continue
+        used += bool(found)
+        if not found:
+            continue
+        if each and set(found).isdisjoint(each[-1]):
+            each[-1] |= found
+        else:
+            each.append(found)
+    if used < MOSTLY * len(lines):
+        return None
+    return _named(each, len(lines))
+
+
+def _named(each: list[dict[str, float]], lines: int) -> tuple[list[str], int, int] | None:
+    often = Counter(name for one in each for name in one)
+    names = [name for name, n in often.items() if n >= MOSTLY * len(each)]
+    if not names or len(each) < LEAST:
+        return None
+    rows = [[one.get(name) for name in names] for one in each]
+    words, _ = guess_columns(names, rows)
+    told = [f"{name}={w}" for name, w in zip(names, words, strict=True) if w != "-"]
+    whole = sum(all(cell is not None for cell in row) for row in rows)
+    return (told, whole, lines) if _measures(words) and whole >= MOSTLY * len(each) else None
+
+
+def _of_places(lines: list[str]) -> tuple[list[str], int, int] | None:
+    """Numbers at their places between spaces, commas and the like."""
+    cut = [fields(line) for line in lines]
+    width, often = Counter(len(c) for c in cut).most_common(1)[0]
+    if often < MOSTLY * len(lines):
+        return None
+    same = [(line, c) for line, c in zip(lines, cut, strict=True) if len(c) == width]
+    rows = [[number(word) for word in c] for _, c in same]
+    share = [sum(row[k] is not None for row in rows) / len(rows) for k in range(width)]
+    numeric = [k for k in range(width) if share[k] >= MOSTLY]
+    if 2 * len(numeric) < width or (2 * len(numeric) == width and width > 2):
+        return None
+    if sum("=" in line or ": " in line for line, _ in same) > len(same) / 2 and width > 1:
+        labelled = _of_labels(lines)  # names tell more than places
+        if labelled is not None and len(labelled[0]) >= len(numeric) - 1:
+            return labelled
+    dated = {k for k in numeric if all(_is_date(line, c[k]) for line, c in same[:20])}
+    words, _ = guess_columns((), rows, dated)
+    if not _measures(words):
+        return None
+    varied = {tuple(row) for row in rows}
+    return (words, often, len(lines)) if len(varied) > 1 or width > 1 else None
+
+
+def _measures(words: Iterable[str]) -> bool:
+    return any("." in word for word in words if not word.startswith("time"))
+
+
+def _is_date(line: str, word: str) -> bool:
+    return word not in line and in_seconds(line) != line
+
+
+def _numbers(value: Any, at: str) -> Iterable[tuple[str, float]]:
+    if isinstance(value, dict):
+        for key, one in value.items():
+            yield from _numbers(one, f"{at}.{key}" if at else str(key))
+    elif isinstance(value, list):
+        for k, one in enumerate(value):
+            yield from _numbers(one, f"{at}.{k}")
+    elif isinstance(value, int | float) and not isinstance(value, bool) and at:
+        yield at, float(value)
+
+
+def _unprintable(lines: list[str]) -> bool:
+    text = "".join(lines)
+    odd = sum(not c.isprintable() and c != "\t" for c in text) + text.count("\ufffd")
+    return odd * 20 > len(text)
+
+
+# what a column is
+
+
+def _column(rows: Rows, k: int) -> NDArray[np.float64] | None:
+    """The numbers of a column, NaN where there are none; None if it hardly has any."""
+    cells = [row[k] if k < len(row) else None for row in rows]
+    there = sum(c is not None for c in cells)
+    if not cells or there < MOSTLY * len(cells):
+        return None
+    return np.array([np.nan if c is None else c for c in cells], np.float64)
+
+
+def _bare(name: str) -> str:
+    return _BRACKET.sub("", name).strip().strip('"')
+
+
+def _place_time(
+    names: Sequence[str], series: Sequence[NDArray[np.float64] | None], dated: Collection[int]
+) -> tuple[int, str] | None:
+    for k in sorted(dated):
+        return k, "time:iso"
+    known = [k for k, name in enumerate(names) if _TIME.fullmatch(_bare(name))]
+    for k in [*known, *(() if known else range(len(series)))]:
+        v = series[k]
+        if v is None or len(v) < 2 or not np.isfinite(v).all():
+            continue
+        steps = np.diff(v)
+        rising = (steps >= 0).all() and v[-1] > v[0]
+        if k in known:
+            if rising or (steps >= 0).mean() > MOSTLY:
+                return k, f"time:{_time_unit(names[k], v)}"
+        elif rising and (steps > 0).mean() > 0.5 and not names and not (steps == 1).all():
+            if np.std(steps) <= np.mean(steps):  # a ramp of a measurement is as steady hardly ever
+                return k, f"time:{_time_unit('', v)}"
+    return None
+
+
+def _time_unit(name: str, v: NDArray[np.float64]) -> str:
+    """The unit of a time, by its name, by how long ago it began, or by its steps."""
+    if found := _TIME_UNIT.search(name.strip().lower().replace("μ", "µ")):
+        told = found[1].replace("µ", "u").removesuffix("s") if len(found[1]) > 2 else found[1]
+        return {"sec": "s", "nsec": "ns", "µs": "us"}.get(told, told)
+    if "millis" in name.lower():
+        return "ms"
+    if "micros" in name.lower():
+        return "us"
+    size = float(np.nanmedian(np.abs(v)))
+    for least, unit in ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s")):
+        if size > least:
+            return unit
+    if (v % 1 != 0).any():
+        return "s"
+    steps = np.diff(v)
+    step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1.0
+    return "ms" if step < 200 else "us" if step < 500_000 else "ns"
+
+
+def _place_count(
+    names: Sequence[str], series: Sequence[NDArray[np.float64] | None], kinds: Sequence[str]
+) -> int | None:
+    for k, v in enumerate(series):
+        if v is None or kinds[k] or (names and not _COUNT.fullmatch(_bare(names[k]))):
+            continue
+        if len(v) > 2 and np.isfinite(v).all() and (v % 1 == 0).all():
+            if (np.diff(v) == 1).mean() > MOSTLY and (v >= 0).all():
+                return k
+    return None
+
+
+def _is_index(name: str, v: NDArray[np.float64] | None) -> bool:
+    """Whether this is a number of something, which goes up but counts no samples."""
+    if v is None or not _COUNT.fullmatch(_bare(name)):
+        return False
+    steps = np.diff(v[np.isfinite(v)])
+    return bool(len(steps)) and bool((steps >= 0).all())
+
+
+def _by_places(measured: Sequence[int]) -> dict[int, str]:
+    return {k: f"T{i}.value" for i, k in enumerate(measured)}
+
+
+def _by_names(
+    names: Sequence[str], series: Sequence[NDArray[np.float64] | None], measured: Sequence[int]
+) -> dict[int, str]:
+    """Element, channel and unit of each; those alone of which every element has all channels."""
+    parsed = {k: _parsed(names[k]) for k in measured}
+    known = {k: p for k, p in parsed.items() if p[1]}
+    loads = any(unit for _, _, unit in known.values())
+    if 2 * len(known) < len(parsed) and not loads:  # where something is, beside what it feels
+        known = {k: (e, "value", u) for k, (e, c, u) in parsed.items() if not c}
+    chosen = known or {k: (e, "value", u) for k, (e, _, u) in parsed.items()}
+    groups: dict[str, dict[str, int]] = {}
+    for k, (element, channel, _) in chosen.items():
+        groups.setdefault(element, {}).setdefault(channel, k)
+    shapes = Counter(frozenset(g) for g in groups.values())
+    if not shapes:
+        return {}
+    best = max(shapes, key=lambda s: (len(s) * shapes[s], len(s)))
+    units = {c: {chosen[g[c]][2] for g in groups.values() if frozenset(g) == best} for c in best}
+    words = {}
+    for element, g in groups.items():
+        if frozenset(g) != best:
+            continue
+        for channel, k in g.items():
+            (unit,) = units[channel] if len(units[channel]) == 1 else ("",)
+            words[k] = f"{element}.{channel}:{unit or '1'}"
+    return words
+
+
+def _parsed(name: str) -> tuple[str, str, str]:
+    """Element, channel (empty: none is known) and unit that a name tells."""
+    unit = ""
+    for told in _BRACKET.findall(name):
+        word = told.strip()
+        unit = word if word in UNITS else _ALIASES.get(word.lower(), "")
+    bare = _bare(name)
+    if not unit and (tail := _TAIL_UNIT.search(bare)):
+        unit, bare = tail[1], bare[: tail.start()]
+    for pattern, channel, usual in _QUANTITY:
+        if (found := pattern.search(bare)) is None:
+            continue
+        axis = next((g for g in found.groups() if g), "").lower()
+        rest = bare[: found.start()] + " " + bare[found.end() :]
+        rest = re.sub(r"(?i)(?:^|\W)(?:field|wrench|data|msg)(?=\W|$)", " ", rest)
+        element = _PLAIN.sub("_", rest).strip("_-") or "S"
+        element = f"S{element}" if element.isdecimal() else element
+        return element, channel.format(axis), unit or usual
+    return _PLAIN.sub("_", bare).strip("_-") or "S", "", unit

@@ -1,0 +1,100 @@
+"""One line of a log of text: what `tactile-rt dump`, candump and dumps in hexadecimal print."""
+
+import re
+from typing import Any, Final
+
+from tactile_rt.drivers.codec import CanFrame
+from tactile_rt.drivers.codecs.ascii_text import in_seconds
+from tactile_rt.stream import NS_PER_S
+
+__all__ = ["of_candump", "of_dump", "of_dump_can", "of_hex"]
+
+_CANDUMP: Final = re.compile(
+    r"\s*(?:\((?P<t>[^)]*)\)\s*)?(?P<bus>[A-Za-z]\w*)\s+(?:[TR]X\s+\S+\s+\S+\s+)?"
+    r"(?:(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
+    r"(?:#(?P<fd>#[0-9A-Fa-f])?(?P<rtr>[Rr]\d?)?(?P<hex>(?:[0-9A-Fa-f]{2}\.?)*)(?:\s+[TR])?"
+    r"|\s+\[(?P<n>\d+)\](?P<spaced>(?:\s+[0-9A-Fa-f]{2})*|\s+remote request)(?:\s+'.*')?)"
+    r"|(?P<error>[0-9A-Fa-f]{8}\s+\[\d+\].*ERRORFRAME.*))\s*"
+)
+_DUMP: Final = re.compile(
+    r" *(?P<t>\d+\.\d{3}) ms  (?P<hex>[0-9a-f]{2}(?: [0-9a-f]{2}){0,15}) *  .*"
+)
+_DUMP_CAN: Final = re.compile(
+    r" *(?P<t>\d+\.\d{3}) ms  (?P<id>[0-9A-F]{3}|[0-9A-F]{8}) (?P<kind>[RF ]) \[(?P<n>\d+)\]"
+    r" ?(?P<hex>(?:[0-9a-f]{2} ?)*)"
+)
+# xxd, hexdump -C, and bytes in hex with or without a time before them
+_XXD: Final = re.compile(
+    r"[0-9a-fA-F]{7,16}:? +(?P<hex>(?:[0-9a-fA-F]{2,8} {1,2})*[0-9a-fA-F]{2,8})(?:  .*| \|.*)?"
+)
+_HEX: Final = re.compile(
+    r"\s*(?:\[?(?P<t>\d+\.\d+)\]?(?:\s*s)?[\s,:;]+)?"
+    r"(?P<hex>(?:0x)?[0-9a-fA-F]{2}(?:[\s,]+(?:0x)?[0-9a-fA-F]{2})*|(?:[0-9a-fA-F]{2}){8,})\s*,?\s*"
+)
+_ERROR, _EXTENDED = 1 << 29, 0x1FFFFFFF
+
+Found = tuple[str, Any, int | None] | None  # bus, packet (None: an error frame), when, ns
+
+
+def of_candump(line: str) -> Found:
+    """A line of candump, of any of its forms."""
+    found = _CANDUMP.fullmatch(line)
+    if found is None:
+        return None
+    if found["error"]:
+        return found["bus"], None, None
+    t_ns = _time(found["t"]) if found["t"] else None
+    number = int(found["id"], 16)
+    extended = len(found["id"]) == 8
+    if extended and number & _ERROR:
+        return found["bus"], None, None
+    fd = found["fd"] is not None
+    remote = found["rtr"] is not None or (found["spaced"] or "").strip() == "remote request"
+    text = "" if remote else found["hex"] or found["spaced"] or ""
+    data = bytes.fromhex(text.replace(".", ""))
+    if len(data) > 64 or (found["n"] and not remote and int(found["n"]) != len(data)):
+        return None
+    fd = fd or len(data) > 8
+    return found["bus"], [CanFrame(number & _EXTENDED, data, extended, fd, remote)], t_ns
+
+
+def of_dump(line: str) -> Found:
+    """A line of `tactile-rt dump` of a serial line."""
+    found = _DUMP.fullmatch(line)
+    if found is None:
+        return None
+    return "", bytes.fromhex(found["hex"]), _time(found["t"], NS_PER_S // 1000)
+
+
+def of_dump_can(line: str) -> Found:
+    """A line of `tactile-rt dump` of a CAN bus."""
+    found = _DUMP_CAN.fullmatch(line)
+    if found is None:
+        return None
+    kind, data = found["kind"], bytes.fromhex(found["hex"])
+    frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, kind == "F", kind == "R")
+    return "", [frame], _time(found["t"], NS_PER_S // 1000)
+
+
+def of_hex(line: str) -> Found:
+    """A line of bytes in hexadecimal."""
+    found = _HEX.fullmatch(line) or _XXD.fullmatch(line)
+    if found is None:
+        return None
+    t_ns = _time(found["t"]) if "t" in found.re.groupindex and found["t"] else None
+    try:
+        return "", bytes.fromhex(found["hex"].replace("0x", "").replace(",", " ")), t_ns
+    except ValueError:
+        return None
+
+
+def _time(text: str, unit_ns: int = NS_PER_S) -> int | None:
+    """A time in ns: whole and parts exactly, or a date."""
+    plain = text.strip()
+    if "-" in plain or ":" in plain:
+        plain = in_seconds(plain)
+    whole, _, part = plain.partition(".")
+    if not (whole.isdecimal() and (part.isdecimal() or not part)):
+        return None
+    scale: int = 10 ** len(part)
+    return int(whole) * unit_ns + int(part or 0) * unit_ns // scale

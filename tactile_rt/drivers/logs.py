@@ -1,0 +1,284 @@
+"""What somebody kept of a line: bytes, hexadecimal text, or a log of a CAN bus, as packets again.
+
+    log = read_log(Path("can.log"))       # candump, asc, blf, trc; bytes, `tactile-rt dump`, hex
+    for packet, t_ns in log.packets(): ...  # t_ns is None where the log has no times
+
+Which form a file has is told by how it begins, whatever its name; gzip is unpacked. Logs end
+anywhere and hold lines that are none: what can be read is, and `notes` say what could not.
+"""
+
+import logging
+import zlib
+from collections import Counter
+from collections.abc import Callable, Iterator
+from io import BufferedReader, RawIOBase, TextIOWrapper
+from pathlib import Path
+from typing import Any, BinaryIO, Final, cast
+
+from tactile_rt.drivers.codec import CanFrame
+from tactile_rt.drivers.log_lines import of_candump, of_dump, of_dump_can, of_hex
+from tactile_rt.files import open_regular
+from tactile_rt.stream import NS_PER_S, ConfigError
+
+__all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
+
+SERIAL_FORMS: Final = ("raw", "dump", "hex")
+CAN_FORMS: Final = ("candump", "dump-can", "asc", "blf", "trc")
+FORMS: Final = (*SERIAL_FORMS, *CAN_FORMS)
+PIECE: Final = 256
+HEAD: Final = 16_384  # bytes that tell the form
+MOSTLY: Final = 0.8  # of the lines at the beginning are of the form
+BLF: Final = b"LOGG"
+GZIP: Final = b"\x1f\x8b"
+
+Timed = tuple[Any, int | None]  # a packet, and when it came, ns
+
+
+LogFile = BufferedReader
+
+
+class LineLog:
+    """A log of a serial line or a CAN bus.
+
+    Args:
+        path: Path of the file.
+        form: One of `FORMS`.
+        bus: Name of the bus whose frames to take, of a log of several; empty for all.
+
+    Attributes:
+        path: Path of the file.
+        form: Form of the log, one of `FORMS`.
+        wire: What was logged: ``serial`` or ``can``.
+        piece: Bytes of a packet where the log says nothing of packets.
+        notes: What could not be read, a sentence each; complete once all packets were read.
+    """
+
+    def __init__(self, path: Path, form: str, bus: str = "") -> None:
+        self.path, self.form, self._bus = path, form, bus
+        self.wire = "can" if form in CAN_FORMS else "serial"
+        self.piece = PIECE
+        self.notes: list[str] = []
+
+    def packets(self) -> Iterator[Timed]:
+        """The packets, bytes or a CAN frame each, and when each came, ns; None where the log does
+        not say. Times never go back.
+
+        Raises:
+            OSError: the file cannot be read.
+        """
+        self.notes.clear()
+        latest, back = -(1 << 62), 0
+        with open_log_file(self.path) as file:
+            for packet, t_ns in self._read(file):
+                if t_ns is not None:
+                    back += t_ns < latest
+                    latest = t_ns = max(t_ns, latest)
+                yield packet, t_ns
+        if back:
+            self.notes.append(f"{back} times go back; these packets have the time before")
+
+    def _read(self, file: "LogFile") -> Iterator[Timed]:
+        read: Callable[[LogFile], Iterator[Timed]] = {
+            "raw": self._raw, "dump": self._text, "hex": self._text, "candump": self._text,
+            "dump-can": self._text, "asc": self._logged, "blf": self._logged, "trc": self._logged,
+        }[self.form]  # fmt: skip
+        yield from read(file)
+        if getattr(file.raw, "broken", False):
+            self.notes.append("it is cut short or damaged: what unpacks of it was read")
+
+    # bytes and text
+
+    def _raw(self, file: LogFile) -> Iterator[Timed]:
+        while piece := file.read(self.piece):
+            yield piece, None
+
+    def _text(self, file: LogFile) -> Iterator[Timed]:
+        parse = {
+            "candump": of_candump, "dump-can": of_dump_can, "dump": of_dump, "hex": of_hex,
+        }[self.form]  # fmt: skip
+        others, errors, buses = 0, 0, Counter[str]()
+        with TextIOWrapper(file, "utf-8", "replace") as lines:
+            for line in lines:
+                found = parse(line.rstrip("\r\n"))
+                if found is None:
+                    others += bool(line.strip())
+                    continue
+                bus, packet, t_ns = found
+                if packet is None:
+                    errors += 1
+                    continue
+                buses[bus] += 1
+                if not self._bus or bus == self._bus:
+                    yield packet, t_ns
+        self._tell(others, "line", errors, buses)
+
+    # what python-can reads
+
+    def _logged(self, file: LogFile) -> Iterator[Timed]:
+        from can.io import ASCReader, BLFReader, TRCReader
+
+        logging.getLogger("can").addHandler(logging.NullHandler())  # it tells us, not the terminal
+        made: Any
+        n, errors, buses = 0, 0, Counter[str]()
+        lines = _Lines(file)
+        try:
+            if self.form == "blf":
+                made = BLFReader(file)
+            elif self.form == "asc":
+                made = ASCReader(cast(Any, lines), relative_timestamp=False)
+            else:
+                made = TRCReader(cast(Any, lines))
+            for message in made:
+                n += 1
+                bus = "" if message.channel is None else str(message.channel)
+                if message.is_error_frame:
+                    errors += 1
+                    continue
+                buses[bus] += 1
+                if not self._bus or bus == self._bus:
+                    yield [
+                        CanFrame(
+                            message.arbitration_id, bytes(message.data), message.is_extended_id,
+                            message.is_fd, message.is_remote_frame,
+                        )
+                    ], round(NS_PER_S * message.timestamp)  # fmt: skip
+            told = made.object_count if self.form == "blf" else n
+            if n < told or (self.form == "asc" and not lines.ended):
+                of = f" of {told}" if n < told else ""
+                self.notes.append(f"it ends before its end: {n} frames{of} were read")
+        except OSError:
+            raise
+        except Exception as error:  # python-can raises anything on a file that is cut or damaged
+            why = " ".join(str(error).split()) or type(error).__name__
+            self.notes.append(f"it is cut short or damaged after {n} frames ({why:.80})")
+        self._tell(0, "frame", errors, buses)
+
+    def _tell(self, others: int, what: str, errors: int, buses: Counter[str]) -> None:
+        if others:
+            self.notes.append(f"passed over, no {what} of a {self.form} log: {others}")
+        if errors:
+            self.notes.append(f"{errors} error frames")
+        if len(buses) > 1:
+            named = ", ".join(f"{bus or 'none'} ({n})" for bus, n in sorted(buses.items()))
+            taken = f"those of {self._bus} are taken" if self._bus else "--bus takes those of one"
+            self.notes.append(f"frames of several buses: {named}; {taken}")
+        elif self._bus and self._bus not in buses:
+            known = ", ".join(sorted(buses)) or "none"
+            self.notes.append(f"no frame is of bus {self._bus}; there are frames of {known}")
+
+
+def read_log(path: Path, form: str = "", bus: str = "") -> LineLog:
+    """A log of a line; raw bytes where it is no other.
+
+    Args:
+        path: the file.
+        form: one of `FORMS`; empty: as it begins.
+        bus: of a CAN log with several, the one to take; empty for all.
+
+    Raises:
+        ConfigError: no such file, or form.
+        OSError: the file cannot be read.
+    """
+    if form and form not in FORMS:
+        raise ConfigError(f"no form {form!r} of a log: there are {', '.join(FORMS)}")
+    if not path.exists():
+        raise ConfigError(f"no file {path}")
+    return LineLog(path, form or _form(path), bus)
+
+
+def open_log_file(path: Path) -> BufferedReader:
+    """A file to read, unpacked if it is of gzip; what is cut short or damaged ends where it does.
+
+    Raises:
+        OSError: it cannot be read, or is a pipe or device.
+    """
+    file = open_regular(path)
+    packed = file.read(len(GZIP)) == GZIP
+    file.seek(0)
+    return BufferedReader(_Unpacked(file)) if packed else cast(BufferedReader, file)
+
+
+class _Unpacked(RawIOBase):
+    """A gzip file, which ends where it is damaged: `broken` says that it does."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self.broken = file, False
+        self._unpack, self._rest = zlib.decompressobj(31), b""
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, room: Any) -> int:
+        while True:
+            packed = self._rest or self._file.read(1 << 16)
+            if not packed:
+                self.broken = self.broken or not self._unpack.eof
+                return 0
+            try:
+                data = self._unpack.decompress(packed, len(room))
+            except zlib.error:
+                self.broken = True
+                self._rest = b""
+                self._file.seek(0, 2)
+                return 0
+            self._rest = self._unpack.unconsumed_tail or self._unpack.unused_data
+            if self._unpack.eof and self._rest:  # another one follows
+                self._unpack = zlib.decompressobj(31)
+            if data:
+                room[: len(data)] = data
+                return len(data)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+class _Lines:
+    """Lines of text, for python-can; whether the last one of a Vector log came."""
+
+    def __init__(self, file: BufferedReader) -> None:
+        self._file, self.ended = file, False
+
+    def __iter__(self) -> Iterator[str]:
+        return self
+
+    def __next__(self) -> str:
+        if line := self.readline():
+            return line
+        raise StopIteration
+
+    def readline(self) -> str:
+        line = self._file.readline().decode("utf-8", "replace")
+        self.ended = self.ended or line.strip().lower() == "end triggerblock"
+        return line
+
+    def close(self) -> None:
+        self._file.close()
+
+
+def _form(path: Path) -> str:
+    with open_log_file(path) as file:
+        head = file.read(HEAD)
+    if head.startswith(BLF):
+        return "blf"
+    if b"\0" in head:
+        return "raw"
+    lines = [x for x in head.decode("utf-8", "replace").splitlines() if x.strip()]
+    if len(head) == HEAD:
+        del lines[-1:]  # it was cut
+    if not lines:
+        return "raw"
+    if lines[0].startswith(";$FILEVERSION"):
+        return "trc"
+    begins = [x.strip().lower() for x in lines[:6]]
+    if any(x.startswith("date ") for x in begins) and any(x.startswith("base ") for x in begins):
+        return "asc"
+    for form, parse in (("dump", of_dump), ("dump-can", of_dump_can), ("candump", of_candump)):
+        if sum(parse(x) is not None for x in lines) >= MOSTLY * len(lines):
+            return form
+    # A table of numbers of two digits is hexadecimal, too: only letters tell that it is bytes.
+    hexes = [of_hex(x) for x in lines]
+    right = sum(x is not None for x in hexes) >= MOSTLY * len(lines)
+    data = b"".join(found[1] or b"" for found in hexes if found is not None)
+    letters = sum(b & 15 > 9 or b > 0x9F for b in data)
+    return "hex" if right and len(data) >= 16 and letters > len(data) / 16 else "raw"

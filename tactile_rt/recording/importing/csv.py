@@ -1,0 +1,227 @@
+"""Tables of numbers in text, whoever wrote them: delimiter, decimal comma, header found by looking.
+
+What is looked at is the beginning. Most of its lines are rows, so the delimiter is that which cuts
+most lines into one number of cells, most of them numbers. Names stand in the last line above the
+rows that has as many cells, a remark (``# time fx fy``) as well as not; what is above that is told
+and passed over. Cells between spaces may stand in brackets and have units, as boards print them.
+"""
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from io import TextIOWrapper
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final
+
+from tactile_rt.drivers.codecs.ascii_text import fields, in_seconds, number
+from tactile_rt.drivers.logs import open_log_file
+from tactile_rt.recording.importing.table import Table
+from tactile_rt.stream import ConfigError, RecordingError
+
+__all__ = ["CsvForm", "csv_form", "read_table"]
+
+LOOKED_AT: Final = 200  # lines
+ENOUGH: Final = 0.5  # of the lines that are looked at are rows
+DELIMITERS: Final = (";", "\t", ",", "|", " ")
+NAMES: Final = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";"}
+REMARKS: Final = ("#", "%", "//")
+LONGEST: Final = 1 << 20  # characters of a line
+_COMMA: Final = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*")
+_NUMBER_COMMA: Final = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
+
+
+@dataclass(frozen=True)
+class CsvForm:
+    """How a table is written.
+
+    Attributes:
+        delimiter: What stands between cells; a space stands for any of spaces and tabs.
+        comma: Whether numbers have a decimal comma.
+        names: Names of the columns; empty for a table without.
+        first: Number of lines before the first row.
+        width: Number of cells of a row.
+        lines: Number of lines of text that are one row.
+    """
+
+    delimiter: str
+    comma: bool
+    names: tuple[str, ...]
+    first: int
+    width: int
+    lines: int = 1
+
+
+def csv_form(
+    path: Path, delimiter: str = "", decimal: str = "", skip: int = 0, lines: int = 1
+) -> CsvForm:
+    """How a table is written, as its beginning shows.
+
+    Args:
+        path: the file; gzip is unpacked.
+        delimiter: what stands between cells, if it is told: a character, tab or space.
+        decimal: ``,`` or ``.``, if it is told.
+        skip: lines to pass over at the beginning.
+        lines: lines of text that are one row.
+
+    Raises:
+        RecordingError: its lines are no table of numbers.
+        OSError: it cannot be read.
+    """
+    with open_log_file(path) as file, _text(file) as text:
+        head = list(islice(_joined(text, skip, lines), LOOKED_AT))
+    told = NAMES.get(delimiter, delimiter)
+    if len(told) > 1:
+        raise ConfigError(f"--delimiter is one character, tab or space, not {delimiter!r}")
+    best: tuple[float, CsvForm] | None = None
+    for one in (told,) if told else DELIMITERS:
+        for comma in (decimal == ",",) if decimal else (False, True):
+            if comma and one == ",":
+                quoted = any(_COMMA.fullmatch(c) for x in head for c in _cells(x, one, False))
+                if not quoted:
+                    continue
+            if not comma and not decimal and one == " " and all(map(_between_digits, head)):
+                continue  # 5,01 -7 0,25
+            found = _tried(head, one, comma)
+            if found is not None and (best is None or found[0] > best[0] + 1e-9):
+                best = found
+    if best is None:
+        raise RecordingError(
+            f"{path} is no table of numbers: no delimiter cuts most of its lines into as many "
+            "numbers (--delimiter, --skip and --lines tell how it is written)"
+        )
+    form = best[1]
+    return CsvForm(
+        form.delimiter, form.comma, form.names, skip + form.first * lines, form.width, lines
+    )
+
+
+def read_table(path: Path, form: CsvForm) -> Table:
+    """The rows of a table.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    table = Table(path, form.names, ())
+    table.rows = _rows(table, form)
+    return table
+
+
+def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
+    with open_log_file(table.path) as file, _text(file) as text:
+        for line in _joined(text, form.first, form.lines):
+            if line.startswith(REMARKS) or not line.strip(" \t,;"):
+                continue
+            cells = _cells(line, form.delimiter, form.comma)
+            if form.names and all(number(c.strip()) is None for c in cells):
+                continue  # units below the names, or names once more
+            yield cells
+        if getattr(getattr(file, "raw", None), "broken", False):
+            table.notes.append("it is cut short or damaged: what unpacks of it was read")
+
+
+def _text(file: Any) -> TextIOWrapper:
+    begins = file.peek(2)[:2]
+    encoding = "utf-16" if begins in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    return TextIOWrapper(file, encoding, "replace", newline="")
+
+
+def _joined(text: TextIOWrapper, skip: int, lines: int) -> Iterator[str]:
+    """The rows' texts, ``lines`` of the file each, after those that are skipped."""
+    begun: list[str] = []
+    # a line ends as anybody ends lines; one that does not end is cut
+    for line in islice(iter(lambda: text.readline(LONGEST), ""), skip, None):
+        for part in line.rstrip("\r\n").split("\r"):
+            begun.append(part)
+            if len(begun) == lines:
+                yield " ".join(begun) if lines > 1 else part
+                begun = []
+
+
+def _cells(line: str, delimiter: str, comma: bool) -> list[str]:
+    if delimiter == " ":
+        cells = fields(_points(line) if comma else line)
+    elif '"' in line:
+        cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+    else:
+        cells = line.split(delimiter)
+    if len(cells) > 1 and not cells[-1].strip():
+        del cells[-1]  # a delimiter at the end of each line
+    return [c.replace(",", ".") if _NUMBER_COMMA.fullmatch(c.strip()) else c for c in cells] \
+        if comma else cells  # fmt: skip
+
+
+def _points(line: str) -> str:
+    return re.sub(r"(?<=\d),(?=\d)", ".", line)
+
+
+def _is_number(cell: str) -> bool:
+    plain = cell.strip()
+    found = number(plain)
+    return (found is not None and found == found) or (":" in plain and in_seconds(plain) != plain)
+
+
+def _between_digits(line: str) -> bool:
+    """Whether a line has commas, all of them in numbers, and spaces between these."""
+    words = line.split()
+    cut = [w for w in words if "," in w]
+    return len(words) > 1 and bool(cut) and all(map(_COMMA.fullmatch, cut))
+
+
+def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm] | None:
+    """How well this fits, and the form that it gives."""
+    rows = [
+        (k, _cells(x, delimiter, comma))
+        for k, x in enumerate(head)
+        if x.strip(" \t,;") and not x.startswith(REMARKS)
+    ]
+    numeric = [(k, c) for k, c in rows if 2 * sum(map(_is_number, c)) >= len(c) > 0]
+    widths = Counter(len(c) for _, c in numeric)
+    if not widths:
+        return None
+    width, often = max(widths.items(), key=lambda w: (w[1], w[0]))
+    first = next(k for k, c in numeric if len(c) == width)
+    below = sum(k >= first for k, _ in rows)
+    if often < ENOUGH * below:
+        return None
+    share = sum(
+        sum(map(_is_number, c)) / width for _, c in numeric if len(c) == width
+    ) / often  # fmt: skip
+    names = _names(head[:first], delimiter, width)
+    # one cell a line is a table, too, but only if nothing else is
+    score = often / below * share + (0.5 if width > 1 else 0.0) + (0.2 if names else 0.0)
+    return score, CsvForm(delimiter, comma, names, first, width)
+
+
+def _names(above: list[str], delimiter: str, width: int) -> tuple[str, ...]:
+    for line in reversed(above):
+        text = line
+        for mark in ("#", "//"):
+            text = text.removeprefix(mark)
+        if delimiter == " ":
+            cells = re.findall(r'"[^"]*"|\S+', text)
+        else:
+            cells = _cells(text, delimiter, False)
+        cells = [c.strip().strip('"').strip() for c in cells]
+        if line.startswith("%") and len(cells) != width:
+            cells = cells[1:] if cells[:1] == ["%"] else cells
+        if len(cells) == width - 1 and delimiter != " " and text.rstrip().endswith(delimiter):
+            cells.append("")
+        words = [c for c in cells if c and not _is_number(c)]
+        if len(cells) == width and 2 * len(words) >= width:
+            units = all(re.fullmatch(r"[\[(].*[\])]|", c) for c in cells)
+            if not units:
+                return tuple(_distinct(cells))
+    return ()
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """Names as they are; one that is not there, or was there before, is called by its place."""
+    seen: set[str] = set()
+    told = []
+    for k, name in enumerate(names, start=1):
+        told.append(name if name and name not in seen else f"{name or 'column'}.{k}")
+        seen.add(told[-1])
+    return told

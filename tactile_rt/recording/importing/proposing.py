@@ -1,0 +1,96 @@
+"""Columns for a table, or for what a board printed, for a user to look at and change."""
+
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
+from tactile_rt.drivers.codecs.column_guess import LOOKED_AT, guess_columns, guess_line_columns
+from tactile_rt.drivers.codecs.column_words import compress_columns
+from tactile_rt.drivers.opening import make_codec
+from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
+from tactile_rt.stream import ConfigError, RecordingError
+
+__all__ = ["ProposedColumns", "line_columns", "propose_columns"]
+
+LEAST = 3  # rows
+DATED = 20  # rows that are looked at for dates
+
+
+@dataclass(frozen=True)
+class ProposedColumns:
+    """What may be in the columns of a file.
+
+    Attributes:
+        columns: The columns in words.
+        table: Whether the file is to be read as a table; else as what a board prints.
+        timed: Whether one of the columns is a time.
+        said: What the file is, for the user.
+    """
+
+    columns: str
+    table: bool
+    timed: bool
+    said: str
+
+
+def line_columns(data: bytes) -> tuple[str, int] | None:
+    """The columns of lines that a board prints, in words, and how many lines are samples by them;
+    None: there are none."""
+    guess = guess_line_columns(data)
+    if guess is None:
+        return None
+    columns = compress_columns(guess[0])
+    try:
+        codec = make_codec("serial", "ascii_line", {"columns": columns})
+    except ConfigError:
+        return None
+    codec.feed(data, 0)
+    whole, corrupt = codec.stats.intact, codec.stats.corrupt
+    return (columns, whole) if whole >= max(LEAST, corrupt) else None
+
+
+def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
+    """The columns of a file of text; None where it has none.
+
+    Args:
+        path: the file.
+        data: how it begins.
+
+    Raises:
+        OSError: it cannot be read.
+    """
+    try:
+        form = csv_form(path)
+    except RecordingError:
+        form = None
+    if form is not None and (form.names or form.delimiter != " "):
+        proposed = _of_table(path, form)
+        if proposed is not None:
+            return proposed
+    told = line_columns(data)
+    if told is None:
+        return None
+    columns, n = told
+    by_places = form is not None and "=" not in columns
+    return ProposedColumns(columns, by_places, "time" in columns, f"{n} lines are samples")
+
+
+def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
+    rows = [r for r in islice(read_table(path, form).rows, LOOKED_AT) if len(r) == form.width]
+    cells = [[number(in_seconds(c.strip())) for c in row] for row in rows]
+    numbers = sum(c is not None for row in cells for c in row)
+    if len(rows) < LEAST or 2 * numbers < len(rows) * form.width:
+        return None
+    dated = {
+        k
+        for k in range(form.width)
+        if all(":" in row[k] and in_seconds(row[k]) != row[k] for row in rows[:DATED])
+    }
+    words, timed = guess_columns(form.names, cells, dated)
+    if not any("." in word for word in words if not word.startswith("time")):
+        return None
+    if form.names:
+        words = [f"{n}={w}" for n, w in zip(form.names, words, strict=True) if w != "-"]
+    said = f"{path} is a table of {form.width} columns"
+    return ProposedColumns(compress_columns(words), True, timed, said)

@@ -1,0 +1,329 @@
+"""Rows of numbers as a recording: columns in words, a time or a rate, losses by a counter.
+
+    time=time:s,(x{0..3}=T{0..3}.fx:mN,y{0..3}=T{0..3}.fy:mN)
+
+What a column may be is told in `ascii_mapping`; here a time may have decimals in every unit, and
+does not wrap. Columns are found by their names or, without names, by their places.
+
+Times. Rows that share one time (a clock that is too coarse) are spread evenly up to the next. Where
+a time goes back, another stretch begins, one period after the row before.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.drivers.codecs.ascii_mapping import (
+    Column,
+    LineMapping,
+    array_of,
+    parse_columns,
+    read_mapping,
+)
+from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
+from tactile_rt.drivers.codecs.column_words import compress_columns
+from tactile_rt.recording.description import Description
+from tactile_rt.recording.importing.account import Import, clock_of, write_chunks
+from tactile_rt.settings import nearest
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError
+
+__all__ = ["Table", "import_table", "place_columns", "shown_names"]
+
+NS: Final = {"s": NS_PER_S, "iso": NS_PER_S, "ms": 10**6, "us": 1000, "ns": 1}
+GAP: Final = 10  # typical steps: what is longer is no period
+BLOCK: Final = 1024  # rows that are kept as Python's numbers
+BESIDE: Final = ("header.", "layout.", "field.header.")  # of a message, besides what it tells
+SHOWN: Final = 600  # characters of the names that a message tells
+_DECIMAL: Final = re.compile(r"([+-]?)(\d+)(?:\.(\d*))?")
+
+
+@dataclass
+class Table:
+    """Rows as they are read.
+
+    Attributes:
+        path: Path of the file that they are in.
+        names: Names of the columns; empty for a table without.
+        rows: The rows, each with as many cells as there are columns: texts or numbers.
+        times_ns: The times of the rows that were read so far, ns, of a table that has times beside
+            its columns; None for one that has not.
+        notes: What could not be read, a sentence each; complete once all rows were read.
+    """
+
+    path: Path
+    names: tuple[str, ...]
+    rows: Iterable[Sequence[Any]]
+    times_ns: list[int] | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+def shown_names(names: Sequence[str]) -> str:
+    """The names of columns, shortened, for a message."""
+    text = compress_columns([f'"{n}"' if "," in n else n for n in names])
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]} ..."
+
+
+def mapping_of(columns: str, name: str) -> LineMapping:
+    """What a user says of the columns: words, or a TOML file as docs/codecs/ascii_line.toml.
+
+    Raises:
+        ConfigError: the file cannot be read or is none.
+    """
+    if columns.endswith(".toml"):
+        return read_mapping(columns)
+    return LineMapping(columns=(columns,), name=name)
+
+
+def place_columns(
+    columns: Sequence[Column], names: Sequence[str], where: str
+) -> tuple[list[int], list[str]]:
+    """Where each column stands among the cells of a row, and what is told of those left out.
+
+    Raises:
+        ConfigError: no column of that name, or of that place.
+    """
+    labelled = [c.label for c in columns if c.label]
+    if labelled and len(labelled) < len(columns):
+        raise ConfigError(f"{where}: give all columns a name, NAME=COLUMN, or none")
+    if not labelled:
+        if names and len(columns) > len(names):
+            raise ConfigError(f"{where}: {len(columns)} columns for {len(names)} of the file")
+        left = names[len(columns) :]
+        return list(range(len(columns))), [f"left out: {shown_names(left)}"] if left else []
+    plain = {name.strip().lower(): k for k, name in enumerate(reversed(names))}
+    exact = {name: k for k, name in enumerate(reversed(names))}
+    places = []
+    for label in labelled:
+        found = exact.get(label, plain.get(label.strip().lower()))
+        if found is None:
+            if not names:
+                raise ConfigError(
+                    f"{where}: the file does not name its columns: give them by their places"
+                )
+            raise ConfigError(f"{where}: no column {label!r}; {nearest(label, names)}")
+        places.append(len(names) - 1 - found)
+    left = [n for k, n in enumerate(names) if k not in places and not n.startswith(BESIDE)]
+    return places, [f"left out: {shown_names(left)}"] if left else []
+
+
+def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0) -> Import:
+    """Write rows of numbers as a recording.
+
+    Args:
+        table: the rows.
+        output: the recording; it is there whole or not at all.
+        columns: what is in which column: words, or the path of a TOML file.
+        rate_hz: rate of the samples, Hz; 0: by their times.
+
+    Raises:
+        ConfigError: the columns cannot be, or nothing tells the time.
+        RecordingError: there is no row of numbers.
+        OSError: a file cannot be read or written.
+    """
+    mapping = mapping_of(columns, table.path.stem)
+    where = columns if columns.endswith(".toml") else "--columns"
+    parsed = parse_columns(mapping.columns, where)
+    places, notes = place_columns(parsed, table.names, where)
+    if rate_hz:
+        mapping = msgspec.structs.replace(mapping, rate_hz=rate_hz)
+    spec = array_of(mapping, parsed, where)
+    if not rate_hz and table.times_ns is None and not any(c.kind in NS for c in parsed):
+        raise ConfigError(f"{table.path}: no column is a time: give --rate, in Hz")
+    read = _read(table, parsed, places, spec)
+    if not len(read.values):
+        why = f", all {read.corrupt} lines are otherwise" if read.corrupt else ""
+        raise RecordingError(
+            f"{table.path}: no line has the {len(parsed)} columns that are described{why}"
+            + (f" ({read.complaint})" if read.complaint else "")
+        )
+    account = Import(intact=len(read.values), corrupt=read.corrupt, notes=[*table.notes, *notes])
+    seq, keep = _numbers(read.count, parsed, len(read.values), account)
+    values, times = read.values[keep], None if read.times is None else read.times[keep]
+    if read.complaint and read.corrupt:
+        account.notes.append(f"the first line that is no sample: {read.complaint}")
+    if times is None:
+        t_ns, zero = np.round(seq * (NS_PER_S / rate_hz)).astype(np.int64), 0
+    else:
+        zero = clock_of(int(times[0]))
+        t_ns, told = _strictly(times - zero, rate_hz, account)
+        spec = replace(spec, rate_hz=rate_hz or told)
+    valid = np.logical_and.reduce(np.isfinite(values), axis=2)
+    about = Description(
+        spec, zero, table.path.name,
+        session={"imported": table.path.name, "columns": columns},
+    )  # fmt: skip
+    return write_chunks(output, about, Chunk(seq, t_ns, values, valid), account, str(table.path))
+
+
+@dataclass
+class _Read:
+    values: NDArray[np.float32]
+    times: NDArray[np.int64] | None
+    count: NDArray[np.int64] | None
+    corrupt: int
+    complaint: str
+
+
+def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: ArraySpec) -> _Read:
+    at = {(c.element, c.channel): k for k, c in enumerate(columns)}
+    order = [at[e, c] for e in spec.elements for c in spec.channels]
+    scale = np.array([columns[k].scale for k in order])
+    offset = np.array([columns[k].offset for k in order])
+    measured = [places[k] for k in order]
+    clock = next(((places[k], c) for k, c in enumerate(columns) if c.kind in NS), None)
+    counter = next((places[k] for k, c in enumerate(columns) if c.kind == "count"), None)
+    need = max(places) + 1
+    width = len(table.names) or need
+    blocks: list[NDArray[np.float32]] = []
+    rows: list[list[float]] = []
+    times: list[int] = []
+    counts: list[int] = []
+    corrupt, complaint = 0, ""
+
+    def close() -> None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            block = np.array(rows, np.float64).reshape(len(rows), len(order)) * scale + offset
+            blocks.append(block.astype(np.float32).reshape(len(rows), *spec.shape))
+        rows.clear()
+
+    for cells in table.rows:
+        try:
+            if len(cells) < need or (table.names and len(cells) > width):
+                raise ValueError(f"{len(cells)} columns, not {width}")
+            row = [_number(cells[k]) for k in measured]
+            t_ns = 0
+            if clock is not None:
+                t_ns = _time(cells[clock[0]], clock[1])
+            elif table.times_ns is not None:
+                t_ns = table.times_ns[-1]
+            if counter is not None:
+                counts.append(_whole(cells[counter]))
+        except (ValueError, OverflowError) as error:
+            corrupt += 1
+            complaint = complaint or str(error)
+            continue
+        rows.append(row)
+        times.append(t_ns)
+        if len(rows) == BLOCK:
+            close()
+    close()
+    timed = clock is not None or table.times_ns is not None
+    return _Read(
+        np.concatenate(blocks), np.array(times, np.int64) if timed else None,
+        np.array(counts, np.int64) if counter is not None else None, corrupt, complaint,
+    )  # fmt: skip
+
+
+def _number(cell: Any) -> float:
+    """What a cell measures; NaN where there is none.
+
+    Raises:
+        ValueError: it is another word.
+    """
+    if isinstance(cell, str):
+        try:
+            return float(cell)
+        except ValueError:
+            if not cell.strip():
+                return np.nan
+            found = number(cell.strip())
+            if found is None:
+                raise ValueError(f"{cell[:40]!r} is no number") from None
+            return found
+    return float(cell)
+
+
+def _whole(cell: Any) -> int:
+    value = float(cell)
+    if not value.is_integer() or abs(value) >= 2.0**53:
+        raise ValueError(f"{cell!r:.40} is no count")
+    return int(value)
+
+
+def _time(cell: Any, column: Column) -> int:
+    """A time in ns, exactly where it is written in decimals.
+
+    Raises:
+        ValueError: it is none.
+    """
+    unit = NS[column.kind]
+    if isinstance(cell, int | np.integer):
+        text = str(int(cell))
+    elif not isinstance(cell, str):
+        return round(float(cell) * column.scale * unit)
+    else:
+        text = in_seconds(cell.strip()) if column.kind == "iso" else cell.strip()
+    found = _DECIMAL.fullmatch(text) if column.scale == 1.0 else None
+    if found is None:
+        value = float(text) * column.scale * unit
+        if not abs(value) < 2.0**62:
+            raise ValueError(f"{cell!r:.40} is no time")
+        return round(value)
+    part = found[3] or ""
+    scale: int = 10 ** len(part)
+    ns = int(found[2]) * unit + int(part or 0) * unit // scale
+    if ns >= 1 << 62:
+        raise ValueError(f"{cell!r:.40} is no time")
+    return -ns if found[1] == "-" else ns
+
+
+def _numbers(
+    count: NDArray[np.int64] | None, columns: Sequence[Column], n: int, account: Import
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Sequence numbers, and which rows to keep; what is missing is counted."""
+    if count is None:
+        return np.arange(n, dtype=np.int64), np.ones(n, np.bool_)
+    wrap = 1 << next(c.bits for c in columns if c.kind == "count")
+    steps = np.diff(count) % wrap
+    keep = np.concatenate([[True], steps != 0])
+    forward = (steps > 0) & (steps <= wrap // 2)
+    account.missing = int((steps[forward] - 1).sum())
+    if again := int((~keep).sum()):
+        account.notes.append(f"{again} lines repeat the count of the one before: left out")
+    if resets := int((steps > wrap // 2).sum()):
+        account.notes.append(f"the count goes back {resets} times")
+    advance = np.where(forward, steps, 1)[keep[1:]]
+    return np.concatenate([[0], np.cumsum(advance)]).astype(np.int64), keep
+
+
+def _strictly(
+    times: NDArray[np.int64], rate_hz: float, account: Import
+) -> tuple[NDArray[np.int64], float]:
+    """Times that increase strictly, and the rate that they tell, Hz."""
+    n = len(times)
+    if n == 1:
+        return times, rate_hz or 1.0
+    steps = np.diff(times)
+    forward = steps[steps > 0]
+    if not len(forward):
+        raise ConfigError("all lines have one time: is its column another? or give --rate")
+    stretches = int((steps < 0).sum())
+    repeats = int((steps == 0).sum())  # a coarse clock: several rows at a time
+    usual = forward[forward <= GAP * np.median(forward)]
+    period = float(usual.sum()) / (len(usual) + repeats)
+    if stretches:
+        account.notes.append(f"times go back {stretches} times: there they go on a period later")
+        jump = np.where(steps < 0, round(period) - steps, 0)
+        times = times + np.concatenate([[0], np.cumsum(jump)])
+    if repeats:
+        account.notes.append(f"{repeats} lines have the time of the one before: spread evenly")
+        times = _spread(times, period)
+    rate = NS_PER_S / period
+    return times, float(f"{rate:.6g}")
+
+
+def _spread(times: NDArray[np.int64], period: float) -> NDArray[np.int64]:
+    """Rows of one time evenly up to the next time, or by the period where that is less."""
+    first = np.flatnonzero(np.concatenate([[True], np.diff(times) > 0]))
+    lengths = np.diff(np.append(first, len(times)))
+    room = np.diff(np.append(times[first], times[-1] + round(period * lengths[-1])))
+    step = np.maximum(1.0, np.minimum(room / lengths, period))
+    within = np.arange(len(times)) - np.repeat(first, lengths)
+    spread: NDArray[np.int64] = np.floor(within * np.repeat(step, lengths)).astype(np.int64)
+    return times + spread

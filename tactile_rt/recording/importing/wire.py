@@ -1,0 +1,240 @@
+"""A log of a line, decoded by a codec into a recording that holds the packets, too.
+
+Packets that carry the time at which they came are decoded as they were live. Where the log has no
+times, the device's own clock dates the samples; a device without one is taken to have sent at its
+nominal rate, and what its counter or its damaged frames tell of lost samples takes time, too.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from tactile_rt.classifier.array_file import read_array
+from tactile_rt.drivers.clocks import DeviceTime, Stamper
+from tactile_rt.drivers.codec import Codec, Command, Samples, codec_class
+from tactile_rt.drivers.logs import LineLog
+from tactile_rt.drivers.opening import make_codec
+from tactile_rt.files import write_whole
+from tactile_rt.recording.description import SUMMARY, Description
+from tactile_rt.recording.importing.account import Import, clock_of
+from tactile_rt.recording.layout import SAMPLES, WIRE, encode_packet, encode_samples
+from tactile_rt.recording.writer import McapFile
+from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, RecordingError, SourceStats
+
+__all__ = ["import_wire"]
+
+PROBED, SHORTEST = 16_384, 8  # bytes
+AHEAD = 4096  # packets in which a device may describe itself before samples must come
+
+
+def import_wire(
+    log: LineLog, output: Path, fields: Mapping[str, str], rate_hz: float = 0.0
+) -> Import:
+    """Decode a log, and write samples and packets as a recording.
+
+    Args:
+        log: what was logged.
+        output: the recording; it is there whole or not at all.
+        fields: ``codec`` and its options, as in a URL, also ``array``.
+        rate_hz: rate of the samples, Hz; 0 for the codec's.
+
+    Raises:
+        ConfigError: no such codec or option, or a device that describes itself did not.
+        RecordingError: there is no whole sample.
+        OSError: a file cannot be read or written.
+    """
+    codec, about = _prepared(log, fields, rate_hz)
+    if log.form == "raw":
+        log.piece = _bytes_of_a_sample(log, make_codec(log.wire, about.codec, _own(fields)))
+    account, stats = Import(), SourceStats()
+
+    def fill(file: BinaryIO) -> None:
+        decoded = _Decoded(log, codec, about, stats)
+        made = McapFile(file, decoded.about)
+        made.add(WIRE, encode_packet(None, about.wire), 0)
+        first = last = packets = 0
+        for packet, t_ns, chunk in decoded:
+            made.add(WIRE, encode_packet(packet, about.wire), t_ns)
+            packets += 1
+            if chunk is None:
+                continue
+            own = decoded.about.clock == "device"
+            made.add(SAMPLES, encode_samples(chunk), t_ns if own else int(chunk.t_ns[-1]))
+            first = first if account.samples else int(chunk.t_ns[0])
+            last = int(chunk.t_ns[-1])
+            account.samples += len(chunk)
+        if not account.samples:
+            raise RecordingError(f"{log.path}: {_why_none(log, codec, str(fields['codec']))}")
+        if log.wire == "serial" and decoded.unfinished:
+            account.notes.append(f"it ends with {decoded.unfinished} bytes of no whole sample")
+        made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
+        made.finish()
+        account.seconds = (last - first) / NS_PER_S
+        account.rate_hz = decoded.about.spec.rate_hz
+
+    write_whole(output, fill)
+    account.intact, account.corrupt = codec.stats.intact, codec.stats.corrupt
+    account.missing, account.notes = stats.missing, [*log.notes, *account.notes]
+    if codec.stats.incomplete:
+        account.notes.append(f"{codec.stats.incomplete} samples lack a part")
+    if stats.duplicates:
+        account.notes.append(f"{stats.duplicates} samples came twice")
+    return account
+
+
+def _prepared(
+    log: LineLog, fields: Mapping[str, str], rate_hz: float
+) -> tuple[Codec[Any], Description]:
+    """The codec, and the description of the recording but for what the packets tell."""
+    own, name, array = _own(fields), fields.get("codec", ""), fields.get("array", "")
+    if not name:
+        raise ConfigError("--as needs codec=NAME, see `tactile-rt codecs`")
+    if rate_hz and "rate_hz" in codec_class(log.wire, name).Options.__dataclass_fields__:
+        own.setdefault("rate_hz", f"{rate_hz:g}")
+    codec = make_codec(log.wire, name, own)
+    written = {k: str(Path(v).resolve()) if k == "mapping" else v for k, v in own.items()}
+    if array and codec.spec is None:
+        codec.spec = read_array(Path(array))
+        written["array"] = codec.spec.to_json()
+    elif array:
+        raise ConfigError(f"array= is for devices that are asked what they are, not for {name}")
+    if rate_hz and codec.spec is not None and codec.spec.rate_hz != rate_hz:
+        codec.spec = replace(codec.spec, rate_hz=rate_hz)
+    about = Description(
+        codec.spec,  # type: ignore[arg-type]  # until the packets tell
+        0, f"{log.path.name}", log.wire, name, written,
+        session={"imported": log.path.name, "form": log.form},
+    )  # fmt: skip
+    return codec, about
+
+
+def _own(fields: Mapping[str, str]) -> dict[str, str]:
+    """The options of the codec alone."""
+    return {k: v for k, v in fields.items() if k not in ("codec", "array")}
+
+
+def _bytes_of_a_sample(log: LineLog, codec: Codec[Any]) -> int:
+    """How many bytes one takes: of so many a packet is made, that each has a time of its own."""
+    size = frames = 0
+    for packet, _ in log.packets():
+        codec.feed(packet, 0)
+        size, frames = size + len(packet), codec.stats.intact
+        if size >= PROBED:
+            break
+    return max(SHORTEST, size // max(1, frames))
+
+
+class _Decoded:
+    """(packet, when it came, the samples that it completes) of a log, one after the other.
+
+    Raises:
+        ConfigError: the device did not describe itself.
+    """
+
+    def __init__(
+        self, log: LineLog, codec: Codec[Any], about: Description, stats: SourceStats
+    ) -> None:
+        self._codec, self._now, self.unfinished = codec, 0, 0
+        self._count: int | None = None  # of the newest sample
+        codec.commands(Command.START)  # some note what they have asked for
+        packets = log.packets()
+        waiting: list[tuple[Any, int | None, Samples | None]] = []
+        for packet, t_ns in packets:
+            waiting.append((packet, t_ns, codec.feed(packet, t_ns or 0)))
+            if codec.spec is not None or len(waiting) > AHEAD:
+                break
+        if codec.spec is None:
+            why = _why_none(log, codec, about.codec)
+            if codec.stats.intact:
+                why = (
+                    f"{codec.stats.intact} whole {about.codec} frames, and none describes the "
+                    "array: give array=FILE.json in --as, as `tactile-rt describe` writes it"
+                )
+            raise ConfigError(f"{log.path}: {why}")
+        self._packets = chain(waiting, self._fed(packets))
+        self._stamped = bool(waiting) and waiting[0][1] is not None
+        self._zero = clock_of(waiting[0][1] or 0) if self._stamped else 0
+        self._stamper = Stamper(codec, codec.spec, stats)
+        own_clock = not self._stamped and codec.tick_ns is not None
+        if own_clock and codec.tick_ns is not None:
+            self._stamper.clock = DeviceTime(codec.tick_ns, codec.tick_bits)
+        self._period_ns = NS_PER_S / codec.spec.rate_hz
+        self._passed = 0.0  # periods, where the log has no times
+        self.about = replace(
+            about, spec=codec.spec, utc_offset_ns=self._zero,
+            clock="device" if own_clock else "host",
+        )  # fmt: skip
+
+    def _fed(
+        self, packets: Iterator[tuple[Any, int | None]]
+    ) -> Iterator[tuple[Any, int | None, Samples | None]]:
+        """Packets and what they complete; `unfinished` is what follows the last sample, bytes."""
+        packet, t_ns = next(packets, (None, None))
+        while packet is not None:
+            following, later = next(packets, (None, None))
+            if following is None and isinstance(packet, bytes):
+                yield packet, t_ns, self._fed_slowly(packet, t_ns or 0)
+            else:
+                samples = self._codec.feed(packet, t_ns or 0)
+                self.unfinished = 0 if samples is not None else self.unfinished + len(packet)
+                yield packet, t_ns, samples
+            packet, t_ns = following, later
+
+    def _fed_slowly(self, packet: bytes, t_ns: int) -> Samples | None:
+        """The last bytes of a log one by one, to see where the last sample ends."""
+        found = []
+        for k in range(len(packet)):
+            samples = self._codec.feed(packet[k : k + 1], t_ns)
+            self.unfinished += 1
+            if samples is not None:
+                found.append(samples)
+                self.unfinished = 0
+        return _joined(found) if found else None
+
+    def __iter__(self) -> Iterator[tuple[Any, int, Chunk | None]]:
+        for packet, t_ns, samples in self._packets:
+            if t_ns is not None:
+                self._now = max(self._now, t_ns - self._zero)
+            if samples is None:
+                yield packet, self._now, None
+                continue
+            if not self._stamped:
+                self._passed += self._periods(samples)
+                self._now = max(self._now + 1, round(self._passed * self._period_ns))
+            samples.arrived_ns[:] = self._now
+            yield packet, self._now, self._stamper.chunk(samples)
+
+    def _periods(self, samples: Samples) -> int:
+        """How many periods these samples took, with those that were lost before them."""
+        n = len(samples)
+        bits, before = self._codec.count_bits, self._count
+        if samples.count is None or bits is None:
+            return n + int(samples.damaged.sum())
+        self._count = int(samples.count[-1])
+        if before is None:
+            return n
+        ahead = (self._count - before) % (1 << bits)
+        return ahead if n <= ahead <= 1 << (bits - 1) else n
+
+
+def _joined(parts: list[Samples]) -> Samples:
+    """Samples of one codec as one."""
+    fields = {
+        name: np.concatenate([getattr(part, name) for part in parts])
+        for name in ("values", "valid", "arrived_ns", "damaged", "count", "ticks", "status")
+        if getattr(parts[0], name) is not None
+    }
+    return Samples(**fields)
+
+
+def _why_none(log: LineLog, codec: Codec[Any], name: str) -> str:
+    stats = codec.stats
+    guess = codec.complaint or (
+        f"{stats.intact} intact and {stats.corrupt} damaged frames, {stats.skipped} "
+        f"{'bytes' if codec.wire == 'serial' else 'frames'} beside them"
+    )
+    return f"no whole {name} sample ({guess}); `tactile-rt sniff {log.path}` tells what fits"

@@ -1,0 +1,157 @@
+"""`tactile-rt sniff`: what fits a file or a port, and the command to go on with, which works."""
+
+import shlex
+
+import pytest
+
+from bench.drivers.fuzzing import wire_of
+from tactile_rt.drivers import device_source, listening
+from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
+from tactile_rt.drivers.opening import make_codec
+from tactile_rt.sources.opening import open_source
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def next_command(said: str) -> list[str]:
+    """The arguments of the last line, which is a command."""
+    words = shlex.split(said.splitlines()[-1])
+    assert words[0] == "tactile-rt"
+    return words[1:]
+
+
+def spoken(wire: str, name: str, options: dict | None = None):
+    packets = wire_of(make_codec(wire, name, options or {}))
+    return b"".join(packets) if wire == "serial" else [f for packet in packets for f in packet]
+
+
+FILES = {
+    "bytes": (lambda: spoken("serial", "ft300")[9:], "--as codec=ft300"),
+    "bytes of an option": (
+        lambda: spoken("serial", "anyskin", {"magnetometers": "1"}),
+        "--as codec=anyskin&magnetometers=1",
+    ),
+    "hex": (
+        lambda: spoken("serial", "kwr75").hex(" ", 1).replace(" ", "\n").encode(),
+        "--as codec=kwr75",
+    ),
+    "candump": (
+        lambda: "".join(
+            f"({k / 9:.6f}) can0 {f.id:03X}#{f.data.hex()}\n"
+            for k, f in enumerate(spoken("can", "xela"))
+        ).encode(),
+        "--as codec=xela",
+    ),
+    "table": (
+        lambda: b"time;Fx [N];Fy [N]\n" + b"".join(b"%d,25;%d;0,5\n" % (k, k) for k in range(20)),
+        "--columns time=time:s,Fx [N]=S.fx:N,Fy [N]=S.fy:N",
+    ),
+    "table without a time": (
+        lambda: b"Fx,Fy\n" + b"".join(b"%d,%d.5\n" % (k * k, k) for k in range(20)),
+        "--columns Fx=S.fx:N,Fy=S.fy:N --rate 100",
+    ),
+    "lines": (
+        lambda: b"".join(b"%d %d %d.5\r\n" % (10 * k, k * k % 7, k % 5) for k in range(40)),
+        "--columns time:ms,T{0..1}.value",
+    ),
+    "names": (
+        lambda: b"".join(b"Fx: %d N\r\nFy: %d N\r\n" % (k * k % 7, k % 5) for k in range(40)),
+        "--as codec=ascii_line&columns=Fy%3DS.fy:N,Fx%3DS.fx:N",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_command_for_a_file_imports_it(call, here, name):
+    made, options = FILES[name]
+    (here / "file.log").write_bytes(made())
+    code, said, _ = call("sniff", "file.log")
+    assert code == 0
+    command = next_command(said)
+    assert " ".join(command) == f"import file.log {options}"
+    code, told, _ = call(*command)
+    assert code == 0 and int(told.split()[1]) >= 15
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"", bytes(3000), bytes(range(256)) * 3,
+        b"".join(b"12:00:%02d INFO worker %d has started\n" % (k % 60, k) for k in range(60)),
+    ],
+)  # fmt: skip
+def test_nothing_fits_and_it_says_so(call, here, data):
+    (here / "file.log").write_bytes(data)
+    code, said, _ = call("sniff", "file.log")
+    assert code == 1 and said.startswith("nothing fits file.log")
+
+
+def test_frames_that_no_codec_knows_are_shown(call, here):
+    text = "".join(f"({k / 9:.3f}) can0 3A{k % 2}#{k:08X}\n" for k in range(60))
+    (here / "can.log").write_text(text)
+    code, said, _ = call("sniff", "can.log")
+    assert code == 1 and "3A0  30 frames of 4 bytes" in said and "codec=can-dbc" in said
+    (here / "raw.bin").write_bytes(b"".join(b"\xa5\x5a%03d" % (k * 7 % 501) for k in range(99)))
+    code, said, _ = call("sniff", "raw.bin")
+    assert code == 1 and "frames of 5 bytes, it seems, with A5 5A" in said
+
+
+def test_a_further_codec_is_tried(call, here):
+    (here / "mine.toml").write_text(
+        'name = "m"\nrate_hz = 100\nlength = 5\nsync = "A5 5A"\n'
+        '[[values]]\nat = 2\ntype = "uint8"\nchannels = ["a", "b", "c"]\nunit = "1"\n'
+    )
+    (here / "raw.bin").write_bytes(b"".join(b"\xa5\x5a%03d" % (k * 7 % 501) for k in range(99)))
+    code, said, _ = call("sniff", "raw.bin", "--try", "codec=binary_frame&mapping=mine.toml")
+    assert code == 0
+    assert next_command(said) == [
+        "import",
+        "raw.bin",
+        "--as",
+        "codec=binary_frame&mapping=mine.toml",
+    ]
+    assert "--try is codec=NAME" in call("sniff", "raw.bin", "--try", "binary_frame")[2]
+
+
+@pytest.mark.parametrize(
+    ("codec", "options", "further"),
+    [("mlx_hex", {}, ""), ("ascii_line", {"columns": "time:ms,A0.fx,A0.fy"}, "&baud=9600")],
+)
+def test_a_port_is_heard_at_every_speed(call, monkeypatch, codec, options, further):
+    monkeypatch.setattr(listening, "line_speeds", lambda: [(115_200, "N"), (9600, "N")])
+    line = {"baud": "9600"} if further else {}
+    with open_source("synthetic:") as signal, EmulatedSerial(
+        signal, codec, options=options | line, log=False
+    ) as device:  # fmt: skip
+        code, said, told = call("sniff", device.port)
+    assert code == 0 and "9600 bit/s: " in told
+    (url,) = next_command(said)[2:]
+    assert url.startswith(f"serial://{device.port}?codec={codec}") and url.endswith(further)
+
+
+def test_a_device_that_must_be_asked_is_asked_only_if_it_is_allowed(call, monkeypatch):
+    monkeypatch.setattr(listening, "FIRST_S", 0.2)
+    monkeypatch.setattr(device_source, "ATTEMPTS", 1)
+    with open_source("synthetic:") as signal, EmulatedCan(signal, "xela", log=False) as device:
+        url = f"can:{device.port}"
+        code, said, _ = call("sniff", url, "--seconds", "0.2")
+        assert code == 1 and "try --ask" in said
+        assert not device.codec.streaming
+        code, said, _ = call("sniff", url, "--seconds", "0.2", "--ask")
+    assert code == 0 and next_command(said) == ["run", "--source", f"{url}?codec=xela"]
+
+
+def test_what_is_nothing_at_all_is_one_line(refused, here):
+    assert "is no port, bus or file" in refused("sniff", "nix")
+    assert "is a folder" in refused("sniff", ".")
+
+
+def test_a_recording_is_known(call, here):
+    (here / "raw.bin").write_bytes(spoken("serial", "bota"))
+    call("import", "raw.bin", "--as", "codec=bota")
+    code, said, _ = call("sniff", "raw.mcap")
+    assert code == 0 and next_command(said) == ["run", "--source", "replay:raw.mcap"]

@@ -1,0 +1,93 @@
+"""What columns of names and numbers may be."""
+
+import pytest
+
+from tactile_rt.drivers.codecs.column_guess import guess_columns, guess_line_columns
+from tactile_rt.drivers.codecs.column_words import compress_columns
+from tactile_rt.drivers.opening import make_codec
+
+N = 40
+
+
+def lines(form: str) -> bytes:
+    """Lines cut at both ends, in which t is a time in ms, and a, b are measured."""
+    text = "".join(
+        form.format(k=k, t=10 * k, s=0.01 * k, a=k * k % 17, b=0.5 - k % 7) for k in range(N)
+    )
+    return text.encode()[3:-3]
+
+
+@pytest.mark.parametrize(
+    ("form", "columns"),
+    [
+        ("{a} {b}\r\n", "T{0..1}.value"),
+        ("{t},{a},{b}\n", "time:ms,T{0..1}.value"),
+        ("{k}\t{s:.4f}\t{a}\t{b}\n", "count,time:s,T{0..1}.value"),
+        ("2024-05-10 09:48:16.{t:03d}  {a}  {b}\n", "time:iso,T{0..1}.value"),
+        ("Fx: {a} N, Fy: {b} N\n", "Fx=S.fx:N,Fy=S.fy:N"),
+        ("magX[{a}] magY[{b}]\r\n", "magX=S.bx:1,magY=S.by:1"),
+        ("X: {a} uT\r\nY: {b} uT\r\n", "Y=S.y:1,X=S.x:1"),
+        ('{{"t": {t}, "f": {{"x": {a}, "y": {b}}}}}\n', "t=time:ms,f.x=S.fx:N,f.y=S.fy:N"),
+        ("left:{a}\tright:{b}\r\n", "T{0..1}.value"),
+        ("{t},{a},kg,\n", "time:ms,T0.value,-"),
+    ],
+)
+def test_what_a_board_prints_has_columns_that_read_it(form, columns):
+    data = lines(form)
+    words, samples, _ = guess_line_columns(data)
+    assert compress_columns(words) == columns
+    codec = make_codec("serial", "ascii_line", {"columns": columns})
+    codec.feed(data, 0)
+    assert codec.stats.intact >= N - 3 and samples >= N - 3 and codec.stats.corrupt <= 1
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "Nov 24 18:37:16 host sshd[{t}]: Accepted password for bob from 10.0.0.{a} port {t}\n",
+        "[{s:12.6f}] usb 1-{a}: new full-speed USB device number {k} using xhci_hcd\n",
+        "2024-05-10 09:48:16.{t:03d} INFO worker {k} has finished {a} of the jobs\n",
+        "def function{k}(argument: int = {a}) -> float:\n    return {b}\n",
+        "no number at all in this line of text\n",
+    ],
+)
+def test_a_log_in_words_has_none(form):
+    assert guess_line_columns(lines(form)) is None
+
+
+def test_this_page_has_none():
+    with open(__file__, "rb") as file:
+        assert guess_line_columns(file.read()) is None
+
+
+def guessed(names: list[str], first: list[float], step: list[float]) -> list[str]:
+    rows = [[a + k * d for a, d in zip(first, step, strict=True)] for k in range(20)]
+    return guess_columns(names, rows)[0]
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (["timestamp_ms", "Fx [N]", "Fy [N]"], ["time:ms", "S.fx:N", "S.fy:N"]),
+        (["time", "wrench.force.x", "wrench.torque.x"], ["time:s", "S.fx:N", "S.mx:Nm"]),
+        (["t", "p0_x", "p1_x"], ["time:s", "p0.x:1", "p1.x:1"]),
+        (["%time", "field.header.seq", "field.wrench.force.x"], ["time:s", "-", "S.fx:N"]),
+        (["Time (s)", "Force X (mN)", "note"], ["time:s", "S.fx:mN", "-"]),
+        (["t", "bx0", "bx1"], ["time:s", "S0.bx:1", "S1.bx:1"]),
+        (["x", "taxel0", "taxel1"], ["-", "taxel0.value:1", "taxel1.value:1"]),
+        (["a", "taxel0", "taxel1"], ["a.value:1", "taxel0.value:1", "taxel1.value:1"]),
+    ],
+)
+def test_names_say_what_is_what(names, words):
+    assert guessed(names, [0.5, 3.25, 1.5], [0.01, 0.3, -0.7]) == words
+
+
+@pytest.mark.parametrize(
+    ("first", "step", "unit"),
+    [
+        (1.7e9, 0.01, "s"), (1.7e12, 10, "ms"), (1.7e15, 10_000, "us"), (1.7e18, 1e7, "ns"),
+        (0, 10, "ms"), (0, 10_000, "us"), (12.5, 0.01, "s"),
+    ],
+)  # fmt: skip
+def test_the_unit_of_a_time_is_told_by_its_size(first, step, unit):
+    assert guessed(["time", "Fx"], [first, 0.5], [step, 0.1])[0] == f"time:{unit}"

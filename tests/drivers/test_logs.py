@@ -1,0 +1,157 @@
+"""Logs that others wrote, as packets: whole, cut anywhere, packed, of several buses."""
+
+import gzip
+import itertools
+import random
+
+import can
+import pytest
+
+from tactile_rt.drivers.codec import CanFrame
+from tactile_rt.drivers.logs import read_log
+from tactile_rt.stream import ConfigError
+
+T0 = 1_700_000_000.5
+N = 60
+WRITERS = {".log": "candump", ".asc": "asc", ".blf": "blf", ".trc": "trc"}
+
+
+def messages():
+    for k in range(N):
+        yield can.Message(
+            timestamp=T0 + 0.01 * k, arbitration_id=0x710 + k % 16, is_extended_id=False,
+            data=bytes([k, 255 - k, 3]), channel=0,
+        )  # fmt: skip
+    yield can.Message(
+        timestamp=T0 + 1, arbitration_id=0x1ABCDE, is_extended_id=True, data=b"", channel=0
+    )
+
+
+def written(path):
+    with can.Logger(path) as log:
+        for message in messages():
+            log(message)
+    return path
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_what_python_can_wrote_is_read(tmp_path, suffix):
+    log = read_log(written(tmp_path / f"run{suffix}"))
+    assert (log.wire, log.form) == ("can", WRITERS[suffix])
+    packets = list(log.packets())
+    assert [frame for packet, _ in packets for frame in packet] == [
+        CanFrame(m.arbitration_id, bytes(m.data), m.is_extended_id) for m in messages()
+    ]
+    gaps = [b - a for (_, a), (_, b) in itertools.pairwise(packets)]
+    assert all(abs(gap - 10_000_000) < 300_000 for gap in gaps[: N - 1])
+    assert abs(packets[0][1] - T0 * 1e9) < 1e6 and log.notes == []
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_its_gzip_is_unpacked_also_where_it_is_cut(tmp_path, suffix):
+    path = written(tmp_path / f"run{suffix}")
+    packed = tmp_path / f"run{suffix}.gz"
+    packed.write_bytes(gzip.compress(path.read_bytes()))
+    assert len(list(read_log(packed).packets())) == N + 1
+    packed.write_bytes(packed.read_bytes()[:-200])
+    log = read_log(packed)
+    assert 0 < len(list(log.packets())) < N + 1
+    assert any("cut short" in note for note in log.notes)
+
+
+@pytest.mark.parametrize("suffix", [".log", ".asc", ".blf"])
+def test_half_a_log_is_read_with_a_note(tmp_path, suffix):
+    path = written(tmp_path / f"run{suffix}")
+    data = path.read_bytes()
+    path.write_bytes(data[: len(data) // 2 + 5])
+    log = read_log(path)
+    assert 10 < len(list(log.packets())) < N
+    assert len(log.notes) == 1
+
+
+@pytest.mark.parametrize("suffix", WRITERS)
+def test_damage_never_raises(tmp_path, suffix):
+    path = written(tmp_path / f"run{suffix}")
+    whole, draw = path.read_bytes(), random.Random(1)
+    for k in range(60):
+        data = bytearray(whole[: draw.randrange(len(whole))] if k % 2 else whole)
+        for _ in range(draw.randrange(1, 8)):
+            if data:
+                data[draw.randrange(len(data))] = draw.randrange(256)
+        path.write_bytes(data)
+        for form in ("", WRITERS[suffix]):
+            for _ in read_log(path, form).packets():
+                pass
+
+
+def test_a_log_of_several_buses_is_of_the_one_that_is_named(tmp_path):
+    path = tmp_path / "two.log"
+    path.write_text("(1.0) can0 123#AA\n(1.1) can1 123#BB\n(1.2) can0 124#\n")
+    log = read_log(path, bus="can0")
+    assert [f.data for packet, _ in log.packets() for f in packet] == [b"\xaa", b""]
+    assert log.notes == ["frames of several buses: can0 (2), can1 (1); those of can0 are taken"]
+    assert list(read_log(path, bus="can7").packets()) == []
+
+
+# One line of each, by hand: what tools print.
+LINES = [
+    ("  can0  201   [8]  0E 16 00 00 FF FD 21 00", 0x201, "0e160000fffd2100", None),
+    (" (1788865430.176578)  can0  201   [2]  0B 0F", 0x201, "0b0f", 1788865430_176578000),
+    (" (2023-11-14 22:13:20.500000)  can0  201   [1]  0B", 0x201, "0b", 1700000000_500000000),
+    ("(0.100000) vcan0 00ABCDEF#1122", 0xABCDEF, "1122", 100_000_000),
+    ("(0.1) can0 123##1AABB", 0x123, "aabb", 100_000_000),
+    ("(0.1) can0 123#11.22.33 T", 0x123, "112233", 100_000_000),
+    ("  slcan0  7FF   [2]  01 02   '..'", 0x7FF, "0102", None),
+    ("       1.250 ms  710   [3] 01 02 03", 0x710, "010203", 1_250_000),
+]
+
+
+@pytest.mark.parametrize(("line", "number", "data", "t_ns"), LINES)
+def test_a_line_of_a_can_log(tmp_path, line, number, data, t_ns):
+    path = tmp_path / "can.txt"
+    path.write_text(f"{line}\n" * 3)
+    ((frame,), at), *_ = read_log(path).packets()
+    assert (frame.id, frame.data.hex(), at) == (number, data, t_ns)
+    assert frame.extended == (number > 0x7FF) and frame.fd == ("##" in line)
+
+
+HEX = [
+    ("00000000: aa07 080a 0001 ff7e  ........", "aa07080a0001ff7e", None),
+    ("00000000  aa 07 08 0a 00 01 ff 7e  |........|", "aa07080a0001ff7e", None),
+    ("AA 07 08 0A 00 01 FF 7E", "aa07080a0001ff7e", None),
+    ("aa07080a0001ff7e", "aa07080a0001ff7e", None),
+    ("[1.25] 0xAA, 0x07, 0x08, 0x0A, 0x00, 0x01, 0xFF, 0x7E", "aa07080a0001ff7e", 1_250_000_000),
+    ("      12.345 ms  aa 07 08                                         ...", "aa0708", 12_345_000),
+]
+
+
+@pytest.mark.parametrize(("line", "data", "t_ns"), HEX)
+def test_bytes_in_hexadecimal(tmp_path, line, data, t_ns):
+    path = tmp_path / "dump.txt"
+    path.write_text(f"{line}\r\n" * 4)
+    log = read_log(path)
+    assert log.wire == "serial" and log.form in ("hex", "dump")
+    assert [(packet.hex(), at) for packet, at in log.packets()] == [(data, t_ns)] * 4
+
+
+@pytest.mark.parametrize("text", ["12 34 56\n12 33 57\n" * 9, "1,2\n3,4\n", "", "\n\n", "hello\n"])
+def test_text_is_bytes_as_they_are(tmp_path, text):
+    path = tmp_path / "board.txt"
+    path.write_text(text)
+    log = read_log(path)
+    assert log.form == "raw" and b"".join(p for p, _ in log.packets()) == text.encode()
+
+
+def test_times_never_go_back(tmp_path):
+    path = tmp_path / "back.log"
+    path.write_text("(2.0) can0 123#AA\n(1.0) can0 123#BB\n(3.0) can0 124#\n")
+    log = read_log(path)
+    assert [t for _, t in log.packets()] == [2_000_000_000, 2_000_000_000, 3_000_000_000]
+    assert log.notes == ["1 times go back; these packets have the time before"]
+
+
+def test_what_is_no_file_or_form_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="no file"):
+        read_log(tmp_path / "none")
+    with pytest.raises(ConfigError, match="no form 'pcap' of a log"):
+        read_log(written(tmp_path / "a.log"), "pcap")

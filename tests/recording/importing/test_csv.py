@@ -1,0 +1,177 @@
+"""Tables that others wrote: delimiters, commas, headers, times; what is no table."""
+
+import gzip
+
+import numpy as np
+import pytest
+
+from tactile_rt.recording import Recording
+from tactile_rt.recording.importing.csv import csv_form, read_table
+from tactile_rt.recording.importing.table import import_table
+from tactile_rt.stream import ConfigError, RecordingError, concatenate
+
+N = 50
+
+
+def imported(path, columns, rate_hz=0.0, **form):
+    output = path.with_suffix(".mcap")
+    made = import_table(read_table(path, csv_form(path, **form)), output, columns, rate_hz)
+    return made, concatenate(list(Recording(output))), Recording(output).description
+
+
+def rows(form: str) -> str:
+    return "".join(form.format(k=k, s=5 + 0.01 * k, a=k - 7, b=0.25 * k) for k in range(N))
+
+
+WRITTEN = {
+    "plain": ("time,Fx,Fy\n", "{s:.2f},{a},{b}\n", "time=time:s,Fx=S.fx:mN,Fy=S.fy:mN"),
+    "by places": ("", "{s:.2f},{a},{b}\n", "time:s,S.fx:mN,S.fy:mN"),
+    "semicolons": ("t;x;y\n", "{s:.2f};{a};{b};\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
+    "tabs": ("t\tx\ty\n", "{s:.2f}\t{a}\t{b}\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
+    "numpy": ("# t x y\n", "{s:.18e} {a:.18e} {b:.18e}\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
+    "yarpdatadumper": ("", "{k} {s:.6f} {a} {b} \n", "count,time:s,S.fx:mN,S.fy:mN"),
+    "quoted": ('"t","x, N","y"\n', '"{s:.2f}","{a}","{b}"\n', 't=time:s,"x, N"=S.fx:mN,y=S.fy:mN'),
+    "units below": ("t,x,y\n[s],[mN],[mN]\n", "{s:.2f},{a},{b}\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
+    "above it": (
+        "Sensor: ATI mini40\nRate, 100\n\nt,x,y\n", "{s:.2f},{a},{b}\n",
+        "t=time:s,x=S.fx:mN,y=S.fy:mN",
+    ),
+    "Windows": ("\ufefft,x,y\r\n", "{s:.2f},{a},{b}\r\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
+    "rostopic -p": (
+        "%time,field.wrench.force.x,field.wrench.force.y\n", "{s:.2f},{a},{b}\n",
+        "%time=time:s,field.wrench.force.x=S.fx:mN,field.wrench.force.y=S.fy:mN",
+    ),
+    "words between": ("", "{s:.2f} N: ({a}, {b})\n", "time:s,S.fx:mN,S.fy:mN"),
+    "case": ("Time , FX,fY\n", "{s:.2f}, {a}, {b}\n", "time=time:s,fx=S.fx:mN,fy=S.fy:mN"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_table_is_read_as_it_is_written(tmp_path, name):
+    header, form, columns = WRITTEN[name]
+    (tmp_path / "t.csv").write_text(header + rows(form))
+    made, chunk, about = imported(tmp_path / "t.csv", columns)
+    assert (made.samples, made.intact, made.corrupt, made.missing) == (N, N, 0, 0)
+    expected = [[1e-3 * (k - 7), 0.25e-3 * k] for k in range(N)]
+    assert chunk.values[:, 0] == pytest.approx(np.array(expected))
+    assert np.diff(chunk.t_ns).tolist() == [10_000_000] * (N - 1)
+    assert about.spec.rate_hz == 100 and about.spec.units == ("N", "N")
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t", " "])
+def test_a_decimal_comma(tmp_path, delimiter):
+    text = rows("{s:.2f}D{a}D{b:.2f}\n").replace(".", ",").replace("D", delimiter)
+    (tmp_path / "t.csv").write_text(text)
+    made, chunk, _ = imported(tmp_path / "t.csv", "time:s,S.fx,S.fy")
+    assert made.samples == N
+    assert chunk.values[7, 0].tolist() == [0, 1.75]
+
+
+def test_a_decimal_comma_between_commas_is_quoted(tmp_path):
+    (tmp_path / "t.csv").write_text("".join(f'"{k},5","{k},25"\n' for k in range(9)))
+    _, chunk, _ = imported(tmp_path / "t.csv", "time:s,S.fx")
+    assert chunk.values[3, 0, 0] == 3.25
+
+
+@pytest.mark.parametrize("packed", [gzip.compress, lambda text: text])
+def test_gzip_and_utf16(tmp_path, packed):
+    text = ("t,x\n" + rows("{s:.2f},{a}\n")).encode(
+        "utf-16" if packed is not gzip.compress else "utf-8"
+    )
+    (tmp_path / "t.csv").write_bytes(packed(text))
+    assert imported(tmp_path / "t.csv", "t=time:s,x=S.fx")[0].samples == N
+
+
+@pytest.mark.parametrize(
+    ("cell", "column", "t_ns"),
+    [
+        ("1700000000.123456789", "time:s", 1_700_000_000_123_456_789),
+        ("1700000000123456789", "time:ns", 1_700_000_000_123_456_789),
+        ("1700000000123.25", "time:ms", 1_700_000_000_123_250_000),
+        ("2023-11-14T22:13:20.5Z", "time:iso", 1_700_000_000_500_000_000),
+        ("2023-11-14 22:13:20.5", "time:iso", 1_700_000_000_500_000_000),
+    ],
+)
+def test_times_are_exact_and_those_since_1970_are_utc(tmp_path, cell, column, t_ns):
+    later = {"time:s": "1700000001", "time:ns": "1700000001000000000", "time:ms": "1700000001000"}
+    second = later.get(column, "2023-11-14 22:13:21")
+    (tmp_path / "t.csv").write_text(f"{cell},1\n{second},2\n" + f"{second[:-1]}9,3\n")
+    _, chunk, about = imported(tmp_path / "t.csv", f"{column},S.fx")
+    assert int(chunk.t_ns[0]) + about.utc_offset_ns == t_ns
+
+
+def test_what_is_missing_is_not_valid_and_what_is_no_row_is_corrupt(tmp_path):
+    lines = ["t,x,y", "0.0,1,2", "0.1,,3", "0.2,nan,null", "0.3,abc,1", "0.4,1", "0.5,4,5", "0.6,7"]
+    (tmp_path / "t.csv").write_text("\n".join([*lines[:6], *(f"0.{k},1,1" for k in range(5, 10))]))
+    made, chunk, _ = imported(tmp_path / "t.csv", "t=time:s,x=A0.fx,y=B0.fx")
+    assert (made.samples, made.corrupt) == (8, 2 - (len(lines) < 7))
+    assert chunk.valid[:3].tolist() == [[True, True], [False, True], [False, False]]
+    assert any("'abc' is no number" in note for note in made.notes)
+
+
+def test_a_count_tells_what_is_missing(tmp_path):
+    counts = [250, 251, 252, 255, 0, 1, 1, 2]
+    (tmp_path / "t.csv").write_text("".join(f"{c} {k} 5\n" for k, c in enumerate(counts)))
+    made, chunk, _ = imported(tmp_path / "t.csv", "count:8,time:s,S.fx")
+    assert (made.samples, made.missing) == (7, 2)
+    assert chunk.seq.tolist() == [0, 1, 2, 5, 6, 7, 8]
+
+
+def test_rows_of_one_time_are_spread_and_times_that_go_back_go_on(tmp_path):
+    coarse = [0.0, 0.0, 0.0, 0.0, 0.1, 0.1, 0.1, 0.1, 0.2, 0.2, 0.2, 0.2]
+    (tmp_path / "t.csv").write_text("".join(f"{t},1,2\n" for t in coarse))
+    made, chunk, about = imported(tmp_path / "t.csv", "time:s,S.fx,S.fy")
+    assert np.diff(chunk.t_ns).min() > 15e6 and any("spread" in note for note in made.notes)
+    assert about.spec.rate_hz == pytest.approx(50, rel=0.3)
+    (tmp_path / "t.csv").write_text("".join(f"{t / 10},1,2\n" for t in [*range(9), *range(9)]))
+    made, chunk, _ = imported(tmp_path / "t.csv", "time:s,S.fx,S.fy")
+    assert np.diff(chunk.t_ns).tolist() == [100_000_000] * 17
+    assert any("times go back 1 times" in note for note in made.notes)
+
+
+def test_rows_of_several_lines_after_some_to_skip(tmp_path):
+    lines = ["-10000", *(x for k in range(9) for x in (f"{k} 1 2", f"{k + 1} 3", "7"))]
+    (tmp_path / "t.txt").write_text("\n".join(lines) + "\n")
+    made, chunk, _ = imported(tmp_path / "t.txt", "-{1..3},T{0..2}.p:1", 20, skip=1, lines=3)
+    assert made.samples == 9 and chunk.values[4].ravel().tolist() == [5, 3, 7]
+    assert np.diff(chunk.t_ns).tolist() == [50_000_000] * 8
+
+
+def test_columns_of_a_file_are_with_their_places(tmp_path):
+    (tmp_path / "c.toml").write_text(
+        'name = "pad"\ncolumns = ["t=time:s", "x=A0.fx:mN"]\n[elements.A0]\nposition = [1, 2, 3]\n'
+    )
+    (tmp_path / "t.csv").write_text("t,x\n" + rows("{s:.2f},{a}\n"))
+    _, _, about = imported(tmp_path / "t.csv", str(tmp_path / "c.toml"))
+    assert about.spec.name == "pad" and about.spec.positions == ((1, 2, 3),)
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "why"),
+    [
+        ("t,Fx\n1,2\n2,3\n", "t=time:s,Fz=S.fz", "no column 'Fz'; there are t, Fx"),
+        ("t,Fx\n1,2\n2,3\n", "t=time:s,S.fz", "give all columns a name"),
+        ("1,2\n2,3\n", "t=time:s,x=S.fz", "does not name its columns"),
+        ("t,Fx\n1,2\n2,3\n", "Fx=S.fx", "no column is a time: give --rate"),
+        ("t,Fx\n1,2\n2,3\n", "Fx=S", "'S' is no column"),
+        ("t,Fx\n1,2\n1,3\n", "t=time:s,Fx=S.fx", "all lines have one time"),
+        ("1,2\n2,3\n", "time:s,S.fx,S.fy,S.fz", "no line has the 4 columns"),
+        ("hello, world\nhow, are you\n", "time:s,S.fx", "is no table of numbers"),
+        ("", "time:s,S.fx", "is no table of numbers"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_told_and_nothing_is_written(tmp_path, text, columns, why):
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises((ConfigError, RecordingError), match=why):
+        imported(tmp_path / "t.csv", columns)
+    assert [p.name for p in tmp_path.iterdir()] == ["t.csv"]
+
+
+def test_cut_anywhere_nothing_raises(tmp_path):
+    whole = ("t,x\n" + rows("{s:.2f},{a}\n")).encode()
+    for at in range(0, len(whole), 7):
+        (tmp_path / "t.csv").write_bytes(whole[at:])
+        try:
+            imported(tmp_path / "t.csv", "time:s,S.fx")
+        except (ConfigError, RecordingError):
+            assert len(whole) - at < 60
