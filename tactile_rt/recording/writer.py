@@ -38,7 +38,6 @@ from tactile_rt.recording.description import (
     utc_offset_ns,
 )
 from tactile_rt.recording.layout import (
-    CHANNELS,
     HEALTH,
     SAMPLES,
     WIRE,
@@ -46,7 +45,9 @@ from tactile_rt.recording.layout import (
     encode_packet,
     samples_in,
 )
+from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, FileForm
 from tactile_rt.recording.syncing import Extent, Syncer
+from tactile_rt.ros2.definitions import schema_text
 from tactile_rt.stream import Source
 
 __all__ = ["PART", "McapFile", "RecordingWriter", "WriterStats"]
@@ -69,29 +70,39 @@ class McapFile:
         self.about, self._file = about, file
         # Checksums over the whole file, too: a record that is lost altogether must be noticed.
         self._writer: Any = mcap.writer.Writer(file, enable_data_crcs=True)
-        self._writer.start(profile="", library="tactile_rt")
+        self._writer.start(profile="ros2", library="tactile_rt")
         # In this order: a file that says what it is of has the notes, too, wherever it is cut.
         if about.session:
             self._writer.add_metadata(SESSION, seal(about.session))
         self._writer.add_metadata(METADATA, about.to_metadata())
+        self._form = FileForm(about)
         self._channels: dict[str, int] = {}
         self._counts: dict[str, int] = {}
-        for topic, wire in CHANNELS:
+        schemas: dict[str, int] = {}
+        for (name, wire), message in CHANNELS.items():
             if wire not in ("", about.wire):
                 continue
-            schema = CHANNELS[topic, wire]
-            kind = self._writer.register_schema(schema.name, schema.encoding, schema.text.encode())
-            self._channels[topic] = self._writer.register_channel(
-                topic, schema.message_encoding, kind
+            if message not in schemas:
+                schemas[message] = self._writer.register_schema(
+                    message, "ros2msg", schema_text(message).encode()
+                )
+            self._channels[name] = self._writer.register_channel(
+                self._form.topic(name), "cdr", schemas[message]
             )
-            self._counts[topic] = 0
+            self._counts[name] = 0
 
-    def add(self, topic: str, data: bytes, t_ns: int) -> None:
-        """Add a message of this host time, ns; messages are numbered so that none gets lost."""
+    def add(self, name: str, data: bytes, t_ns: int) -> None:
+        """Add a message, as `layout` has it, of this host time, ns; messages are numbered so that
+        none gets lost."""
+        if not self._counts[ARRAY]:
+            self._put(ARRAY, self._form.array(t_ns), t_ns)
+        self._put(name, self._form.encode(name, data), t_ns)
+
+    def _put(self, name: str, data: bytes, t_ns: int) -> None:
         utc = max(0, t_ns + self.about.utc_offset_ns)
-        count = self._counts[topic]
-        self._writer.add_message(self._channels[topic], utc, data, utc, count % SEQUENCES)
-        self._counts[topic] = count + 1
+        count = self._counts[name]
+        self._writer.add_message(self._channels[name], utc, data, utc, count % SEQUENCES)
+        self._counts[name] = count + 1
 
     def note(self, name: str, fields: Mapping[str, str]) -> None:
         """Add metadata."""

@@ -124,9 +124,10 @@ def test_any_mcap_reader_reads_it_by_the_schemas_in_the_file(path):
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
         topics = {c.topic: c.message_encoding for c in summary.channels.values()}
-        json = dict.fromkeys(("health", "decisions", "events"), "json")
-        assert topics == {"samples": "cdr", **json}
-        found = list(reader.iter_messages(topics=["samples"]))
+        names = ("samples", "health", "decisions", "events", "array")
+        assert topics == {f"/tactile/{SPEC.name}/{name}": "cdr" for name in names}
+        assert reader.get_header().profile == "ros2"
+        found = list(reader.iter_messages(topics=[f"/tactile/{SPEC.name}/samples"]))
         names = [m.name for m in reader.iter_metadata()]
     assert len(found) == len(chunks)
     assert names == ["tactile_rt", "summary"]

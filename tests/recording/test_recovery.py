@@ -255,7 +255,7 @@ def test_so_many_messages_may_be_none_and_not_one_more(none, comes_back, tmp_pat
         made = McapFile(file, Description(SPEC, 0))
         made.add("samples", encode_samples(chunk), int(chunk.t_ns[-1]))
         for _ in range(none):
-            made.add("samples", b"none", 1)
+            made._put("samples", b"none", 1)
         made.flush()
     if comes_back:
         assert all_parts(Recording(recover(path))) == all_parts([chunk])
@@ -268,7 +268,7 @@ def test_without_a_whole_message_nothing_comes_back(tmp_path):
     path = tmp_path / "cut.mcap"
     with path.open("wb") as file:
         made = McapFile(file, Description(SPEC, 0))
-        made.add("samples", b"none", 1)
+        made._put("samples", b"none", 1)
         made.flush()
     with pytest.raises(RecordingError, match="nothing in it is whole"):
         recover(path)
