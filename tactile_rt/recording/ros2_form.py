@@ -21,7 +21,7 @@ from tactile_rt.ros2 import messages
 from tactile_rt.ros2.cdr import CDR
 from tactile_rt.ros2.definitions import token
 
-__all__ = ["ARRAY", "CHANNELS", "FileForm", "is_in_file_form", "name_of", "plain"]
+__all__ = ["ARRAY", "CHANNELS", "TEXTS", "WRENCH", "FileForm", "is_in_file_form", "name_of", "plain"]
 
 ARRAY, WRENCH = "array", "wrench"
 # In the order in which they are numbered, by which a file is recovered whose beginning is damaged.

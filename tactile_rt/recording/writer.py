@@ -62,9 +62,16 @@ class McapFile:
     Args:
         file: to write; not closed with this.
         about: what it is of.
+        further: channels besides those of a recording, and the ROS 2 message of each.
+
+    Attributes:
+        about: What it is of.
+        counts: The number of messages of each channel so far.
     """
 
-    def __init__(self, file: BinaryIO, about: Description) -> None:
+    def __init__(
+        self, file: BinaryIO, about: Description, further: Mapping[str, str] | None = None
+    ) -> None:
         import mcap.writer
 
         self.about, self._file = about, file
@@ -77,32 +84,29 @@ class McapFile:
         self._writer.add_metadata(METADATA, about.to_metadata())
         self._form = FileForm(about)
         self._channels: dict[str, int] = {}
-        self._counts: dict[str, int] = {}
         schemas: dict[str, int] = {}
-        for (name, wire), message in CHANNELS.items():
-            if wire not in ("", about.wire):
-                continue
-            if message not in schemas:
-                schemas[message] = self._writer.register_schema(
-                    message, "ros2msg", schema_text(message).encode()
-                )
-            self._channels[name] = self._writer.register_channel(
-                self._form.topic(name), "cdr", schemas[message]
-            )
-            self._counts[name] = 0
+        kinds = {name: kind for (name, wire), kind in CHANNELS.items() if wire in ("", about.wire)}
+        for name, kind in (*kinds.items(), *(further or {}).items()):
+            if kind not in schemas:
+                text = schema_text(kind).encode()
+                schemas[kind] = self._writer.register_schema(kind, "ros2msg", text)
+            topic = self._form.topic(name)
+            self._channels[name] = self._writer.register_channel(topic, "cdr", schemas[kind])
+        self.counts = dict.fromkeys(self._channels, 0)
 
     def add(self, name: str, data: bytes, t_ns: int) -> None:
-        """Add a message, as `layout` has it, of this host time, ns; messages are numbered so that
-        none gets lost."""
-        if not self._counts[ARRAY]:
-            self._put(ARRAY, self._form.array(t_ns), t_ns)
-        self._put(name, self._form.encode(name, data), t_ns)
+        """Add a message, as `layout` has it, of this host time, ns."""
+        if not self.counts[ARRAY]:
+            self.put(ARRAY, self._form.array(t_ns), t_ns)
+        self.put(name, self._form.encode(name, data), t_ns)
 
-    def _put(self, name: str, data: bytes, t_ns: int) -> None:
+    def put(self, name: str, data: bytes, t_ns: int) -> None:
+        """Add a message as it is to stand in the file; messages are numbered so that none gets
+        lost."""
         utc = max(0, t_ns + self.about.utc_offset_ns)
-        count = self._counts[name]
+        count = self.counts[name]
         self._writer.add_message(self._channels[name], utc, data, utc, count % SEQUENCES)
-        self._counts[name] = count + 1
+        self.counts[name] = count + 1
 
     def note(self, name: str, fields: Mapping[str, str]) -> None:
         """Add metadata."""
