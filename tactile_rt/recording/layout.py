@@ -40,6 +40,7 @@ Packet = bytes | Sequence[CanFrame] | None  # None: the line was opened here
 _CDR = b"\x00\x01\x00\x00"  # little-endian, no options
 _FRAME = struct.Struct("<I???xI")  # and its data, padded to 4
 
+
 @dataclass(frozen=True)
 class Raw:
     """One message of a recording, as it stands in the file.

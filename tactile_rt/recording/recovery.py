@@ -77,9 +77,7 @@ def _bounded(path: Path, file: BinaryIO) -> "Iterator[Record]":
         raise RecordingError(f"{path} is no recording: {error}") from None
 
 
-def _begun(
-    path: Path, records: "Iterator[Record]"
-) -> "tuple[Description, bool, Iterator[Record]]":
+def _begun(path: Path, records: "Iterator[Record]") -> "tuple[Description, bool, Iterator[Record]]":
     """What the recording is of, whether it is of layout 1, and what follows."""
     from mcap.records import Metadata
 

@@ -3,8 +3,8 @@ definition is in the file, so that whatever reads ROS 2 reads it.
 
     /tactile/whiskers/samples    tactile_rt_msgs/msg/Samples
 
-A recording of layout 1 had topics such as ``samples``, samples without a header, and all but samples
-and packets as JSON.
+A recording of layout 1 had topics such as ``samples``, samples without a header, and all but
+samples and packets as JSON.
 """
 
 from tactile_rt.recording.description import Description
@@ -21,7 +21,16 @@ from tactile_rt.ros2 import messages
 from tactile_rt.ros2.cdr import CDR
 from tactile_rt.ros2.definitions import token
 
-__all__ = ["ARRAY", "CHANNELS", "TEXTS", "WRENCH", "FileForm", "is_in_file_form", "name_of", "plain"]
+__all__ = [
+    "ARRAY",
+    "CHANNELS",
+    "TEXTS",
+    "WRENCH",
+    "FileForm",
+    "is_in_file_form",
+    "name_of",
+    "plain",
+]
 
 ARRAY, WRENCH = "array", "wrench"
 # In the order in which they are numbered, by which a file is recovered whose beginning is damaged.

@@ -20,7 +20,9 @@ STANDARD = {
     "geometry_msgs/msg/Point": "float64 x\nfloat64 y\nfloat64 z\n",
     "geometry_msgs/msg/Vector3": "float64 x\nfloat64 y\nfloat64 z\n",
     "geometry_msgs/msg/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w\n",
-    "geometry_msgs/msg/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n",
+    "geometry_msgs/msg/Pose": (
+        "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation\n"
+    ),
     "geometry_msgs/msg/Wrench": "geometry_msgs/Vector3 force\ngeometry_msgs/Vector3 torque\n",
     "geometry_msgs/msg/WrenchStamped": "std_msgs/Header header\ngeometry_msgs/Wrench wrench\n",
 }

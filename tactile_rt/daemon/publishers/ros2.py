@@ -4,13 +4,17 @@ Nothing of ROS is needed here. A node needs the definitions, which `tactile-rt c
 writes as a package. Messages for a node that cannot keep up are dropped, and nobody waits for it.
 """
 
+import os
 import re
+import socket
+import stat
 from functools import cache
-from ipaddress import ip_address
+from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
+import numpy as np
 from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.idl import make_idl_struct, types
@@ -44,6 +48,10 @@ from tactile_rt.stream import ConfigError, SourceError
 
 __all__ = ["Ros2Options", "Ros2Publisher"]
 
+OF_SOURCE = {
+    "samples": messages.SAMPLES, "wrench": messages.WRENCH, "decision": messages.DECISION,
+    "contact": messages.EVENT, "skip": messages.EVENT,
+}  # fmt: skip
 KINDS: dict[str, Any] = {
     "bool": bool, "uint8": types.uint8, "int32": types.int32, "uint32": types.uint32,
     "int64": types.int64, "float32": types.float32, "float64": types.float64, "string": str,
@@ -53,6 +61,7 @@ LOOPBACK = """<AllowMulticast>false</AllowMulticast></General>
 <Discovery><ParticipantIndex>auto</ParticipantIndex>
 <MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
 <Peers><Peer address="{0}"/></Peers></Discovery>"""
+FIRST_PORT, PORTS = 7400, 250  # of domain 0, and of each
 CONFIG = """<CycloneDDS><Domain Id="any"><General>
 <Interfaces><NetworkInterface address="{0}"/></Interfaces>{1}</Domain></CycloneDDS>"""
 
@@ -79,10 +88,10 @@ class Ros2Options(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_onl
 
     def __post_init__(self) -> None:
         try:
-            ip_address(self.interface)
+            IPv4Address(self.interface)
         except ValueError:
             raise ValueError(
-                f"interface is the IP address of one, like 127.0.0.1, not {self.interface}"
+                f"interface is the IPv4 address of one, like 127.0.0.1, not {self.interface}"
             ) from None
 
 
@@ -117,8 +126,10 @@ class Ros2Publisher(Consumer):
             ) from None
         if options.config_file:
             tell_exposed(view, self.name, f"what {options.config_file} opens")
-        else:
-            tell_exposed(view, self.name, options.interface)
+        elif not (is_loopback(options.interface) and _keep_to_loopback(options.domain)):
+            tell_exposed(view, self.name, f"DDS at {options.interface}")
+        for name in ("health", "state"):
+            self._writer(name, messages.EVENT)
         for opened in view.streams().values():
             self._opened(opened)
 
@@ -144,12 +155,26 @@ class Ros2Publisher(Consumer):
             "domain": self._options.domain,
             "interface": self._options.config_file or self._options.interface,
             "topics": len(self._writers),
+            "nodes": self._nodes(),  # the most that listen to one topic
             "messages": self._messages,
             "bytes": self._bytes,
             "dropped": self._dropped,  # messages that at least one node did not get
         }
 
+    def _nodes(self) -> int:
+        writers = tuple(self._writers.values())
+        return max((len(w.get_matched_subscriptions()) for w in writers), default=0)
+
     def _opened(self, item: Opened) -> None:
+        """A source's topics are there before anything is said: a node finds them, and misses
+        nothing."""
+        spec, wanted = item.spec, dict(OF_SOURCE)
+        if not self._options.samples:
+            del wanted["samples"], wanted["wrench"]
+        elif messages.wrenches_of(spec, np.zeros((0, *spec.shape), np.float32)) is None:
+            del wanted["wrench"]
+        for name, message in wanted.items():
+            self._writer(f"{item.source}/{name}", message)
         utc_ns = item.t_ns + item.utc_offset_ns
         data = messages.array_message(item.spec, item.source, utc_ns)
         self._write(f"{item.source}/array", messages.ARRAY, data, keep=True)
@@ -176,7 +201,7 @@ class Ros2Publisher(Consumer):
             self._write(name, messages.EVENT, messages.event_message(encode(message)))
 
     def _write(self, name: str, message: str, data: bytes, keep: bool = False) -> None:
-        writer = self._writers.get(name) or self._begin(name, message, keep)
+        writer = self._writer(name, message, keep)
         try:
             writer.write(_sample(_type(message), data))
         except DDSException as error:
@@ -186,8 +211,10 @@ class Ros2Publisher(Consumer):
         self._messages += 1
         self._bytes += len(data)
 
-    def _begin(self, name: str, message: str, keep: bool) -> "DataWriter[Any]":
+    def _writer(self, name: str, message: str, keep: bool = False) -> "DataWriter[Any]":
         """The writer of a topic; keep: the newest message is for those, too, that come later."""
+        if name in self._writers:
+            return self._writers[name]
         parts = map(token, f"{self._options.prefix}/{name}".split("/"))
         durability = Policy.Durability.TransientLocal if keep else Policy.Durability.Volatile
         qos = Qos(
@@ -209,6 +236,27 @@ class Ros2Publisher(Consumer):
         lone = is_loopback(options.interface)
         rest = LOOPBACK.format(options.interface) if lone else "</General>"
         return CONFIG.format(options.interface, rest)
+
+
+def _keep_to_loopback(domain: int) -> bool:
+    """Let DDS, which waits for others at any address, be reached on loopback alone; whether the
+    system allows that."""
+    first = FIRST_PORT + PORTS * domain
+    for name in os.listdir("/proc/self/fd"):
+        try:
+            if not stat.S_ISSOCK(os.stat(f"/proc/self/fd/{name}").st_mode):
+                continue
+            mine = socket.socket(fileno=os.dup(int(name)))
+        except OSError:  # closed by now
+            continue
+        with mine:
+            if mine.type == socket.SOCK_DGRAM and mine.family == socket.AF_INET:
+                if first <= mine.getsockname()[1] < first + PORTS:
+                    try:
+                        mine.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo\0")
+                    except OSError:
+                        return False
+    return True
 
 
 def _sample(kind: Any, data: bytes) -> Any:
