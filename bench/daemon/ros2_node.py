@@ -22,8 +22,8 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 HERE = """<CycloneDDS><Domain Id="any"><General>
-<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces><AllowMulticast>false</AllowMulticast>
-</General><Discovery><ParticipantIndex>auto</ParticipantIndex>
+<Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery></Domain></CycloneDDS>"""
 
 
@@ -166,21 +166,22 @@ def heard(reader):
 
 
 def main(domain, topic):
-    """Hear samples until one is numbered below 0; print when each came, and how old it was."""
+    """Hear samples until one is numbered below 0; tell when each came, and how old it was."""
     node = Node(int(domain), own=True)
     reader = node.subscribe(topic, Samples)
     any_state = SampleState.Any | ViewState.Any | InstanceState.Any
     waiting = WaitSet(node.participant)
     waiting.attach(ReadCondition(reader, any_state))
     came, more = [], True
-    print("ready", flush=True)
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
     while more:
         waiting.wait(10**9)
         for message in heard(reader):
             now = time.monotonic_ns()
             more = more and message.seq[0] >= 0
             came += [(seq, t, now) for seq, t in zip(message.seq, message.t_ns, strict=True)]
-    print(json.dumps(came))
+    sys.stdout.write(json.dumps(came))
 
 
 if __name__ == "__main__":

@@ -42,6 +42,7 @@ from tactile_rt.recording.reader import Recording
 from tactile_rt.stream import (
     NS_PER_S,
     ArraySpec,
+    Chunk,
     ConfigError,
     RecordingError,
     SpecMismatch,
@@ -162,7 +163,7 @@ def _blocks(
     spec = recording.spec
     counts = np.diff(ends, prepend=0)
     chunks = told.chunks(spec, recording.raw(SAMPLES, *TEXTS))
-    held = {
+    held: _Arrays = {
         "seq": np.zeros(0, np.int64), "t_ns": np.zeros(0, np.int64),
         "values": np.zeros((0, *spec.shape), np.float32),
         "valid": np.zeros((0, spec.shape[0]), np.bool_),
@@ -171,11 +172,11 @@ def _blocks(
     for first in range(0, len(counts), BLOCK_ROWS):
         count = counts[first : first + BLOCK_ROWS]
         need = int(count.sum())
-        more, n = [], len(held["seq"])
+        more, n = list[Chunk](), len(held["seq"])
         while n < need:
             more.append(next(chunks))
             n += len(more[-1])
-        whole = {
+        whole: _Arrays = {
             name: np.concatenate([kept, *(getattr(c, name) for c in more)])
             for name, kept in held.items()
         }

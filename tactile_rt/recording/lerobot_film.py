@@ -127,17 +127,18 @@ def write_film(film: Film, folder: Path, rows: int, fps: int) -> dict[str, NDArr
 def _frames(av: Any, film: Film, rows: int, fps: int) -> Iterator[Any]:
     """A decoded frame for each row."""
     with av.open(str(film.path)) as file:
-        decoded = iter(file.decode(video=0))
+        # Times are read first: whoever writes a frame gives it others.
+        decoded = ((frame.time or 0.0, frame) for frame in file.decode(video=0))
         now = following = next(decoded, None)
         if now is None:
             raise ConfigError(f"{film.path} has no frame")
-        first = now.time or 0.0
+        first = now[0]
         for k in range(rows):
             # A hundredth of a frame: times of a film are rounded to its own clock.
             until = (k + 0.01) / fps - film.begin_s
-            while following is not None and (following.time or 0.0) - first <= until:
+            while following is not None and following[0] - first <= until:
                 now, following = following, next(decoded, None)
-            yield now
+            yield now[1]
 
 
 def _need_av() -> Any:

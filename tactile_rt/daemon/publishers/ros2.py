@@ -215,6 +215,7 @@ class Ros2Publisher(Consumer):
         """The writer of a topic; keep: the newest message is for those, too, that come later."""
         if name in self._writers:
             return self._writers[name]
+        assert self._participant is not None
         parts = map(token, f"{self._options.prefix}/{name}".split("/"))
         durability = Policy.Durability.TransientLocal if keep else Policy.Durability.Volatile
         qos = Qos(
@@ -269,9 +270,10 @@ def _sample(kind: Any, data: bytes) -> Any:
 @cache
 def _type(message: str) -> Any:
     """A message as DDS knows it."""
-    fields = {}
+    fields: dict[str, Any] = {}
+    sequence: Any = types.sequence
     for name, kind, many in fields_of(message):
         one = KINDS[kind] if kind in SIMPLE else _type(kind)
-        fields[name] = types.sequence[one] if many else one
+        fields[name] = sequence[one] if many else one
     name = dds_type(message)
     return make_idl_struct(re.sub(r"\W", "_", name), name.replace("::", "."), fields)
