@@ -1,12 +1,13 @@
 """LeRobot itself reads our datasets, and records our sensors.
 
-    python -m venv peer && peer/bin/pip install -e '.[record,lerobot,view]' -e plugins/lerobot_robot_tactile
+    python -m venv peer
+    peer/bin/pip install -e '.[record,lerobot,view]' -e plugins/lerobot_robot_tactile
     HF_HUB_OFFLINE=1 peer/bin/python -m bench.recording.lerobot_peer
 
-A minute of 35 x 6 at 1 kHz and a film of 30 frames a second become a dataset, which `LeRobotDataset`
-loads: every sample is compared with the recording, and every frame with the film. Then
-``lerobot-record`` records a made-up arm with a sensor by the plug-in. LeRobot is a gigabyte of other
-packages, so no test needs it.
+A minute of 35 x 6 at 1 kHz and a film of 30 frames a second become a dataset, which
+`LeRobotDataset` loads: every sample is compared with the recording, and every frame with the film.
+Then ``lerobot-record`` records a made-up arm with a sensor by the plug-in. LeRobot is gigabytes of
+other packages, so no test needs it.
 """
 
 import argparse
@@ -87,7 +88,7 @@ class Hand(Teleoperator):
 
     config_class, name = HandConfig, "made_up_hand"
     action_features: Any = dict.fromkeys(JOINTS, float)
-    feedback_features: Any = {}
+    feedback_features: Any = dict.fromkeys(())
     is_connected: Any = False
     is_calibrated: Any = True
 

@@ -205,7 +205,8 @@ def _as_folder(
     *recordings, output = files if len(files) > 1 else [*files, files[0].with_suffix("")]
     if len(files) == 1:
         output = output.with_name(f"{output.name}-{to}")
-    check_output(output)
+    if not output.parent.is_dir():
+        raise ConfigError(f"no folder {output.parent} to write {output.name} in")
     if output.exists():
         if not force:
             raise ConfigError(f"{output} is there already: name another folder, or give --force")

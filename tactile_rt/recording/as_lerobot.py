@@ -250,8 +250,9 @@ def _table(pa: Any, schema: Any, columns: _Arrays) -> Any:
     for field in schema:
         column = columns[field.name]
         made = pa.array(column.ravel())
-        for size in reversed(column.shape[1:]):
-            made = pa.FixedSizeListArray.from_arrays(made, size)
+        if pa.types.is_fixed_size_list(field.type):  # an array of one number is that number
+            for size in reversed(column.shape[1:]):
+                made = pa.FixedSizeListArray.from_arrays(made, size)
         arrays.append(made)
     return pa.Table.from_arrays(arrays, schema=schema)
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from lerobot.robots import Robot, make_robot_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
-from lerobot_robot_tactile.config_tactile import TactileConfig
 
+from lerobot_robot_tactile.config_tactile import TactileConfig
 from tactile_rt.recording import StreamWriter
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, EndOfStream, SourceError
