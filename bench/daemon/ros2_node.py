@@ -28,33 +28,33 @@ HERE = """<CycloneDDS><Domain Id="any"><General>
 
 
 @dataclass
-class Time(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
+class TimeMsg(IdlStruct, typename="builtin_interfaces.msg.dds_.Time_"):
     sec: int32
     nanosec: uint32
 
 
 @dataclass
-class Header(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
-    stamp: Time
+class HeaderMsg(IdlStruct, typename="std_msgs.msg.dds_.Header_"):
+    stamp: TimeMsg
     frame_id: str
 
 
 @dataclass
-class Vector3(IdlStruct, typename="geometry_msgs.msg.dds_.Vector3_"):
+class Vector3Msg(IdlStruct, typename="geometry_msgs.msg.dds_.Vector3_"):
     x: float64
     y: float64
     z: float64
 
 
 @dataclass
-class Point(IdlStruct, typename="geometry_msgs.msg.dds_.Point_"):
+class PointMsg(IdlStruct, typename="geometry_msgs.msg.dds_.Point_"):
     x: float64
     y: float64
     z: float64
 
 
 @dataclass
-class Quaternion(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
+class QuaternionMsg(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
     x: float64
     y: float64
     z: float64
@@ -62,26 +62,26 @@ class Quaternion(IdlStruct, typename="geometry_msgs.msg.dds_.Quaternion_"):
 
 
 @dataclass
-class Pose(IdlStruct, typename="geometry_msgs.msg.dds_.Pose_"):
-    position: Point
-    orientation: Quaternion
+class PoseMsg(IdlStruct, typename="geometry_msgs.msg.dds_.Pose_"):
+    position: PointMsg
+    orientation: QuaternionMsg
 
 
 @dataclass
-class Wrench(IdlStruct, typename="geometry_msgs.msg.dds_.Wrench_"):
-    force: Vector3
-    torque: Vector3
+class WrenchMsg(IdlStruct, typename="geometry_msgs.msg.dds_.Wrench_"):
+    force: Vector3Msg
+    torque: Vector3Msg
 
 
 @dataclass
-class WrenchStamped(IdlStruct, typename="geometry_msgs.msg.dds_.WrenchStamped_"):
-    header: Header
-    wrench: Wrench
+class WrenchStampedMsg(IdlStruct, typename="geometry_msgs.msg.dds_.WrenchStamped_"):
+    header: HeaderMsg
+    wrench: WrenchMsg
 
 
 @dataclass
-class Samples(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Samples_"):
-    header: Header
+class SamplesMsg(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Samples_"):
+    header: HeaderMsg
     seq: sequence[int64]
     t_ns: sequence[int64]
     elements: uint32
@@ -91,22 +91,22 @@ class Samples(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Samples_"):
 
 
 @dataclass
-class Array(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Array_"):
-    header: Header
+class ArrayMsg(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Array_"):
+    header: HeaderMsg
     source: str
     name: str
     elements: sequence[str]
     rows: sequence[int32]
     columns: sequence[int32]
-    poses: sequence[Pose]
+    poses: sequence[PoseMsg]
     channels: sequence[str]
     units: sequence[str]
     rate_hz: float64
 
 
 @dataclass
-class Decision(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Decision_"):
-    header: Header
+class DecisionMsg(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Decision_"):
+    header: HeaderMsg
     source: str
     model: str
     t_ns: int64
@@ -126,8 +126,8 @@ class Decision(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Decision_"):
 
 
 @dataclass
-class Event(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Event_"):
-    header: Header
+class EventMsg(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Event_"):
+    header: HeaderMsg
     type: str
     source: str
     part: str
@@ -138,7 +138,7 @@ class Event(IdlStruct, typename="tactile_rt_msgs.msg.dds_.Event_"):
     json: str
 
 
-class Node:
+class Ros2Node:
     """Subscriptions in a domain.
 
     Args:
@@ -167,8 +167,8 @@ def heard(reader):
 
 def main(domain, topic):
     """Hear samples until one is numbered below 0; tell when each came, and how old it was."""
-    node = Node(int(domain), own=True)
-    reader = node.subscribe(topic, Samples)
+    node = Ros2Node(int(domain), own=True)
+    reader = node.subscribe(topic, SamplesMsg)
     any_state = SampleState.Any | ViewState.Any | InstanceState.Any
     waiting = WaitSet(node.participant)
     waiting.attach(ReadCondition(reader, any_state))

@@ -10,7 +10,7 @@ LeRobot knows one rate, that of the rows, and arrays of one shape.
 
 The plan. A row has all samples since the row before, in an array that is as long as the fullest row
 needs, and how many they are. A row at time t has samples up to t and none after it: what a policy
-could know then. `observation.state`, which every policy reads, is the newest sample.
+could know then. ``observation.state``, which every policy reads, is the newest sample.
 
 It is read and written piece by piece; it need not fit into memory.
 """
@@ -28,7 +28,7 @@ from tactile_rt.recording.as_arrays import COLUMNS, TEXTS, Told, raws_of
 from tactile_rt.recording.as_csv import told_of, told_text
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.layout import SAMPLES, Raw
-from tactile_rt.recording.lerobot_film import Film, write_film
+from tactile_rt.recording.lerobot_film import CameraFilm, write_film
 from tactile_rt.recording.lerobot_meta import (
     DATA,
     FRAME,
@@ -70,7 +70,7 @@ def write_dataset(
     folder: Path,
     fps: int = 30,
     task: str = "",
-    films: Sequence[Film] = (),
+    films: Sequence[CameraFilm] = (),
 ) -> int:
     """Write recordings of one array as the episodes of a dataset; the number of samples.
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.stream import ConfigError
 
-__all__ = ["VIDEO", "Film", "film_of", "write_film"]
+__all__ = ["VIDEO", "CameraFilm", "film_of", "write_film"]
 
 VIDEO = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
 CODEC = "libx264"
@@ -21,7 +21,7 @@ PIXELS = 16384  # of each, at most
 
 
 @dataclass(frozen=True)
-class Film:
+class CameraFilm:
     """A film and when it was taken.
 
     Attributes:
@@ -29,7 +29,7 @@ class Film:
         path: The file of the film, in any form that FFmpeg reads.
         begin_s: The time of the film's first frame after the recording's first sample, s; below 0
             it was before.
-        size: (height, width) of a frame.
+        size: The (height, width) of a frame.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Film:
         }  # fmt: skip
 
 
-def film_of(text: str) -> Film:
+def film_of(text: str) -> CameraFilm:
     """A film as it is named on the command line: ``front=front.mp4`` or ``front=front.mp4@1.25``.
 
     Raises:
@@ -82,10 +82,10 @@ def film_of(text: str) -> Film:
         raise ConfigError(f"no film {file}") from None
     except (av.error.FFmpegError, IndexError) as error:
         raise ConfigError(f"{file} is no film: {error}") from None
-    return Film(name, Path(file), begin_s, size)
+    return CameraFilm(name, Path(file), begin_s, size)
 
 
-def write_film(film: Film, folder: Path, rows: int, fps: int) -> dict[str, NDArray[Any]]:
+def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str, NDArray[Any]]:
     """Write the frame of each row: the newest that there was; before the first one, that.
 
     Returns:
@@ -124,7 +124,7 @@ def write_film(film: Film, folder: Path, rows: int, fps: int) -> dict[str, NDArr
     return {**shaped, "count": np.array([len(seen)])}
 
 
-def _frames(av: Any, film: Film, rows: int, fps: int) -> Iterator[Any]:
+def _frames(av: Any, film: CameraFilm, rows: int, fps: int) -> Iterator[Any]:
     """A decoded frame for each row."""
     with av.open(str(film.path)) as file:
         # Times are read first: whoever writes a frame gives it others.

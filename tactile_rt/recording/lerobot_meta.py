@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.recording.lerobot_film import VIDEO, Film
+from tactile_rt.recording.lerobot_film import VIDEO, CameraFilm
 from tactile_rt.stream import ConfigError
 
 __all__ = ["DATA", "FRAME", "INFO", "Episode", "Statistics", "need_pyarrow", "write_meta"]
@@ -60,7 +60,7 @@ class Episode:
         first: The number of rows of all episodes before it.
         task: What was done, in words.
         task_index: The number of that task.
-        statistics: Of each feature, as `Statistics.found` gives them.
+        statistics: The statistics of each feature, as `Statistics.found` gives them.
     """
 
     index: int
@@ -151,7 +151,7 @@ def write_meta(
     features: Mapping[str, Mapping[str, Any]],
     episodes: Sequence[Episode],
     tasks: Mapping[str, int],
-    films: Sequence[Film],
+    films: Sequence[CameraFilm],
 ) -> None:
     """Write all of it but what is ours."""
     pa, pq = need_pyarrow()
@@ -179,7 +179,7 @@ def write_meta(
     pq.write_table(pa.Table.from_pylist(rows), path, compression="zstd")
 
 
-def _episode(episode: Episode, fps: int, films: Sequence[Film]) -> dict[str, Any]:
+def _episode(episode: Episode, fps: int, films: Sequence[CameraFilm]) -> dict[str, Any]:
     chunk, file = divmod(episode.index, IN_CHUNK)
     row: dict[str, Any] = {
         "episode_index": episode.index,

@@ -65,7 +65,7 @@ class McapFile:
         further: channels besides those of a recording, and the ROS 2 message of each.
 
     Attributes:
-        about: What it is of.
+        about: The description of what the file is of.
         counts: The number of messages of each channel so far.
     """
 

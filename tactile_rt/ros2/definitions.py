@@ -34,7 +34,7 @@ class Field(NamedTuple):
 
     Attributes:
         name: The name of the field.
-        kind: One of `SIMPLE`, or the name of a message such as ``std_msgs/msg/Header``.
+        kind: The kind of its value: of `SIMPLE`, or a message such as ``std_msgs/msg/Header``.
         many: Whether the field is a sequence of any length.
     """
 

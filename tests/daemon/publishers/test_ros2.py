@@ -47,7 +47,7 @@ class Heard:
     """Subscriptions of a node in this process: `heard["/tactile/health"]` are the messages."""
 
     def __init__(self, **topics):
-        node = ros2_node.Node(DOMAIN, own=False)
+        node = ros2_node.Ros2Node(DOMAIN, own=False)
         self._readers = {t: node.subscribe(t, kind, latched=t.endswith("array"))
                          for t, kind in topics.items()}  # fmt: skip
         self._found = {t: [] for t in topics}
@@ -68,12 +68,12 @@ def test_each_message_comes_to_its_topic_as_its_type():
     topics = ("/tactile/whiskers/decision", "/tactile/whiskers/contact", "/tactile/health")
     made = publisher()
     with running(made, View(FORCES)) as view:
-        kinds = (ros2_node.Decision, ros2_node.Event, ros2_node.Event)
+        kinds = (ros2_node.DecisionMsg, ros2_node.EventMsg, ros2_node.EventMsg)
         heard = Heard(**dict(zip(topics, kinds, strict=True)))
         made.handle(items)
         told, touched, health = (heard.one(topic) for topic in topics)
         assert view.reports == []
-    assert told.header == ros2_node.Header(ros2_node.Time(1_700_000_000, 1000), "mount")
+    assert told.header == ros2_node.HeaderMsg(ros2_node.TimeMsg(1_700_000_000, 1000), "mount")
     assert (told.source, told.model, told.label, told.step) == ("whiskers", "whiskers", "mug", 2)
     assert dict(zip(told.labels, told.probabilities, strict=True)) == {"duck": 0.25, "mug": 0.75}
     assert np.isnan(told.coverage) and told.candidates == [] and not told.is_final
@@ -90,8 +90,8 @@ def test_samples_come_bit_for_bit_and_a_late_node_hears_what_the_array_is():
     values = np.array([[1.5, -0.0, 1e-42], [3, np.inf, np.nan]], np.float32)
     with running(made, View(FORCES)):
         heard = Heard(
-            **{"/tactile/whiskers/samples": ros2_node.Samples,
-               "/tactile/whiskers/array": ros2_node.Array}
+            **{"/tactile/whiskers/samples": ros2_node.SamplesMsg,
+               "/tactile/whiskers/array": ros2_node.ArrayMsg}
         )  # fmt: skip
         made.handle([samples(FORCES, values, t_ns=50, valid=[True, False])])
         message, array = (heard.one(f"/tactile/whiskers/{n}") for n in ("samples", "array"))
@@ -110,7 +110,7 @@ def test_samples_come_bit_for_bit_and_a_late_node_hears_what_the_array_is():
 def test_one_element_is_a_wrench_at_the_origin_of_its_mount():
     made = publisher()
     with running(made, View(FINGER)):
-        heard = Heard(**{"/tactile/whiskers/wrench": ros2_node.WrenchStamped})
+        heard = Heard(**{"/tactile/whiskers/wrench": ros2_node.WrenchStampedMsg})
         # Channels are fz fx fy mx my mz; the element's x is the mount's y, its y is minus x.
         made.handle([samples(FINGER, [[3, 1, 2, 0.25, 0, 0]]),
                      samples(FINGER, [[9] * 6], valid=[False])])  # fmt: skip
@@ -125,7 +125,7 @@ def test_one_element_is_a_wrench_at_the_origin_of_its_mount():
 def test_names_are_those_that_ros_allows_and_the_state_comes_again_and_again():
     made = publisher(prefix="fleet-7/left.arm", state_s=0.01, samples=False)
     with running(made, View(FORCES, busy_snapshot())):
-        heard = Heard(**{"/fleet_7/left_arm/state": ros2_node.Event})
+        heard = Heard(**{"/fleet_7/left_arm/state": ros2_node.EventMsg})
         until(lambda: made.handle([]) or len(heard["/fleet_7/left_arm/state"]) > 2)
         (first, *_) = heard["/fleet_7/left_arm/state"]
         assert json.loads(first.json)["snapshot"]["state"] == "degraded"
@@ -136,8 +136,8 @@ def test_names_are_those_that_ros_allows_and_the_state_comes_again_and_again():
 def test_a_node_that_does_not_read_holds_nobody_up():
     made = publisher(queue=10)
     with running(made, View(FORCES)):
-        node = ros2_node.Node(DOMAIN, own=False)
-        reader = node.subscribe("/tactile/health", ros2_node.Event, depth=5)
+        node = ros2_node.Ros2Node(DOMAIN, own=False)
+        reader = node.subscribe("/tactile/health", ros2_node.EventMsg, depth=5)
         fat = event(reason="x" * 200_000)
         for _ in range(100):  # 20 MB
             made.handle([fat])
