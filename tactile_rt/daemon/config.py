@@ -110,8 +110,8 @@ class PublisherConfig(_Table, frozen=True, kw_only=True):
     """``[[publisher]]``: where messages go.
 
     Attributes:
-        kind: Kind of publisher: ``jsonl``, ``zmq``, ``zenoh``, ``foxglove``, ``ros2``, or one that another
-            package adds.
+        kind: Kind of publisher: ``jsonl``, ``zmq``, ``zenoh``, ``foxglove``, ``ros2``, or one that
+            another package adds.
         name: The name of the publisher in the log and on the page; empty to name it like its kind.
         options: The table of options that this kind of publisher takes.
     """
