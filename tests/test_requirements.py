@@ -78,7 +78,8 @@ def test_what_is_installed_is_what_is_written() -> None:
         if installed not in pin.specifier:
             wrong[str(pin)] = str(installed)
     assert wrong == {}
-    missing = [r.name for r in asked_for("sim", "train", "record", "publish", "test", "dev")
+    extras = ("sim", "train", "record", "publish", "ros2", "lerobot", "test", "dev")
+    missing = [r.name for r in asked_for(*extras)
                if not is_installed(r.name)]  # fmt: skip
     assert missing == []
 

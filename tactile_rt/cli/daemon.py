@@ -95,6 +95,24 @@ def alerts(
     _give(ALERTS.read_text("utf-8"), output, "name it under rule_files of prometheus.yml")
 
 
+@config.command("ros2-messages")
+def ros2_messages(
+    folder: Annotated[Path, typer.Argument(help="The src folder of a ROS 2 workspace.")],
+) -> None:
+    """Write tactile_rt_msgs, the ROS 2 package of what recordings and the publisher ros2 say."""
+    import shutil
+
+    from tactile_rt.ros2.definitions import PACKAGE
+
+    made = folder / PACKAGE.name
+    if not folder.is_dir():
+        raise ConfigError(f"no folder {folder}")
+    if made.exists():
+        raise ConfigError(f"{made} is there already")
+    shutil.copytree(PACKAGE, made)
+    typer.echo(f"{made} is written; build it with: colcon build --packages-select {PACKAGE.name}")
+
+
 def _give(text: str, output: Path | None, then: str) -> None:
     """Print a text, or write it to where there is nothing yet."""
     check_output(output)

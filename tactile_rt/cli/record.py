@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
+from tactile_rt.settings import no_such
 from tactile_rt.stream import ConfigError, EndOfStream, Source
 
 if TYPE_CHECKING:
@@ -139,21 +140,83 @@ def recover(
 
 @app.command()
 def convert(
-    recording: Annotated[Path, typer.Argument(help="A .mcap of tactile-rt, .npz, .csv or .h5.")],
-    output: Annotated[Path, typer.Argument(help="Another of these.")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RECORDING... OUTPUT",
+            help="A .mcap of tactile-rt, .npz, .csv, .h5, LeRobot dataset; then another of them.",
+        ),
+    ],
+    to: Annotated[
+        str, typer.Option(help="ros2 or lerobot: a folder, of one .mcap or of several.")
+    ] = "",
+    fps: Annotated[int, typer.Option(min=1, max=1000, help="Of lerobot: rows a second.")] = 30,
+    task: Annotated[
+        str, typer.Option(help="Of lerobot: what was done; default: the note `task`.")
+    ] = "",
+    video: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Of lerobot: NAME=FILE or NAME=FILE@SECONDS, a camera's film and how long after "
+            "the first sample it begins; may be repeated."
+        ),
+    ] = None,
+    episode: Annotated[int, typer.Option(min=0, help="Which one of a LeRobot dataset.")] = 0,
     force: Force = False,
 ) -> None:
-    """Write a recording as arrays (.npz, .h5) or text (.csv), or make it one again (.mcap).
+    """Write a recording as arrays (.npz, .h5), text (.csv), bag or dataset, or make it one again.
 
     Samples, description, decisions, events and health come back bit for
-    bit; raw packets are in the .mcap alone. A .csv has a .csv.json beside
-    it, with all that is no sample.
+    bit; raw packets are in the .mcap and in bags alone. A .csv has a
+    .csv.json beside it, with all that is no sample. OUTPUT may be left out
+    with --to: RECORDING-ros2, RECORDING-lerobot.
     """
     from tactile_rt.recording.conversion import convert as converted
     from tactile_rt.recording.conversion import outputs_of
 
+    if to:
+        typer.echo(_as_folder(to, files, fps, task, video or [], force))
+        return
+    if len(files) != 2:
+        raise ConfigError("name a recording and what to write, or say what --to")
+    recording, output = files
     for file in outputs_of(output):
         check_output(file)
         if file.exists() and not force:
             raise ConfigError(f"{file} is there already: name another file, or give --force")
-    typer.echo(f"{output}: {converted(recording, output)} samples")
+    typer.echo(f"{output}: {converted(recording, output, episode)} samples")
+
+
+# What a folder of each form has, which may be replaced.
+MARKS = {"ros2": "metadata.yaml", "lerobot": "meta/info.json"}
+
+
+def _as_folder(
+    to: str, files: list[Path], fps: int, task: str, video: list[str], force: bool
+) -> str:
+    """Write a bag or a dataset; what to say of it."""
+    from tactile_rt.recording import Recording
+    from tactile_rt.recording.as_lerobot import write_dataset
+    from tactile_rt.recording.as_ros2 import write_bag
+    from tactile_rt.recording.lerobot_film import film_of
+
+    if to not in MARKS:
+        raise ConfigError(no_such("form", to, sorted(MARKS)))
+    *recordings, output = files if len(files) > 1 else [*files, files[0].with_suffix("")]
+    if len(files) == 1:
+        output = output.with_name(f"{output.name}-{to}")
+    if not output.parent.is_dir():
+        raise ConfigError(f"no folder {output.parent} to write {output.name} in")
+    if output.exists():
+        if not force:
+            raise ConfigError(f"{output} is there already: name another folder, or give --force")
+        if not (output / MARKS[to]).is_file():
+            raise ConfigError(f"{output} is there already, and nothing that --to {to} made")
+    read = [Recording(path) for path in recordings]
+    if to == "ros2":
+        if task or video:
+            raise ConfigError("--task and --video go with --to lerobot")
+        return f"{output}: {write_bag(read, output)} samples"
+    films = [film_of(one) for one in video]
+    n = write_dataset(read, output, fps, task, films)
+    return f"{output}: {n} samples, {len(read)} episodes"

@@ -41,6 +41,7 @@ def check_config(loaded: Loaded) -> None:
     _check_tables(loaded, config)
     found = wanted_consumers(loaded)
     _check_listeners(loaded, found)
+    _check_domains(loaded, found)
     _check_outputs(loaded, found)
     for wanted in found:
         try:
@@ -187,6 +188,18 @@ def _check_listeners(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
                 if port == number and (host == other or host in ANY or other in ANY):
                     loaded.refuse(path, f"{host}:{port} is where {name} listens")
             taken.append((host, port, one.name))
+
+
+def _check_domains(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
+    """Refuse a second one in a DDS domain, of which a process has one."""
+    taken: dict[int, str] = {}
+    for one in wanted:
+        if one.kind == "ros2":
+            domain = one.options.domain
+            if domain in taken:
+                path = _path(loaded, one, "domain")
+                loaded.refuse(path, f"DDS domain {domain} is where {taken[domain]} publishes")
+            taken[domain] = one.name
 
 
 def _check_outputs(loaded: Loaded, wanted: Sequence[Wanted]) -> None:

@@ -110,8 +110,8 @@ class PublisherConfig(_Table, frozen=True, kw_only=True):
     """``[[publisher]]``: where messages go.
 
     Attributes:
-        kind: Kind of publisher: ``jsonl``, ``zmq``, ``zenoh``, ``foxglove``, or one that another
-            package adds.
+        kind: Kind of publisher: ``jsonl``, ``zmq``, ``zenoh``, ``foxglove``, ``ros2``, or one that
+            another package adds.
         name: The name of the publisher in the log and on the page; empty to name it like its kind.
         options: The table of options that this kind of publisher takes.
     """
@@ -287,7 +287,7 @@ url = "synthetic:mouse"        # a device: serial:///dev/ttyACM0?codec=native
 # behind_ms = 0                # how far it may be behind; 0: three steps, at least 150 ms
 
 [[publisher]]
-kind = "jsonl"                 # also zmq, zenoh, foxglove
+kind = "jsonl"                 # also zmq, zenoh, foxglove, ros2
 options = { samples = false }  # file: default standard output; state_s: how often
 
 # [recorder]

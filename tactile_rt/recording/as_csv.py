@@ -27,7 +27,7 @@ from tactile_rt.recording.description import Description
 from tactile_rt.recording.layout import Raw
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError, RecordingError, concatenate
 
-__all__ = ["beside", "read_csv", "write_csv"]
+__all__ = ["beside", "read_csv", "told_of", "told_text", "write_csv"]
 
 BITS = "bits"
 BATCH = 4096
@@ -56,12 +56,7 @@ def write_csv(
     text.detach()
     if not n:
         raise RecordingError(f"{what} has no samples")
-    further = {
-        ABOUT: msgspec.Raw(about_text(about).encode()),
-        **{name: times.tolist() for name, times in told.times().items()},
-        **{topic: [msgspec.Raw(t.encode()) for t in texts] for topic, texts in told.texts.items()},
-    }
-    data = msgspec.json.encode(further)
+    data = told_text(about, told)
     write_whole(beside(output), lambda other: other.write(data))
     return n
 
@@ -85,17 +80,27 @@ def _rows(chunk: Chunk) -> Iterator[list[Any]]:
         yield [seq, t_ns, *cells, " ".join(bits)]
 
 
-def read_csv(path: Path) -> tuple[Description, Generator[Raw, None, None]]:
-    """What it is of, and its messages.
+def told_text(about: Description, told: Told) -> bytes:
+    """What a recording is of and all that is no sample, as JSON."""
+    further = {
+        ABOUT: msgspec.Raw(about_text(about).encode()),
+        **{name: times.tolist() for name, times in told.times().items()},
+        **{topic: [msgspec.Raw(t.encode()) for t in texts] for topic, texts in told.texts.items()},
+    }
+    return msgspec.json.encode(further)
+
+
+def told_of(path: Path) -> tuple[Description, dict[str, Any], dict[str, list[str]]]:
+    """What a recording is of, its arrays besides samples, and its texts, from a file that
+    `told_text` was written to.
 
     Raises:
-        ConfigError: the file beside it is missing.
-        RecordingError: it is damaged, or holds something else.
+        ConfigError: There is none.
+        RecordingError: It is damaged.
     """
-    other = beside(path)
     try:
-        found = msgspec.json.decode(other.read_bytes(), type=dict[str, msgspec.Raw])
-        about = about_of(str(other), bytes(found.pop(ABOUT)).decode())
+        found = msgspec.json.decode(path.read_bytes(), type=dict[str, msgspec.Raw])
+        about = about_of(str(path), bytes(found.pop(ABOUT)).decode())
         texts: dict[str, list[str]] = {}
         arrays: dict[str, Any] = {}
         for name, raw in found.items():
@@ -106,10 +111,21 @@ def read_csv(path: Path) -> tuple[Description, Generator[Raw, None, None]]:
                 texts[name] = [bytes(item).decode() for item in items]
     except FileNotFoundError:
         raise ConfigError(
-            f"no {other}, which says what array {path.name} is of: `tactile-rt convert` makes both"
+            f"no {path}, which says what array {path.stem} is of: `tactile-rt convert` makes both"
         ) from None
     except (msgspec.MsgspecError, KeyError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{other} is damaged ({error})") from None
+        raise RecordingError(f"{path} is damaged ({error})") from None
+    return about, arrays, texts
+
+
+def read_csv(path: Path) -> tuple[Description, Generator[Raw, None, None]]:
+    """What it is of, and its messages.
+
+    Raises:
+        ConfigError: the file beside it is missing.
+        RecordingError: it is damaged, or holds something else.
+    """
+    about, arrays, texts = told_of(beside(path))
     whole = concatenate(list(_chunks(path, about.spec)))
     arrays |= {name: getattr(whole, name) for name in COLUMNS}
     return about, raws_of(str(path), about, arrays, texts)

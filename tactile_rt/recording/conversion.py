@@ -1,4 +1,5 @@
-"""A recording as plain arrays or text, and these as a recording again: bit for bit."""
+"""A recording as plain arrays or text, and these, or an episode of a LeRobot dataset, as a
+recording again: bit for bit."""
 
 from collections.abc import Generator, Iterable
 from contextlib import closing
@@ -9,8 +10,10 @@ from tactile_rt.files import write_whole
 from tactile_rt.recording.as_arrays import TEXTS, read_npz, write_npz
 from tactile_rt.recording.as_csv import beside, read_csv, write_csv
 from tactile_rt.recording.as_hdf5 import need_h5py, read_hdf5, write_hdf5
+from tactile_rt.recording.as_lerobot import is_dataset, read_dataset
 from tactile_rt.recording.description import RECOVERED, Description
 from tactile_rt.recording.layout import SAMPLES, Raw, decode_samples, need_mcap, samples_in
+from tactile_rt.recording.lerobot_meta import need_pyarrow
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.writer import McapFile
 from tactile_rt.stream import Chunk, ConfigError
@@ -27,8 +30,9 @@ def outputs_of(output: str | Path) -> list[Path]:
     return [path, beside(path)] if path.suffix == ".csv" else [path]
 
 
-def convert(path: str | Path, output: str | Path) -> int:
-    """Write a recording as ``.npz``, ``.csv`` or ``.h5``, or any of these as a recording again.
+def convert(path: str | Path, output: str | Path, episode: int = 0) -> int:
+    """Write a recording as ``.npz``, ``.csv`` or ``.h5``, or any of these, or an episode of a
+    LeRobot dataset that was made of recordings, as another of them or a recording again.
 
     All forms hold samples, description, decisions, events and health, and the chunks in which the
     samples came; raw packets stay behind. They are laid out in docs/recording.md. What is written
@@ -42,11 +46,11 @@ def convert(path: str | Path, output: str | Path) -> int:
         RecordingError: what is read is damaged, or has no samples.
     """
     path, output = Path(path), Path(output)
-    for file in (path, output):
-        _check_kind(file)
+    _check_kind(path)
+    _check_output(output)
     if path.suffix == output.suffix == MCAP:
         raise ConfigError(f"{path} is a recording already: {output} would be no other")
-    about, raws = _read(path)
+    about, raws = _read(path, episode)
     n = 0
 
     def fill(file: BinaryIO) -> None:
@@ -73,6 +77,13 @@ def chunks_of(path: str | Path) -> tuple[Description, Generator[Chunk, None, Non
 
 def _check_kind(path: Path) -> None:
     """Refuse what is no form of a recording, or needs an extra that is not there."""
+    if is_dataset(path):
+        need_pyarrow()
+    else:
+        _check_output(path)
+
+
+def _check_output(path: Path) -> None:
     if path.suffix not in (MCAP, *READERS):
         raise ConfigError(f"{path} is neither .mcap nor {', '.join(READERS)}")
     if path.suffix in HDF5:
@@ -81,7 +92,9 @@ def _check_kind(path: Path) -> None:
         need_mcap()
 
 
-def _read(path: Path) -> tuple[Description, Generator[Raw, None, None]]:
+def _read(path: Path, episode: int = 0) -> tuple[Description, Generator[Raw, None, None]]:
+    if is_dataset(path):
+        return read_dataset(path, episode)
     if path.suffix == MCAP:
         recording = Recording(path)
         return recording.description, recording.raw(SAMPLES, *TEXTS)

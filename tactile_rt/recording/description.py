@@ -24,7 +24,8 @@ __all__ = [
     "utc_offset_ns",
 ]
 
-LAYOUT_VERSION = 1
+LAYOUT_VERSION = 2
+READABLE = ("1", "2")  # 1: topics, samples and texts were not yet those of ROS 2
 METADATA, SESSION, SUMMARY, RECOVERED = "tactile_rt", "session", "summary", "recovered"
 
 
@@ -84,9 +85,10 @@ class Description:
             RecordingError: it is damaged, or of another version.
         """
         version = fields.get("version")
-        if version != str(LAYOUT_VERSION):
+        if version not in READABLE:
             raise RecordingError(
-                f"{what} is a recording of version {version!r}; this release reads {LAYOUT_VERSION}"
+                f"{what} is a recording of version {version!r}; this release reads "
+                f"{' and '.join(READABLE)}"
             )
         plain = unseal(what, fields)
         try:

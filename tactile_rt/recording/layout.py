@@ -1,23 +1,20 @@
-"""What is in a recording, byte by byte.
+"""What is in a recording, as it is written and read here; `ros2_form` says how it stands in the
+file.
 
-Samples and packets are ROS 2 messages in CDR (little-endian), which MCAP tools decode by the schema
-that stands in the file; health is JSON. A message's log time is UTC: the host's monotonic time and
-the offset that the metadata gives.
+Samples and packets are in CDR (little-endian), without a header; health, decisions and events are
+JSON.
 """
 
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
-import msgspec
 import numpy as np
 
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.stream import Chunk, ConfigError
 
 __all__ = [
-    "CHANNELS",
     "DECISIONS",
     "EVENTS",
     "HEALTH",
@@ -25,12 +22,12 @@ __all__ = [
     "WIRE",
     "Packet",
     "Raw",
-    "Schema",
     "decode_packet",
     "decode_samples",
     "encode_packet",
     "encode_samples",
     "is_message",
+    "last_ns",
     "need_mcap",
     "samples_in",
 ]
@@ -42,66 +39,6 @@ Packet = bytes | Sequence[CanFrame] | None  # None: the line was opened here
 
 _CDR = b"\x00\x01\x00\x00"  # little-endian, no options
 _FRAME = struct.Struct("<I???xI")  # and its data, padded to 4
-
-SAMPLES_MSG = """\
-# n consecutive samples of an array; its elements, channels and units are in the file's metadata
-int64[] seq          # (n,) sequence number of each sample; a gap means lost samples
-int64[] t_ns         # (n,) host monotonic time at which each was taken, ns
-uint32 elements
-uint32 channels
-float32[] values     # (n, element, channel), C order, SI units
-bool[] valid         # (n, element); false: no trustworthy value
-"""
-SERIAL_MSG = """\
-# bytes as they came from a serial line
-bool opened          # the line was opened here; no bytes
-uint8[] data
-"""
-CAN_MSG = f"""\
-# frames as they came from a CAN bus
-bool opened          # the bus was opened here; no frames
-tactile_rt/CanFrame[] frames
-{"=" * 80}
-MSG: tactile_rt/CanFrame
-uint32 id
-bool extended        # whether the identifier is of 29 bits
-bool fd
-bool remote
-uint8[] data
-"""
-HEALTH_SCHEMA: dict[str, Any] = {
-    "title": "tactile_rt health",
-    "type": "object",
-    "properties": {
-        "t_ns": {"type": "integer", "description": "host monotonic time, ns"},
-        "utc_offset_ns": {"type": "integer", "description": "UTC less monotonic time, now"},
-        "state": {"type": "string", "description": "connecting, streaming, stale, lost or closed"},
-        "reason": {"type": "string"},
-        "device": {"type": "object", "description": "as tactile_rt.drivers.health.Health"},
-        "stats": {"type": "object", "description": "samples, as tactile_rt.stream.SourceStats"},
-        "recorder": {"type": "object", "description": "what was recorded, and dropped"},
-    },
-}
-EVENT_SCHEMA: dict[str, Any] = {
-    "title": "tactile_rt decision, contact or health message",
-    "type": "object",
-    "properties": {
-        "type": {"type": "string", "description": "decision, contact or health"},
-        "version": {"type": "integer", "description": "of the messages, see docs/messages.md"},
-        "t_ns": {"type": "integer", "description": "host monotonic time, ns"},
-        "utc_ns": {"type": "integer", "description": "UTC, ns"},
-    },
-}
-
-
-@dataclass(frozen=True)
-class Schema:
-    """How a channel's messages are written."""
-
-    name: str
-    encoding: str
-    text: str
-    message_encoding: str
 
 
 @dataclass(frozen=True)
@@ -117,23 +54,6 @@ class Raw:
     topic: str
     t_ns: int
     data: bytes
-
-
-CHANNELS = {
-    (SAMPLES, ""): Schema("tactile_rt/msg/Samples", "ros2msg", SAMPLES_MSG, "cdr"),
-    (WIRE, "serial"): Schema("tactile_rt/msg/SerialPacket", "ros2msg", SERIAL_MSG, "cdr"),
-    (WIRE, "can"): Schema("tactile_rt/msg/CanPacket", "ros2msg", CAN_MSG, "cdr"),
-    (HEALTH, ""): Schema(
-        "tactile_rt.Health", "jsonschema", msgspec.json.encode(HEALTH_SCHEMA).decode(), "json"
-    ),
-    # At the end: a recording whose first piece is damaged is recovered by the order of these.
-    (DECISIONS, ""): Schema(
-        "tactile_rt.Decision", "jsonschema", msgspec.json.encode(EVENT_SCHEMA).decode(), "json"
-    ),
-    (EVENTS, ""): Schema(
-        "tactile_rt.Event", "jsonschema", msgspec.json.encode(EVENT_SCHEMA).decode(), "json"
-    ),
-}
 
 
 def need_mcap() -> None:
@@ -152,7 +72,7 @@ def need_mcap() -> None:
 
 
 def encode_samples(chunk: Chunk) -> bytes:
-    """A chunk as a message of `SAMPLES_MSG`."""
+    """A chunk as a message of ``Samples.msg``, less its header."""
     n, elements, channels = chunk.values.shape
     return b"".join(
         (
@@ -170,9 +90,15 @@ def encode_samples(chunk: Chunk) -> bytes:
 
 
 def samples_in(data: bytes) -> int:
-    """How many samples a message of `SAMPLES_MSG` holds."""
+    """How many samples a message of ``Samples.msg``, less its header holds."""
     (n,) = struct.unpack_from("<I", data, 4)
     return int(n)
+
+
+def last_ns(data: bytes) -> int:
+    """When the last sample of a message was taken, host time, ns."""
+    (t_ns,) = struct.unpack_from("<q", data, 12 + 16 * samples_in(data))
+    return int(t_ns)
 
 
 def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
@@ -209,7 +135,7 @@ def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
 
 
 def encode_packet(packet: Packet, wire: str) -> bytes:
-    """A raw packet as a message of `SERIAL_MSG` or `CAN_MSG`."""
+    """A raw packet as a message of ``SerialPacket.msg`` or ``CanPacket.msg``."""
     opened, things = packet is None, packet or b""
     parts = [_CDR, struct.pack("<?3xI", opened, len(things))]
     if wire == "serial":

@@ -38,7 +38,6 @@ from tactile_rt.recording.description import (
     utc_offset_ns,
 )
 from tactile_rt.recording.layout import (
-    CHANNELS,
     HEALTH,
     SAMPLES,
     WIRE,
@@ -46,7 +45,9 @@ from tactile_rt.recording.layout import (
     encode_packet,
     samples_in,
 )
+from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, FileForm
 from tactile_rt.recording.syncing import Extent, Syncer
+from tactile_rt.ros2.definitions import schema_text
 from tactile_rt.stream import Source
 
 __all__ = ["PART", "McapFile", "RecordingWriter", "WriterStats"]
@@ -61,37 +62,51 @@ class McapFile:
     Args:
         file: to write; not closed with this.
         about: what it is of.
+        further: channels besides those of a recording, and the ROS 2 message of each.
+
+    Attributes:
+        about: The description of what the file is of.
+        counts: The number of messages of each channel so far.
     """
 
-    def __init__(self, file: BinaryIO, about: Description) -> None:
+    def __init__(
+        self, file: BinaryIO, about: Description, further: Mapping[str, str] | None = None
+    ) -> None:
         import mcap.writer
 
         self.about, self._file = about, file
         # Checksums over the whole file, too: a record that is lost altogether must be noticed.
         self._writer: Any = mcap.writer.Writer(file, enable_data_crcs=True)
-        self._writer.start(profile="", library="tactile_rt")
+        self._writer.start(profile="ros2", library="tactile_rt")
         # In this order: a file that says what it is of has the notes, too, wherever it is cut.
         if about.session:
             self._writer.add_metadata(SESSION, seal(about.session))
         self._writer.add_metadata(METADATA, about.to_metadata())
+        self._form = FileForm(about)
         self._channels: dict[str, int] = {}
-        self._counts: dict[str, int] = {}
-        for topic, wire in CHANNELS:
-            if wire not in ("", about.wire):
-                continue
-            schema = CHANNELS[topic, wire]
-            kind = self._writer.register_schema(schema.name, schema.encoding, schema.text.encode())
-            self._channels[topic] = self._writer.register_channel(
-                topic, schema.message_encoding, kind
-            )
-            self._counts[topic] = 0
+        schemas: dict[str, int] = {}
+        kinds = {name: kind for (name, wire), kind in CHANNELS.items() if wire in ("", about.wire)}
+        for name, kind in (*kinds.items(), *(further or {}).items()):
+            if kind not in schemas:
+                text = schema_text(kind).encode()
+                schemas[kind] = self._writer.register_schema(kind, "ros2msg", text)
+            topic = self._form.topic(name)
+            self._channels[name] = self._writer.register_channel(topic, "cdr", schemas[kind])
+        self.counts = dict.fromkeys(self._channels, 0)
 
-    def add(self, topic: str, data: bytes, t_ns: int) -> None:
-        """Add a message of this host time, ns; messages are numbered so that none gets lost."""
+    def add(self, name: str, data: bytes, t_ns: int) -> None:
+        """Add a message, as `layout` has it, of this host time, ns."""
+        if not self.counts[ARRAY]:
+            self.put(ARRAY, self._form.array(t_ns), t_ns)
+        self.put(name, self._form.encode(name, data), t_ns)
+
+    def put(self, name: str, data: bytes, t_ns: int) -> None:
+        """Add a message as it is to stand in the file; messages are numbered so that none gets
+        lost."""
         utc = max(0, t_ns + self.about.utc_offset_ns)
-        count = self._counts[topic]
-        self._writer.add_message(self._channels[topic], utc, data, utc, count % SEQUENCES)
-        self._counts[topic] = count + 1
+        count = self.counts[name]
+        self._writer.add_message(self._channels[name], utc, data, utc, count % SEQUENCES)
+        self.counts[name] = count + 1
 
     def note(self, name: str, fields: Mapping[str, str]) -> None:
         """Add metadata."""

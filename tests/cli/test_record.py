@@ -104,6 +104,29 @@ def test_a_recording_is_converted_and_made_one_again(name, call, path):
     assert samples(again) == 300
 
 
+def test_a_bag_is_made_of_one_recording_or_more(call, path):
+    call("record", SOURCE, path)
+    bag = path.with_name("run-ros2")
+    assert call("convert", path, "--to", "ros2") == (0, f"{bag}: 300 samples\n", "")
+    assert samples(bag / "run-ros2_0.mcap") == 300 and (bag / "metadata.yaml").is_file()
+    assert call("convert", path, path, bag, "--to", "ros2")[0] == 2
+    assert call("convert", path, path, bag, "--to", "ros2", "--force")[1] == f"{bag}: 600 samples\n"
+
+
+def test_a_lerobot_dataset_is_made_and_made_one_again(call, path):
+    pytest.importorskip("pyarrow")
+    call("record", SOURCE, path)
+    made, again = path.with_name("run-lerobot"), path.with_name("again.mcap")
+    code, out, err = call("convert", path, "--to", "lerobot", "--fps", "50", "--task", "touch it")
+    assert (code, out, err) == (0, f"{made}: 300 samples, 1 episodes\n", "")
+    assert call("convert", made, again) == (0, f"{again}: 300 samples\n", "")
+    assert samples(again) == 300
+    precious = path.with_name("precious")
+    precious.mkdir()
+    code, _, err = call("convert", path, precious, "--to", "lerobot", "--force")
+    assert code == 2 and "nothing that --to lerobot made" in err
+
+
 def test_a_file_that_is_there_is_not_written_over(call, path):
     path.write_bytes(b"precious")
     code, out, err = call("record", SOURCE, path)
@@ -127,6 +150,10 @@ def test_a_file_that_is_there_is_not_written_over(call, path):
         (("convert", "text.mcap", "x.csv"), "text.mcap is not an MCAP file"),
         (("convert", "text.mcap", "x.mcap"), "text.mcap is a recording already"),
         (("convert", "none.npz", "x.mcap"), "no file none.npz"),
+        (("convert", "text.mcap"), "name a recording and what to write, or say what --to"),
+        (("convert", "text.mcap", "--to", "ros"), "did you mean ros2?"),
+        (("convert", "text.mcap", "--to", "ros2"), "text.mcap is not an MCAP file"),
+        (("convert", "none.mcap", "--to", "lerobot"), "no recording none.mcap"),
         (("run", "--source", "replay:text.mcap"), "text.mcap is no recording: it is neither MCAP"),
         (("run", "--source", "replay:"), "replay: needs a file"),
     ],

@@ -1,7 +1,6 @@
 """What docs/messages.md and docs/daemon.md show does what they say."""
 
 import contextlib
-import dataclasses
 import re
 import select
 import socket
@@ -29,7 +28,6 @@ from tests.helpers.published import (
     decision,
     event,
     running,
-    samples,
 )
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -174,27 +172,3 @@ def test_the_mqtt_example_does_as_it_says_to_a_stub(monkeypatch):
     ]
     assert publisher.details()["dropped"] == 1
     client.loop_stop.assert_called_once_with()
-
-
-@pytest.mark.usefixtures("still_clock")
-def test_the_ros_2_example_does_as_it_says_to_a_stub(monkeypatch):
-    node, text = mock.MagicMock(), mock.MagicMock()
-    stubs(
-        monkeypatch,
-        rclpy=dict.fromkeys(("Context", "init", "shutdown", "SignalHandlerOptions"), mock.Mock())
-        | {"create_node": lambda *a, **k: node},
-        rclpy__qos=dict.fromkeys(("HistoryPolicy", "QoSProfile", "ReliabilityPolicy"), mock.Mock()),
-        geometry_msgs__msg={"WrenchStamped": mock.MagicMock},
-        std_msgs__msg={"String": text},
-    )
-    names = loaded("ros2")
-    spec = dataclasses.replace(FORCES, channels=names["CHANNELS"], units=("N",) * 3 + ("N m",) * 3)
-    publisher = names["Ros2Publisher"]("r", names["Ros2Options"](wrenches=True, state_s=0))
-    with running(publisher):
-        publisher.handle([samples(spec, [[1, 2, 3, 4, 5, 6]] * 2, valid=[True, False]), decision()])
-    topics = [c.args[1] for c in node.create_publisher.call_args_list]
-    assert topics == ["tactile/whiskers/wrench/B1", "tactile/whiskers/decision"]
-    wrench, _ = [c.args[0] for c in node.create_publisher.return_value.publish.call_args_list]
-    force, torque = wrench.wrench.force, wrench.wrench.torque
-    assert (force.x, force.z, torque.x, torque.z) == (1, 3, 4, 6)
-    assert text.call_args.kwargs == {"data": encode(message_of(decision())).decode()}

@@ -89,10 +89,15 @@ def cdr(schema, data):
     texts = re.split(r"=+\n", schema)
     kinds = {"": texts[0]} | {t.split("\n")[0].removeprefix("MSG: "): t for t in texts[1:]}
     simple = {"bool": "?", "uint8": "B", "uint32": "I", "int64": "q", "float32": "f"}
+    simple |= {"int32": "i", "float64": "d"}
     at = 0
 
     def one(kind):
         nonlocal at
+        if kind == "string":
+            length = one("uint32")
+            at += length
+            return data[4 + at - length : 4 + at - 1].decode()
         if kind not in simple:
             return message(kind)
         size = struct.calcsize(simple[kind])
@@ -124,15 +129,20 @@ def test_any_mcap_reader_reads_it_by_the_schemas_in_the_file(path):
         reader = make_reader(file, validate_crcs=True)
         summary = reader.get_summary()
         topics = {c.topic: c.message_encoding for c in summary.channels.values()}
-        json = dict.fromkeys(("health", "decisions", "events"), "json")
-        assert topics == {"samples": "cdr", **json}
-        found = list(reader.iter_messages(topics=["samples"]))
+        names = ("samples", "health", "decisions", "events", "array")
+        assert topics == {f"/tactile/{SPEC.name}/{name}": "cdr" for name in names}
+        assert reader.get_header().profile == "ros2"
+        found = list(reader.iter_messages(topics=[f"/tactile/{SPEC.name}/samples"]))
         names = [m.name for m in reader.iter_metadata()]
     assert len(found) == len(chunks)
     assert names == ["tactile_rt", "summary"]
     for chunk, (schema, _, message) in zip(chunks, found, strict=True):
-        assert (schema.name, schema.encoding) == ("tactile_rt/msg/Samples", "ros2msg")
+        assert (schema.name, schema.encoding) == ("tactile_rt_msgs/msg/Samples", "ros2msg")
         fields = cdr(schema.data.decode(), message.data)
+        stamp = fields["header"]["stamp"]
+        utc_ns = int(chunk.t_ns[-1]) + Recording(path).description.utc_offset_ns
+        assert stamp["sec"] * 10**9 + stamp["nanosec"] == min(utc_ns, (2**31 - 1) * 10**9)
+        assert fields["header"]["frame_id"] == SPEC.frame
         assert fields["seq"] == chunk.seq.tolist()
         assert fields["t_ns"] == chunk.t_ns.tolist()
         assert (fields["elements"], fields["channels"]) == SPEC.shape
@@ -146,11 +156,12 @@ def test_any_mcap_reader_reads_it_by_the_schemas_in_the_file(path):
 def test_packets_are_read_by_their_schema(make, path):
     record_device(make(noise(50, (4, 6)), pace="fast"), path, 50)
     packets = list(Recording(path).packets())
+    wire = f"/tactile/{Recording(path).spec.name}/wire"
     from mcap.reader import make_reader
 
     with path.open("rb") as file:
         for (schema, _, message), (packet, t_ns) in zip(
-            make_reader(file).iter_messages(topics=["wire"]), packets, strict=True
+            make_reader(file).iter_messages(topics=[wire]), packets, strict=True
         ):
             fields = cdr(schema.data.decode(), message.data)
             assert fields["opened"] == (packet is None)

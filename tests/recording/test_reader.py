@@ -53,7 +53,7 @@ def newer(path):
     with path.open("wb") as file:
         other = Writer(file)
         other.start()
-        other.add_metadata("tactile_rt", {"version": "2"})
+        other.add_metadata("tactile_rt", {"version": "3"})
         other.finish()
 
 
@@ -65,7 +65,7 @@ def newer(path):
         (lambda p: p.write_bytes(b""), RecordingError, "not an MCAP file"),
         (lambda p: p.write_text("seq,t_ns\n"), RecordingError, "not an MCAP file"),
         (foreign, RecordingError, "no recording of tactile-rt"),
-        (newer, RecordingError, "of version '2'; this release reads 1"),
+        (newer, RecordingError, "of version '3'; this release reads 1 and 2"),
     ],
     ids=["missing", "folder", "empty", "text", "another's mcap", "newer"],
 )

@@ -14,6 +14,7 @@ PUBLISHERS = {
     "zmq": (f"{__name__}.zmq:ZmqPublisher", "publish"),
     "zenoh": (f"{__name__}.zenoh:ZenohPublisher", "publish"),
     "foxglove": (f"{__name__}.foxglove:FoxglovePublisher", "publish"),
+    "ros2": (f"{__name__}.ros2:Ros2Publisher", "ros2"),
 }
 ENTRY_POINTS = "tactile_rt.publishers"  # of other packages
 

@@ -14,6 +14,8 @@ from tactile_rt.daemon.publishers.connections import ConnectionLimit
 
 __all__ = [
     "Connections",
+    "Due",
+    "ListenerOptions",
     "Prefix",
     "Repeated",
     "Sender",
@@ -41,13 +43,40 @@ class SenderOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         samples: Whether samples are published, too.
         state_s: The time after which ``state`` and all ``array`` messages are repeated, for those
             that come late, s; 0: never.
-        connections: The number of connections at a time; more are shut down.
     """
 
     prefix: Prefix = "tactile"
     samples: bool = False
     state_s: StateSeconds = 1.0
+
+
+class ListenerOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Options of those that others connect to.
+
+    Attributes:
+        connections: The number of connections at a time; more are shut down.
+    """
+
     connections: Connections = 32
+
+
+class Due:
+    """Tells when something is due that is done again and again.
+
+    Args:
+        every_s: so often, s; 0: never.
+    """
+
+    def __init__(self, every_s: float) -> None:
+        self._every_s, self._at = every_s, 0.0
+
+    def now(self) -> bool:
+        """Whether it is; then it is done, and due again later."""
+        now = time.monotonic()
+        if not self._every_s or now < self._at:
+            return False
+        self._at = now + self._every_s
+        return True
 
 
 class Repeated:
@@ -58,14 +87,12 @@ class Repeated:
     """
 
     def __init__(self, every_s: float) -> None:
-        self._every_s, self._due = every_s, 0.0
+        self._due = Due(every_s)
 
     def messages(self, view: View) -> list[Message]:
         """Those that are due."""
-        now = time.monotonic()
-        if not self._every_s or now < self._due:
+        if not self._due.now():
             return []
-        self._due = now + self._every_s
         arrays = [m for m in map(message_of, view.streams().values()) if m is not None]
         return [*arrays, state_message(view.snapshot())]
 

@@ -13,8 +13,8 @@ from tactile_rt.daemon.consumer import View
 from tactile_rt.daemon.messages import Message, encode, topic_of
 from tactile_rt.daemon.publishers.connections import ConnectionLimit
 from tactile_rt.daemon.publishers.sending import (
+    ListenerOptions,
     Sender,
-    SenderOptions,
     is_port,
     tell_exposed,
 )
@@ -26,7 +26,7 @@ ON_PORTS = ("tcp", "udp", "tls", "quic", "ws")
 DROP = zenoh.CongestionControl.DROP
 
 
-class ZenohOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class ZenohOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Options of ``kind = "zenoh"``.
 
     Attributes:

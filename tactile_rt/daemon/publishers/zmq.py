@@ -11,8 +11,8 @@ from tactile_rt.daemon.consumer import View
 from tactile_rt.daemon.messages import Message, encode, topic_of
 from tactile_rt.daemon.publishers.connections import ConnectionLimit
 from tactile_rt.daemon.publishers.sending import (
+    ListenerOptions,
     Sender,
-    SenderOptions,
     is_port,
     tell_exposed,
 )
@@ -23,7 +23,7 @@ __all__ = ["ZmqOptions", "ZmqPublisher"]
 LINGER_MS = 200  # how long what was sent last may take to leave
 
 
-class ZmqOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class ZmqOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Options of ``kind = "zmq"``.
 
     Attributes:

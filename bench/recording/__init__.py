@@ -1,0 +1,1 @@
+"""Recordings in the hands of other people's programs."""

@@ -1,0 +1,308 @@
+"""Recordings as a LeRobot dataset (v3.0): an episode each, a row for each frame of the camera.
+
+    data/chunk-000/file-000.parquet      rows, a file for each episode
+    videos/...                           what a camera saw, if there is a film of it
+    meta/info.json, tasks, episodes, stats
+    meta/tactile_rt/episode-000000.json  what is no sample, so that it becomes the recording again
+
+What is needed: a camera has 30 frames a second, a sensor a thousand samples, and none may be lost;
+LeRobot knows one rate, that of the rows, and arrays of one shape.
+
+The plan. A row has all samples since the row before, in an array that is as long as the fullest row
+needs, and how many they are. A row at time t has samples up to t and none after it: what a policy
+could know then. ``observation.state``, which every policy reads, is the newest sample.
+
+It is read and written piece by piece; it need not fit into memory.
+"""
+
+from collections.abc import Generator, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.files import whole_folder
+from tactile_rt.recording.as_arrays import COLUMNS, TEXTS, Told, raws_of
+from tactile_rt.recording.as_csv import told_of, told_text
+from tactile_rt.recording.description import Description
+from tactile_rt.recording.layout import SAMPLES, Raw
+from tactile_rt.recording.lerobot_film import CameraFilm, write_film
+from tactile_rt.recording.lerobot_meta import (
+    DATA,
+    FRAME,
+    INFO,
+    Episode,
+    Statistics,
+    need_pyarrow,
+    write_meta,
+)
+from tactile_rt.recording.reader import Recording
+from tactile_rt.stream import (
+    NS_PER_S,
+    ArraySpec,
+    Chunk,
+    ConfigError,
+    RecordingError,
+    SpecMismatch,
+)
+
+__all__ = ["is_dataset", "read_dataset", "write_dataset"]
+
+STATE = "observation.state"
+TACTILE = "observation.tactile"
+COUNT = f"{TACTILE}.count"
+BLOCK_ROWS = 256  # written at once
+MOST_PADDING = 8  # times the samples: else they do not come as evenly as rows need
+FREE_CELLS = 1_000_000
+
+_Arrays = dict[str, NDArray[Any]]
+
+
+def is_dataset(path: Path) -> bool:
+    """Whether it is the folder of a LeRobot dataset."""
+    return (path / INFO).is_file()
+
+
+def write_dataset(
+    recordings: Sequence[Recording],
+    folder: Path,
+    fps: int = 30,
+    task: str = "",
+    films: Sequence[CameraFilm] = (),
+) -> int:
+    """Write recordings of one array as the episodes of a dataset; the number of samples.
+
+    Args:
+        recordings: An episode each.
+        folder: To make; one that is there is replaced.
+        fps: Rows a second.
+        task: What was done, in words, of all episodes; empty: what the note ``task`` of each
+            recording says, or its array's name.
+        films: What cameras saw, of one recording.
+
+    Raises:
+        ConfigError: An extra is missing, or a film is of no use.
+        RecordingError: A recording is damaged, has no samples, or its samples are spread too
+            unevenly for rows.
+        SpecMismatch: They are of several arrays.
+    """
+    pa, pq = need_pyarrow()
+    if films and len(recordings) != 1:
+        raise ConfigError("films go with one recording: make a dataset of each")
+    spec = recordings[0].spec
+    for other in recordings[1:]:
+        if differing := spec.differences(other.spec):
+            raise SpecMismatch(f"{other.path} is of another array: {differing[0]}")
+    ends = [_rows_of(recording, fps) for recording in recordings]
+    width = max(int(np.diff(end, prepend=0).max()) for end in ends)
+    schema = _schema(pa, spec, width)
+    n, first, episodes = 0, 0, []
+    with whole_folder(folder) as made:
+        tasks: dict[str, int] = {}
+        for k, (recording, end) in enumerate(zip(recordings, ends, strict=True)):
+            about = recording.description
+            said = task or about.session.get("task") or spec.name
+            episode = Episode(k, len(end), first, said, tasks.setdefault(said, len(tasks)))
+            told, state, values = Told(), Statistics(), Statistics()
+            path = made / DATA.format(k // 1000, k % 1000)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # A dictionary of values takes all kinds of NaN for one.
+            with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=False) as file:
+                for columns, samples in _blocks(recording, told, end, width):
+                    n += len(samples["seq"])
+                    state.add(columns[STATE])
+                    values.add(samples["values"], samples["valid"])
+                    columns |= episode.columns(columns["frame_index"], fps)
+                    file.write_table(_table(pa, schema, columns))
+            episode.statistics[STATE] = state.found()
+            episode.statistics[f"{TACTILE}.values"] = values.found(repeat=width)
+            for film in films:
+                episode.statistics[film.key] = write_film(film, made, len(end), fps)
+            beside = _beside(made, k)
+            beside.parent.mkdir(parents=True, exist_ok=True)
+            beside.write_bytes(told_text(about, told))
+            episodes.append(episode)
+            first += episode.rows
+        write_meta(made, fps, {**_features(spec, width), **FRAME}, episodes, tasks, films)
+    return n
+
+
+def _rows_of(recording: Recording, fps: int) -> NDArray[np.int64]:
+    """(row,) How many samples there are up to the end of each row; row k is at k / fps after the
+    first sample."""
+    t_ns = np.concatenate([chunk.t_ns for chunk in recording] or [np.zeros(0, np.int64)])
+    if not len(t_ns):
+        raise RecordingError(f"{recording.path} has no samples")
+    # Whole numbers: a sample that is taken at the very time of a row is in it.
+    times = t_ns.tolist()
+    row = [-(-max(0, t - times[0]) * fps // NS_PER_S) for t in times]
+    most = FREE_CELLS + MOST_PADDING * len(row)
+    if max(row) >= most:
+        raise _uneven(recording, max(row), len(row))
+    # Where time goes back, samples stay in their order.
+    last = np.maximum.accumulate(np.array(row, np.int64))
+    ends = np.searchsorted(last, np.arange(last[-1] + 1), side="right")
+    if len(ends) * int(np.diff(ends, prepend=0).max()) > most:
+        raise _uneven(recording, len(ends), len(row))
+    return ends
+
+
+def _uneven(recording: Recording, rows: int, samples: int) -> RecordingError:
+    return RecordingError(
+        f"{recording.path}: its {samples} samples are spread over {rows} rows too unevenly for "
+        "arrays of one length: convert what was recorded without a pause"
+    )
+
+
+def _blocks(
+    recording: Recording, told: Told, ends: NDArray[np.int64], width: int
+) -> Iterator[tuple[_Arrays, _Arrays]]:
+    """Columns of some rows, and the samples in them; all else is kept in `told`."""
+    spec = recording.spec
+    counts = np.diff(ends, prepend=0)
+    chunks = told.chunks(spec, recording.raw(SAMPLES, *TEXTS))
+    held: _Arrays = {
+        "seq": np.zeros(0, np.int64), "t_ns": np.zeros(0, np.int64),
+        "values": np.zeros((0, *spec.shape), np.float32),
+        "valid": np.zeros((0, spec.shape[0]), np.bool_),
+    }  # fmt: skip
+    newest = np.zeros(spec.shape, np.float32)
+    for first in range(0, len(counts), BLOCK_ROWS):
+        count = counts[first : first + BLOCK_ROWS]
+        need = int(count.sum())
+        more, n = list[Chunk](), len(held["seq"])
+        while n < need:
+            more.append(next(chunks))
+            n += len(more[-1])
+        whole: _Arrays = {
+            name: np.concatenate([kept, *(getattr(c, name) for c in more)])
+            for name, kept in held.items()
+        }
+        samples = {name: values[:need] for name, values in whole.items()}
+        held = {name: values[need:] for name, values in whole.items()}
+        columns: _Arrays = {
+            "frame_index": np.arange(first, first + len(count)), COUNT: count,
+        }  # fmt: skip
+        begins = np.cumsum(count) - count
+        row = np.repeat(np.arange(len(count)), count)
+        within = np.arange(need) - begins[row]
+        for name, values in samples.items():
+            padded = np.zeros((len(count), width, *values.shape[1:]), values.dtype)
+            padded[row, within] = values
+            columns[f"{TACTILE}.{name}"] = padded
+        states = []
+        for begin, many in zip(begins, count, strict=True):
+            mine = slice(begin, begin + many)
+            newest = _newest(newest, samples["values"][mine], samples["valid"][mine])
+            states.append(newest.ravel())
+        columns[STATE] = np.array(states)
+        yield columns, samples
+    for _ in chunks:  # what was told after the last sample
+        pass
+
+
+def _newest(
+    before: NDArray[np.float32], values: NDArray[np.float32], valid: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    """(element, channel) The newest value that can be trusted, of each element."""
+    found = before.copy()
+    for element in np.flatnonzero(valid.any(axis=0)):
+        found[element] = values[np.flatnonzero(valid[:, element])[-1], element]
+    return found
+
+
+def _features(spec: ArraySpec, width: int) -> dict[str, dict[str, Any]]:
+    """As ``info.json`` has them."""
+    elements, channels = list(spec.elements), list(spec.channels)
+
+    def feature(kind: str, *shape: int, names: Any = None) -> dict[str, Any]:
+        return {"dtype": kind, "shape": list(shape), "names": names}
+
+    flat = [f"{e}.{c}" for e in elements for c in channels]
+    return {
+        STATE: feature("float32", len(flat), names=flat),
+        COUNT: feature("int64", 1),
+        f"{TACTILE}.seq": feature("int64", width),
+        f"{TACTILE}.t_ns": feature("int64", width),
+        f"{TACTILE}.values": feature(
+            "float32", width, *spec.shape,
+            names={"sample": None, "element": elements, "channel": channels},
+        ),
+        f"{TACTILE}.valid": feature("bool", width, spec.shape[0]),
+    }  # fmt: skip
+
+
+def _schema(pa: Any, spec: ArraySpec, width: int) -> Any:
+    kinds = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}
+    fields = []
+    for name, feature in {**_features(spec, width), **FRAME}.items():
+        kind = kinds[feature["dtype"]]
+        for size in reversed(feature["shape"] if feature["shape"] != [1] else []):
+            kind = pa.list_(kind, size)
+        fields.append(pa.field(name, kind))
+    return pa.schema(fields)
+
+
+def _table(pa: Any, schema: Any, columns: _Arrays) -> Any:
+    arrays = []
+    for field in schema:
+        column = columns[field.name]
+        made = pa.array(column.ravel())
+        if pa.types.is_fixed_size_list(field.type):  # an array of one number is that number
+            for size in reversed(column.shape[1:]):
+                made = pa.FixedSizeListArray.from_arrays(made, size)
+        arrays.append(made)
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def _beside(folder: Path, episode: int) -> Path:
+    return folder / "meta" / "tactile_rt" / f"episode-{episode:06d}.json"
+
+
+def read_dataset(folder: Path, episode: int = 0) -> tuple[Description, Generator[Raw, None, None]]:
+    """What an episode is of, and its messages.
+
+    Raises:
+        ConfigError: No such episode, or pyarrow is missing.
+        RecordingError: It was not made of a recording, or is damaged.
+    """
+    _, pq = need_pyarrow()
+    beside = _beside(folder, episode)
+    if not beside.is_file():
+        there = len(list(beside.parent.glob("*.json")))
+        if not there:
+            raise RecordingError(
+                f"{folder} was not made of recordings, or is no longer as it was: no {beside}"
+            )
+        raise ConfigError(f"{folder} has episodes 0 to {there - 1}, not {episode}")
+    about, arrays, texts = told_of(beside)
+    what = f"{folder}, episode {episode}"
+    try:
+        info = msgspec.json.decode((folder / INFO).read_bytes(), type=dict[str, Any])
+        names = [COUNT, *(f"{TACTILE}.{name}" for name in COLUMNS)]
+        filters = [("episode_index", "==", episode)]
+        pieces: list[_Arrays] = []
+        for path in sorted((folder / "data").glob("*/*.parquet")):
+            table = pq.read_table(path, columns=[*names, "episode_index"], filters=filters)
+            pieces += [_samples(batch, info["features"]) for batch in table.to_batches()]
+        arrays |= {name: np.concatenate([p[name] for p in pieces]) for name in COLUMNS}
+    except Exception as error:  # as for any damaged file
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise RecordingError(f"{what} is damaged ({reason})") from None
+    return about, raws_of(what, about, arrays, texts)
+
+
+def _samples(batch: Any, features: dict[str, Any]) -> _Arrays:
+    """The samples of some rows, without what fills the rows up."""
+    count = batch.column(COUNT).to_numpy(zero_copy_only=False)
+    found = {}
+    for name in COLUMNS:
+        feature = features[f"{TACTILE}.{name}"]
+        column = batch.column(f"{TACTILE}.{name}")
+        while hasattr(column.type, "value_type"):
+            column = column.flatten()
+        padded = column.to_numpy(zero_copy_only=False).reshape(len(count), *feature["shape"])
+        found[name] = padded[np.arange(padded.shape[1]) < count[:, None]]
+    return found

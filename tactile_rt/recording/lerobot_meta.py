@@ -1,0 +1,250 @@
+"""What a LeRobot dataset (v3.0) says of itself: ``meta/``.
+
+Its names and shapes are LeRobot's; https://github.com/huggingface/lerobot, ``datasets/utils.py``.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.recording.lerobot_film import VIDEO, CameraFilm
+from tactile_rt.stream import ConfigError
+
+__all__ = ["DATA", "FRAME", "INFO", "Episode", "Statistics", "need_pyarrow", "write_meta"]
+
+INFO = "meta/info.json"
+DATA = "data/chunk-{:03d}/file-{:03d}.parquet"
+CODEBASE = "v3.0"
+IN_CHUNK = 1000  # files of a folder
+# What every row has besides.
+FRAME: dict[str, dict[str, Any]] = {
+    "timestamp": {"dtype": "float32", "shape": [1], "names": None},
+    **{
+        name: {"dtype": "int64", "shape": [1], "names": None}
+        for name in ("frame_index", "episode_index", "index", "task_index")
+    },
+}
+QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
+MOST_KEPT = 10_000  # rows of numbers, of which quantiles are taken
+
+
+def need_pyarrow() -> tuple[Any, Any]:
+    """The modules ``pyarrow`` and ``pyarrow.parquet``.
+
+    Raises:
+        ConfigError: The extra is not installed.
+    """
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"LeRobot datasets need {error.name}, which is not installed: "
+            "pip install 'tactile-rt[lerobot]'"
+        ) from None
+    return pyarrow, pyarrow.parquet
+
+
+@dataclass
+class Episode:
+    """An episode: a recording.
+
+    Attributes:
+        index: The number of the episode, from 0.
+        rows: The number of rows.
+        first: The number of rows of all episodes before it.
+        task: What was done, in words.
+        task_index: The number of that task.
+        statistics: The statistics of each feature, as `Statistics.found` gives them.
+    """
+
+    index: int
+    rows: int
+    first: int
+    task: str
+    task_index: int
+    statistics: dict[str, dict[str, NDArray[Any]]] = field(default_factory=dict)
+
+    def columns(self, frame: NDArray[np.int64], fps: int) -> dict[str, NDArray[Any]]:
+        """What some rows have besides samples.
+
+        Args:
+            frame: (row,) Their numbers within the episode.
+            fps: Rows a second.
+        """
+        return {
+            "timestamp": (frame / fps).astype(np.float32),
+            "frame_index": frame,
+            "episode_index": np.full(len(frame), self.index),
+            "index": frame + self.first,
+            "task_index": np.full(len(frame), self.task_index),
+        }
+
+
+class Statistics:
+    """What policies scale their inputs by; added to piece by piece.
+
+    Quantiles are of every so many rows, at most `MOST_KEPT` of them; all else is of all.
+    """
+
+    def __init__(self) -> None:
+        self._n: Any = 0
+        self._sum: Any = 0.0
+        self._squares: Any = 0.0
+        self._least: Any = np.inf
+        self._most: Any = -np.inf
+        self._kept: list[NDArray[np.float32]] = []
+        self._every, self._seen = 1, 0
+
+    def add(self, values: NDArray[np.float32], valid: NDArray[np.bool_] | None = None) -> None:
+        """Count some rows in.
+
+        Args:
+            values: (n, ...) Numbers.
+            valid: (n, ...) Which of them count, of a shape that begins as that of `values`.
+        """
+        good = np.isfinite(values)
+        if valid is not None:
+            good &= valid.reshape(valid.shape + (1,) * (values.ndim - valid.ndim))
+        exact = np.where(good, values, 0).astype(np.float64)
+        self._n = self._n + good.sum(axis=0)
+        self._sum = self._sum + exact.sum(axis=0)
+        self._squares = self._squares + (exact**2).sum(axis=0)
+        for row in np.where(good, values, np.nan)[(-self._seen) % self._every :: self._every]:
+            self._kept.append(row)
+        self._seen += len(values)
+        if len(values):
+            self._least = np.minimum(self._least, np.where(good, values, np.inf).min(axis=0))
+            self._most = np.maximum(self._most, np.where(good, values, -np.inf).max(axis=0))
+        while len(self._kept) > MOST_KEPT:
+            self._kept, self._every = self._kept[::2], 2 * self._every
+
+    def found(self, repeat: int = 0) -> dict[str, NDArray[Any]]:
+        """By LeRobot's names; where nothing counted, 0.
+
+        Args:
+            repeat: Say it so many times, along a new first axis; 0: once, without one.
+        """
+        n = np.maximum(self._n, 1)
+        mean = self._sum / n
+        one = {
+            "min": self._least, "max": self._most, "mean": mean,
+            "std": np.sqrt(np.maximum(self._squares / n - mean**2, 0)),
+        }  # fmt: skip
+        kept = np.array(self._kept)
+        kept[:, np.isnan(kept).all(axis=0)] = 0  # what never counted
+        one |= {name: np.nanquantile(kept, q, axis=0) for name, q in QUANTILES.items()}
+        one = {name: np.where(np.isfinite(value), value, 0.0) for name, value in one.items()}
+        if repeat:
+            one = {k: np.broadcast_to(v, (repeat, *v.shape)) for k, v in one.items()}
+        return {**one, "count": np.array([self._seen])}
+
+
+def write_meta(
+    folder: Path,
+    fps: int,
+    features: Mapping[str, Mapping[str, Any]],
+    episodes: Sequence[Episode],
+    tasks: Mapping[str, int],
+    films: Sequence[CameraFilm],
+) -> None:
+    """Write all of it but what is ours."""
+    pa, pq = need_pyarrow()
+    info = {
+        "codebase_version": CODEBASE,
+        "robot_type": "tactile_rt",
+        "total_episodes": len(episodes),
+        "total_frames": sum(e.rows for e in episodes),
+        "total_tasks": len(tasks),
+        "chunks_size": IN_CHUNK,
+        "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+        "fps": fps,
+        "splits": {"train": f"0:{len(episodes)}"},
+        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+        "video_path": VIDEO if films else None,
+        "features": {**features, **{film.key: film.feature(fps) for film in films}},
+    }
+    (folder / INFO).write_bytes(msgspec.json.format(msgspec.json.encode(info), indent=4))
+    (folder / "meta" / "stats.json").write_bytes(msgspec.json.encode(_all_of(episodes)))
+    pq.write_table(_tasks(pa, tasks), folder / "meta" / "tasks.parquet")
+    path = folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet"
+    path.parent.mkdir(parents=True)
+    rows = [_episode(e, fps, films) for e in episodes]
+    pq.write_table(pa.Table.from_pylist(rows), path, compression="zstd")
+
+
+def _episode(episode: Episode, fps: int, films: Sequence[CameraFilm]) -> dict[str, Any]:
+    chunk, file = divmod(episode.index, IN_CHUNK)
+    row: dict[str, Any] = {
+        "episode_index": episode.index,
+        "tasks": [episode.task],
+        "length": episode.rows,
+        "data/chunk_index": chunk,
+        "data/file_index": file,
+        "dataset_from_index": episode.first,
+        "dataset_to_index": episode.first + episode.rows,
+        "meta/episodes/chunk_index": 0,
+        "meta/episodes/file_index": 0,
+    }
+    for film in films:
+        row |= {
+            f"videos/{film.key}/chunk_index": 0,
+            f"videos/{film.key}/file_index": 0,
+            f"videos/{film.key}/from_timestamp": 0.0,
+            f"videos/{film.key}/to_timestamp": episode.rows / fps,
+        }
+    for feature, found in episode.statistics.items():
+        row |= {f"stats/{feature}/{name}": value.tolist() for name, value in found.items()}
+    return row
+
+
+def _all_of(episodes: Sequence[Episode]) -> dict[str, Any]:
+    """Statistics of all episodes together; quantiles are the means of theirs, as LeRobot has it."""
+    made: dict[str, Any] = {}
+    for feature in episodes[0].statistics:
+        each = [e.statistics[feature] for e in episodes]
+        weight = np.array([float(found["count"][0]) for found in each])
+        weight /= weight.sum()
+
+        def mean(values: list[NDArray[Any]], w: NDArray[np.float64] = weight) -> NDArray[Any]:
+            return np.tensordot(w, np.array(values), 1)
+
+        whole = {name: mean([f[name] for f in each]) for name in ("mean", *QUANTILES)}
+        spread = [f["std"] ** 2 + (f["mean"] - whole["mean"]) ** 2 for f in each]
+        made[feature] = {
+            "min": np.min([f["min"] for f in each], axis=0).tolist(),
+            "max": np.max([f["max"] for f in each], axis=0).tolist(),
+            "std": np.sqrt(mean(spread)).tolist(),
+            "count": [int(sum(f["count"][0] for f in each))],
+            **{name: value.tolist() for name, value in whole.items()},
+        }
+    return made
+
+
+def _tasks(pa: Any, tasks: Mapping[str, int]) -> Any:
+    """As pandas would write a table whose index the tasks are: LeRobot reads it so."""
+    index = "__index_level_0__"
+    text = {"pandas_type": "unicode", "numpy_type": "object"}
+    about = {
+        "index_columns": [index],
+        "column_indexes": [
+            {"name": None, "field_name": None, **text, "metadata": {"encoding": "UTF-8"}}
+        ],
+        "columns": [
+            {
+                "name": "task_index", "field_name": "task_index", "pandas_type": "int64",
+                "numpy_type": "int64", "metadata": None,
+            },
+            {"name": None, "field_name": index, **text, "metadata": None},
+        ],
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.2.0",
+    }  # fmt: skip
+    table = pa.table({"task_index": list(tasks.values()), index: list(tasks)})
+    return table.replace_schema_metadata({"pandas": msgspec.json.encode(about)})

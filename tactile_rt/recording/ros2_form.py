@@ -1,0 +1,116 @@
+"""How what is recorded stands in the file: every channel is a ROS 2 topic of a message whose
+definition is in the file, so that whatever reads ROS 2 reads it.
+
+    /tactile/whiskers/samples    tactile_rt_msgs/msg/Samples
+
+A recording of layout 1 had topics such as ``samples``, samples without a header, and all but
+samples and packets as JSON.
+"""
+
+from tactile_rt.recording.description import Description
+from tactile_rt.recording.layout import (
+    DECISIONS,
+    EVENTS,
+    HEALTH,
+    SAMPLES,
+    WIRE,
+    is_message,
+    last_ns,
+)
+from tactile_rt.ros2 import messages
+from tactile_rt.ros2.cdr import CDR
+from tactile_rt.ros2.definitions import token
+
+__all__ = [
+    "ARRAY",
+    "CHANNELS",
+    "TEXTS",
+    "WRENCH",
+    "FileForm",
+    "is_in_file_form",
+    "name_of",
+    "plain",
+]
+
+ARRAY, WRENCH = "array", "wrench"
+# In the order in which they are numbered, by which a file is recovered whose beginning is damaged.
+CHANNELS = {
+    (SAMPLES, ""): messages.SAMPLES,
+    (WIRE, "serial"): f"{messages.OURS}/SerialPacket",
+    (WIRE, "can"): f"{messages.OURS}/CanPacket",
+    (HEALTH, ""): messages.EVENT,
+    (DECISIONS, ""): messages.DECISION,
+    (EVENTS, ""): messages.EVENT,
+    (ARRAY, ""): messages.ARRAY,
+}
+PREFIX = "tactile"
+TEXTS = (HEALTH, DECISIONS, EVENTS)
+
+
+class FileForm:
+    """How the messages of one recording stand in its file.
+
+    Args:
+        about: What it is of.
+    """
+
+    def __init__(self, about: Description) -> None:
+        self._spec, self._offset_ns = about.spec, about.utc_offset_ns
+        self._source = about.session.get("daemon_source") or about.spec.name
+
+    def topic(self, name: str) -> str:
+        """The topic of a channel such as ``samples``."""
+        return f"/{PREFIX}/{token(self._source)}/{name}"
+
+    def array(self, t_ns: int) -> bytes:
+        """What the array is, told at this host time, ns."""
+        return messages.array_message(self._spec, self._source, t_ns + self._offset_ns)
+
+    def encode(self, name: str, data: bytes) -> bytes:
+        """A message of `layout` as it stands in the file."""
+        if name == SAMPLES:
+            return messages.stamped(data, last_ns(data) + self._offset_ns, self._spec.frame)
+        if name == DECISIONS:
+            return messages.decision_message(data)
+        return messages.event_message(data) if name in TEXTS else data
+
+
+def name_of(topic: str) -> tuple[str, bool]:
+    """The channel of a topic, such as ``samples``, and whether its messages stand as `FileForm`
+    writes them; else as in layout 1, or they are nothing of ours."""
+    parts = topic.split("/")
+    if len(parts) == 4 and parts[:2] == ["", PREFIX]:
+        return parts[3], True
+    return " ".join(topic.split()), False
+
+
+def plain(name: str, data: bytes) -> bytes:
+    """What was given to `FileForm.encode`.
+
+    Raises:
+        ValueError: It is no such message.
+    """
+    if name == SAMPLES:
+        return messages.unstamped(data)
+    if name in TEXTS:
+        return messages.json_of(messages.DECISION if name == DECISIONS else messages.EVENT, data)
+    return data
+
+
+def is_in_file_form(name: str, data: bytes, shape: tuple[int, int]) -> bool:
+    """Whether data can be what `FileForm.encode` gave for a message of this channel, as far as its
+    length, beginning and end tell.
+
+    Args:
+        name: The channel.
+        data: The message.
+        shape: (element, channel) of the array.
+    """
+    if name in TEXTS:
+        return data[:4] == CDR and data[-2:] == b"}\0"
+    if name != SAMPLES:
+        return is_message(name, data, shape)
+    try:
+        return is_message(name, messages.unstamped(data), shape)
+    except ValueError:
+        return False
