@@ -268,7 +268,8 @@ def _sniff_bag(path: Path) -> None:
     from rich.table import Table
 
     from tactile_rt.recording import Recording
-    from tactile_rt.recording.importing.bag import OURS, bag_topics
+    from tactile_rt.recording.importing.bag import bag_topics
+    from tactile_rt.ros2 import messages
 
     try:
         about = Recording(path).description if path.suffix == ".mcap" else None
@@ -283,7 +284,7 @@ def _sniff_bag(path: Path) -> None:
     for topic in topics:
         table.add_row(topic.name, topic.type, str(topic.messages), topic.columns)
     Console(soft_wrap=True).print(table)
-    known = [t for t in topics if t.columns or t.type == OURS]
+    known = [t for t in topics if t.columns or t.type == messages.SAMPLES]
     if not known:
         _nothing(f"{path}: of no topic is known what is what", "`import` takes it with --columns")
     best = max(known, key=lambda t: t.messages)

@@ -18,6 +18,7 @@ __all__ = [
     "SAMPLES",
     "WRENCH",
     "array_message",
+    "array_of",
     "decision_message",
     "event_message",
     "json_of",
@@ -204,6 +205,29 @@ def _matrix(quaternion: tuple[float, float, float, float]) -> NDArray[np.float64
 
 def _vector(numbers: Any) -> Mapping[str, float]:
     return dict(zip("xyz", numbers, strict=True))
+
+
+def array_of(data: bytes) -> ArraySpec:
+    """The array that a message of `array_message` tells of.
+
+    Raises:
+        ValueError: It is no such message.
+    """
+    told = cdr.decode(ARRAY, data)
+    poses = told["poses"]
+    return ArraySpec(
+        name=told["name"],
+        elements=tuple(told["elements"]),
+        grid=tuple(zip(map(int, told["rows"]), map(int, told["columns"]), strict=True)),
+        positions=tuple((p["x"], p["y"], p["z"]) for p in (pose["position"] for pose in poses)),
+        orientations=tuple(
+            (q["w"], q["x"], q["y"], q["z"]) for q in (pose["orientation"] for pose in poses)
+        ),
+        channels=tuple(told["channels"]),
+        units=tuple(told["units"]),
+        rate_hz=float(told["rate_hz"]),
+        frame=told["header"]["frame_id"],
+    )
 
 
 def _header(utc_ns: int, frame: str) -> dict[str, Any]:

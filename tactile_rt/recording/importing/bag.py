@@ -24,13 +24,14 @@ from tactile_rt.recording.importing.table import Table, import_table, shown_name
 from tactile_rt.recording.layout import decode_samples
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC
+from tactile_rt.recording.ros2_form import ARRAY
+from tactile_rt.ros2 import messages
 from tactile_rt.settings import nearest
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError, concatenate
 
-__all__ = ["OURS", "BagTopic", "bag_topics", "import_bag", "is_bag"]
+__all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag"]
 
 SQLITE: Final = b"SQLite format 3\0"
-OURS: Final = "tactile_rt/msg/Samples"
 MOST: Final = 4096  # fields of a message that are columns
 # What messages are of: columns by the end of the type's name, with {} for the frame's name.
 KNOWN: Final = {
@@ -47,7 +48,7 @@ KNOWN: Final = {
     "std_msgs/msg/Float32": "data={0}.value",
     "std_msgs/msg/Float64": "data={0}.value",
 }  # fmt: skip
-ARRAY: Final = re.compile(r"std_msgs/msg/(?:U?Int(?:8|16|32|64)|Float(?:32|64))MultiArray")
+NUMBERS: Final = re.compile(r"std_msgs/msg/(?:U?Int(?:8|16|32|64)|Float(?:32|64))MultiArray")
 _NO_NAME: Final = re.compile(r"[^A-Za-z0-9_-]+")
 
 
@@ -125,7 +126,7 @@ def import_bag(
         raise ConfigError(f"{path} is a recording already: `tactile-rt replay` and run take it")
     chosen = _chosen(path, bag_topics(path), topic, columns)
     with open_bag(path) as bag:
-        if chosen.type == OURS and not columns:
+        if chosen.type == messages.SAMPLES and not columns:
             return _own(path, bag, chosen, output, array)
         if array:
             raise ConfigError(f"--array is for samples of ours, not for {chosen.type}")
@@ -147,7 +148,7 @@ def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> Bag
             if one.name in (topic, f"/{topic}"):
                 return one
         raise ConfigError(f"{path}: no topic {topic!r}; {nearest(topic, [t.name for t in topics])}")
-    fitting = topics if columns else [t for t in topics if t.columns or t.type == OURS]
+    fitting = topics if columns else [t for t in topics if t.columns or t.type == messages.SAMPLES]
     if len(fitting) == 1:
         return fitting[0]
     told = ", ".join(f"{t.name} ({t.type})" for t in fitting or topics) or "none"
@@ -171,7 +172,7 @@ def _columns_of(kind: str, message: Any) -> str:
     """What a message of this type is a sample of, in words; empty: only a user can tell."""
     if kind in KNOWN:
         return KNOWN[kind].format(_frame_of(message))
-    if not ARRAY.fullmatch(kind) or not len(message.data):
+    if not NUMBERS.fullmatch(kind) or not len(message.data):
         return ""
     sizes = [d.size for d in message.layout.dim] or [len(message.data)]
     if int(np.prod(sizes)) != len(message.data):
@@ -244,7 +245,8 @@ def _stamp(message: Any) -> int:
 
 def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str) -> Import:
     """Samples of ours in a bag of others: bit for bit."""
-    account, told = Import(notes=bag.notes), read_array(Path(array)) if array else None
+    account = Import(notes=bag.notes)
+    told = read_array(Path(array)) if array else _array_in(bag, topic.name)
     chunks: list[Chunk] = []
     offset = 0
     for t_ns, raw, message in bag.messages(topic.name):
@@ -254,18 +256,20 @@ def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str) ->
         shape = int(message.elements), int(message.channels)
         if told is not None and shape != told.shape:
             raise ConfigError(
-                f"{array} is of {told.shape[0]} x {told.shape[1]}, {topic.name} of "
-                f"{shape[0]} x {shape[1]}"
+                f"{array or 'the array in the bag'} is of {told.shape[0]} x {told.shape[1]}, "
+                f"{topic.name} of {shape[0]} x {shape[1]}"
             )
         try:
-            chunk = decode_samples(bytes(raw), shape)
+            chunk = decode_samples(messages.unstamped(bytes(raw)), shape)
         except ValueError:
             account.corrupt += 1
             continue
         if chunks and chunk.values.shape[1:] != chunks[0].values.shape[1:]:
             account.corrupt += 1
             continue
-        offset = offset if chunks else t_ns - int(chunk.t_ns[-1])
+        stamp = message.header.stamp
+        told_ns = int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+        offset = offset if chunks else (told_ns or t_ns) - int(chunk.t_ns[-1])
         chunks.append(chunk)
         account.intact += 1
     if not chunks:
@@ -279,6 +283,19 @@ def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str) ->
         session={"imported": path.name, "topic": topic.name},
     )  # fmt: skip
     return write_chunks(output, about, whole, account, str(path))
+
+
+def _array_in(bag: OpenBag, samples: str) -> ArraySpec | None:
+    """What the bag says of the array that the samples of a topic are of, if it does."""
+    beside = f"{samples.rpartition('/')[0]}/{ARRAY}"
+    if bag.types.get(beside) != messages.ARRAY:
+        return None
+    for _, raw, _ in bag.messages(beside):
+        try:
+            return messages.array_of(bytes(raw))
+        except (ValueError, TypeError, KeyError):
+            continue
+    return None
 
 
 def _unnamed(name: str, chunk: Chunk) -> ArraySpec:

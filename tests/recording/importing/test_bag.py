@@ -9,7 +9,9 @@ import pytest
 
 from tactile_rt.recording import Recording
 from tactile_rt.recording.importing.bag import bag_topics, import_bag, is_bag
-from tactile_rt.recording.layout import SAMPLES_MSG, encode_samples
+from tactile_rt.recording.layout import encode_samples
+from tactile_rt.ros2 import messages
+from tactile_rt.ros2.definitions import schema_text
 from tactile_rt.stream import ConfigError, RecordingError, TactileError, concatenate
 from tactile_rt.testing import cut, small_spec
 
@@ -23,7 +25,7 @@ T0, STEP, N = 1_700_000_000_000_000_000, 10_000_000, 60
 FORMS = ("ros1", "sqlite3", "mcap")
 
 
-def bag(folder, form):
+def bag(folder, form, told=False):
     """A bag with wrenches, an array, chatter, and samples of ours."""
     if form == "ros1":
         store = get_typestore(Stores.ROS1_NOETIC)
@@ -35,10 +37,15 @@ def bag(folder, form):
     path = folder / form
     with Writer2(path, version=9, storage_plugin=StoragePlugin[form.upper()]) as writer:
         fill(store, writer, store.serialize_cdr, {})
-        store.register(get_types_from_msg(SAMPLES_MSG, "tactile_rt/msg/Samples"))
-        ours = writer.add_connection("/ours", "tactile_rt/msg/Samples", typestore=store)
+        for message in (messages.SAMPLES, messages.ARRAY):
+            store.register(get_types_from_msg(schema_text(message), message))
+        ours = writer.add_connection("/skin/samples", messages.SAMPLES, typestore=store)
         for k, chunk in enumerate(our_chunks()):
-            writer.write(ours, T0 + k, encode_samples(chunk))
+            stamp = T0 + int(chunk.t_ns[-1])
+            writer.write(ours, T0 + k, messages.stamped(encode_samples(chunk), stamp, "mount"))
+        if told:
+            array = writer.add_connection("/skin/array", messages.ARRAY, typestore=store)
+            writer.write(array, T0, messages.array_message(small_spec(), "skin", T0))
     return path
 
 
@@ -106,15 +113,22 @@ def test_an_array_has_the_shape_of_its_layout_and_the_bags_times(tmp_path, form)
 
 @pytest.mark.parametrize("form", ["sqlite3", "mcap"])
 def test_samples_of_ours_come_back_bit_for_bit(tmp_path, form):
-    _made, chunk, about = imported(bag(tmp_path, form), tmp_path / "o.mcap", topic="/ours")
+    _made, chunk, about = imported(bag(tmp_path, form), tmp_path / "o.mcap", topic="/skin/samples")
     ours = concatenate(our_chunks())
     assert chunk.values.tobytes() == ours.values.tobytes()
     assert chunk.t_ns.tolist() == ours.t_ns.tolist() and chunk.seq.tolist() == ours.seq.tolist()
     assert about.spec.elements[0] == "T0" and about.spec.rate_hz == 1000
     (tmp_path / "a.json").write_text(small_spec().to_json())
     array = str(tmp_path / "a.json")
-    _, _, told = imported(tmp_path / form, tmp_path / "p.mcap", topic="/ours", array=array)
-    assert told.spec == small_spec()
+    _, _, told = imported(tmp_path / form, tmp_path / "p.mcap", topic="/skin/samples", array=array)
+    assert told.spec == small_spec() and told.utc_offset_ns == T0
+
+
+def test_the_array_of_samples_of_ours_is_told_in_the_bag(tmp_path):
+    path = bag(tmp_path, "mcap", told=True)
+    _, chunk, about = imported(path, tmp_path / "o.mcap", topic="/skin/samples")
+    assert about.spec == small_spec()
+    assert chunk.values.tobytes() == concatenate(our_chunks()).values.tobytes()
 
 
 def test_columns_say_what_nobody_knows(tmp_path):
@@ -128,7 +142,7 @@ def test_columns_say_what_nobody_knows(tmp_path):
 
 def test_topics_are_told_with_what_they_are(tmp_path):
     topics = {t.name: t for t in bag_topics(bag(tmp_path, "mcap"))}
-    assert set(topics) == {"/ft/wrench", "/skin", "/talk", "/ours"}
+    assert set(topics) == {"/ft/wrench", "/skin", "/talk", "/skin/samples"}
     assert topics["/skin"].messages == N and topics["/talk"].columns == ""
     assert topics["/ft/wrench"].columns.startswith("wrench.force.x=tool0_ft.fx:N,")
 
