@@ -7,6 +7,7 @@ strict, pooling, paper_code, building   the two protocols: recordings -> a froze
 benchmark, benchmark_file   the frozen benchmark and its file
 scoring, statistics      a model's layers -> score, exact p-value
 stimuli_input, layers, activations, onnx_taps, onnx_activations, loading   a model -> its layers
+metrics/, targets        more than 15 numbers: metrics in a table, layers of cortex, types of cell
 fidelity, gate, decoding, results, pictures, report   what is done with them
 """
 
