@@ -30,8 +30,8 @@ from tests.helpers.source_tree import (
     why_a_fragment,
 )
 
-# What is loaded by its name when it is asked for: sources, codecs, publishers, encoders, metrics, data
-# sets of recordings, commands, rigs, and what `from tactile_rt import ...` gives.
+# What is loaded by its name when it is asked for: sources, codecs, publishers, encoders, metrics,
+# datasets, commands, rigs, and what `from tactile_rt import ...` gives.
 TABLES = {
     "tactile_rt",
     "tactile_rt.cli",
