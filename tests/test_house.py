@@ -39,6 +39,7 @@ TABLES = {
     "tactile_rt.daemon.publishers",
     "tactile_rt.drivers.codec",
     "tactile_rt.models",
+    "tactile_rt.models.alignment.datasets",
     "tactile_rt.models.alignment.metrics",
     "tactile_rt.models.ead",
     "tactile_rt.models.training",

@@ -53,20 +53,29 @@ def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float,
 
 
 def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | None:
-    """Layers of a checkpoint's network before training; None for any other file.
+    """Layers of a model's network before training: of the same architecture, with random weights.
+
+    An ONNX file knows its architecture by the card in its metadata. None for responses, and for a
+    card that does not name its network.
 
     Raises:
         ModelError: not such a file.
         ConfigError: a seed below 0.
     """
-    if path.suffix != CHECKPOINT:
+    if path.suffix == RESPONSES:
         return None
     if seed < 0:
         raise ConfigError(f"a seed is at least 0, not {seed}")
-    from tactile_rt.models.alignment.activations import untrained_layers
-    from tactile_rt.models.checkpoints import load_checkpoint
+    from tactile_rt.models.alignment.activations import (
+        untrained_card_layers,
+        untrained_layers,
+    )
 
-    return untrained_layers(load_checkpoint(path)[1], stimuli, seed)
+    if path.suffix == CHECKPOINT:
+        from tactile_rt.models.checkpoints import load_checkpoint
+
+        return untrained_layers(load_checkpoint(path)[1], stimuli, seed)
+    return untrained_card_layers(read_model(path, None)[0], stimuli, seed)
 
 
 def _accuracy(figures: object) -> tuple[float, str] | None:

@@ -1,8 +1,8 @@
 """Parts of an animal's cortex as targets of their own: a layer, or a type of cell.
 
-Depths are below the pia. The borders are the means over mouse C2 columns of Lefort, Tomm, Sarria
-and Petersen (2009, Neuron 61:301-316); a single mouse's differ by some tens of micrometres, and
-what lies at a border is what its depth says.
+Depths are below the pia. The borders are those that the recordings' author draws
+(github.com/cxrodgers/my, plot.py); a single mouse's differ, and what lies at a border is what its
+depth says.
 """
 
 from collections.abc import Sequence
@@ -19,10 +19,10 @@ __all__ = ["CELLS", "LAMINAE", "TARGET_PARTS", "part_of"]
 
 # (from, to) in um below the pia
 LAMINAE = {
-    "L2/3": (128.0, 418.0),
-    "L4": (418.0, 588.0),
-    "L5": (588.0, 890.0),
-    "L6": (890.0, 1154.0),
+    "L2/3": (128.0, 419.0),
+    "L4": (419.0, 626.0),
+    "L5": (626.0, 1006.0),
+    "L6": (1006.0, 1366.0),
 }
 CELLS = ("excitatory", "inhibitory")  # putative, by the width of their spikes
 TARGET_PARTS = ("all", *LAMINAE, *CELLS)

@@ -39,7 +39,7 @@ def test_a_perfect_model_reaches_the_ceiling_and_noise_does_not(scene, name):
     perfect = features @ rng.normal(size=(8, 4000))
     for animal in animals:
         measure = find_metric(name)(animal)
-        assert MINIMUM_CEILING <= measure.ceiling <= 1
+        assert measure.usable and MINIMUM_CEILING <= measure.ceiling <= 1
         assert measure.fit(perfect) / measure.ceiling == pytest.approx(1, abs=0.12)
         others = [measure.fit(rng.normal(size=(6, 10, 200))) for _ in range(8)]
         assert np.mean(others) / measure.ceiling < 0.35
@@ -229,7 +229,7 @@ def test_what_all_stimuli_share_earns_nothing():
 def test_parts_of_cortex():
     rng = np.random.default_rng(12)
     plain = brains.session(rng, "a", "s", brains.geometry(rng), units=12)
-    depth = np.array([50, 128, 417, 418, 500, 588, 700, 890, 1000, 1154, np.nan, 200.0])
+    depth = np.array([50, 128, 418, 419, 500, 626, 700, 1006, 1100, 1366, np.nan, 200.0])
     inhibitory = np.arange(12) % 3 == 0
     session = NeuralSession(
         "a", "s", plain.rates, plain.stimulus, plain.rates[:, None].repeat(2, 1), depth, inhibitory
@@ -244,7 +244,7 @@ def test_parts_of_cortex():
     cut = found["L4"][0].sessions[0]
     np.testing.assert_array_equal(cut.rates, plain.rates[:, 3:5])
     np.testing.assert_array_equal(cut.course[:, 1], plain.rates[:, 3:5])
-    assert cut.depth.tolist() == [418, 500]
+    assert cut.depth.tolist() == [419, 500]
     assert part_of([animal, unknown], "all") == (animal, unknown)
     with pytest.raises(ConfigError, match="no part of cortex 'L9'"):
         part_of([animal], "L9")

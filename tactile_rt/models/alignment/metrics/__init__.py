@@ -27,7 +27,7 @@ __all__ = ["METRICS", "MINIMUM_CEILING", "Measure", "Metric", "find_metric", "me
 Floats = NDArray[np.float64]
 
 ENTRY_POINTS = "tactile_rt.alignment_metrics"  # of other packages
-# With a lower ceiling the correction for noise would more than double a value.
+# Of a correlation: with a lower one the correction for noise would more than double a value.
 MINIMUM_CEILING = 0.5
 
 
@@ -40,15 +40,18 @@ class Measure:
             animal cannot be measured on.
         fit: The function that measures a layer, given as responses (6 stimuli, step, unit) with
             NaN in the steps that input cannot reach. NaN for a layer that tells nothing apart.
+        minimum: The lowest ceiling that is corrected for; for a share of variance the square of
+            that for a correlation.
     """
 
     ceiling: float
     fit: Callable[[Floats], float]
+    minimum: float = MINIMUM_CEILING
 
     @property
     def usable(self) -> bool:
         """Whether the noise is low enough to be corrected for."""
-        return bool(self.ceiling >= MINIMUM_CEILING)
+        return bool(self.ceiling >= self.minimum)
 
 
 Metric = Callable[[Animal], Measure]

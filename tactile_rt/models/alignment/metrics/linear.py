@@ -7,7 +7,8 @@ stimuli in each bin, so that a course which all stimuli share, such as the onset
 nothing, and a regression that knows nothing scores 0 (a correlation would be negative: the mean of
 the others lies opposite to what was held out).
 
-The score is 1 - error / variance over all bins and units, each unit by its own spread. The ceiling
+The score is 1 - error / variance over all bins and units, each unit in units of its noise, so that
+units which tell stimuli apart weigh most. The ceiling
 is what is left of the variance without the noise of the means, known from the spread of trials: a
 perfect model reaches it in expectation.
 """
@@ -15,7 +16,7 @@ perfect model reaches it in expectation.
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.models.alignment.metrics import Measure
+from tactile_rt.models.alignment.metrics import MINIMUM_CEILING, Measure
 from tactile_rt.models.alignment.metrics.geometry import NOTHING, mean_pattern
 from tactile_rt.models.alignment.metrics.halves import bins_of, means_of, sessions_of, values_of
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
@@ -40,7 +41,9 @@ def linear(animal: Animal) -> Measure:
     live = spread > 1e-12 * np.abs(goal).max(initial=0.0)
     if not live.any():
         return NOTHING
-    goal, noise = goal[..., live] / spread[live], noise[..., live] / spread[live] ** 2
+    scale = np.sqrt(noise.mean(axis=(0, 1)))
+    scale = np.where(scale > 0, scale, spread)[live]
+    goal, noise = goal[..., live] / scale, noise[..., live] / scale**2
     variance = sum(
         float(((goal[i] - np.delete(goal, i, axis=0).mean(axis=0)) ** 2).sum())
         for i in range(len(goal))
@@ -57,7 +60,7 @@ def linear(animal: Animal) -> Measure:
         steps = np.pad(steps, ((0, 0), (0, max(missing, 0)), (0, 0)))
         return 1 - float(((goal - predicted(steps, goal)) ** 2).sum()) / variance
 
-    return Measure(1 - unknown / variance, fit)
+    return Measure(1 - unknown / variance, fit, MINIMUM_CEILING**2)
 
 
 def predicted(layer: Floats, goal: Floats) -> Floats:
