@@ -141,12 +141,13 @@ def _rows(
         layers: Layers = load_layers(path, felt)[0]
         if any(layers.name == row.name for row, _ in rows):
             layers = replace(layers, name=f"{layers.name} ({path.name})")
-        row = BoardRow(layers.name, "model", layers.sha256, layers.parameters, layers.notes)
-        rows.append((row, traces_of(layers)))
         before = load_untrained(path, felt, seed) if untrained else None
+        # The same network: a file keeps some of its numbers in other places than a checkpoint.
+        size = before.parameters if before else layers.parameters
+        row = BoardRow(layers.name, "model", layers.sha256, size, layers.notes)
+        rows.append((row, traces_of(layers)))
         if before is not None:
-            rows.append((BoardRow(before.name, "untrained", "", before.parameters),
-                         traces_of(before)))  # fmt: skip
+            rows.append((BoardRow(before.name, "untrained", "", size), traces_of(before)))
         update(advance=1)
     rows.append((BoardRow("raw sensor input", "input"), traces_of_stimuli(felt)))
     return rows

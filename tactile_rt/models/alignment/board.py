@@ -51,7 +51,8 @@ class BoardRow(msgspec.Struct, frozen=True):
 
     Attributes:
         name: The name of the row, as the board prints it.
-        kind: The kind of row: ``model``, ``untrained``, ``input`` (the sensors' readings) or ``animal``.
+        kind: The kind of row: ``model``, ``untrained``, ``input`` (the sensors' readings) or
+            ``animal``.
         sha256: The SHA-256 sum of the model's file, hex; empty for what has no file.
         parameters: The count of numbers that the model is made of; 0 where there are none.
         notes: Remarks on what could not be had and why, a line each.
