@@ -166,19 +166,19 @@ def _show(board: "Alignments") -> None:
     for dataset, part in places:
         columns = [k for k, c in enumerate(board.columns) if (c.dataset, c.part) == (dataset, part)]
         heads = [board.columns[k].metric for k in columns]
-        table = Table(Column("", overflow="fold"), *heads, title=f"{dataset}, {part}")
+        table = Table(Column("", overflow="fold"), *heads, title=f"{dataset}, {part}: shares of "
+                      "what noise permits")  # fmt: skip
         for r, row in enumerate(board.rows):
             cells = [board.cell(r, k) for k in columns]
-            table.add_row(row.name, *(_said(c.score, c.sem) for c in cells))
+            name = f"  {row.name}" if row.kind == "untrained" else row.name
+            table.add_row(name, *(_said(c.score) for c in cells))
         table.add_section()
-        table.add_row("ceiling", *(_said(board.columns[k].ceiling, None) for k in columns))
+        table.add_row("ceiling", *(_said(board.columns[k].ceiling) for k in columns))
         table.add_row(
             "animals", *(f"{board.columns[k].usable}/{board.columns[k].animals}" for k in columns)
         )
         console.print(table)
 
 
-def _said(value: float | None, sem: float | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.2f}" if sem is None else f"{value:.2f} ± {sem:.2f}"
+def _said(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"

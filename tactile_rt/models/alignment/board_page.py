@@ -25,9 +25,10 @@ th,td{padding:.35rem .7rem;border-bottom:1px solid var(--rule);text-align:right;
 vertical-align:top}
 th:first-child,td:first-child{text-align:left;min-width:9rem}th{font-weight:600}
 td b{font-size:1rem}td small{display:block;white-space:nowrap}
-.bar{display:block;height:5px;border-radius:2px;margin:.15rem 0 .1rem auto}
-tr.model .bar{background:var(--model)}tr.untrained .bar{background:var(--untrained)}
-tr.input .bar{background:var(--input)}tr.animal .bar{background:var(--animal)}
+.bar{display:block;height:5px;border-radius:2px;margin:.2rem 0 .1rem;background:var(--rule)}
+.bar i{display:block;height:5px;border-radius:2px}
+tr.model .bar i{background:var(--model)}tr.untrained .bar i{background:var(--untrained)}
+tr.input .bar i{background:var(--input)}tr.animal .bar i{background:var(--animal)}
 tr.untrained td:first-child{padding-left:1.8rem}tr.ceiling td{border-top:2px solid var(--rule)}
 .key{display:flex;flex-wrap:wrap;gap:.3rem 1.1rem;font-size:.86rem;padding:0}
 .key span{display:inline-flex;align-items:center;gap:.4rem}
@@ -109,7 +110,7 @@ def _value(cell: BoardCell) -> str:
     sem = "" if cell.sem is None else f" ± {cell.sem:.2f}"
     wide = 100 * min(max(cell.score, 0.0), 1.0)
     return (
-        f'<td><b>{cell.score:.2f}</b>{sem}<span class="bar" style="width:{wide:.0f}%"></span>'
+        f'<td><b>{cell.score:.2f}</b>{sem}<span class="bar"><i style="width:{wide:.0f}%"></i></span>'
         f"<small>{escape(cell.layer)}</small></td>"
     )
 
