@@ -350,6 +350,7 @@ def _show_scores(results: Any) -> None:
     raw, b = results.raw, results.benchmark
     table.add_row("raw sensor input", f"{_said(raw.score)} ± {_said(raw.sem)}", _said(raw.p, 4))
     table.add_row("animal to animal", f"{_said(b.a2a_mean)} ± {_said(b.a2a_sem)}")
+    table.add_row("its highest", _said(b.a2a_highest))
     Console().print(table)
 
 

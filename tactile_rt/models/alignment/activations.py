@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +57,8 @@ def checkpoint_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, dict[s
     stimuli.check(ArraySpec.from_json(saved["spec"]), timing.steps, timing.substeps, str(path))
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     name = path.resolve().parent.name if path.stem in ("best", "last") else path.stem
-    return network_layers(model, stimuli, name, sha256), saved
+    layers = network_layers(model, stimuli, name, sha256)
+    return replace(layers, training=saved.get("config", {})), saved
 
 
 def untrained_layers(saved: dict[str, Any], stimuli: StimuliInput, seed: int = 0) -> Layers:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.models.alignment.rdm import STIMULI
-from tactile_rt.models.alignment.statistics import standard_error
 
 __all__ = ["PROTOCOLS", "Benchmark", "Consistency", "Frozen", "Target"]
 
@@ -70,11 +69,14 @@ class Consistency:
             where there is none.
         pairwise: (animal, animal) The score of a row's animal against a column's; NaN on the
             diagonal.
+        ddof: The degrees of freedom that the standard error leaves to the mean: 1, and 0 in the
+            published analysis.
     """
 
     animals: tuple[str, ...]
     pooled: Floats
     pairwise: Floats
+    ddof: int = 1
 
     @property
     def mean(self) -> float:
@@ -84,7 +86,10 @@ class Consistency:
     @property
     def sem(self) -> float:
         """Standard error of that mean."""
-        return standard_error(self.pooled)
+        there = self.pooled[np.isfinite(self.pooled)]
+        if there.size <= self.ddof:
+            return math.nan
+        return float(there.std(ddof=self.ddof) / math.sqrt(there.size))
 
     @property
     def highest(self) -> float:

@@ -117,6 +117,7 @@ def load_benchmark(path: Path) -> Benchmark:
             pairwise=np.array([_array(row) for row in file.a2a.pairwise]).reshape(
                 len(file.a2a.animals), len(file.a2a.animals)
             ),
+            ddof=0 if file.protocol == "paper-code" else 1,
         ),
         bootstraps=file.bootstraps,
         seed=file.seed,

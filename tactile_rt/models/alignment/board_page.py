@@ -110,7 +110,8 @@ def _value(cell: BoardCell) -> str:
     sem = "" if cell.sem is None else f" ± {cell.sem:.2f}"
     wide = 100 * min(max(cell.score, 0.0), 1.0)
     return (
-        f'<td><b>{cell.score:.2f}</b>{sem}<span class="bar"><i style="width:{wide:.0f}%"></i></span>'
+        f"<td><b>{cell.score:.2f}</b>{sem}"
+        f'<span class="bar"><i style="width:{wide:.0f}%"></i></span>'
         f"<small>{escape(cell.layer)}</small></td>"
     )
 

@@ -26,6 +26,7 @@ class Layers:
         precision: The number format of the weights, such as ``fp32`` or ``int8``.
         sha256: The SHA-256 sum of the model's file, hex; empty for a network in memory.
         network: The configuration of the network, as far as it is known.
+        training: The configuration of the training, as far as it is known.
         notes: Remarks on what could not be had and why, a line each.
     """
 
@@ -37,6 +38,7 @@ class Layers:
     precision: str = "fp32"
     sha256: str = ""
     network: Mapping[str, object] = field(default_factory=dict)
+    training: Mapping[str, object] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
     @property

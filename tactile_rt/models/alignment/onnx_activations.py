@@ -77,6 +77,7 @@ def onnx_layers(
         precision=precision_of(model),
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
         network=card.provenance.get("network", {}),
+        training=card.provenance.get("training", {}),
         notes=tuple(notes),
     ), card
 

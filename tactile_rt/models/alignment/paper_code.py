@@ -90,7 +90,7 @@ def freeze_paper_code(
         protocol="paper-code",
         targets=tuple(targets),
         pooled=pooled,
-        a2a=Consistency(names, held_out, pairwise),
+        a2a=Consistency(names, held_out, pairwise, ddof=0),
         bootstraps=bootstraps,
         seed=seed,
     )

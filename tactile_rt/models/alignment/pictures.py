@@ -1,17 +1,20 @@
 """Figures of the report, as SVG that takes its colours from the page: light or dark."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from html import escape
+from itertools import combinations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tactile_rt.models.alignment.rdm import square
 
-__all__ = ["Bar", "Level", "Point", "bars", "heat_map", "scatter"]
+__all__ = ["Bar", "Level", "Point", "bars", "heat_map", "profiles", "scatter"]
 
 Values = Sequence[float]
+COLOURS = 6  # of groups and of lines: the page's classes g0 to g5
 
 
 @dataclass(frozen=True)
@@ -39,12 +42,13 @@ class Level:
 
 @dataclass(frozen=True)
 class Point:
-    """One model in a scatter plot."""
+    """One model in a scatter plot; models of one `group` share a colour and a line."""
 
     name: str
     x: float
     y: float
     error: float = 0.0
+    group: str = ""
 
 
 class PlotArea:
@@ -121,7 +125,10 @@ def bars(columns: Sequence[Bar], levels: Sequence[Level], title: str, label: str
 def scatter(
     points: Sequence[Point], x_title: str, y_title: str, label: str, log: bool = False
 ) -> str:
-    """Models as points, each with its name, and the least-squares line through three or more."""
+    """Models as points, each with its name, and the least-squares line through three or more.
+
+    Of several groups, each has a line of its own.
+    """
     frame = PlotArea(
         [v for p in points for v in (p.y - p.error, p.y + p.error)], 720.0, 400.0, 52.0
     )
@@ -151,15 +158,22 @@ def scatter(
         f'<text class="title" x="{(frame.left + frame.right) / 2}" y="{frame.height - 8}" '
         f'text-anchor="middle">{escape(x_title)}</text>'
     )
-    if len(points) >= 3 and np.ptp(xs) > 0:
-        slope, at_zero = np.polyfit(xs, ys, 1)
-        r = float(np.corrcoef(xs, ys)[0, 1]) if np.ptp(ys) > 0 else math.nan
-        (x1, y1), (x2, y2) = ((x_of(x), frame.y(slope * x + at_zero)) for x in (low, high))
-        out.append(
-            f'<line class="fit" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
-            f'<text class="level" x="{frame.right + 8}" y="{frame.top + 12}">'
-            f"line: r = {r:.2f}, {len(points)} models</text>"
-        )
+    groups = list(dict.fromkeys(p.group for p in points))
+    several = len(groups) > 1
+    colours = {g: f"g{k % COLOURS}" if several else "model" for k, g in enumerate(groups)}
+    for k, group in enumerate(groups):
+        member = np.array([p.group == group for p in points])
+        colour = colours[group] if several else ""
+        line = _line(xs[member], ys[member], (low, high), x_of, frame, colour, out)
+        said = line or _models(int(member.sum()))
+        x, y = frame.right + 8, frame.top + 12 + 34 * k
+        if several:
+            out.append(
+                f'<text class="level {colour}" x="{x}" y="{y}">{escape(group or "others")}</text>'
+                f'<text class="tick" x="{x}" y="{y + 15}">{said}</text>'
+            )
+        elif line:
+            out.append(f'<text class="level" x="{x}" y="{y}">line: {line}</text>')
     named: list[tuple[float, float]] = []
     for point, x in zip(points, xs, strict=True):
         px, py = x_of(float(x)), frame.y(point.y)
@@ -172,11 +186,52 @@ def scatter(
         named.append((px, at))
         out.append(
             f'<g><line class="error" x1="{px:.1f}" x2="{px:.1f}" y1="{ends[0]:.1f}" '
-            f'y2="{ends[1]:.1f}"/><circle class="model" cx="{px:.1f}" cy="{py:.1f}" r="6"/>'
+            f'y2="{ends[1]:.1f}"/>'
+            f'<circle class="{colours[point.group]}" cx="{px:.1f}" cy="{py:.1f}" r="6"/>'
             f'<text class="name" x="{px + (-9 if right else 9):.1f}" y="{at:.1f}" '
             f'text-anchor="{"end" if right else "start"}">{escape(point.name)}</text></g>'
         )
     return _svg(out, frame.width, frame.height, label, "scatter")
+
+
+def profiles(series: Sequence[tuple[str, Values]], names: Sequence[str], label: str) -> str:
+    """RDMs (15,) as lines over the pairs of stimuli, each moved and scaled to mean 0, spread 1.
+
+    Their correlation, which is what is compared, is that of the lines as they are drawn. An RDM
+    with a NaN, or of equals, has none.
+    """
+    drawn = []
+    for name, entries in series:
+        values = np.asarray(entries, dtype=np.float64)
+        spread = float(values.std())
+        if np.isfinite(values).all() and spread > 0:
+            drawn.append((name, (values - values.mean()) / spread))
+    pairs = [f"{a} and {b}" for a, b in combinations(names, 2)]
+    frame = PlotArea([float(v) for _, line in drawn for v in line], 960.0, 480.0, 190.0)
+    out = frame.axis("dissimilarity, scaled")
+    pitch = (frame.right - frame.left - 40) / max(len(pairs) - 1, 1)
+    places = [frame.left + 20 + k * pitch for k in range(len(pairs))]
+    for x, pair in zip(places, pairs, strict=True):
+        out.append(
+            '<text class="tick" text-anchor="end" transform="'
+            f'translate({x + 4:.1f} {frame.bottom + 14:.1f}) rotate(-45)">{escape(pair)}</text>'
+        )
+    for k, (name, line) in enumerate(drawn):
+        colour = f"g{k % COLOURS}"
+        points = " ".join(
+            f"{x:.1f},{frame.y(float(v)):.1f}" for x, v in zip(places, line, strict=True)
+        )
+        out.append(f'<polyline class="{colour}" points="{points}"/>')
+        out += [
+            f'<circle class="{colour}" cx="{x:.1f}" cy="{frame.y(float(v)):.1f}" r="3">'
+            f"{_tip(f'{name}, {pair}: {v:.2f}')}</circle>"
+            for x, v, pair in zip(places, line, pairs, strict=True)
+        ]
+        out.append(
+            f'<text class="level {colour}" x="{frame.right + 8}" y="{frame.top + 12 + 17 * k}">'
+            f"{escape(name)}</text>"
+        )
+    return _svg(out, frame.width, frame.height, label)
 
 
 def heat_map(entries: Values, names: Sequence[str], title: str, beneath: str = "") -> str:
@@ -219,6 +274,31 @@ def ticks(low: float, high: float, about: int = 6) -> list[float]:
     step = next(power * s for s in (1, 2, 5, 10) if power * s >= rough * 0.999)
     first = math.ceil(low / step)
     return [round(k * step, 10) for k in range(first, math.floor(high / step) + 1)]
+
+
+def _line(
+    xs: NDArray[np.float64],
+    ys: NDArray[np.float64],
+    ends: tuple[float, float],
+    x_of: Callable[[float], float],
+    frame: PlotArea,
+    colour: str,
+    out: list[str],
+) -> str:
+    """Draw the least-squares line of three or more models; what is said of it, else nothing."""
+    if len(xs) < 3 or not np.ptp(xs) > 0:
+        return ""
+    slope, at_zero = np.polyfit(xs, ys, 1)
+    r = float(np.corrcoef(xs, ys)[0, 1]) if np.ptp(ys) > 0 else math.nan
+    (x1, y1), (x2, y2) = ((x_of(x), frame.y(slope * x + at_zero)) for x in ends)
+    out.append(
+        f'<line class="fit {colour}" x1="{x1:.1f}" y1="{y1:.1f}" x2="{x2:.1f}" y2="{y2:.1f}"/>'
+    )
+    return f"r = {r:.2f}, {_models(len(xs))}"
+
+
+def _models(number: int) -> str:
+    return f"{number} model{'s' * (number != 1)}"
 
 
 def _bar(bar: Bar, frame: PlotArea, x: float, wide: float) -> list[str]:

@@ -8,7 +8,15 @@ from pathlib import Path
 import numpy as np
 
 from tactile_rt.files import write_whole
-from tactile_rt.models.alignment.pictures import Bar, Level, Point, bars, heat_map, scatter
+from tactile_rt.models.alignment.pictures import (
+    Bar,
+    Level,
+    Point,
+    bars,
+    heat_map,
+    profiles,
+    scatter,
+)
 from tactile_rt.models.alignment.results import AlignmentControl, ModelResult, Number, Results
 
 __all__ = ["page", "write_page"]
@@ -54,6 +62,12 @@ svg text.a2a{fill:var(--a2a)}svg text.null{fill:var(--null)}svg text.one{fill:va
 .cell{fill:var(--panel)}.heat{fill:var(--heat)}
 .fit{stroke:var(--soft);stroke-width:1.5;stroke-dasharray:6 4}
 .error{stroke:var(--ink);opacity:.5}.model{fill:var(--decoder)}
+.g0{--own:#3a6fb8}.g1{--own:#c4523a}.g2{--own:#2f8a58}.g3{--own:#b98a1a}.g4{--own:#9a5bb5}
+.g5{--own:#4f9aa8}@media(prefers-color-scheme:dark){.g0{--own:#6f9fe0}.g1{--own:#e07a62}
+.g2{--own:#58b881}.g3{--own:#dcb04a}.g4{--own:#c08ad8}.g5{--own:#79c2cf}}
+circle.g0,circle.g1,circle.g2,circle.g3,circle.g4,circle.g5{fill:var(--own)}
+polyline{fill:none;stroke:var(--own);stroke-width:2}line.fit[class*=g]{stroke:var(--own)}
+svg text.level[class*=g]{fill:var(--own);font-weight:600}
 details{margin:.6rem 0}summary{cursor:pointer}
 .scale{width:120px;height:12px;display:inline-block;vertical-align:middle;margin:0 .5rem;
 background:linear-gradient(90deg,var(--panel),var(--heat));border:1px solid var(--rule)}
@@ -139,7 +153,8 @@ def _summary(results: Results) -> str:
         f"{''.join(rows)}<tr><td>raw sensor input</td><td>{_said(results.raw.score)} ± "
         f"{_said(results.raw.sem)}</td><td>{_p(results.raw.p)}</td><td></td><td></td><td></td>"
         "<td></td></tr>"
-        f"<tr><td>an animal, from the others</td><td>{_said(b.a2a_mean)} ± {_said(b.a2a_sem)}</td>"
+        f"<tr><td>an animal, from the others</td><td>{_said(b.a2a_mean)} ± {_said(b.a2a_sem)}"
+        f"<br><small>highest {_said(b.a2a_highest)}</small></td>"
         "<td></td><td></td><td></td><td></td><td></td></tr></table></div>"
         '<p class="soft">p: share of the 720 relabellings of the stimuli that score as high, the '
         "layer chosen anew each time. A model passes with a score of at least animal to animal "
@@ -227,42 +242,101 @@ def _comparison(results: Results) -> str:
             scatter(points, f"task performance{f' ({what})' if what else ''}", "score ± s.e.m.",
                     "Neural fit against task performance"),
         ]  # fmt: skip
-    if len(scored) > 1 and all(m.parameters > 0 for m in scored):
+        for by, word in (("objective", "loss"), ("augmentation", "augmentation")):
+            if len(known) > 1 and len({m.groups.get(by) for m in known}) > 1:
+                grouped = [_point(m, _float(m.performance), by) for m in known]
+                out += [
+                    f"<h3>The same by {word}</h3>",
+                    scatter(grouped, f"task performance{f' ({what})' if what else ''}",
+                            "score ± s.e.m.", f"Neural fit against task performance by {word}"),
+                ]  # fmt: skip
+    sized = [m for m in scored if m.parameters > 0]
+    if len(sized) > 1:
+        by = "encoder" if len({m.groups.get("encoder") for m in sized}) > 1 else ""
         out += [
-            "<h3>Neural fit against size</h3>",
-            scatter([_point(m, float(m.parameters)) for m in scored], "parameters",
+            f"<h3>Neural fit against size{', by encoder' if by else ''}</h3>",
+            scatter([_point(m, float(m.parameters), by) for m in sized], "parameters",
                     "score ± s.e.m.", "Neural fit against parameters", log=True),
         ]  # fmt: skip
-    return "".join(out)
+    both = [m for m in sized if m.performance is not None]
+    if len(both) > 1:
+        by = "objective" if len({m.groups.get("objective") for m in both}) > 1 else ""
+        points = [
+            Point(m.name, float(m.parameters), _float(m.performance), 0.0, m.groups.get(by, ""))
+            for m in both
+        ]
+        out += [
+            f"<h3>Task performance against size{', by loss' if by else ''}</h3>",
+            scatter(points, "parameters", "task performance", "Task performance against parameters",
+                    log=True),
+        ]  # fmt: skip
+    return "".join([*out, _masking(results)])
 
 
-def _point(model: ModelResult, x: float) -> Point:
+def _masking(results: Results) -> str:
+    """Models that differ in the masking of steps alone, beside each other."""
+    families: dict[tuple[tuple[str, str], ...], list[ModelResult]] = {}
+    for model in results.models:
+        if "masking" in model.groups:
+            rest = tuple(sorted((k, v) for k, v in model.groups.items() if k != "masking"))
+            families.setdefault(rest, []).append(model)
+    rows = [
+        f"<tr><td>{escape(m.name)}</td><td>{escape(_percent(m.groups['masking']))}</td>"
+        f"<td>{_said(m.performance)}</td><td>{_said(m.score)} ± {_said(m.sem)}</td></tr>"
+        for models in families.values()
+        if len({m.groups["masking"] for m in models}) > 1
+        for m in sorted(models, key=lambda m: float(m.groups["masking"]))
+    ]
+    if not rows:
+        return ""
+    return (
+        "<h3>With and without masking of steps</h3><p>Networks of the same kind, trained alike but "
+        'for the share of steps that was blanked.</p><div class="scroll"><table><tr><th>model</th>'
+        "<th>steps masked</th><th>task performance</th><th>score ± s.e.m.</th></tr>"
+        f"{''.join(rows)}</table></div>"
+    )
+
+
+def _percent(share: str) -> str:
+    return f"{100 * float(share):g} %"
+
+
+def _point(model: ModelResult, x: float, by: str = "") -> Point:
     sem = _float(model.sem)
-    return Point(model.name, x, _float(model.score), sem if math.isfinite(sem) else 0.0)
+    error = sem if math.isfinite(sem) else 0.0
+    return Point(model.name, x, _float(model.score), error, model.groups.get(by, ""))
 
 
 def _maps(results: Results) -> str:
     b = results.benchmark
     maps = [heat_map(_floats(results.raw_rdm), results.stimuli, "raw sensor input")]
     rest: list[str] = []
+    lines = [("raw sensor input", _floats(results.raw_rdm))]
     for model in results.models:
         counted = [name for name in model.chosen if name]
         best = max(set(counted), key=counted.count) if counted else ""
         for layer, row in zip(model.layers, model.rdms, strict=True):
             drawn = heat_map(_floats(row), results.stimuli, layer, model.name)
             (maps if layer == best else rest).append(drawn)
+            if layer == best:
+                lines.append((model.name, _floats(row)))
     animals = [
         heat_map(_floats(row), results.stimuli, name, f"reliability {_said(reliability)}")
         for name, row, reliability in zip(b.targets, b.rdms, b.reliabilities, strict=True)
     ]
     reliable = [_floats(row) for row, good in zip(b.rdms, b.reliable, strict=True) if good]
     if reliable:
-        maps.append(heat_map(np.mean(reliable, axis=0).tolist(), results.stimuli, "mean animal"))
+        mean = np.mean(reliable, axis=0).tolist()
+        maps.append(heat_map(mean, results.stimuli, "mean animal"))
+        lines.insert(0, ("mean animal", mean))
     return (
         "<p>1 - correlation over units of the responses to two stimuli. Each map has its own "
         'scale, for fits do not depend on it: alike<span class="scale"></span>most dissimilar. '
         "Shown are the input, the layer that is chosen most often and the mean of the reliable "
         f'animals.</p><div class="maps">{"".join(maps)}</div>'
+        "<h3>The same as lines</h3><p>Each line moved and scaled, for a fit depends on neither: "
+        "lines that rise and fall together fit.</p>"
+        f"<div class='scroll'>{profiles(lines, results.stimuli, 'Dissimilarities as lines')}</div>"
         f'<details><summary>every animal ({len(animals)})</summary><div class="maps">'
         f"{''.join(animals)}</div></details><details><summary>every other layer ({len(rest)})"
         f'</summary><div class="maps">{"".join(rest)}</div></details>'

@@ -61,6 +61,8 @@ class ModelResult(msgspec.Struct, frozen=True):
         performance: The accuracy on the task, 0 to 1; None if no accuracy is known.
         performance_of: The words that say what that accuracy was measured on.
         untrained: The network before its training as a control, where there is one.
+        groups: The groups that the model belongs to, by what they divide models by: encoder,
+            attender, objective, augmentation, masking; without those that are not known.
     """
 
     name: str
@@ -83,6 +85,7 @@ class ModelResult(msgspec.Struct, frozen=True):
     performance_of: str = ""
     untrained: AlignmentControl | None = None
     notes: tuple[str, ...] = ()
+    groups: dict[str, str] = {}
 
 
 class BenchmarkResult(msgspec.Struct, frozen=True):
@@ -182,6 +185,7 @@ def model_result(
             _control(untrained.name, score(benchmark, untrained.patterns)) if untrained else None
         ),
         notes=layers.notes,
+        groups=_groups(layers),
     ), made
 
 
@@ -251,6 +255,16 @@ def _control(name: str, made: Score) -> AlignmentControl:
         sem=_number(made.sem),
         p=_number(made.p),
     )
+
+
+def _groups(layers: Layers) -> dict[str, str]:
+    told = {key: layers.network.get(key) for key in ("encoder", "attender")}
+    told |= {key: layers.training.get(key) for key in ("objective", "augmentation", "masking")}
+    return {
+        key: f"{value:g}" if isinstance(value, float | int) else str(value)
+        for key, value in told.items()
+        if value is not None
+    }
 
 
 def _number(value: float) -> Number:

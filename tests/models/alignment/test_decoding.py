@@ -5,7 +5,14 @@ import itertools
 import numpy as np
 import pytest
 
-from tactile_rt.models.alignment.decoding import DISTANCE, SHAPE, decode, decode_paper, decode_rdm
+from tactile_rt.models.alignment.decoding import (
+    DISTANCE,
+    SHAPE,
+    decode,
+    decode_paper,
+    decode_rdm,
+    mean_decoded,
+)
 from tactile_rt.models.alignment.rdm import rdm
 
 
@@ -80,3 +87,28 @@ def test_the_papers_variant_is_below_a_guess_on_noise():
     found = decode_paper(rng.normal(size=(6, 1000)))
     assert found.shape == found.distance == 0
     assert max(found.shape_chance, found.distance_chance) < 0.1
+
+
+def test_the_papers_variant_uses_one_thread_whatever_others_use():
+    pytest.importorskip("sklearn")
+    threadpoolctl = pytest.importorskip("threadpoolctl")
+    seen = []
+
+    def fit(values, labels):
+        seen.append({pool["num_threads"] for pool in threadpoolctl.threadpool_info()})
+        return 0.0
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tactile_rt.models.alignment.decoding._one_out", fit)
+        decode_paper(np.random.default_rng(0).normal(size=(6, 9)))
+    assert seen and set().union(*seen) == {1}
+
+
+def test_the_row_of_animals_is_their_mean():
+    rng = np.random.default_rng(6)
+    several = [decode(rng.normal(size=(6, 9))) for _ in range(5)]
+    found = mean_decoded([*several, decode(np.ones((6, 4)))])
+    assert found.shape == pytest.approx(np.mean([d.shape for d in several]))
+    assert found.distance_chance == pytest.approx(np.mean([d.distance_chance for d in several]))
+    assert np.isnan(found.shape_p)
+    assert np.isnan(mean_decoded([]).shape)

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 
 from tactile_rt.models.alignment.layers import Layers
-from tactile_rt.models.alignment.pictures import Bar, Level, Point, bars, heat_map, scatter, ticks
+from tactile_rt.models.alignment.pictures import (
+    Bar,
+    Level,
+    Point,
+    bars,
+    heat_map,
+    profiles,
+    scatter,
+    ticks,
+)
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.report import page
 from tactile_rt.models.alignment.results import (
@@ -24,7 +33,7 @@ from tactile_rt.models.alignment.strict import freeze_strict
 from tactile_rt.stream import ConfigError
 from tests.helpers import brains
 
-ALONE = {"meta", "line", "rect", "circle", "br"}
+ALONE = {"meta", "line", "rect", "circle", "polyline", "br"}
 
 
 @pytest.fixture(scope="module")
@@ -210,3 +219,74 @@ def test_a_baseline_is_one_model_on_the_same_benchmark(results, benchmark, tmp_p
     assert before == dict(zip(one.benchmark.targets, one.models[0].per_target, strict=True))
     with pytest.raises(ConfigError, match="another benchmark"):
         baseline_of(path, replace(benchmark, seed=1))
+
+
+def test_an_rdm_as_a_line_is_moved_and_scaled():
+    rng = np.random.default_rng(1)
+    one, other = rng.normal(size=15), rng.normal(size=15)
+    series = [("one", one), ("again", 3 * one + 2), ("other", other), ("none", np.full(15, np.nan))]
+    drawn = profiles(series, STIMULI, "lines")
+    lines = [
+        np.array([[float(v) for v in point.split(",")] for point in points.split()])
+        for points in re.findall(r'<polyline[^>]*points="([^"]*)"', drawn)
+    ]
+    assert len(lines) == 3 and all(line.shape == (15, 2) for line in lines)
+    np.testing.assert_allclose(lines[0], lines[1], atol=0.11)
+    # Downwards is positive on a page; what is compared is what is seen.
+    seen = np.corrcoef(-lines[0][:, 1], -lines[2][:, 1])[0, 1]
+    assert seen == pytest.approx(np.corrcoef(one, other)[0, 1], abs=2e-3)
+    assert "convex-close and concave-far" in drawn and ">none<" not in drawn
+
+
+def test_groups_have_colours_and_lines_of_their_own():
+    points = [Point(f"{g}{k}", 0.1 * k, y, 0.0, g) for g, ys in
+              (("simclr", (0.1, 0.3, 0.2)), ("supervised", (0.5, 0.4)), ("", (0.9,)))
+              for k, y in enumerate(ys)]  # fmt: skip
+    drawn = scatter(points, "x", "y", "figure")
+    r = np.corrcoef([0, 1, 2], [0.1, 0.3, 0.2])[0, 1]
+    assert f"r = {r:.2f}, 3 models" in drawn
+    assert drawn.count('<line class="fit') == 1, "two points make no line"
+    assert [drawn.count(f'circle class="g{k}"') for k in range(3)] == [3, 2, 1]
+    for said in (">simclr<", ">supervised<", "2 models", ">others<", "1 model<"):
+        assert said in drawn
+
+
+GROUPS = {"encoder": "gru", "attender": "none", "augmentation": "tactile"}
+
+
+def test_models_are_compared_by_how_they_were_trained(results):
+    groups = [
+        GROUPS | {"objective": "supervised", "masking": "0"},
+        GROUPS | {"objective": "simclr", "masking": "0"},
+        GROUPS | {"objective": "simclr", "masking": "0.75", "augmentation": "image"},
+    ]
+    models = [
+        msgspec.structs.replace(m, groups=g) for m, g in zip(results.models, groups, strict=True)
+    ]
+    text = page(msgspec.structs.replace(results, models=tuple(models)))
+    parsed(text)
+    for said in ("The same by loss", "The same by augmentation", "Task performance against size, "
+                 "by loss", ">simclr<", ">image<", "The same as lines"):  # fmt: skip
+        assert said in text, said
+    assert "masking of steps" not in text, "the third differs in its augmentation, too"
+    models[2] = msgspec.structs.replace(models[2], groups=groups[1] | {"masking": "0.75"})
+    text = page(msgspec.structs.replace(results, models=tuple(models)))
+    assert "With and without masking of steps" in text
+    rows = re.findall(r"<td>(model &lt;\d&gt;)</td><td>([\d.]+ %)</td><td>([\d.]+)</td>", text)
+    assert rows == [("model &lt;1&gt;", "0 %", "0.50"), ("model &lt;2&gt;", "75 %", "0.70")]
+
+
+def test_the_groups_are_what_the_file_says(benchmark):
+    layers = replace(
+        network(np.random.default_rng(2), "m"),
+        network={"encoder": "gru", "attender": "none", "width": 1.0},
+        training={"objective": "simclr", "augmentation": "tactile", "masking": 0.75, "seed": 1},
+    )
+    made, _ = model_result(benchmark, layers)
+    assert made.groups == GROUPS | {"objective": "simclr", "masking": "0.75"}
+    assert model_result(benchmark, network(np.random.default_rng(2), "m"))[0].groups == {}
+
+
+def test_the_highest_of_the_animals_is_on_the_page(results):
+    highest = results.benchmark.a2a_highest
+    assert highest is not None and f"highest {highest:.2f}" in page(results)
