@@ -87,24 +87,49 @@ def build_benchmark(
     ],
     out: Annotated[Path, typer.Option(help="The benchmark to write, .json.")],
     protocol: Annotated[str, typer.Option(help="strict, or paper-code.")] = "strict",
+    task: Annotated[
+        str | None, typer.Option(help="Only sessions of: discrimination, or detection.")
+    ] = None,
+    session: Annotated[
+        list[str] | None, typer.Option(help="Only sessions whose name has this; * and ? fit any.")
+    ] = None,
+    depth: Annotated[
+        str | None, typer.Option(help="Only units of a layer, L4, or a range in um, 419-626.")
+    ] = None,
+    cells: Annotated[
+        str | None, typer.Option(help="Only units that are: excitatory, or inhibitory.")
+    ] = None,
+    clock: Annotated[
+        str | None,
+        typer.Option(help="Spike times are on the session's, or the recording's. See the docs."),
+    ] = None,
     bootstraps: Annotated[int, typer.Option(help="Splits of the trials.")] = 1000,
     seed: Annotated[int, typer.Option(help="Of the splits.")] = 1234,
 ) -> None:
     """Freeze recordings into a small benchmark, so that nobody else needs them."""
     from tactile_rt.models.alignment import build, save_benchmark
+    from tactile_rt.models.alignment.selection import Selection
 
     check_output(out)
     console = Console(stderr=True)
+    selection = Selection.of(task, session or (), depth, cells)
     with progress_bar(console, "building", total=1.0) as update:
         try:
             made = build(
-                recordings, protocol, bootstraps, seed, lambda share: update(completed=share)
+                recordings,
+                protocol,
+                bootstraps,
+                seed,
+                lambda share: update(completed=share),
+                selection,
+                clock,
             )
         except ModuleNotFoundError as error:
             raise needs("align", error) from None
     save_benchmark(made, out)
     for note in made.notes:
-        console.print(note, highlight=False, markup=False)
+        colour = "bold red" if note.startswith("WARNING") else None
+        console.print(note, highlight=False, markup=False, style=colour)
     console.print(
         f"{out}: {len(made.reliable)} of {len(made.targets)} animals are reliable; animal to "
         f"animal {made.a2a.mean:.3f} ± {made.a2a.sem:.3f}",

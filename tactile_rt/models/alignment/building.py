@@ -5,11 +5,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from tactile_rt.models.alignment.benchmark import PROTOCOLS, Benchmark
-from tactile_rt.models.alignment.neural import by_animal, published_layout
-from tactile_rt.models.alignment.nwb import find_nwb, read_nwb
+from tactile_rt.models.alignment.clock import CLOCKS, WARNING, ContactResponse, said_of
+from tactile_rt.models.alignment.copies import refuse_copies
+from tactile_rt.models.alignment.neural import NeuralSession, by_animal, published_layout
+from tactile_rt.models.alignment.nwb import Reading, find_nwb, read_nwb
 from tactile_rt.models.alignment.paper_code import freeze_paper_code
 from tactile_rt.models.alignment.published import read_published
+from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.reliability import BOOTSTRAPS, SEED
+from tactile_rt.models.alignment.selection import Selection
 from tactile_rt.models.alignment.strict import freeze_strict
 from tactile_rt.stream import ConfigError
 
@@ -25,6 +29,8 @@ def build(
     bootstraps: int = BOOTSTRAPS,
     seed: int = SEED,
     progress: Callable[[float], None] = lambda share: None,
+    selection: Selection | None = None,
+    clock: str | None = None,
 ) -> Benchmark:
     """Freeze a benchmark from NWB files or from rates in the published layout.
 
@@ -33,12 +39,22 @@ def build(
         protocol: ``strict`` or ``paper-code``.
         bootstraps, seed: of the splits.
         progress: called with the share done, 0 to 1.
+        selection: which sessions and units of NWB files are kept; None for all.
+        clock: spike times are on the ``session``'s clock, as NWB has it and strict by default, or
+            on the ``recording``'s, as the published analysis has it and paper-code by default.
+
+    Returns:
+        A benchmark with a reliable animal at least. Its notes begin with what the clock's check
+        found, and say what was left out.
 
     Raises:
-        ConfigError: recordings that cannot be used, and why.
+        ConfigError: recordings that cannot be used, and why: no animal is reliable, a session is
+            there twice, or, under strict, contacts show that spikes are on another clock.
     """
     if protocol not in PROTOCOLS:
         raise ConfigError(f"no protocol {protocol!r}: there are {', '.join(PROTOCOLS)}")
+    if clock is not None and clock not in CLOCKS:
+        raise ConfigError(f"no clock {clock!r}: there are {', '.join(CLOCKS)}")
     if not inputs:
         raise ConfigError("name NWB files or a folder of them to build from")
     if bootstraps < 1:
@@ -51,6 +67,11 @@ def build(
             f"{archives[0]}: its stimuli have no names, and trials that did not show a stimulus "
             "count as zero: build with protocol paper-code, or strict from the NWB files"
         )
+    if archives and (clock or str(selection or "")):
+        raise ConfigError(
+            f"{archives[0]}: holds rates, not spikes: neither a clock nor a selection of sessions "
+            "or units applies to it"
+        )
 
     def reading(share: float) -> None:
         progress(READING * share)
@@ -61,14 +82,97 @@ def build(
     if archives:
         rates = read_published(archives[0])
         made = freeze_paper_code(rates, bootstraps, seed, splitting)
-        return replace(made, sources=(archives[0].name,))
+        units = sum(array.shape[2] for array in rates.values())
+        note = f"{archives[0].name}: {len(rates)} animals, {units} units"
+        made = replace(made, sources=(archives[0].name,), notes=(note, *made.notes))
+        _check_reliable(made)
+        return made
+    strict = protocol == "strict"
+    clock = clock or ("session" if strict else "recording")
     files = find_nwb(inputs)
-    window = "contact" if protocol == "strict" else "start"
-    sessions, notes = read_nwb(files, window, reading)
-    animals = by_animal(sessions)
-    if protocol == "strict":
-        made = freeze_strict(animals, bootstraps, seed, splitting)
+    readings, notes = read_nwb(
+        files, "contact" if strict else "start", reading, clock, selection or Selection()
+    )
+    readings, said = _clock_checked(readings, clock, strict)
+    tasks = {
+        task: len({r.session.animal for r in readings if r.task == task})
+        for task in sorted({r.task for r in readings})
+    }
+    if len(tasks) > 1:
+        pooled = " and ".join(f"{n} of {task}" for task, n in tasks.items())
+        notes.append(f"animals of two tasks are together, {pooled}: --task keeps one")
+    sessions = [reading.session for reading in readings]
+    refuse_copies(sessions)
+    if strict:
+        made = freeze_strict(by_animal(sessions), bootstraps, seed, splitting)
     else:
-        layouts = {animal.name: published_layout(animal) for animal in animals}
+        sessions = _complete(sessions, notes)
+        layouts = {animal.name: published_layout(animal) for animal in by_animal(sessions)}
         made = freeze_paper_code(layouts, bootstraps, seed, splitting)
-    return replace(made, sources=tuple(sorted(f.name for f in files)), notes=(*notes, *made.notes))
+    made = replace(
+        made,
+        sources=tuple(sorted(f.name for f in files)),
+        notes=(*said, *notes, *made.notes),
+    )
+    _check_reliable(made)
+    return made
+
+
+def _clock_checked(
+    readings: list[Reading], clock: str, strict: bool
+) -> tuple[list[Reading], list[str]]:
+    """Readings whose contacts do not speak against their clock, and what the check found."""
+    responses = [r.response for r in readings if r.response is not None]
+    if not responses:
+        return readings, [
+            WARNING + "the clock of the spikes is unchecked: no contacts, or no spikes"
+        ]
+    said = [said_of(responses, clock)]
+    wrong = [response for response in responses if response.elsewhere]
+    if not wrong:
+        return readings, said
+    why = _other(wrong, readings)
+    if strict and 2 * len(wrong) > len(responses):
+        raise ConfigError(f"{said[0].removeprefix(WARNING)}; {why}: see --clock")
+    if not strict:
+        return readings, [*said, WARNING + why]
+    names = {response.session for response in wrong}
+    kept = [r for r in readings if r.session.name not in names]
+    return kept, [*said, f"{WARNING}{why}: left out: {', '.join(sorted(names))}"]
+
+
+def _other(wrong: Sequence[ContactResponse], readings: Sequence[Reading]) -> str:
+    first = wrong[0]
+    return (
+        f"in {len(wrong)} of {len(readings)} sessions another offset fits contacts better: in "
+        f"{first.session} rates rise most (z = {first.other_z:.1f}) if {first.other_s:.3f} s is "
+        f"subtracted from spike times, and not {first.shift_s:.3f} s (z = {first.z:.1f})"
+    )
+
+
+def _complete(sessions: Sequence[NeuralSession], notes: list[str]) -> list[NeuralSession]:
+    """Sessions with every stimulus, which paper-code can place; the others are noted."""
+    kept = []
+    for session in sessions:
+        missing = [name for name, n in zip(STIMULI, session.trials, strict=True) if not n]
+        if missing:
+            notes.append(
+                f"session {session.name} left out: it has no correct trial of {', '.join(missing)}"
+            )
+        else:
+            kept.append(session)
+    if not kept:
+        raise ConfigError("no session can be used: " + "; ".join(notes))
+    return kept
+
+
+def _check_reliable(made: Benchmark) -> None:
+    if not made.reliable:
+        found = ", ".join(
+            f"{t.name} {t.chosen.reliability:.2f} ({t.chosen.units} of {t.unfiltered.units} units)"
+            for t in made.targets
+        )
+        raise ConfigError(
+            f"no animal is reliable enough to score on; reliabilities: {found}; "
+            + "; ".join(made.notes)
+        )

@@ -25,11 +25,14 @@ class NeuralSession:
         rates: (trial, unit) Firing rates in spikes per second, in the order of the trials.
         stimulus: (trial,) The stimulus of each trial, as an index into `STIMULI`.
         course: (trial, bin, unit) Firing rates in spikes per second in bins of 45 ms from the
-            beginning of the window on, NaN from the choice on; None if it is not known.
+            beginning of the window on, NaN from the choice on; None if it is not known. A bin that
+            the choice falls into is NaN, and there are as many bins as a model has steps, 22.
         depth: (unit,) The depth of each unit below the pia in um, NaN where it is not known; None
             if it is known of no unit.
         inhibitory: (unit,) Whether each unit is a putative inhibitory neuron; None if it is not
             known.
+        begin: (trial,) The time when each trial began on the session's clock in s, by which two
+            sortings of one recording are recognised; None if it is not known.
     """
 
     animal: str
@@ -39,6 +42,7 @@ class NeuralSession:
     course: Floats | None = None
     depth: Floats | None = None
     inhibitory: NDArray[np.bool_] | None = None
+    begin: Floats | None = None
 
     def __post_init__(self) -> None:
         rates, stimulus = self.rates, self.stimulus
@@ -48,6 +52,19 @@ class NeuralSession:
             )
         if not np.isfinite(rates).all():
             raise ConfigError(f"session {self.name}: a rate is not finite")
+        if stimulus.dtype.kind not in "iu" or not np.isin(stimulus, range(len(STIMULI))).all():
+            raise ConfigError(
+                f"session {self.name}: a stimulus is a number from 0 to {len(STIMULI) - 1}"
+            )
+        trials, units = rates.shape
+        for what, shape in (("depth", (units,)), ("inhibitory", (units,)), ("begin", (trials,))):
+            value = getattr(self, what)
+            if value is not None and value.shape != shape:
+                raise ConfigError(f"session {self.name}: {what} is {value.shape}, not {shape}")
+        if self.course is not None and self.course.shape[::2] != rates.shape:
+            raise ConfigError(
+                f"session {self.name}: course is {self.course.shape}, not (trial, bin, unit)"
+            )
 
     @property
     def trials(self) -> NDArray[np.int64]:

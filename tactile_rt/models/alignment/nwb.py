@@ -1,46 +1,74 @@
 """NWB files of the barrel-cortex recordings (Rodgers 2022, DANDI 000231), read with h5py alone.
 
     general/subject/subject_id                            animal
+    general/experiment_description                        task
     intervals/trials/...                                  one column per dataset
     units/spike_times, units/spike_times_index            ragged: unit k ends at index[k]
-    acquisition/<electrical series>/starting_time         subtracted from spike times
+    units/depth, units/inhibitory                         um, putative cell type
+    acquisition/<electrical series>/starting_time         see below
     processing/*/contacts_by_whisker_*/start_time         touches
     processing/*/processed_position_whisker_*/angle/...   the clock that touches are read on
 
+NWB defines spike times on the session's clock, as it does all times. The published analysis takes
+them to be on the recording's, and subtracts its starting time; `clock` says which, and the module
+of that name checks it.
 A rate is a number of spikes over the bins of 45 ms that cover the window, as published.
 """
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.models.alignment.clock import CLOCKS, ContactResponse, contact_response
 from tactile_rt.models.alignment.neural import NeuralSession
 from tactile_rt.models.alignment.nwb_parts import (
     TRIALS,
     animal_name,
-    booleans,
     contact_times,
+    flags,
     numbers,
     spike_times,
     starting_time,
+    task_of,
     text,
     trial_columns,
+    unit_column,
 )
 from tactile_rt.models.alignment.rdm import DISTANCES, SHAPES, stimulus_index
+from tactile_rt.models.alignment.selection import Selection
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     import h5py
 
-__all__ = ["BIN_S", "WINDOWS", "find_nwb", "read_nwb", "read_session"]
+__all__ = ["BIN_S", "WINDOWS", "Reading", "find_nwb", "read_nwb", "read_session"]
 
 Floats = NDArray[np.float64]
 
 BIN_S = 0.045
+COURSE_BINS = 22  # as many as the steps of a model that is compared
 WINDOWS = ("contact", "start")  # where a trial's window begins; it ends with the choice
+LONGEST_TRIAL_S, LONGEST_SESSION_S = 600.0, 1e6
+NAMED = 5  # trials that a note names
+
+
+class Reading(NamedTuple):
+    """What a file holds.
+
+    Attributes:
+        session: The session with the units that were selected.
+        notes: Remarks on what was left out and why, a line each.
+        task: The task of the mouse, ``discrimination`` or ``detection``.
+        response: The change of the rates with contact; None without contacts to tell by.
+    """
+
+    session: NeuralSession
+    notes: list[str]
+    task: str
+    response: ContactResponse | None
 
 
 def find_nwb(paths: Iterable[Path]) -> list[Path]:
@@ -70,94 +98,162 @@ def read_nwb(
     files: Iterable[Path],
     window: str = "contact",
     progress: Callable[[float], None] = lambda share: None,
-) -> tuple[list[NeuralSession], list[str]]:
+    clock: str = "session",
+    selection: Selection | None = None,
+) -> tuple[list[Reading], list[str]]:
     """Sessions of NWB files.
 
     Args:
         files: one per session.
         window: rates count from first ``contact`` or from the ``start`` of the trial, to choice.
         progress: called with the share done, 0 to 1, after every unit.
+        clock: spike times are on the ``session``'s clock, or the ``recording``'s.
+        selection: which sessions and units are kept; None for all.
 
     Returns:
-        Sessions, and notes on trials that were left out.
+        What was read of the sessions that are selected, and notes on what was left out, sessions
+        that cannot be read among these.
 
     Raises:
-        ConfigError: a file that cannot be read as one of these recordings, and why.
+        ConfigError: no session is left; why, of each.
     """
-    files, sessions, notes = list(files), [], []
+    _h5py()
+    wanted = selection or Selection()
+    named = list(files)
+    files = [path for path in named if wanted.takes(path.stem)]
+    readings: list[Reading] = []
+    spoilt: list[str] = []
     for i, path in enumerate(files):
-        session, said = read_session(
-            path,
-            window,
-            lambda share, i=i: progress((i + share) / len(files)),  # type: ignore[misc]
+
+        def read(share: float, i: int = i) -> None:
+            progress((i + share) / len(files))
+
+        try:
+            reading = read_session(path, window, read, clock, wanted)
+        except ConfigError as error:
+            spoilt.append(f"session {path.stem} left out: {error}")
+        else:
+            if wanted.task in (None, reading.task) and reading.session.rates.shape[1]:
+                readings.append(reading)
+        read(1.0)
+    if not readings:
+        raise ConfigError("; ".join(spoilt) or f"no session of {len(named)} is of {wanted}")
+    notes = [*spoilt, *(note for reading in readings for note in reading.notes)]
+    if str(wanted):
+        units = sum(r.session.rates.shape[1] for r in readings)
+        notes.insert(
+            0, f"selected: {wanted}: {len(readings)} of {len(named)} sessions, {units} units"
         )
-        sessions.append(session)
-        notes += said
-    return sessions, notes
+    return readings, notes
 
 
 def read_session(
-    path: Path, window: str = "contact", progress: Callable[[float], None] = lambda share: None
-) -> tuple[NeuralSession, list[str]]:
-    """One NWB file; see `read_nwb`."""
-    if window not in WINDOWS:
-        raise ConfigError(f"no window {window!r}: there are {', '.join(WINDOWS)}")
+    path: Path,
+    window: str = "contact",
+    progress: Callable[[float], None] = lambda share: None,
+    clock: str = "session",
+    selection: Selection | None = None,
+) -> Reading:
+    """One NWB file; see `read_nwb`.
+
+    Raises:
+        ConfigError: naming the file, which cannot be read as one of these recordings, and why.
+    """
+    for what, value, known in (("window", window, WINDOWS), ("clock", clock, CLOCKS)):
+        if value not in known:
+            raise ConfigError(f"no {what} {value!r}: there are {', '.join(known)}")
+    h5py = _h5py()
+    try:
+        with h5py.File(path, "r") as file:
+            return _session(file, path.stem, window, progress, clock, selection or Selection())
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+    except Exception as error:  # of a damaged file HDF5 raises a dozen unrelated types
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"{path}: cannot be read as NWB ({reason})") from None
+
+
+def _h5py() -> Any:
     try:
         import h5py
     except ModuleNotFoundError:
         raise ConfigError(
             "reading NWB needs h5py, which is not installed: pip install 'tactile-rt[align]'"
         ) from None
-    try:
-        with h5py.File(path, "r") as file:
-            return _session(file, path, window, progress)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read as NWB ({error})") from None
+    return h5py
 
 
 def _session(
-    file: "h5py.File", path: Path, window: str, progress: Callable[[float], None]
-) -> tuple[NeuralSession, list[str]]:
-    trials = trial_columns(file, path)
-    kept = (
-        ~booleans(trials["ignore_trial"], path)
-        & (text(trials["outcome"]) == "correct")
-        & np.isin(text(trials["stimulus"]), SHAPES)
-    )
-    rows = np.flatnonzero(kept)
-    start, stop = (numbers(trials[c], path, c)[rows] for c in ("start_time", "choice_time"))
-    bad = np.flatnonzero(~(stop > start))
-    if bad.size:
-        k = bad[0]
-        raise ConfigError(
-            f"{path}: {TRIALS} row {rows[k]}: choice_time {stop[k]:g} s is not after "
-            f"start_time {start[k]:g} s"
-        )
+    file: "h5py.File",
+    name: str,
+    window: str,
+    progress: Callable[[float], None],
+    clock: str,
+    selection: Selection,
+) -> Reading:
+    notes: list[str] = []
+    trials = trial_columns(file)
     shapes, places = text(trials["stimulus"]), text(trials["servo_position"])
-    for row in rows:
-        if places[row] not in DISTANCES:
-            raise ConfigError(
-                f"{path}: {TRIALS} row {row}: servo_position {str(places[row])!r}, "
-                f"not one of {', '.join(DISTANCES)}"
-            )
-    notes = []
-    if window == "contact":
-        first = _first_contacts(contact_times(file, path), start, stop)
-        touched = np.isfinite(first)
-        if not touched.all():
-            notes.append(
-                f"session {path.stem}: {(~touched).sum()} of {len(rows)} correct trials left out: "
-                "no contact before the choice"
-            )
-        rows, start, stop = rows[touched], first[touched], stop[touched]
-    if not rows.size:
+    ignored = flags(trials["ignore_trial"], "ignore_trial")
+    start, stop = (numbers(trials[c], c) for c in ("start_time", "choice_time"))
+    kept = (ignored != 1) & (text(trials["outcome"]) == "correct") & np.isin(shapes, SHAPES)
+    task = task_of(file, shapes[ignored == 0])
+
+    def drop(bad: NDArray[np.bool_], why: str) -> None:
+        """Leave bad trials out, and say which."""
+        nonlocal kept
+        rows = np.flatnonzero(bad & kept)
+        if rows.size:
+            few = ", ".join(map(str, rows[:NAMED])) + (", ..." if rows.size > NAMED else "")
+            notes.append(f"{rows.size} of {kept.sum()} correct trials left out ({few}): {why}")
+        kept = kept & ~bad
+
+    drop(ignored == -1, "ignore_trial is neither true nor false")
+    drop(~np.isin(places, DISTANCES), f"servo_position is not one of {', '.join(DISTANCES)}")
+    with np.errstate(invalid="ignore", over="ignore"):
+        lasts = stop - start
+        good = (lasts > 0) & (lasts < LONGEST_TRIAL_S) & (np.abs(start) < LONGEST_SESSION_S)
+    drop(~good, f"choice_time is not after start_time, by {LONGEST_TRIAL_S:g} s at most")
+    units = spike_times(file, notes)
+    origin = starting_time(file)
+    if clock == "recording" and origin is None:
         raise ConfigError(
-            f"{path}: no trial is left: correct, not ignored, convex or concave"
-            + (", with a contact before the choice" if window == "contact" else "")
+            "acquisition has no electrical recording with a starting_time, which the published "
+            "analysis counts spike times from"
         )
-    stimulus = np.array([stimulus_index(shapes[r], places[r]) for r in rows], dtype=np.int64)
-    rates = _rates(spike_times(file, path), starting_time(file, path), start, stop, progress)
-    return NeuralSession(animal_name(file, path), path.stem, rates, stimulus), notes
+    shift = origin or 0.0 if clock == "recording" else 0.0
+    response = None
+    try:
+        contacts = contact_times(file, notes)
+    except ConfigError:
+        if window == "contact":
+            raise
+    else:
+        response = contact_response(name, units, contacts, shift, origin or 0.0)
+        if window == "contact":
+            start = _first_contacts(contacts, start, stop)
+            drop(~np.isfinite(start), "no contact before the choice")
+    rows = np.flatnonzero(kept)
+    if not rows.size:
+        raise ConfigError("; ".join([f"no trial is left in {TRIALS}: correct, not ignored, convex "
+                                     "or concave", *notes]))  # fmt: skip
+    depth = unit_column(file, "depth", len(units), notes)
+    kind = unit_column(file, "inhibitory", len(units), notes)
+    inhibitory = None if kind is None else kind == 1
+    chosen = selection.units(depth, inhibitory, len(units))
+    spikes = [times - shift for times, wanted in zip(units, chosen, strict=True) if wanted]
+    rates, course = _rates(spikes, start[rows], stop[rows], progress)
+    session = NeuralSession(
+        animal=animal_name(file, name),
+        name=name,
+        rates=rates,
+        stimulus=np.array([stimulus_index(shapes[r], places[r]) for r in rows], dtype=np.int64),
+        course=course,
+        depth=None if depth is None else depth[chosen],
+        inhibitory=None if inhibitory is None else inhibitory[chosen],
+        begin=numbers(trials["start_time"], "start_time")[rows],
+    )
+    return Reading(session, [f"session {name}: {note}" for note in notes], task, response)
 
 
 def _first_contacts(contacts: Floats, start: Floats, stop: Floats) -> Floats:
@@ -169,18 +265,21 @@ def _first_contacts(contacts: Floats, start: Floats, stop: Floats) -> Floats:
 
 def _rates(
     spikes: list[Floats],
-    origin: float,
     start: Floats,
     stop: Floats,
     progress: Callable[[float], None],
-) -> Floats:
-    """Spikes per second in [start, stop), (trial, unit)."""
+) -> tuple[Floats, Floats]:
+    """Spikes per second in [start, stop), (trial, unit), and by bin, (trial, bin, unit)."""
     bins = np.array(
         [len(np.arange(a, b + BIN_S, BIN_S)) - 1 for a, b in zip(start, stop, strict=True)]
     )
+    edges = start[:, None] + BIN_S * np.arange(COURSE_BINS + 1)
     rates = np.empty((len(start), len(spikes)))
+    course = np.empty((len(start), COURSE_BINS, len(spikes)))
     for unit, times in enumerate(spikes):
-        before = np.searchsorted(times - origin, [start, stop])  # spikes before each edge
+        before = np.searchsorted(times, [start, stop])  # spikes before each edge
         rates[:, unit] = (before[1] - before[0]) / (bins * BIN_S)
+        course[:, :, unit] = np.diff(np.searchsorted(times, edges), axis=1) / BIN_S
         progress((unit + 1) / len(spikes))
-    return rates
+    course[edges[:, 1:] > stop[:, None]] = np.nan
+    return rates, course

@@ -3,6 +3,8 @@
 It exists so that published numbers can be checked. What it does otherwise than the paper says:
 
 - rates count from the start of a trial, not from first contact (`nwb.read_nwb`);
+- the recording's starting time is subtracted from spike times, which NWB has on the session's clock
+  already: the published shift (clock ``recording`` of `nwb.read_nwb`);
 - the stimulus axis is the order of first appearance in each session (`neural.published_layout`);
 - a stimulus that a trial did not show counts as a rate of zero (same place);
 - no neuron is filtered; bootstraps are, by raw r_yy and r_xx >= 0.5 (`reliability.filtered_mean`);
@@ -58,16 +60,23 @@ def freeze_paper_code(
         progress: called with the share done, 0 to 1.
 
     Raises:
-        ConfigError: an animal whose mean response is not finite.
+        ConfigError: no animal has a mean response that makes an RDM; one of several is left out.
     """
-    names = tuple(rates)
-    steps = 2 * len(names) + 1
+    steps = 2 * len(rates) + 1
     targets: list[Target] = []
+    notes: list[str] = []
     halves: dict[str, Floats] = {}
     done = 0
-    for name in names:
-        targets.append(_target(name, rates[name], bootstraps, seed, halves))
+    for name in rates:
+        try:
+            targets.append(_target(name, rates[name], bootstraps, seed, halves))
+        except ConfigError as error:
+            notes.append(f"{error}: left out")
         progress((done := done + 1) / steps)
+    if not targets:
+        raise ConfigError("; ".join(notes) or "there is no animal")
+    names = tuple(target.name for target in targets)
+    rates = {name: rates[name] for name in names}
     pooled = None
     if len(names) > 1:
         pooled = _target(POOLED, pad(list(rates.values())), bootstraps, seed, halves)
@@ -93,6 +102,7 @@ def freeze_paper_code(
         a2a=Consistency(names, held_out, pairwise, ddof=0),
         bootstraps=bootstraps,
         seed=seed,
+        notes=tuple(notes),
     )
 
 

@@ -1,7 +1,10 @@
 """Benchmarks from rates in the published layout, and requests that cannot be met."""
 
+import re
 import subprocess
 import sys
+import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from tactile_rt.models.alignment import build
 from tactile_rt.models.alignment.published import read_published, write_published
 from tactile_rt.stream import ConfigError
 from tests.helpers.brains import geometry, padded
+from tests.helpers.nwb_sessions import write_session
 
 
 @pytest.fixture
@@ -38,6 +42,53 @@ def test_its_stimuli_have_no_names_so_strict_refuses_it(rates, tmp_path):
         build([tmp_path / "rates.npz"])
     with pytest.raises(ConfigError, match="name nothing beside it"):
         build([tmp_path / "rates.npz", tmp_path], "paper-code")
+
+
+def test_the_published_option_is_passed_over_and_never_unpickled(rates, tmp_path):
+    """numpy saved `allow_pickle=True` among the animals; were it a pickle, it would stay one."""
+
+    class Trap:
+        def __reduce__(self):
+            return Path(tmp_path / "sprung").touch, ()
+
+    np.savez(tmp_path / "rates.npz", **rates)
+    for entry in (np.array(True), np.array([Trap()], dtype=object)):
+        with zipfile.ZipFile(tmp_path / "rates.npz", "a") as archive:
+            if "allow_pickle.npy" not in archive.namelist():
+                with archive.open("allow_pickle.npy", "w") as member:
+                    np.lib.format.write_array(member, entry)
+        made = build([tmp_path / "rates.npz"], "paper-code", bootstraps=30)
+        assert [t.name for t in made.targets] == list(rates)
+        assert made.notes == ("rates.npz: 3 animals, 51 units",)
+        np.savez(tmp_path / "rates.npz", **rates)
+    assert not (tmp_path / "sprung").exists()
+    with pytest.raises(ConfigError, match="holds rates, not spikes: neither a clock nor a sel"):
+        build([tmp_path / "rates.npz"], "paper-code", clock="session")
+
+
+def test_an_animal_without_an_rdm_is_left_out_alone(rates, tmp_path):
+    silent = {**rates, "silent": np.zeros_like(rates["sub-0"])}
+    write_published(silent, tmp_path / "rates.npz")
+    made = build([tmp_path / "rates.npz"], "paper-code", bootstraps=30)
+    assert [t.name for t in made.targets] == list(rates)
+    assert made.notes[1].startswith("animal silent: no RDM") and made.notes[1].endswith("left out")
+    write_published({"silent": silent["silent"]}, tmp_path / "rates.npz")
+    with pytest.raises(ConfigError, match="animal silent: no RDM"):
+        build([tmp_path / "rates.npz"], "paper-code", bootstraps=30)
+
+
+def test_a_build_without_reliable_animals_says_why(tmp_path):
+    pytest.importorskip("h5py", reason="h5py reads the files")
+    for i in range(2):  # units that answer to contact, and to all stimuli alike
+        rng = np.random.default_rng(i)
+        write_session(tmp_path / f"{i}.nwb", rng, np.full((6, 12), 7.0), f"mouse-{i}", trials=48)
+    with pytest.raises(ConfigError) as error:
+        build([tmp_path], bootstraps=30)
+    said = str(error.value)
+    assert re.match(
+        r"no animal is reliable enough .*: mouse-0 (-?\d\.\d\d|nan) \(\d+ of 12 un", said
+    )
+    assert "\n" not in said
 
 
 @pytest.mark.parametrize(

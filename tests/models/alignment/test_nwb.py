@@ -1,27 +1,40 @@
 """The h5py reader against pynwb, on files that pynwb wrote, and every way a file can be wrong."""
 
+import re
 from datetime import UTC, datetime
 
 import numpy as np
 import pytest
 
 from tactile_rt.models.alignment import build, nwb
+from tactile_rt.models.alignment.clock import CLOCKS
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.stream import ConfigError
 
 h5py = pytest.importorskip("h5py", reason="h5py reads the files")
 pynwb = pytest.importorskip("pynwb", reason="pynwb writes the files and is the oracle")
 
-ORIGIN = 3.7  # s, when the electrical recording began
+ORIGIN = 10.03  # s, when the electrical recording began
 STRINGS = ("outcome", "stimulus", "servo_position")
 
 
-def write(path, rng, trials=60, units=5, animal="mouse", tuned=None, touches=True):
+def write(
+    path,
+    rng,
+    trials=60,
+    units=5,
+    animal="mouse",
+    tuned=None,
+    touches=True,
+    late=0.0,
+    task="discrimination",
+):
     """A session in the layout of the published files."""
     file = pynwb.NWBFile(
         session_description="a session",
         identifier=str(path),
         session_start_time=datetime(2020, 1, 1, tzinfo=UTC),
+        experiment_description=f"whisker-based shape {task}",
     )
     file.subject = pynwb.file.Subject(subject_id=animal, species="Mus musculus", age="P90D")
     device = file.create_device("probe")
@@ -42,8 +55,9 @@ def write(path, rng, trials=60, units=5, animal="mouse", tuned=None, touches=Tru
     begin = 5 + 10.0 * np.arange(trials)
     choice = begin + rng.uniform(1.5, 3, trials)
     contact = begin + rng.uniform(0.2, 1, trials)
-    contact[3] = begin[3] - 1  # before the trial: it has none of its own
-    contact[6] = choice[6] + 0.01  # too late
+    written = contact.copy()
+    written[3] = begin[3] - 0.4  # before the trial: it has none of its own
+    written[6] = choice[6] + 0.01  # too late
     for k, (s, b, c) in enumerate(zip(shown, begin, choice, strict=True)):
         shape, place = STIMULI[s].split("-")
         file.add_trial(
@@ -55,14 +69,27 @@ def write(path, rng, trials=60, units=5, animal="mouse", tuned=None, touches=Tru
             servo_position=place,
             ignore_trial=k == 5,
         )
+    for name in ("depth", "inhibitory"):
+        file.add_unit_column(name, name)
     for unit in range(units):
         rate = rng.uniform(2, 20, 6) if tuned is None else tuned[:, unit]
         spikes = [
-            rng.uniform(b, b + 10, rng.poisson(10 * rate[s]))
-            for s, b in zip(shown, begin, strict=True)
+            np.concatenate(
+                [
+                    rng.uniform(c, b, rng.poisson((b - c) * rate[s])),
+                    rng.uniform(c + 0.005, c + 0.03, rng.poisson(0.25 * rate[s])),
+                    rng.uniform(b, e, rng.poisson((e - b) * rate.mean() / 3)),
+                ]
+            )
+            for s, c, b, e in zip(shown, contact, choice, begin + 9, strict=True)
         ]
-        # Ragged, and one unit that never fires.
-        file.add_unit(spike_times=np.sort(np.concatenate(spikes)) + ORIGIN if unit != 1 else [])
+        # Ragged, and one unit that never fires. The recording begins late, and spikes with it.
+        times = np.sort(np.concatenate(spikes)) if unit != 1 else np.empty(0)
+        file.add_unit(
+            spike_times=times[times > ORIGIN] + late,
+            depth=100.0 + 100 * unit,
+            inhibitory=unit % 4 == 3,
+        )
     behavior = file.create_processing_module("behavior", "whiskers")
     for w in range(2):
         angle = pynwb.behavior.SpatialSeries(
@@ -81,7 +108,7 @@ def write(path, rng, trials=60, units=5, animal="mouse", tuned=None, touches=Tru
             table = pynwb.epoch.TimeIntervals(
                 name=f"contacts_by_whisker_C{w}", description="touches"
             )
-            for t in contact[w::2]:
+            for t in written[w::2]:
                 table.add_interval(start_time=t, stop_time=t + 0.02)
                 table.add_interval(start_time=t + 0.1, stop_time=t + 0.12)
             behavior.add(table)
@@ -90,7 +117,7 @@ def write(path, rng, trials=60, units=5, animal="mouse", tuned=None, touches=Tru
     return path
 
 
-def through_pynwb(path, window):
+def through_pynwb(path, window, clock):
     """Rates and stimuli as section 'Definitions' has them, from what pynwb reads."""
     with pynwb.NWBHDF5IO(path, "r") as io:
         file = io.read()
@@ -105,6 +132,7 @@ def through_pynwb(path, window):
             )
         )
         origin = file.acquisition["extracellular array recording"].starting_time
+        origin = origin if clock == "recording" else 0.0
         spikes = [np.asarray(t) - origin for t in file.units.to_dataframe()["spike_times"]]
     rates, shown = [], []
     for _, trial in trials.iterrows():
@@ -142,10 +170,11 @@ def broken(session, tmp_path):
     return make
 
 
+@pytest.mark.parametrize("clock", CLOCKS)
 @pytest.mark.parametrize("window", nwb.WINDOWS)
-def test_rates_are_those_of_what_pynwb_reads(session, window):
-    made, notes = nwb.read_session(session, window)
-    rates, shown = through_pynwb(session, window)
+def test_rates_are_those_of_what_pynwb_reads(session, window, clock):
+    made, notes, *_ = nwb.read_session(session, window, clock=clock)
+    rates, shown = through_pynwb(session, window, clock)
     np.testing.assert_allclose(made.rates, rates, rtol=0, atol=1e-12)
     assert made.stimulus.tolist() == shown.tolist()
     assert (made.animal, made.name) == ("mouse", session.stem)
@@ -153,7 +182,7 @@ def test_rates_are_those_of_what_pynwb_reads(session, window):
     assert made.rates[:, 1].any() == False  # noqa: E712
     assert made.rates[:, 0].mean() > 1
     assert len(notes) == (window == "contact")
-    assert all("2 of 56 correct trials left out: no contact before the choice" in n for n in notes)
+    assert all("2 of 56 correct trials left out (3, 6): no contact before" in n for n in notes)
 
 
 def replace(file, name, values, **kwargs):
@@ -170,14 +199,14 @@ def test_strings_may_be_bytes(session, broken):
         replace(file, "intervals/trials/ignore_trial",
                 file["intervals/trials/ignore_trial"][()].astype(np.uint8))  # fmt: skip
 
-    expected, made = (nwb.read_session(p)[0] for p in (session, broken(as_bytes)))
+    expected, made = (nwb.read_session(p).session for p in (session, broken(as_bytes)))
     np.testing.assert_array_equal(made.rates, expected.rates)
     np.testing.assert_array_equal(made.stimulus, expected.stimulus)
 
 
 def test_a_file_without_a_subject_is_named_by_its_file(broken):
     path = broken(lambda f: f.__delitem__("general/subject"))
-    assert nwb.read_session(path)[0].animal == "broken"
+    assert nwb.read_session(path).session.animal == "broken"
 
 
 def test_unsorted_spikes_count_alike(session, broken):
@@ -187,8 +216,8 @@ def test_unsorted_spikes_count_alike(session, broken):
         values[: ends[0]] = values[: ends[0]][::-1]
         times[...] = values
 
-    made = nwb.read_session(broken(shuffle))[0]
-    np.testing.assert_array_equal(made.rates, nwb.read_session(session)[0].rates)
+    made = nwb.read_session(broken(shuffle)).session
+    np.testing.assert_array_equal(made.rates, nwb.read_session(session).session.rates)
 
 
 def late_contact(file):
@@ -242,35 +271,41 @@ PITFALLS = {
         lambda f: replace(f, "units/spike_times_index", f["units/spike_times_index"][()][::-1]),
         "does not divide",
     ),
+    "index of text": (
+        lambda f: replace(f, "units/spike_times_index", np.array([b"a"] * 5)),
+        "does not divide",
+    ),
     "lengths": (
         lambda f: replace(f, "intervals/trials/outcome", f["intervals/trials/outcome"][:-1]),
         "columns of intervals/trials differ in length: .*'outcome': 59",
     ),
-    "late contact": (
-        late_contact,
-        r"contacts_by_whisker_C1: a contact at 5000\.000 s comes after the last .* 615\.0",
+    "a column that is none": (
+        lambda f: replace(f, "intervals/trials/outcome", np.zeros((60, 2))),
+        "outcome is not a column of values",
     ),
-    "late contact, rate": (late_without_timestamps, r"last timestamp of the whiskers, 1\.500 s"),
-    "no contacts": (no_contacts, "without contacts only protocol paper-code"),
+    "a column without end": (
+        lambda f: (
+            drop("units/spike_times")(f),
+            f.create_dataset("units/spike_times", (1 << 40,), "f8", chunks=(1024,)),
+        ),
+        "has 1099511627776 values, more than a session can have",
+    ),
+    "no contacts": (no_contacts, "without them only protocol paper-code"),
     "contacts without times": (
         drop("processing/behavior/contacts_by_whisker_C0/start_time"),
         "contacts_by_whisker_C0 lacks the column start_time",
     ),
-    "no recording": (drop("acquisition"), "acquisition has no 'extracellular array recording'"),
-    "servo": (set_column("servo_position", 9, b"afar"), "row 9: servo_position 'afar', not one of"),
-    "choice": (set_column("choice_time", 9, 0.0), "row 9: choice_time 0 s is not after start_time"),
-    "choice missing": (set_column("choice_time", 9, np.nan), "row 9: choice_time nan s is not"),
     "text for times": (
         lambda f: replace(f, "intervals/trials/choice_time", f["intervals/trials/outcome"][()]),
         "choice_time is object, not times in seconds",
     ),
     "ignore": (
-        lambda f: replace(f, "intervals/trials/ignore_trial", np.full(60, 7)),
-        "ignore_trial is int64, not true or false",
+        lambda f: replace(f, "intervals/trials/ignore_trial", np.full(60, 0.5)),
+        "ignore_trial is float64, not true or false",
     ),
     "nothing left": (
         lambda f: replace(f, "intervals/trials/ignore_trial", np.full(60, True)),
-        "no trial is left: correct, not ignored, convex or concave",
+        "no trial is left in intervals/trials: correct, not ignored, convex or concave",
     ),
 }
 
@@ -281,6 +316,79 @@ def test_a_wrong_file_is_named_in_one_line(broken, change, message):
         nwb.read_session(broken(change))
     assert "broken.nwb" in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_the_published_shift_needs_a_starting_time(broken):
+    path = broken(drop("acquisition"))
+    assert len(nwb.read_session(path).session.rates) == 54
+    with pytest.raises(ConfigError, match="no electrical recording with a starting_time"):
+        nwb.read_session(path, clock="recording")
+
+
+def first_spike(value):
+    def change(file):
+        file["units/spike_times"][0] = value
+
+    return change
+
+
+SMALL_FAULTS = {  # and how many of 54 trials are left
+    "late contact": (
+        late_contact,
+        r"1 of 60 contacts in contacts_by_whisker_C1 left out: 5000\.000 s .* 615\.000 s",
+        54,
+    ),
+    "late contact, rate": (late_without_timestamps, r"60 of 60 .* whiskers, 1\.500 s", 27),
+    "servo": (set_column("servo_position", 9, b"afar"), r"1 of 56 .*\(9\): servo_position", 53),
+    "choice": (set_column("choice_time", 9, 0.0), r"\(9\): choice_time is not after start", 53),
+    "no choice": (set_column("choice_time", 9, np.nan), r"\(9\): choice_time is not after", 53),
+    "a choice years later": (set_column("choice_time", 9, 1e200), r"\(9\): choice_time is not", 53),
+    "ignore": (
+        lambda f: replace(f, "intervals/trials/ignore_trial", np.r_[np.zeros(59, int), 7]),
+        r"1 of 57 correct trials left out \(59\): ignore_trial is neither true nor false",
+        54,
+    ),
+    "no spike": (first_spike(np.nan), "1 of .* spikes left out: their times are no times", 54),
+    "depth": (
+        lambda f: replace(f, "units/depth", np.zeros(4)),
+        "units/depth left out: it is not a number for each of 5 units",
+        54,
+    ),
+}
+
+
+@pytest.mark.parametrize(("change", "message", "left"), SMALL_FAULTS.values(), ids=SMALL_FAULTS)
+def test_a_trial_a_contact_or_a_spike_is_left_out_alone(broken, change, message, left):
+    made = nwb.read_session(broken(change))
+    assert len(made.session.rates) == left
+    notes = [note for note in made.notes if re.search(message, note)]
+    assert len(notes) == 1, made.notes
+    assert notes[0].startswith("session broken: ")
+
+
+def test_a_session_that_cannot_be_read_is_left_out_alone(folder, tmp_path):
+    files = sorted(folder.glob("*.nwb"))
+    (tmp_path / "text.nwb").write_text("hello")
+    made = build([*files, tmp_path / "text.nwb"], bootstraps=50)
+    assert [t.name for t in made.targets] == ["a", "b"]
+    assert any(re.match(r"session text left out: .*text\.nwb: cannot be", n) for n in made.notes)
+
+
+def test_units_have_their_columns_and_rates_their_course(session):
+    made = nwb.read_session(session).session
+    assert made.depth.tolist() == [100, 200, 300, 400, 500]
+    assert made.inhibitory.tolist() == [False, False, False, True, False]
+    assert made.course.shape == (54, 22, 5)
+    # The course of a trial adds up to its rate, but for the bin that the choice falls into.
+    there = np.isfinite(made.course[:, :, 0])
+    assert (np.diff(there.astype(int), axis=1) <= 0).all()
+    spikes = np.nansum(made.course[:, :, 0], axis=1) * nwb.BIN_S
+    whole = ~there[:, -1]  # the choice is within the course
+    all_spikes = made.rates[:, 0] * (there.sum(axis=1) + 1) * nwb.BIN_S
+    assert whole.any()
+    missing = (all_spikes - spikes)[whole]
+    assert (missing > -1e-9).all()
+    np.testing.assert_allclose(missing, np.round(missing), atol=1e-9)
 
 
 def test_what_is_no_hdf5_is_refused(tmp_path):

@@ -1,0 +1,211 @@
+"""The clock that spikes are on, checked on the data: rates must rise 3 to 40 ms after contact.
+
+Barrel cortex answers a touch within milliseconds, so a recording tells by itself whether its spikes
+and its contacts are on one clock.
+
+- *Contacts* count that begin a bout, none within 250 ms before: the rate before them is a baseline,
+  and the rhythm of whisking makes no other shift look right.
+- *The rise* is the number of spikes 3 to 40 ms after contact less that in as long a time before.
+- *What chance does* is seen by shifting spikes against contacts by up to 20 s, or somewhat more
+  than the recording's starting time: the rises at all those shifts have a spread, and z is the rise
+  in units of it. Slow changes of the rate, with the trials say, cancel in the difference.
+- *Another clock* is suspected where some other shift has a rise that no chance explains and that is
+  clearly greater than the rise without a shift.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["CLOCKS", "WARNING", "ContactResponse", "contact_response", "said_of"]
+
+Floats = NDArray[np.float64]
+
+CLOCKS = ("session", "recording")  # NWB's; and the published shift by the starting time
+WARNING = "WARNING: "  # begins a note that must not be overlooked
+
+APART_S = 0.25  # between a contact that counts and the one before it
+RISE_MS = (3, 40)
+BEFORE_MS, AFTER_MS = 40, 60  # of the histogram
+BIN_S = 0.002  # of the search for another shift
+HERE_S = 0.03  # a shift below this is none
+SEARCH_S, FURTHER_S = 20.0, 5.0  # as far as that, and so much beyond the starting time
+FURTHEST_S, LONGEST_S = 600.0, 14_400.0  # of a shift, and of a session, that is searched
+RISES_Z = 5.0
+ELSEWHERE_Z, CLEARLY = 7.0, 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class ContactResponse:
+    """How the rates of a session, or of several, change with contact.
+
+    Attributes:
+        session: The name of the session.
+        shift_s: What was subtracted from the stored spike times, in s.
+        histogram: (100,) The number of spikes of all units in each ms from 40 ms before to 60 ms
+            after contact.
+        windows: The number of contacts times the number of units.
+        rise: The number of spikes 3 to 40 ms after contact less that in as long a time before.
+        spread: The spread of that number over other shifts, which chance alone makes.
+        other_s: The shift in s from the stored spike times at which the rise is greatest otherwise.
+        other_z: The rise at that shift, in units of `spread`.
+    """
+
+    session: str
+    shift_s: float
+    histogram: NDArray[np.int64]
+    windows: int
+    rise: float
+    spread: float
+    other_s: float
+    other_z: float
+
+    @property
+    def z(self) -> float:
+        """The rise in units of what chance makes; 0 where there are no spikes."""
+        return self.rise / self.spread if self.spread > 0 else 0.0
+
+    @property
+    def rises(self) -> bool:
+        """Whether the rates rise after contact, beyond chance."""
+        return self.z >= RISES_Z
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether another shift fits clearly better."""
+        return self.other_z >= max(ELSEWHERE_Z, CLEARLY * self.z)
+
+    @property
+    def before_hz(self) -> float:
+        """Mean rate of a unit 3 to 40 ms before contact, in spikes per second."""
+        low, high = RISE_MS
+        return self._rate(BEFORE_MS - high, BEFORE_MS - low)
+
+    @property
+    def after_hz(self) -> float:
+        """Mean rate of a unit 3 to 40 ms after contact, in spikes per second."""
+        low, high = RISE_MS
+        return self._rate(BEFORE_MS + low, BEFORE_MS + high)
+
+    @property
+    def latency_s(self) -> float:
+        """When the rate is half way from its level before contact to its highest after, in s."""
+        smooth = np.convolve(self.histogram, np.ones(3) / 3, mode="same")
+        base, after = smooth[1:BEFORE_MS].mean(), smooth[BEFORE_MS:-1]
+        return float(np.argmax(after >= (base + after.max()) / 2) + 0.5) * 1e-3
+
+    def _rate(self, begin: int, end: int) -> float:
+        time_s = self.windows * (end - begin) * 1e-3
+        return float(self.histogram[begin:end].sum() / time_s) if time_s else 0.0
+
+
+def contact_response(
+    session: str,
+    spikes: Sequence[Floats],
+    contacts: Floats,
+    shift_s: float = 0.0,
+    starting_time_s: float = 0.0,
+) -> ContactResponse | None:
+    """How a session's rates change with contact.
+
+    Args:
+        session: its name.
+        spikes: (spike,) stored times of each unit in s, finite.
+        contacts: (contact,) times when contacts begin in s, finite and sorted.
+        shift_s: is subtracted from the stored times.
+        starting_time_s: of the electrical recording, which the search reaches beyond.
+
+    Returns:
+        None without contacts or spikes to tell by.
+    """
+    first = contacts[np.diff(contacts, prepend=-np.inf) > APART_S]
+    times = np.sort(np.concatenate([*spikes, np.empty(0)])) - shift_s
+    reach = min(max(SEARCH_S, abs(starting_time_s) + FURTHER_S), FURTHEST_S)
+    if not first.size or first[-1] - first[0] > LONGEST_S:
+        return None
+    times = times[(times > first[0] - 2 * reach) & (times < first[-1] + 2 * reach)]
+    if not times.size:
+        return None
+    edges_s = np.arange(-BEFORE_MS, AFTER_MS + 1) * 1e-3
+    # A microsecond less: what is stored in seconds lies beside a bin's edge by rounding.
+    reached = np.searchsorted(times, first[:, None] + edges_s - 1e-6)
+    histogram = np.diff(reached.sum(axis=0))
+    begin, end = RISE_MS
+    rise = (
+        histogram[BEFORE_MS + begin : BEFORE_MS + end].sum()
+        - histogram[BEFORE_MS - end : BEFORE_MS - begin].sum()
+    )
+    shifts, rises = _search(times, first, reach)
+    low, high = np.percentile(rises, (2.5, 97.5))  # few enough shifts lie in a true rise
+    spread = float(high - low) / 3.92
+    far = np.abs(shifts) > HERE_S
+    best = int(np.argmax(np.where(far, rises, -np.inf)))
+    return ContactResponse(
+        session=session,
+        shift_s=shift_s,
+        histogram=histogram,
+        windows=len(first) * len(spikes),
+        rise=float(rise),
+        spread=spread,
+        other_s=float(shifts[best]) + shift_s,
+        other_z=float(rises[best]) / spread if spread > 0 else 0.0,
+    )
+
+
+def _search(times: Floats, contacts: Floats, reach: float) -> tuple[Floats, Floats]:
+    """Shifts in s, and the rise after contact when so much is subtracted from the spike times."""
+    begin = contacts[0] - 2 * reach
+    bins = int((contacts[-1] - contacts[0] + 4 * reach) / BIN_S) + 2
+
+    def binned(values: Floats) -> NDArray[np.int64]:
+        return np.bincount(((values - begin) / BIN_S).astype(np.int64), minlength=bins)[:bins]
+
+    size = 1 << (bins - 1).bit_length()
+    product = np.conj(np.fft.rfft(binned(contacts), size)) * np.fft.rfft(binned(times), size)
+    together = np.fft.irfft(product, size)  # at k: pairs of a contact and a spike k bins later
+    window = round(RISE_MS[1] * 1e-3 / BIN_S)
+    lags = np.arange(-int(reach / BIN_S), int(reach / BIN_S) + 1)
+    total = np.concatenate([[0.0], np.cumsum(np.roll(together, size // 2))])
+    at = lags + size // 2
+    rises = (total[at + window + 1] - total[at + 1]) - (total[at] - total[at - window])
+    return np.asarray(lags * BIN_S, dtype=np.float64), np.asarray(rises, dtype=np.float64)
+
+
+def said_of(responses: Sequence[ContactResponse], clock: str) -> str:
+    """One line on a build: the clock, the rates around contact, the latency, the effect.
+
+    Args:
+        responses: of the sessions, at least one.
+        clock: one of `CLOCKS`.
+    """
+    whole = ContactResponse(
+        session="all",
+        shift_s=0.0,
+        histogram=np.sum([r.histogram for r in responses], axis=0),
+        windows=sum(r.windows for r in responses),
+        rise=sum(r.rise for r in responses),
+        spread=float(np.sqrt(sum(r.spread**2 for r in responses))),
+        other_s=0.0,
+        other_z=0.0,
+    )
+    shifts = [r.shift_s for r in responses]
+    where = "spikes on the session's clock (offset 0 s)"
+    if clock == "recording":
+        where = f"spikes shifted by the starting time ({_span(shifts)} s), as published"
+    before, after = whole.before_hz, whole.after_hz
+    figures = f"{before:.2f} spikes/s before contact, {after:.2f} in the 3-40 ms after it"
+    if not whole.rises:
+        return f"{WARNING}{where}: rates do not rise after contact: {figures} (z = {whole.z:.1f})"
+    rising = sum(r.rises for r in responses)
+    more = f" ({after / before - 1:+.0%})" if before else ""
+    return (
+        f"{where}: {figures}{more}, z = {whole.z:.1f}, latency {whole.latency_s * 1e3:.1f} ms; "
+        f"they rise in {rising} of {len(responses)} sessions"
+    )
+
+
+def _span(values: Sequence[float]) -> str:
+    low, high = min(values), max(values)
+    return f"{low:.2f}" if low == high else f"{low:.2f} to {high:.2f}"
