@@ -244,6 +244,10 @@ def decode_stimuli(
     benchmark: Annotated[
         Path | None, typer.Option(help="Decode its animals' mean responses too.")
     ] = None,
+    animals: Annotated[
+        Path | None,
+        typer.Option(help="Decode recorded animals too, and their mean: a published .npz, or NWB."),
+    ] = None,
     stimuli: Stimuli = None,
     paper: Annotated[
         bool, typer.Option(help="Also the paper's variant: one stimulus held out at a time.")
@@ -253,13 +257,20 @@ def decode_stimuli(
     """Decode shape and distance of the stimuli from every layer, with permutation chance."""
     check_output(json)
     with _train():
+        from tactile_rt.models.alignment.animal_means import animal_means
         from tactile_rt.models.alignment.benchmark_file import load_benchmark
-        from tactile_rt.models.alignment.decoding import decode, decode_paper, decode_rdm
+        from tactile_rt.models.alignment.decoding import (
+            decode,
+            decode_paper,
+            decode_rdm,
+            mean_decoded,
+        )
         from tactile_rt.models.alignment.loading import check_models, load_layers
         from tactile_rt.models.alignment.stimuli_input import read_stimuli
 
         felt = read_stimuli(stimuli)
         targets = load_benchmark(benchmark).targets if benchmark else ()
+        recorded, notes = animal_means(animals) if animals else ({}, [])
         check_models(models)
         rows: list[tuple[str, str, Any]] = []
 
@@ -273,6 +284,14 @@ def decode_stimuli(
             layers, _ = load_layers(path, felt)
             for layer, patterns in layers.patterns.items():
                 add(f"{layers.name}: {layer}" if len(models) > 1 else layer, patterns)
+        for name, patterns in recorded.items():
+            add(name, patterns)
+        for variant in ("", "paper"):
+            found = [d for name, v, d in rows if name in recorded and v == variant]
+            if found:
+                rows.append((f"animals, mean of {len(found)}", variant, mean_decoded(found)))
+    for note in notes:
+        Console(stderr=True).print(note, highlight=False, markup=False)
     for target in targets:
         rows.append((target.name, "", decode_rdm(target.chosen.rdm)))
     _show_decoded(rows)
@@ -361,7 +380,10 @@ def _performances(text: str | None, number: int) -> list[tuple[float, str] | Non
 
 
 def _show_scores(results: Any) -> None:
-    table = Table("model", "score", "p", "95 % of chance", "untrained", "most chosen layer")
+    widest = max(len(model.name) for model in results.models)
+    name = Column("model", min_width=min(widest, 24), overflow="fold")
+    layer = Column("most chosen layer", overflow="fold")
+    table = Table(name, "score", "p", "95 % of chance", "untrained", layer)
     for model in results.models:
         chosen = [name for name in model.chosen if name]
         table.add_row(

@@ -50,7 +50,7 @@ def write_board(
     ] = None,
     part: Annotated[
         list[str] | None,
-        typer.Option(help="all, L2/3, L4, L5, L6, excitatory or inhibitory; may be repeated."),
+        typer.Option(help="all, L1, L2/3, L4, L5, L6, excitatory or inhibitory; may be repeated."),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write the board here.")] = None,
     page: Annotated[Path | None, typer.Option(help="Write it as a page here, .html.")] = None,

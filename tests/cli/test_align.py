@@ -101,6 +101,29 @@ def test_decode(call, frozen, tmp_path):
     assert rows[0]["shape_chance"] == pytest.approx(0.5)
 
 
+def test_the_row_of_animals_as_published(call, tmp_path):
+    """Decoded by mouse, then the mean: the paper's last row."""
+    rng = np.random.default_rng(0)
+    patterns = brains.geometry(rng)
+    rates = {f"animal-{i}": brains.padded(rng, patterns=patterns) for i in range(3)}
+    source, table = tmp_path / "rates.npz", tmp_path / "table.json"
+    write_published(rates, source)
+    code, out, err = call(
+        "align", "decode", MODEL, "--animals", source, "--paper", "--json", table
+    )  # fmt: skip
+    assert code == 0, err
+    rows = {(r["name"], r["variant"]): r for r in json.loads(table.read_text())}
+    for variant in ("balanced", "paper"):
+        mean = rows["animals, mean of 3", variant]
+        each = [rows[f"animal-{i}", variant] for i in range(3)]
+        assert mean["shape"] == pytest.approx(np.mean([r["shape"] for r in each]))
+        assert mean["distance"] == pytest.approx(np.mean([r["distance"] for r in each]))
+        assert mean["shape_p"] is None
+    assert "animals, mean of 3" in out
+    code, _, err = call("align", "decode", MODEL, "--animals", tmp_path / "none.npz")
+    assert code == 2 and "no file" in err
+
+
 def test_build_from_the_published_layout(call, tmp_path):
     rng = np.random.default_rng(0)
     patterns = brains.geometry(rng)

@@ -9,7 +9,7 @@ from tactile_rt.classifier.model_file import shipped_model
 
 pytest.importorskip("onnx")
 pytest.importorskip("torch")
-h5py = pytest.importorskip("h5py")
+pytest.importorskip("h5py")
 
 MODEL = shipped_model()
 
@@ -20,10 +20,7 @@ def brain(tmp_path_factory):
     from tactile_rt.models.alignment.example_files import write_example
 
     folder = tmp_path_factory.mktemp("board") / "brain"
-    recordings, _ = write_example(folder, Brain(mice=3, sessions=1, units=30, trials=12))
-    for path in recordings.rglob("*.nwb"):
-        with h5py.File(path, "r+") as file:
-            file["acquisition/extracellular array recording/starting_time"][()] = 0.0
+    write_example(folder, Brain(mice=3, sessions=1, units=30, trials=12))
     return folder
 
 

@@ -2,7 +2,7 @@
 
 Times are as the recordings' author shows them of one session (DANDI 000231, UsageNotes): trials
 from 5.9 s of the session's clock on, first contact at 7.9 s, first spikes at 10.03 s, where the
-recording begins. Spikes follow contact by a few ms, and the trial's stimulus from contact to choice.
+recording begins. Spikes follow contact by a few ms, and the stimulus from contact to choice.
 """
 
 import numpy as np

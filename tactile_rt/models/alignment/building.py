@@ -17,7 +17,7 @@ from tactile_rt.models.alignment.selection import Selection
 from tactile_rt.models.alignment.strict import freeze_strict
 from tactile_rt.stream import ConfigError
 
-__all__ = ["build"]
+__all__ = ["build", "checked_sessions"]
 
 # Of the time that a build takes; the rest is bootstraps.
 READING = 0.8
@@ -88,11 +88,48 @@ def build(
         _check_reliable(made)
         return made
     strict = protocol == "strict"
-    clock = clock or ("session" if strict else "recording")
     files = find_nwb(inputs)
-    readings, notes = read_nwb(
-        files, "contact" if strict else "start", reading, clock, selection or Selection()
+    sessions, notes = checked_sessions(files, strict, reading, clock, selection)
+    if strict:
+        made = freeze_strict(by_animal(sessions), bootstraps, seed, splitting)
+    else:
+        sessions = _complete(sessions, notes)
+        layouts = {animal.name: published_layout(animal) for animal in by_animal(sessions)}
+        made = freeze_paper_code(layouts, bootstraps, seed, splitting)
+    made = replace(
+        made,
+        sources=tuple(sorted(f.name for f in files)),
+        notes=(*notes, *made.notes),
     )
+    _check_reliable(made)
+    return made
+
+
+def checked_sessions(
+    files: Sequence[Path],
+    strict: bool = True,
+    progress: Callable[[float], None] = lambda share: None,
+    clock: str | None = None,
+    selection: Selection | None = None,
+) -> tuple[list[NeuralSession], list[str]]:
+    """Sessions of NWB files whose clock is the one that contacts show, and none of them twice.
+
+    Args:
+        files: one per session.
+        strict: rates count from first contact, and sessions of another clock are left out; else
+            from the start of the trial, and a note warns of them.
+        progress: called with the share done, 0 to 1.
+        clock, selection: as `build` has them.
+
+    Returns:
+        Sessions, and notes that begin with what the clock's check found.
+
+    Raises:
+        ConfigError: recordings that cannot be used, and why.
+    """
+    clock = clock or ("session" if strict else "recording")
+    window = "contact" if strict else "start"
+    readings, notes = read_nwb(files, window, progress, clock, selection or Selection())
     readings, said = _clock_checked(readings, clock, strict)
     tasks = {
         task: len({r.session.animal for r in readings if r.task == task})
@@ -103,19 +140,7 @@ def build(
         notes.append(f"animals of two tasks are together, {pooled}: --task keeps one")
     sessions = [reading.session for reading in readings]
     refuse_copies(sessions)
-    if strict:
-        made = freeze_strict(by_animal(sessions), bootstraps, seed, splitting)
-    else:
-        sessions = _complete(sessions, notes)
-        layouts = {animal.name: published_layout(animal) for animal in by_animal(sessions)}
-        made = freeze_paper_code(layouts, bootstraps, seed, splitting)
-    made = replace(
-        made,
-        sources=tuple(sorted(f.name for f in files)),
-        notes=(*said, *notes, *made.notes),
-    )
-    _check_reliable(made)
-    return made
+    return sessions, [*said, *notes]
 
 
 def _clock_checked(

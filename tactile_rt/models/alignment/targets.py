@@ -1,7 +1,6 @@
 """Parts of an animal's cortex as targets of their own: a layer, or a type of cell.
 
-Depths are below the pia. The borders are those that the recordings' author draws
-(github.com/cxrodgers/my, plot.py); a single mouse's differ, and what lies at a border is what its
+A mouse's borders differ from those of `selection.LAYERS_UM`, and what lies at a border is what its
 depth says.
 """
 
@@ -12,20 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
+from tactile_rt.models.alignment.selection import CELLS, LAYERS_UM
 from tactile_rt.settings import no_such
 from tactile_rt.stream import ConfigError
 
-__all__ = ["CELLS", "LAMINAE", "TARGET_PARTS", "part_of"]
+__all__ = ["TARGET_PARTS", "part_of"]
 
-# (from, to) in um below the pia
-LAMINAE = {
-    "L2/3": (128.0, 419.0),
-    "L4": (419.0, 626.0),
-    "L5": (626.0, 1006.0),
-    "L6": (1006.0, 1366.0),
-}
-CELLS = ("excitatory", "inhibitory")  # putative, by the width of their spikes
-TARGET_PARTS = ("all", *LAMINAE, *CELLS)
+TARGET_PARTS = ("all", *LAYERS_UM, *CELLS)
 
 
 def part_of(animals: Sequence[Animal], part: str) -> tuple[Animal, ...]:
@@ -67,5 +59,5 @@ def _chosen(session: NeuralSession, part: str) -> NDArray[np.bool_] | None:
         return session.inhibitory if part == "inhibitory" else ~session.inhibitory
     if session.depth is None:
         return None
-    low, high = LAMINAE[part]
+    low, high = LAYERS_UM[part]
     return (session.depth >= low) & (session.depth < high)

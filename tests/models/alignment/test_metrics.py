@@ -16,7 +16,8 @@ from tactile_rt.models.alignment.metrics.geometry import cka, cosine, rsa, time_
 from tactile_rt.models.alignment.metrics.halves import bins_of, divisions, half_means, means_of
 from tactile_rt.models.alignment.metrics.linear import PENALTIES, predicted
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
-from tactile_rt.models.alignment.targets import LAMINAE, part_of
+from tactile_rt.models.alignment.selection import LAYERS_UM
+from tactile_rt.models.alignment.targets import part_of
 from tactile_rt.stream import ConfigError
 from tests.helpers import brains
 
@@ -236,11 +237,19 @@ def test_parts_of_cortex():
     )
     animal, unknown = Animal("a", (session,)), Animal("b", (plain,))
     found = {
-        name: part_of([animal, unknown], name) for name in (*LAMINAE, "inhibitory", "excitatory")
+        name: part_of([animal, unknown], name) for name in (*LAYERS_UM, "inhibitory", "excitatory")
     }
     assert all([a.name for a in animals] == ["a"] for animals in found.values())
     units = {name: animals[0].sessions[0].rates.shape[1] for name, animals in found.items()}
-    assert units == {"L2/3": 3, "L4": 2, "L5": 2, "L6": 2, "inhibitory": 4, "excitatory": 8}
+    assert units == {
+        "L1": 1,
+        "L2/3": 3,
+        "L4": 2,
+        "L5": 2,
+        "L6": 2,
+        "inhibitory": 4,
+        "excitatory": 8,
+    }
     cut = found["L4"][0].sessions[0]
     np.testing.assert_array_equal(cut.rates, plain.rates[:, 3:5])
     np.testing.assert_array_equal(cut.course[:, 1], plain.rates[:, 3:5])

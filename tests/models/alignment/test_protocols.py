@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tactile_rt.models.alignment.benchmark_file import load_benchmark, save_benchmark
 from tactile_rt.models.alignment.neural import Animal, NeuralSession, pad, published_layout
 from tactile_rt.models.alignment.paper_code import freeze_paper_code
 from tactile_rt.models.alignment.rdm import STIMULI
@@ -35,6 +36,17 @@ def test_animals_of_one_geometry_agree_and_scrambled_ones_do_not():
     assert len(scrambled.reliable) == 24
     assert abs(scrambled.a2a.mean) < 0.2
     assert abs(np.nanmean(scrambled.a2a.pairwise)) < 0.2
+
+
+def test_the_error_of_a_consistency_is_that_of_its_protocol(tmp_path):
+    made = animals(np.random.default_rng(1), number=5)
+    published = freeze_paper_code({a.name: published_layout(a) for a in made}, 20)
+    for benchmark, ddof in ((freeze_strict(made, 20), 1), (published, 0)):
+        save_benchmark(benchmark, tmp_path / "b.json")
+        for one in (benchmark, load_benchmark(tmp_path / "b.json")):
+            pooled = one.a2a.pooled[np.isfinite(one.a2a.pooled)]
+            wanted = np.std(pooled, ddof=ddof) / np.sqrt(len(pooled))
+            assert one.a2a.sem == pytest.approx(wanted, rel=1e-12)
 
 
 def test_the_order_of_appearance_destroys_what_animals_share():

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_rt.models.alignment.benchmark import Consistency
 from tactile_rt.models.alignment.rdm import pearson, rdm
 from tactile_rt.models.alignment.reliability import (
     filtered_mean,
@@ -80,6 +81,16 @@ def test_the_published_aggregates_follow_from_the_published_bootstraps():
     assert np.nanmedian(score) == pytest.approx(0.457738, abs=1e-6)  # the paper's 0.46
     assert filtered_mean(score, r_yy) == pytest.approx(0.329451, abs=1e-6)  # as models are scored
     assert (r_yy >= 0.5).sum() == 75
+
+
+def test_the_published_standard_error_takes_off_no_degree_of_freedom():
+    with np.load(PUBLISHED) as file:
+        scores = file["r_xy_n_sb"]
+    nothing = np.empty((0, 0))
+    one, other = (Consistency((), scores, nothing, ddof).sem for ddof in (0, 1))
+    assert one == pytest.approx(0.017570933160905067, abs=1e-15)  # as saved with the results
+    assert other > one + 1e-5
+    assert np.isnan(Consistency((), scores[:0], nothing, 0).sem)
 
 
 def test_the_factor_of_a_target_gives_the_same_aggregates():

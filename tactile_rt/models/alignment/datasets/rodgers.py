@@ -3,9 +3,10 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from tactile_rt.models.alignment.building import checked_sessions
 from tactile_rt.models.alignment.datasets import DatasetContents, NeuralDataset
 from tactile_rt.models.alignment.neural import by_animal
-from tactile_rt.models.alignment.nwb import find_nwb, read_nwb
+from tactile_rt.models.alignment.nwb import find_nwb
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 
 __all__ = ["DANDI_000231", "EXAMPLE"]
@@ -14,7 +15,7 @@ __all__ = ["DANDI_000231", "EXAMPLE"]
 def _read(
     paths: Sequence[Path], stimuli: StimuliInput, progress: Callable[[float], None]
 ) -> DatasetContents:
-    sessions, notes = read_nwb(find_nwb(paths), "contact", progress)
+    sessions, notes = checked_sessions(find_nwb(paths), progress=progress)
     return DatasetContents(by_animal(sessions), None, tuple(notes))
 
 
