@@ -3,14 +3,16 @@
 rdm           RDMs of the six stimuli and their comparison
 reliability   split halves, Spearman-Brown, the correction for noise
 neural, nwb, nwb_parts, published   recordings: from NWB files, and in the published layout
-strict, pooling, paper_code, building   the two protocols: recordings -> a frozen benchmark
+strict, canonical, pooling, paper_code, building   the two protocols: recordings -> a frozen benchmark
 benchmark, benchmark_file   the frozen benchmark and its file
 scoring, statistics      a model's layers -> score, exact p-value
 stimuli_input, layers, activations, onnx_taps, onnx_activations, responses_file, loading
                           a model -> its layers
 example, example_files   a made-up brain of known truth, and its files
 metrics/, targets        more than 15 numbers: metrics in a table, layers of cortex, types of cell
-fidelity, gate, decoding, results, pictures, report   what is done with them
+datasets/, animal_means  recordings as plug-ins: license, citation, size, and how to read them
+board, board_page        models by datasets by metrics
+another_mouse, fidelity, gate, decoding, results, pictures, report   what is done with them
 """
 
 from tactile_rt.models.alignment.benchmark import (

@@ -25,11 +25,13 @@ class Frozen:
     """An RDM and how far it can be relied on.
 
     Attributes:
-        rdm: (15,) The dissimilarities of the 15 pairs of stimuli, from the mean over trials.
-        reliability: The mean split-half correlation of the RDM, corrected by Spearman-Brown.
+        rdm: (15,) The dissimilarities of the 15 pairs of stimuli: for paper-code, from the mean over
+            trials; for strict, the mean over divisions of the trials.
+        reliability: The mean split-half correlation of the RDM, corrected by Spearman-Brown; for
+            strict, that of the RDM of one half of a division.
         factor: The factor K by which a model's r_xy is multiplied to give its score; NaN if the RDM
             is too noisy to score on.
-        units: The number of units that the RDM was made from.
+        units: The number of units that the RDM was made from; for strict, on average.
     """
 
     rdm: Floats
@@ -106,7 +108,7 @@ class Benchmark:
         targets: The animals that models are compared to.
         pooled: All animals as one target, which paper-code scores on as well; None under strict.
         a2a: The animal-to-animal consistency, which a model cannot be expected to exceed.
-        bootstraps, seed: Number and seed of the random splits of the trials.
+        bootstraps, seed: Number and seed of the random divisions of the trials.
         sources: The names of the files that were read.
         notes: Remarks on what was left out and why, a line each.
         stimuli: The names of the stimuli along the stimulus axis.

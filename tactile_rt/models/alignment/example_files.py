@@ -169,7 +169,8 @@ def _spikes(
 def _drawn(rng: np.random.Generator, begin: Floats, length: Floats, rate: Floats) -> Floats:
     """Poisson spikes at given rates in windows, (window,) each."""
     number = rng.poisson(rate * length)
-    return np.repeat(begin, number) + rng.random(number.sum()) * np.repeat(length, number)
+    spikes: Floats = np.repeat(begin, number) + rng.random(number.sum()) * np.repeat(length, number)
+    return spikes
 
 
 # NWB 2, as far as its readers need it.

@@ -1,28 +1,33 @@
 """Whether a model may be released: four tests, and the exit code that a pipeline reads.
 
 1. validity: enough reliable animals to say anything.
-2. NeuroAI Turing test: the model fits as well as animals fit each other, and better than chance.
-   The first alone is vacuous where animals hardly fit each other.
+2. NeuroAI Turing test: the model is not worse than another mouse, shown to be near one, and better
+   than chance (`another_mouse`). How far that can be told in this benchmark stands beside it.
 3. regression: not worse than a stored model on the same animals.
 4. export fidelity (`fidelity`), which needs no neural data.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike
 
+from tactile_rt.models.alignment.another_mouse import MARGIN, Mice
 from tactile_rt.models.alignment.benchmark import Benchmark
 from tactile_rt.models.alignment.scoring import Score
+from tactile_rt.models.alignment.statistics import student
 
 __all__ = [
     "FAIL",
     "INCONCLUSIVE",
     "INPUT_ERROR",
+    "LARGEST_DROP",
     "PASS",
     "Check",
     "exit_code",
+    "mice_of",
     "neural_checks",
     "regression",
     "turing",
@@ -32,12 +37,7 @@ __all__ = [
 PASS, FAIL, INCONCLUSIVE, INPUT_ERROR = 0, 1, 2, 3  # exit codes
 LEAST_ANIMALS = 5
 LARGEST_P = 0.05
-LARGEST_DROP = 0.05
-# 97.5 % points of Student's t, for 1, 2, ... degrees of freedom; the normal's beyond.
-STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228, 2.201, 2.179,
-           2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086, 2.080, 2.074, 2.069, 2.064,
-           2.060, 2.056, 2.052, 2.048, 2.045, 2.042)  # fmt: skip
-NORMAL = 1.960
+LARGEST_DROP = 0.05  # of the noise ceiling
 
 
 @dataclass(frozen=True)
@@ -67,23 +67,30 @@ def exit_code(checks: Sequence[Check]) -> int:
 
 
 def neural_checks(
-    score: Score, benchmark: Benchmark, baseline: Mapping[str, float] | None = None
+    score: Score, benchmark: Benchmark, baseline: ArrayLike | None = None
 ) -> tuple[Check, ...]:
     """Tests 1 to 3. Without a valid benchmark the others are inconclusive.
 
     Args:
         score: of the model on the benchmark.
         benchmark: the benchmark.
-        baseline: by animal, the stored model's score on the same benchmark.
+        baseline: (layer, 15) RDMs of the stored model's layers.
     """
     valid = validity(benchmark)
     if valid.code != PASS:
         left = ["turing", *(["regression"] if baseline is not None else [])]
         return valid, *(Check(n, INCONCLUSIVE, "the benchmark is not valid") for n in left)
-    checks = [valid, turing(score, benchmark)]
+    mice = mice_of(benchmark)
+    checks = [valid, turing(score, mice)]
     if baseline is not None:
-        checks.append(regression(score, baseline))
+        checks.append(regression(score, mice, baseline))
     return tuple(checks)
+
+
+def mice_of(benchmark: Benchmark) -> Mice:
+    """The reliable animals of a benchmark; there must be three."""
+    there = benchmark.reliable
+    return Mice(np.array([t.chosen.rdm for t in there]), np.array([t.chosen.factor for t in there]))
 
 
 def validity(benchmark: Benchmark) -> Check:
@@ -96,32 +103,53 @@ def validity(benchmark: Benchmark) -> Check:
     )
 
 
-def turing(score: Score, benchmark: Benchmark) -> Check:
-    """Score at least a2a less its standard error, and p of the maximum below `LARGEST_P`."""
-    bar = benchmark.a2a.mean - benchmark.a2a.sem
+def turing(score: Score, mice: Mice) -> Check:
+    """Fails a model that is worse than another mouse; passes one that is shown to be like one.
+
+    That takes a fit within the margin of the noise ceiling, and a p of the maximum below
+    `LARGEST_P`. What is neither worse nor shown to be like one is inconclusive.
+    """
+    found = mice.compare(score.rdms[None])
+    fit, floor, least = float(found.fit[0]), float(found.floor[0]), (1 - MARGIN) * found.ceiling
     why = (
-        f"score {score.score:.3f}, animal to animal {benchmark.a2a.mean:.3f} "
-        f"± {benchmark.a2a.sem:.3f} (at least {bar:.3f}); p {score.p:.4f} (below {LARGEST_P})"
+        f"fit {fit:.3f}, of another mouse {found.ceiling:.3f} and in 7 of 8 cases at least "
+        f"{found.bound:.3f}; confidently above {floor:.3f} ({least:.3f} is needed); "
+        f"p {score.p:.4f} (below {LARGEST_P})"
     )
-    if not all(map(math.isfinite, (score.score, score.p, bar))):
+    if not all(map(math.isfinite, (fit, floor, score.p))):
         return Check("turing", INCONCLUSIVE, f"cannot be computed: {why}")
-    return Check("turing", PASS if score.score >= bar and score.p < LARGEST_P else FAIL, why)
-
-
-def regression(score: Score, baseline: Mapping[str, float]) -> Check:
-    """Mean paired drop above `LARGEST_DROP` with a 95 % interval (Student's t) above zero fails."""
-    now = dict(zip(score.targets, score.per_target.tolist(), strict=True))
-    drops = np.array([baseline[n] - now[n] for n in now if n in baseline])
-    drops = drops[np.isfinite(drops)]
-    if drops.size < 2:
-        return Check("regression", INCONCLUSIVE, f"{drops.size} animals were scored in both")
-    degrees = drops.size - 1
-    point = STUDENT[degrees - 1] if degrees <= len(STUDENT) else NORMAL
-    half = point * float(drops.std(ddof=1)) / math.sqrt(drops.size)
-    mean = float(drops.mean())
-    return Check(
-        "regression",
-        FAIL if mean > LARGEST_DROP and mean - half > 0 else PASS,
-        f"dropped by {mean:+.3f} [{mean - half:+.3f}, {mean + half:+.3f}] over {drops.size} "
-        f"animals (at most {LARGEST_DROP}, or not to be told from none)",
+    power = mice.power()
+    caught = ", ".join(f"{share:.0%} at {lost:.0%}" for lost, share in power.fails.items())
+    why += (
+        f". Power: of these mice {power.passes:.0%} pass as models of the others; "
+        f"with part of their geometry lost fail {caught}"
     )
+    if found.worse[0]:
+        return Check("turing", FAIL, why)
+    return Check("turing", PASS if found.within[0] and score.p < LARGEST_P else INCONCLUSIVE, why)
+
+
+def regression(score: Score, mice: Mice, baseline: ArrayLike) -> Check:
+    """Passes a drop that is surely small, fails one that is surely there, both by one-sided tests.
+
+    The drop is that of the fit to single mice, paired; small is below `LARGEST_DROP` of the noise
+    ceiling.
+
+    Args:
+        score: of the model.
+        mice: that both models are compared to.
+        baseline: (layer, 15) RDMs of the stored model's layers.
+    """
+    before = mice.compare(np.asarray(baseline, dtype=np.float64)[None]).fits[0]
+    drops = (before - mice.compare(score.rdms[None]).fits[0]) / mice.ceiling
+    mean = float(drops.mean())
+    half = student(drops.size - 1) * float(drops.std(ddof=1)) / math.sqrt(drops.size)
+    why = (
+        f"the fit dropped by {mean:+.3f} [{mean - half:+.3f}, {mean + half:+.3f}] of the noise "
+        f"ceiling over {drops.size} animals (at most {LARGEST_DROP})"
+    )
+    if not math.isfinite(mean):
+        return Check("regression", INCONCLUSIVE, f"cannot be computed: {why}")
+    if mean + half < LARGEST_DROP:
+        return Check("regression", PASS, why)
+    return Check("regression", FAIL if mean - half > 0 else INCONCLUSIVE, why)

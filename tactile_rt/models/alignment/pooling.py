@@ -21,12 +21,12 @@ class Moments:
     """Sums over units of responses to six stimuli.
 
     Attributes:
-        units: The number of units that the sums run over.
+        units: (...) The number of units that the sums run over.
         sums: (..., 6) The sum over units of the response to each stimulus.
         products: (..., 6, 6) The sum over units of the products of the responses to two stimuli.
     """
 
-    units: int
+    units: Floats
     sums: Floats
     products: Floats
 
@@ -37,8 +37,9 @@ class Moments:
 
     def rdm(self) -> Floats:
         """RDMs (..., 15); NaN where a stimulus's response is the same in all units."""
-        mean = self.sums / self.units
-        covariance = self.products - self.units * mean[..., :, None] * mean[..., None, :]
+        units = np.maximum(self.units, 1)[..., None]
+        mean = self.sums / units
+        covariance = self.products - units[..., None] * mean[..., :, None] * mean[..., None, :]
         variance = np.diagonal(covariance, axis1=-2, axis2=-1)
         scale = np.diagonal(self.products, axis1=-2, axis2=-1)
         deviation = np.sqrt(np.where(variance > np.sqrt(CONSTANT) * scale, variance, np.nan))
@@ -46,10 +47,20 @@ class Moments:
         return np.asarray(1 - correlation[..., UPPER[0], UPPER[1]])
 
 
-def moments_of(patterns: Floats) -> Moments:
-    """Moments of responses (..., 6, unit)."""
+def moments_of(patterns: Floats, counted: NDArray[np.bool_] | None = None) -> Moments:
+    """Moments of responses (..., 6, unit).
+
+    Args:
+        patterns: the responses.
+        counted: (..., unit) which units count; default: all.
+    """
+    if counted is None:
+        units = np.full(patterns.shape[:-2], float(patterns.shape[-1]))
+    else:
+        units = counted.sum(axis=-1, dtype=np.float64)
+        patterns = np.where(counted[..., None, :], patterns, 0.0)
     return Moments(
-        units=patterns.shape[-1],
+        units=units,
         sums=patterns.sum(axis=-1),
         products=np.matmul(patterns, np.swapaxes(patterns, -1, -2)),
     )

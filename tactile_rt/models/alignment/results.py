@@ -1,7 +1,7 @@
 """Scores at rest: one JSON file that a report is drawn from and a gate compares with."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
@@ -229,8 +229,8 @@ def read_results(path: Path) -> Results:
     return results
 
 
-def baseline_of(path: Path, benchmark: Benchmark) -> Mapping[str, float]:
-    """By animal, the score of the one model in a file, on this same benchmark.
+def baseline_of(path: Path, benchmark: Benchmark) -> NDArray[np.float64]:
+    """RDMs (layer, 15) of the one model in a file that was scored on this same benchmark.
 
     Raises:
         ConfigError: unreadable, of several models, or of another benchmark.
@@ -240,10 +240,7 @@ def baseline_of(path: Path, benchmark: Benchmark) -> Mapping[str, float]:
         raise ConfigError(f"{path} has {len(results.models)} models; a baseline is one")
     if results.benchmark.sha256 != benchmark_sha256(benchmark):
         raise ConfigError(f"{path} was scored on another benchmark: score the baseline on this one")
-    return {
-        name: value if value is not None else math.nan
-        for name, value in zip(results.benchmark.targets, results.models[0].per_target, strict=True)
-    }
+    return np.array(results.models[0].rdms, dtype=np.float64)
 
 
 def _control(name: str, made: Score) -> AlignmentControl:

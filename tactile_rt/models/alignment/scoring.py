@@ -30,6 +30,7 @@ class Score:
         protocol: The name of the protocol of the benchmark.
         layers: The names of the layers, in the order of the layer axis.
         targets: The names of the targets; for paper-code the pooled animals are the last.
+        rdms: (layer, 15) The RDM of each layer.
         r: (layer, target) Correlations before the correction for noise.
         corrected: (layer, target) Correlations after the correction for noise; NaN where a layer
             has no RDM or a target is too noisy.
@@ -49,6 +50,7 @@ class Score:
     protocol: str
     layers: tuple[str, ...]
     targets: tuple[str, ...]
+    rdms: Floats
     r: Floats
     corrected: Floats
     unfiltered: Floats
@@ -126,6 +128,7 @@ def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> S
         protocol=benchmark.protocol,
         layers=tuple(names),
         targets=tuple(t.name for t in targets),
+        rdms=rdms,
         r=r,
         corrected=corrected,
         unfiltered=unfiltered,

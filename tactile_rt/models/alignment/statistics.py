@@ -19,9 +19,17 @@ __all__ = [
     "max_statistic",
     "mean_held_out",
     "standard_error",
+    "student",
 ]
 
 Floats = NDArray[np.float64]
+
+# Points of Student's t that it exceeds in one of eight cases, for 1, 2, ... degrees of freedom; the
+# normal's beyond.
+STUDENT = (2.414, 1.604, 1.423, 1.344, 1.301, 1.273, 1.254, 1.240, 1.230, 1.221, 1.214, 1.209,
+           1.204, 1.200, 1.197, 1.194, 1.191, 1.189, 1.187, 1.185, 1.183, 1.182, 1.180, 1.179,
+           1.178, 1.177, 1.176, 1.175, 1.174, 1.173)  # fmt: skip
+NORMAL = 1.150
 Statistic = Callable[[Floats], Floats]
 
 # Relabellings that leave an RDM as it is give its statistic again, but for rounding.
@@ -116,3 +124,8 @@ def standard_error(values: ArrayLike) -> float:
     if there.size < 2:
         return float("nan")
     return float(there.std(ddof=1) / np.sqrt(there.size))
+
+
+def student(degrees: int) -> float:
+    """What Student's t of one or more degrees of freedom exceeds in one of eight cases."""
+    return STUDENT[degrees - 1] if degrees <= len(STUDENT) else NORMAL

@@ -1,14 +1,16 @@
 """Protocol `strict`: the default.
 
 - Stimuli are named; sessions pool by name, and nothing that was not shown counts.
-- Trials are first split in two within every session and stimulus: on one half units are chosen
-  (split-half Spearman-Brown > 0.5), on the other everything is scored. The same scoring without the
-  choice of units stands beside it.
-- Halves are drawn within every session and stimulus. Sessions and trials are put in an order that
-  depends on their values alone, so that neither the order of files nor of trials matters.
-- An animal's reliability is that of its mean split-half correlation over all bootstraps, negative
-  ones included; it corrects for noise once, and an animal at or below zero is not scored. Only
-  animals whose RDM has a reliability of at least 0.5 count in a mean.
+- *Cross-fit.* Trials are divided in two within every session and stimulus: on one half units are
+  chosen (reliability of their tuning > 0.5), on the other everything is scored, and the other way
+  round. An RDM is the mean over many such divisions, in both directions; no one draw decides.
+- An animal's reliability is that of the RDM of a scored half: its own halves correlate by r, and
+  Spearman-Brown makes that of the mean over all divisions, negative ones included. It corrects for
+  noise once, and an animal at or below zero is not scored. Only animals whose RDM has a reliability
+  of at least 0.5 count in a mean.
+- The same without the choice of units stands beside it.
+- Divisions are drawn from trials in an order that depends on nothing but the data (`canonical`), so
+  that neither the order of files, trials and units nor the scale of rates matters.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,9 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.models.alignment.benchmark import Benchmark, Consistency, Frozen, Target
+from tactile_rt.models.alignment.canonical import canonical
 from tactile_rt.models.alignment.neural import Animal, NeuralSession, rates_sha256
 from tactile_rt.models.alignment.pooling import Moments, moments_of
-from tactile_rt.models.alignment.rdm import STIMULI, pearson
+from tactile_rt.models.alignment.rdm import CONSTANT, STIMULI, normalised, pearson
 from tactile_rt.models.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
 from tactile_rt.stream import ConfigError
 
@@ -28,48 +31,58 @@ __all__ = [
     "MINIMUM_RELIABILITY",
     "MINIMUM_TRIALS",
     "MINIMUM_UNITS",
-    "disjoint_trials",
+    "Divided",
+    "divided",
     "freeze_strict",
 ]
 
 Floats = NDArray[np.float64]
-Trials = tuple[NDArray[np.intp], ...]  # of every stimulus
 
 MINIMUM_RELIABILITY = 0.5  # of a unit, and of an animal's RDM
 MINIMUM_TRIALS = 4  # of every stimulus in a session: two halves of two halves
+TIE = 1e-9
 MINIMUM_UNITS = 5  # of an RDM: with fewer its correlations are mostly 1 or -1
-SELECTION_BOOTSTRAPS = 100
 
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """Units of an animal, or of several.
+    """Units of an animal, or of several, in every division and both halves of it.
 
     Attributes:
-        full: The moments of the mean responses over all scoring trials.
-        halves: (bootstrap, 2, ...) The moments of both half-means of every bootstrap.
+        halves: (division, 2, ...) The moments of the mean responses over each half of the trials,
+            of the units that were chosen on the other half.
+        quarters: (division, 2, 2, ...) The same of the two halves of each half.
     """
 
-    full: Moments
     halves: Moments
+    quarters: Moments
 
     def __add__(self, other: "_Pool") -> "_Pool":
-        return _Pool(self.full + other.full, self.halves + other.halves)
+        return _Pool(self.halves + other.halves, self.quarters + other.quarters)
 
     def freeze(self) -> Frozen:
-        """RDM, reliability and the factor that corrects for noise."""
-        units = self.full.units
-        reliability = np.nan
-        dissimilarities = np.full(15, np.nan)
-        if units >= MINIMUM_UNITS:
-            dissimilarities = self.full.rdm()
-            halves = self.halves.rdm()
-            r = pearson(halves[:, 0], halves[:, 1])
-            there = r[np.isfinite(r)]
-            if there.size and np.isfinite(dissimilarities).all():
-                reliability = float(spearman_brown(there.mean()))
-        factor = 1 / np.sqrt(reliability) if reliability > 0 else np.nan
-        return Frozen(np.nan_to_num(dissimilarities), reliability, float(factor), units)
+        """Mean RDM, reliability and the factor that corrects for noise.
+
+        A model's score is the mean over halves of its correlation with their RDMs, over the root of
+        their reliability. Correlations are products of RDMs of length one, so that mean is the
+        product with the mean of these, whose length goes into the factor.
+        """
+        enough = self.halves.units >= MINIMUM_UNITS
+        rdms = self.halves.rdm()
+        parts = self.quarters.rdm()
+        r = pearson(parts[..., 0, :], parts[..., 1, :])
+        unit = normalised(rdms)
+        there = enough & np.isfinite(r) & np.isfinite(unit).all(axis=-1)
+        units = round(float(self.halves.units.mean()))
+        if 2 * there.sum() < there.size:
+            return Frozen(np.zeros(rdms.shape[-1]), np.nan, np.nan, units)
+        reliability = float(spearman_brown(r[there].mean()))
+        mean = unit[there].mean(axis=0)
+        length = float(np.sqrt(mean @ mean))
+        factor = length / np.sqrt(reliability) if reliability > 0 else np.nan
+        level = rdms[there].mean(axis=-1, keepdims=True)
+        spread = np.sqrt(((rdms[there] - level) ** 2).sum(axis=-1)).mean()
+        return Frozen(level.mean() + spread * mean, reliability, float(factor), units)
 
 
 def freeze_strict(
@@ -82,7 +95,8 @@ def freeze_strict(
 
     Args:
         animals: whose rates count from first contact to choice.
-        bootstraps, seed: of the splits.
+        bootstraps: the number of divisions of the trials; each is used in both directions.
+        seed: of the divisions.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -103,13 +117,13 @@ def freeze_strict(
                     f"and every stimulus needs {MINIMUM_TRIALS} correct trials"
                 )
             else:
-                sessions.append(_canonical(session))
+                sessions.append(session)
         if not sessions:
             notes.append(f"animal {animal.name} left out: none of its sessions can be used")
             progress(done / len(animals))
             continue
-        sessions.sort(key=_sha256)
-        every, kept = _pools(sessions, bootstraps, seed)
+        ordered = sorted((canonical(s) for s in sessions), key=lambda pair: pair[1])
+        every, kept = _pools(ordered, bootstraps, seed)
         chosen = kept.freeze()
         names.append(animal.name)
         pools.append(kept)
@@ -120,7 +134,7 @@ def freeze_strict(
                 unfiltered=every.freeze(),
                 reliable=bool(chosen.reliability >= MINIMUM_RELIABILITY),
                 trials=sum(len(s.stimulus) for s in sessions),
-                sha256=_sha256(*sessions),
+                sha256=_sha256([one for one, _ in ordered]),
             )
         )
         progress(done / len(animals))
@@ -138,10 +152,10 @@ def freeze_strict(
 
 
 def _refuse_copies(animals: Sequence[Animal]) -> None:
-    """Two copies of a session would be split alike, and agree with each other perfectly."""
-    seen: dict[str, str] = {}
+    """Two copies of a session would be divided alike, and agree with each other perfectly."""
+    seen: dict[int, str] = {}
     for session in (s for animal in animals for s in animal.sessions):
-        key = _sha256(_canonical(session))
+        key = canonical(session)[1]
         if key in seen:
             raise ConfigError(
                 f"sessions {seen[key]} and {session.name} hold the same trials: give one of them"
@@ -149,58 +163,74 @@ def _refuse_copies(animals: Sequence[Animal]) -> None:
         seen[key] = session.name
 
 
-def _canonical(session: NeuralSession) -> NeuralSession:
-    """The same trials in an order that depends on their values alone."""
-    order = np.lexsort((*session.rates.T, session.stimulus))
-    return NeuralSession(
-        session.animal, session.name, session.rates[order], session.stimulus[order]
-    )
-
-
-def _sha256(*sessions: NeuralSession) -> str:
+def _sha256(sessions: Sequence[NeuralSession]) -> str:
     arrays = {f"{i} rates": s.rates for i, s in enumerate(sessions)}
     return rates_sha256(arrays | {f"{i} stimulus": s.stimulus for i, s in enumerate(sessions)})
 
 
-def _pools(sessions: Sequence[NeuralSession], bootstraps: int, seed: int) -> tuple[_Pool, _Pool]:
-    """All units, and the reliable ones, of an animal's sessions."""
+def _pools(
+    sessions: Sequence[tuple[NeuralSession, int]], divisions: int, seed: int
+) -> tuple[_Pool, _Pool]:
+    """All units, and the reliable ones, of an animal's canonical sessions and their keys."""
     every, kept = [], []
-    for session in sessions:
-        rng = np.random.default_rng([seed, int(_sha256(session)[:16], 16)])
-        choosing, scoring = disjoint_trials(session, rng)
-        tuned = _half_means(session.rates, choosing, SELECTION_BOOTSTRAPS, rng).swapaxes(-1, -2)
-        r = pearson(tuned[:, 0], tuned[:, 1])  # (bootstrap, unit), over stimuli
-        there = np.isfinite(r)
-        # A unit that is silent in a half says nothing there; silent in all, it is not reliable.
-        mean = np.where(there, r, 0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
-        reliable = spearman_brown(mean) > MINIMUM_RELIABILITY
-        halves = _half_means(session.rates, scoring, bootstraps, rng)
-        full = np.stack([session.rates[trials].mean(axis=0) for trials in scoring])
-        every.append(_Pool(moments_of(full), moments_of(halves)))
-        kept.append(_Pool(moments_of(full[..., reliable]), moments_of(halves[..., reliable])))
+    for session, key in sessions:
+        made = divided(session, divisions, np.random.default_rng([seed, key]))
+        every.append(_Pool(moments_of(made.halves), moments_of(made.quarters)))
+        chosen = made.reliable[:, ::-1]  # on the other half than is scored
+        kept.append(
+            _Pool(moments_of(made.halves, chosen), moments_of(made.quarters, chosen[:, :, None]))
+        )
     return _sum(every), _sum(kept)
 
 
-def disjoint_trials(session: NeuralSession, rng: np.random.Generator) -> tuple[Trials, Trials]:
-    """Trials to choose units on, and the others, to score on: rows of every stimulus."""
-    choosing, scoring = [], []
+@dataclass(frozen=True, eq=False)
+class Divided:
+    """Random divisions of a session's trials in two, and of each half in two.
+
+    Attributes:
+        halves: (division, 2, 6, unit) The mean responses over each half of the trials.
+        quarters: (division, 2, 2, 6, unit) The mean responses over each half of each half.
+        reliable: (division, 2, unit) Whether the tuning of a unit over that half of the trials has
+            a reliability above `MINIMUM_RELIABILITY`.
+    """
+
+    halves: Floats
+    quarters: Floats
+    reliable: NDArray[np.bool_]
+
+
+def divided(session: NeuralSession, divisions: int, rng: np.random.Generator) -> Divided:
+    """Divide trials within every stimulus at random.
+
+    A unit's reliability is the share of the variance over stimuli of its mean responses that noise,
+    known from the variance within stimuli, does not explain: 1 - 1/F of an analysis of variance. It
+    is what Spearman-Brown makes of the correlation of two halves, without drawing any.
+    """
+    units = session.rates.shape[1]
+    quarters = np.empty((divisions, 4, len(STIMULI), units))
+    halves = np.empty((divisions, 2, len(STIMULI), units))
+    noise = np.zeros((divisions, 2, units))  # variance of a mean response, mean over stimuli
     for stimulus in range(len(STIMULI)):
-        trials = rng.permutation(np.flatnonzero(session.stimulus == stimulus))
-        choosing.append(np.sort(trials[: len(trials) // 2]))
-        scoring.append(np.sort(trials[len(trials) // 2 :]))
-    return tuple(choosing), tuple(scoring)
-
-
-def _half_means(rates: Floats, trials: Trials, bootstraps: int, rng: np.random.Generator) -> Floats:
-    """Means of two random halves of every stimulus's trials: (bootstrap, 2, 6, unit)."""
-    means = np.empty((bootstraps, 2, len(trials), rates.shape[1]))
-    for stimulus, rows in enumerate(trials):
-        n = len(rows)
-        draws = rng.permuted(np.broadcast_to(np.arange(n), (bootstraps, n)), axis=1)
-        first = draws < n // 2
-        weights = np.stack([first / (n // 2), ~first / (n - n // 2)], axis=1)
-        means[:, :, stimulus] = weights @ rates[rows]
-    return means
+        rates = session.rates[session.stimulus == stimulus]
+        n = len(rates)
+        # Sizes of the quarters differ by one at most, and so do those of the halves.
+        edges = np.array([n // 4, n // 2, n // 2 + (n - n // 2) // 2])
+        place = np.searchsorted(edges, np.arange(n), side="right")
+        drawn = rng.permuted(np.broadcast_to(place, (divisions, n)), axis=1)
+        member = (drawn[:, None, :] == np.arange(4)[:, None]).astype(np.float64)
+        sizes = np.bincount(place, minlength=4)[:, None]
+        sums, squares = member @ rates, member @ rates**2
+        quarters[:, :, stimulus] = sums / sizes
+        sizes = sizes[0::2] + sizes[1::2]
+        mean = (sums[:, 0::2] + sums[:, 1::2]) / sizes
+        spread = np.maximum((squares[:, 0::2] + squares[:, 1::2]) / sizes - mean**2, 0)
+        halves[:, :, stimulus] = mean
+        noise += spread / (sizes - 1) / len(STIMULI)
+    signal = halves.var(axis=2, ddof=1)
+    varies = signal > CONSTANT * (halves**2).mean(axis=2)
+    # Counts of spikes are whole, so that a unit may be just at the limit: rounding must not decide.
+    reliable = varies & (noise < (1 - MINIMUM_RELIABILITY - TIE) * signal)
+    return Divided(halves, quarters.reshape(divisions, 2, 2, len(STIMULI), units), reliable)
 
 
 def _consistency(

@@ -4,13 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
 
 from tactile_rt.models.alignment.benchmark_file import load_benchmark, save_benchmark
+from tactile_rt.models.alignment.canonical import canonical
+from tactile_rt.models.alignment.example import Brain
 from tactile_rt.models.alignment.neural import Animal, NeuralSession, pad, published_layout
 from tactile_rt.models.alignment.paper_code import freeze_paper_code
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.scoring import score, score_rdms
-from tactile_rt.models.alignment.strict import disjoint_trials, freeze_strict
+from tactile_rt.models.alignment.strict import divided, freeze_strict
 from tactile_rt.stream import ConfigError
 from tests.helpers.brains import animals, geometry, loop, padded, responses, session
 
@@ -86,15 +91,122 @@ def test_units_that_respond_to_nothing_are_left_out():
         assert target.trials == 240
 
 
-def test_units_are_chosen_on_other_trials_than_are_scored():
-    rng = np.random.default_rng(4)
-    one = session(rng, "mouse", "s", geometry(rng), trials=9)
-    choosing, scoring = disjoint_trials(one, rng)
-    assert [len(rows) for rows in choosing] == [4] * 6
-    assert [len(rows) for rows in scoring] == [5] * 6
-    for stimulus, rows in enumerate(zip(choosing, scoring, strict=True)):
-        expected = np.flatnonzero(one.stimulus == stimulus)
-        assert sorted(np.concatenate(rows)) == expected.tolist()
+def test_a_division_is_of_all_trials_and_none_twice():
+    """Each trial is a power of two, so that sums of trials tell which trials were summed."""
+    trials = 9
+    rates = np.tile(2.0 ** np.arange(trials), 6)[:, None]
+    one = NeuralSession("mouse", "s", rates, np.repeat(np.arange(6), trials))
+    made = divided(one, 50, np.random.default_rng(0))
+    sizes = np.array([4, 5])[:, None, None]
+    halves = np.round(made.halves * sizes).astype(int)
+    assert (halves.sum(axis=1) == 2**trials - 1).all()
+    assert (halves[:, 0] & halves[:, 1] == 0).all()
+    quarters = made.quarters * np.array([[2, 2], [2, 3]])[:, :, None, None]
+    np.testing.assert_allclose(quarters.sum(axis=2), made.halves * sizes)
+    assert len(np.unique(halves[:, 0])) > 20
+
+
+def test_a_unit_is_reliable_by_analysis_of_variance():
+    """scipy's F of each half of the trials; 1 - 1/F > 0.5 is F > 2."""
+    rng = np.random.default_rng(5)
+    one = session(rng, "mouse", "s", geometry(rng), trials=8, noise=12, units=30, idle=1)
+    key = 2.0 ** np.arange(8)  # a unit that tells which trials a mean is of
+    marked = replace(one, rates=np.column_stack([one.rates, np.zeros(len(one.stimulus))]))
+    for stimulus in range(6):
+        marked.rates[marked.stimulus == stimulus, -1] = key
+    made = divided(marked, 10, np.random.default_rng(1))
+    seen = set()
+    for halves, reliable in zip(made.halves, made.reliable, strict=True):
+        for mean, found in zip(halves, reliable, strict=True):
+            groups = []
+            for stimulus in range(6):
+                rows = marked.rates[marked.stimulus == stimulus]
+                code = round(mean[stimulus, -1] * 4)
+                groups.append(rows[[k for k in range(8) if code >> k & 1]])
+            expected = stats.f_oneway(*(g[:, :30] for g in groups)).statistic > 2
+            np.testing.assert_array_equal(found[:30], expected)
+            assert not found[30]  # idle: the same in every trial but for rounding
+            seen |= set(expected.tolist())
+    assert seen == {True, False}
+
+
+def test_a_score_is_the_mean_over_halves_of_units_chosen_on_the_other():
+    """The whole protocol as a plain loop over divisions and directions."""
+    rng = np.random.default_rng(6)
+    shared = geometry(rng)
+    animal = brain_of(rng, shared)
+    (target,) = freeze_strict([animal], 30).targets
+    model = responses(rng, shared, 50)
+    made = [
+        divided(s, 30, np.random.default_rng([1234, key]))
+        for s, key in sorted((canonical(s) for s in animal.sessions), key=lambda pair: pair[1])
+    ]
+
+    def upper(patterns):
+        return (1 - np.corrcoef(patterns))[np.triu_indices(6, k=1)]
+
+    r_xy, r_yy = [], []
+    for b in range(30):
+        for half in range(2):
+            chosen = [m.reliable[b, 1 - half] for m in made]
+            whole, first, second = (
+                np.concatenate([p[:, c] for p, c in zip(parts, chosen, strict=True)], axis=1)
+                for parts in (
+                    [m.halves[b, half] for m in made],
+                    [m.quarters[b, half, 0] for m in made],
+                    [m.quarters[b, half, 1] for m in made],
+                )
+            )
+            r_xy.append(np.corrcoef(upper(model), upper(whole))[0, 1])
+            r_yy.append(np.corrcoef(upper(first), upper(second))[0, 1])
+    r = np.mean(r_yy)
+    expected = np.mean(r_xy) / np.sqrt(2 * r / (1 + r))
+    found = np.corrcoef(upper(model), target.chosen.rdm)[0, 1] * target.chosen.factor
+    assert found == pytest.approx(expected, abs=1e-10)
+    assert target.chosen.reliability == pytest.approx(2 * r / (1 + r), abs=1e-10)
+
+
+def brain_of(rng, shared):
+    return animals(rng, 1, shared=shared, noise=6, trials=9)[0]
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-3, 1e3))
+def test_neither_order_nor_scale_changes_a_score(seed, scale):
+    """Sparse counts, so that many trials and units look alike: the hardest case for an order."""
+    rng = np.random.default_rng(seed)
+    counts = np.random.default_rng(0)
+    made, changed = [], []
+    for k in range(3):
+        tuned = np.exp(counts.normal(size=(6, 14)))
+        shown = np.repeat(np.arange(6), 6)
+        sessions = [
+            NeuralSession(f"m{k}", f"m{k}-{j}", counts.poisson(tuned[shown]) / 0.045, shown)
+            for j in range(2)
+        ]
+        made.append(Animal(f"m{k}", tuple(sessions)))
+        moved = []
+        for one in reversed(sessions):
+            rows, units = rng.permutation(len(shown)), rng.permutation(14)
+            rates = one.rates[np.ix_(rows, units)] * scale
+            moved.append(NeuralSession(one.animal, f"x{one.name}", rates, one.stimulus[rows]))
+        changed.append(Animal(f"m{k}", tuple(moved)))
+    a, b = freeze_strict(made, 12), freeze_strict(changed[::-1], 12)
+    for one, other in zip(a.targets, b.targets, strict=True):
+        np.testing.assert_allclose(one.chosen.rdm, other.chosen.rdm, atol=1e-12, rtol=0)
+        np.testing.assert_allclose(one.chosen.factor, other.chosen.factor, rtol=1e-12)
+        np.testing.assert_allclose(one.unfiltered.rdm, other.unfiltered.rdm, atol=1e-12, rtol=0)
+    np.testing.assert_allclose(a.a2a.pooled, b.a2a.pooled, atol=1e-12, rtol=0)
+
+
+def test_no_one_draw_decides():
+    rng = np.random.default_rng(7)
+    brain = Brain(mice=4, trials=20)
+    made = brain.animals(rng, brain.geometry(rng))
+    fits = np.array([freeze_strict(made, 100, seed=s).a2a.pooled for s in range(5)])
+    assert fits.std(axis=0, ddof=1).max() < 0.02
+    assert fits.mean(axis=1).std(ddof=1) < 0.005
+    assert (fits[0] != fits[1]).any()
 
 
 def test_choosing_units_on_noise_makes_no_reliability():
@@ -116,15 +228,15 @@ def test_an_animal_at_or_below_zero_is_not_scored():
 
 def test_the_factor_corrects_for_noise_once():
     target = freeze_strict(animals(np.random.default_rng(6), number=2, noise=4)).targets[0]
-    assert target.chosen.factor == pytest.approx(1 / np.sqrt(target.chosen.reliability))
-    assert target.chosen.factor > 1
+    # The RDM is a mean over divisions, so its own noise is less than that of one half.
+    assert 1 < target.chosen.factor < 1 / np.sqrt(target.chosen.reliability)
 
 
 def test_of_two_animals_the_other_is_the_pool():
     frozen = freeze_strict(animals(np.random.default_rng(6), number=2, noise=5), BOOTSTRAPS)
     one, other = (t.chosen for t in frozen.targets)
-    expected = np.corrcoef(one.rdm, other.rdm)[0, 1] / np.sqrt(one.reliability * other.reliability)
-    assert min(one.factor, other.factor) > 1.03
+    expected = np.corrcoef(one.rdm, other.rdm)[0, 1] * one.factor * other.factor
+    assert min(one.factor, other.factor) > 1.01
     np.testing.assert_allclose(frozen.a2a.pooled, expected, rtol=1e-10)
     np.testing.assert_allclose(frozen.a2a.pairwise[[0, 1], [1, 0]], expected, rtol=1e-10)
 
