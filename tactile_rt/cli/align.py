@@ -381,8 +381,8 @@ def _performances(text: str | None, number: int) -> list[tuple[float, str] | Non
 
 def _show_scores(results: Any) -> None:
     widest = max(len(model.name) for model in results.models)
-    name = Column("model", min_width=min(widest, 24), overflow="fold")
-    layer = Column("layer, mostly", overflow="fold")
+    name = Column("model", min_width=min(widest, 13), overflow="fold")
+    layer = Column("layer", overflow="fold")
     table = Table(name, "score", "p", "95 % chance", "untrained", layer)
     for model in results.models:
         chosen = [name for name in model.chosen if name]

@@ -164,7 +164,9 @@ def scatter(
     for k, group in enumerate(groups):
         member = np.array([p.group == group for p in points])
         colour = colours[group] if several else ""
-        line = _line(xs[member], ys[member], (low, high), x_of, frame, colour, out)
+        # Past its own models the line of a group would leave the plot.
+        ends = (float(xs[member].min()), float(xs[member].max())) if several else (low, high)
+        line = _line(xs[member], ys[member], ends, x_of, frame, colour, out)
         said = line or _models(int(member.sum()))
         x, y = frame.right + 8, frame.top + 12 + 34 * k
         if several:
