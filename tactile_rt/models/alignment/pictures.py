@@ -200,7 +200,7 @@ def profiles(series: Sequence[tuple[str, Values]], names: Sequence[str], label: 
     """RDMs (15,) as lines over the pairs of stimuli, each moved and scaled to mean 0, spread 1.
 
     Their correlation, which is what is compared, is that of the lines as they are drawn. An RDM
-    with a NaN, or of equals, has none.
+    with a NaN, or of equals, has none. The first is what the others are compared with.
     """
     drawn = []
     for name, entries in series:
@@ -209,29 +209,30 @@ def profiles(series: Sequence[tuple[str, Values]], names: Sequence[str], label: 
         if np.isfinite(values).all() and spread > 0:
             drawn.append((name, (values - values.mean()) / spread))
     pairs = [f"{a} and {b}" for a, b in combinations(names, 2)]
-    frame = PlotArea([float(v) for _, line in drawn for v in line], 960.0, 480.0, 190.0)
+    frame = PlotArea([float(v) for _, line in drawn for v in line], 960.0, 525.0, 232.0)
     out = frame.axis("dissimilarity, scaled")
     pitch = (frame.right - frame.left - 40) / max(len(pairs) - 1, 1)
     places = [frame.left + 20 + k * pitch for k in range(len(pairs))]
     for x, pair in zip(places, pairs, strict=True):
         out.append(
             '<text class="tick" text-anchor="end" transform="'
-            f'translate({x + 4:.1f} {frame.bottom + 14:.1f}) rotate(-45)">{escape(pair)}</text>'
+            f'translate({x + 4:.1f} {frame.bottom + 12:.1f}) rotate(-70)">{escape(pair)}</text>'
         )
-    for k, (name, line) in enumerate(drawn):
-        colour = f"g{k % COLOURS}"
-        points = " ".join(
-            f"{x:.1f},{frame.y(float(v)):.1f}" for x, v in zip(places, line, strict=True)
-        )
-        out.append(f'<polyline class="{colour}" points="{points}"/>')
+    # What is compared with is drawn last, on top.
+    for k, (name, line) in [*enumerate(drawn)][::-1]:
+        again = " again" if k > COLOURS else ""  # colours begin anew, as dashes
+        kind = f"g{(k - 1) % COLOURS}{again}" if k else "goal"
+        points = [(x, frame.y(float(v))) for x, v in zip(places, line, strict=True)]
+        path = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+        out.append(f'<polyline class="{kind}" points="{path}"/>')
         out += [
-            f'<circle class="{colour}" cx="{x:.1f}" cy="{frame.y(float(v)):.1f}" r="3">'
+            f'<circle class="{kind}" cx="{x:.1f}" cy="{y:.1f}" r="3">'
             f"{_tip(f'{name}, {pair}: {v:.2f}')}</circle>"
-            for x, v, pair in zip(places, line, pairs, strict=True)
+            for (x, y), v, pair in zip(points, line, pairs, strict=True)
         ]
         out.append(
-            f'<text class="level {colour}" x="{frame.right + 8}" y="{frame.top + 12 + 17 * k}">'
-            f"{escape(name)}</text>"
+            f'<text class="level {kind}" x="{frame.right + 8}" y="{frame.top + 12 + 17 * k}">'
+            f"{'- - ' if again else ''}{escape(name)}</text>"
         )
     return _svg(out, frame.width, frame.height, label)
 

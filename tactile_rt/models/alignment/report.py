@@ -67,7 +67,8 @@ svg text.a2a{fill:var(--a2a)}svg text.null{fill:var(--null)}svg text.one{fill:va
 .g2{--own:#58b881}.g3{--own:#dcb04a}.g4{--own:#c08ad8}.g5{--own:#79c2cf}}
 circle.g0,circle.g1,circle.g2,circle.g3,circle.g4,circle.g5{fill:var(--own)}
 polyline{fill:none;stroke:var(--own);stroke-width:2}line.fit[class*=g]{stroke:var(--own)}
-svg text.level[class*=g]{fill:var(--own);font-weight:600}
+svg text.level[class*=g]{fill:var(--own);font-weight:600}.goal{--own:var(--ink)}
+polyline.goal{stroke-width:4}circle.goal{fill:var(--own)}polyline.again{stroke-dasharray:6 4}
 details{margin:.6rem 0}summary{cursor:pointer}
 .scale{width:120px;height:12px;display:inline-block;vertical-align:middle;margin:0 .5rem;
 background:linear-gradient(90deg,var(--panel),var(--heat));border:1px solid var(--rule)}

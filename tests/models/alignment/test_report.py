@@ -228,7 +228,7 @@ def test_an_rdm_as_a_line_is_moved_and_scaled():
     drawn = profiles(series, STIMULI, "lines")
     lines = [
         np.array([[float(v) for v in point.split(",")] for point in points.split()])
-        for points in re.findall(r'<polyline[^>]*points="([^"]*)"', drawn)
+        for points in re.findall(r'<polyline[^>]*points="([^"]*)"', drawn)[::-1]  # the first on top
     ]
     assert len(lines) == 3 and all(line.shape == (15, 2) for line in lines)
     np.testing.assert_allclose(lines[0], lines[1], atol=0.11)
