@@ -210,7 +210,7 @@ def test_cosine_annealing_comes_after_its_warm_up():
 @pytest.mark.parametrize(
     "schedule", ["step", "constant", "cosine", "cosine-annealing", "one-cycle"]
 )
-@pytest.mark.parametrize("updates", [1, 2, 3])
+@pytest.mark.parametrize("updates", [1, 2, 3, 10, 11])
 def test_a_schedule_may_be_as_short_as_one_wants(schedule, updates):
     found = rates(updates, schedule=schedule, warmup=0.1)
     assert np.isfinite(found).all()
