@@ -1,4 +1,5 @@
-"""Alignment: how fast a model is scored, beside the plain loop over bootstraps that is published.
+"""Alignment: how fast a model is scored, beside the plain loop over bootstraps that is published;
+and `truth`, what score and gate find where it is known.
 
 Times are processor time: of one thread where `OMP_NUM_THREADS=1` is set.
 """
@@ -12,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.align import truth
 from tactile_rt.evidence.records import Record
 from tactile_rt.models.alignment import load_benchmark, save_benchmark, score
 from tactile_rt.models.alignment.neural import pad
@@ -42,7 +44,11 @@ DRAWS = 2000
 
 
 def run(quick: bool = False) -> list[Record]:
-    """Measure speed on synthetic animals of the recordings' size."""
+    """Measure speed on synthetic animals of the recordings' size, and errors on a made-up brain."""
+    return [*_speed(quick), *truth.run(quick)]
+
+
+def _speed(quick: bool) -> list[Record]:
     rng = np.random.default_rng(0)
     animals = {f"animal-{i}": _animal(rng) for i in range(ANIMALS)}
     layers = {f"layer-{i}": rng.normal(size=(6, LAYER_UNITS)) for i in range(LAYERS)}

@@ -3,7 +3,8 @@
 rdm           RDMs of the six stimuli and their comparison
 reliability   split halves, Spearman-Brown, the correction for noise
 neural, nwb, nwb_parts, published   recordings: from NWB files, and in the published layout
-strict, canonical, pooling, paper_code, building   the two protocols: recordings -> a frozen benchmark
+strict, canonical, pooling, paper_code, building
+                         the two protocols: recordings -> a frozen benchmark
 benchmark, benchmark_file   the frozen benchmark and its file
 scoring, statistics      a model's layers -> score, exact p-value
 stimuli_input, layers, activations, onnx_taps, onnx_activations, responses_file, loading

@@ -25,8 +25,8 @@ class Frozen:
     """An RDM and how far it can be relied on.
 
     Attributes:
-        rdm: (15,) The dissimilarities of the 15 pairs of stimuli: for paper-code, from the mean over
-            trials; for strict, the mean over divisions of the trials.
+        rdm: (15,) The dissimilarities of the 15 pairs of stimuli: for paper-code, from the mean
+            over trials; for strict, the mean over divisions of the trials.
         reliability: The mean split-half correlation of the RDM, corrected by Spearman-Brown; for
             strict, that of the RDM of one half of a division.
         factor: The factor K by which a model's r_xy is multiplied to give its score; NaN if the RDM

@@ -26,8 +26,8 @@ def canonical(session: NeuralSession) -> tuple[NeuralSession, int]:
     """The same trials and units in one order, and a number that tells this session from others.
 
     Returns:
-        The session's rates and stimuli alone, its trials sorted by stimulus; and a key below 2^64 that no order of trials or
-        units and no common factor of the rates changes.
+        The session's rates and stimuli alone, its trials sorted by stimulus; and a key below 2^64
+        that no order of trials or units and no common factor of the rates changes.
     """
     ranks = _ranks(session.rates)
     stimulus = _mixed(session.stimulus.astype(np.uint64) + np.uint64(1))

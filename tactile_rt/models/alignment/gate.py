@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tactile_rt.models.alignment.another_mouse import MARGIN, Mice
+from tactile_rt.models.alignment.another_mouse import MARGIN, Mice, Power
 from tactile_rt.models.alignment.benchmark import Benchmark
 from tactile_rt.models.alignment.scoring import Score
 from tactile_rt.models.alignment.statistics import student
@@ -81,7 +81,7 @@ def neural_checks(
         left = ["turing", *(["regression"] if baseline is not None else [])]
         return valid, *(Check(n, INCONCLUSIVE, "the benchmark is not valid") for n in left)
     mice = mice_of(benchmark)
-    checks = [valid, turing(score, mice)]
+    checks = [valid, turing(score, mice, mice.power())]
     if baseline is not None:
         checks.append(regression(score, mice, baseline))
     return tuple(checks)
@@ -103,11 +103,16 @@ def validity(benchmark: Benchmark) -> Check:
     )
 
 
-def turing(score: Score, mice: Mice) -> Check:
+def turing(score: Score, mice: Mice, power: Power | None = None) -> Check:
     """Fails a model that is worse than another mouse; passes one that is shown to be like one.
 
     That takes a fit within the margin of the noise ceiling, and a p of the maximum below
     `LARGEST_P`. What is neither worse nor shown to be like one is inconclusive.
+
+    Args:
+        score: of the model.
+        mice: that it is compared to.
+        power: of the test in this benchmark, to be told beside the verdict.
     """
     found = mice.compare(score.rdms[None])
     fit, floor, least = float(found.fit[0]), float(found.floor[0]), (1 - MARGIN) * found.ceiling
@@ -118,22 +123,22 @@ def turing(score: Score, mice: Mice) -> Check:
     )
     if not all(map(math.isfinite, (fit, floor, score.p))):
         return Check("turing", INCONCLUSIVE, f"cannot be computed: {why}")
-    power = mice.power()
-    caught = ", ".join(f"{share:.0%} at {lost:.0%}" for lost, share in power.fails.items())
-    why += (
-        f". Power: of these mice {power.passes:.0%} pass as models of the others; "
-        f"with part of their geometry lost fail {caught}"
-    )
+    if power is not None:
+        caught = ", ".join(f"{share:.0%} at {lost:.0%}" for lost, share in power.fails.items())
+        why += (
+            f". Power: of these mice {power.passes:.0%} pass as models of the others; "
+            f"with part of their geometry lost fail {caught}"
+        )
     if found.worse[0]:
         return Check("turing", FAIL, why)
     return Check("turing", PASS if found.within[0] and score.p < LARGEST_P else INCONCLUSIVE, why)
 
 
 def regression(score: Score, mice: Mice, baseline: ArrayLike) -> Check:
-    """Passes a drop that is surely small, fails one that is surely there, both by one-sided tests.
+    """Passes a drop that is surely small; fails one that is surely there, and not small.
 
     The drop is that of the fit to single mice, paired; small is below `LARGEST_DROP` of the noise
-    ceiling.
+    ceiling. Sure is by one-sided tests over the mice, on these stimuli.
 
     Args:
         score: of the model.
@@ -152,4 +157,5 @@ def regression(score: Score, mice: Mice, baseline: ArrayLike) -> Check:
         return Check("regression", INCONCLUSIVE, f"cannot be computed: {why}")
     if mean + half < LARGEST_DROP:
         return Check("regression", PASS, why)
-    return Check("regression", FAIL if mean - half > 0 else INCONCLUSIVE, why)
+    surely = mean - half > 0
+    return Check("regression", FAIL if surely and mean > LARGEST_DROP else INCONCLUSIVE, why)

@@ -77,7 +77,7 @@ def test_a_changed_file_is_refused(path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"schema": 2}, "schema 2, and this release reads 1"),
+        ({"schema": 1}, "schema 1, and this release reads 2"),
         ({"targets": 3}, r"Expected `array`.*\$\.targets"),
         ({"colour": "red"}, "unknown field `colour`"),
         ({"schema": None}, r"\$\.schema"),

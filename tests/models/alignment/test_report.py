@@ -216,7 +216,7 @@ def test_a_baseline_is_one_model_on_the_same_benchmark(results, benchmark, tmp_p
     one = msgspec.structs.replace(results, models=results.models[:1])
     write_results(one, path)
     before = baseline_of(path, benchmark)
-    np.testing.assert_array_equal(before, one.models[0].rdms)
+    np.testing.assert_array_equal(before, np.array(one.models[0].rdms, dtype=float))
     with pytest.raises(ConfigError, match="another benchmark"):
         baseline_of(path, replace(benchmark, seed=1))
 
