@@ -30,16 +30,35 @@ def canonical(session: NeuralSession) -> tuple[NeuralSession, int]:
         that no order of trials or units and no common factor of the rates changes.
     """
     ranks = _ranks(session.rates)
-    stimulus = _mixed(session.stimulus.astype(np.uint64) + np.uint64(1))
-    trial, unit = stimulus, np.zeros(ranks.shape[1], dtype=np.uint64)
-    for _ in range(ROUNDS):
-        unit = _mixed(_mixed(ranks + trial[:, None]).sum(axis=0, dtype=np.uint64))
-        trial = _mixed(_mixed(ranks ^ unit).sum(axis=1, dtype=np.uint64) + stimulus)
+    trial = _mixed(session.stimulus.astype(np.uint64) + np.uint64(1))
+    trial, unit = _refined(ranks, trial)
+    key = int(trial.sum(dtype=np.uint64))
+    while len(found := _twice(trial)):
+        # These may change places, but only together with units: one of them is put first.
+        trial[found[0]] = _mixed(trial[found[:1]])[0]
+        trial, unit = _refined(ranks, trial)
     rows, columns = np.lexsort((trial, session.stimulus)), np.argsort(unit)
     ordered = NeuralSession(
         session.animal, session.name, session.rates[np.ix_(rows, columns)], session.stimulus[rows]
     )
-    return ordered, int(trial.sum(dtype=np.uint64))
+    return ordered, key
+
+
+def _refined(ranks: Keys, start: Keys) -> tuple[Keys, Keys]:
+    """Keys of trials and units that tell apart what the keys of trials to start with do."""
+    trial = start
+    for _ in range(ROUNDS):
+        unit = _mixed(_mixed(ranks + trial[:, None]).sum(axis=0, dtype=np.uint64))
+        trial = _mixed(_mixed(ranks ^ unit).sum(axis=1, dtype=np.uint64) + start)
+    return trial, unit
+
+
+def _twice(keys: Keys) -> NDArray[np.intp]:
+    """Where the lowest of the keys stands that are there more than once."""
+    values, counts = np.unique(keys, return_counts=True)
+    return (
+        np.flatnonzero(keys == values[counts > 1][:1]) if (counts > 1).any() else np.array([], int)
+    )
 
 
 def _ranks(rates: NDArray[np.float64]) -> Keys:
