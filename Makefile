@@ -53,5 +53,5 @@ $(VENV)/.sim: pyproject.toml $(PINS)
 
 $(VENV)/.dev: pyproject.toml $(PINS)
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) --editable '.[sim,train,view,dbc,record,import,publish,ros2,lerobot,ui,test,dev]'
+	$(INSTALL) --editable '.[sim,gym,train,view,dbc,record,import,publish,ros2,lerobot,ui,test,dev]'
 	touch $@ $(VENV)/.sim

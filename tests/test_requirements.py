@@ -78,7 +78,7 @@ def test_what_is_installed_is_what_is_written() -> None:
         if installed not in pin.specifier:
             wrong[str(pin)] = str(installed)
     assert wrong == {}
-    extras = ("sim", "train", "record", "publish", "ros2", "lerobot", "test", "dev")
+    extras = ("sim", "gym", "train", "record", "publish", "ros2", "lerobot", "test", "dev")
     missing = [r.name for r in asked_for(*extras)
                if not is_installed(r.name)]  # fmt: skip
     assert missing == []

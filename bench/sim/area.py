@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from bench.sim.active import active
 from bench.sim.catalogue import catalogue
 from bench.sim.mechanics import mechanics
 from bench.sim.reference_model import PROTOTYPE_CPU_S, reference_cost
@@ -42,7 +43,7 @@ def run(quick: bool) -> list[Record]:
     every press, and a record for each of the 30 whiskers.
     """
     names, ms = (QUICK, QUICK_MS) if quick else (tuple(SWEEPS), None)
-    return [*_costs(names, ms), *catalogue(quick), *mechanics(quick)]
+    return [*_costs(names, ms), *active(quick), *catalogue(quick), *mechanics(quick)]
 
 
 def simulate(name: str, profile: Profile) -> SweepSimulation:

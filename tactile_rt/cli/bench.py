@@ -18,7 +18,7 @@ from tactile_rt.stream import ConfigError
 CHECKOUT = Path(__file__).parents[2]
 # Each area, and the extra that its `run(quick) -> list[Record]` needs.
 AREAS = {
-    "sim": "sim",
+    "sim": "sim,gym",
     "drivers": "record",
     "models": "train",
     "inference": "",

@@ -1,4 +1,4 @@
-"""One whisker stepped through time beside a moving object.
+"""One whisker stepped through time beside a moving object, on a base that may turn.
 
 A step is implicit in stiffness and damping (backward Euler in the joint angles) and in contact:
 
@@ -83,9 +83,10 @@ def advance(
         steps: (whisker,) how many steps make a sample.
         rows, chains, segments, thing: see there; the whiskers' rows stand one after the other.
         state, seen: see there; carried on. `travelled` and `soonest` are a row for each whisker.
-        roots: (whisker, 4, 3) base point and, in the rows after it, the frame of the first link at
-            rest.
-        bases: (sample or 1, 4, 3) see `chains.inertial_forces`; 1: they are not accelerated.
+        roots: (whisker, sample or 1, 4, 3) base point and, in the rows after it, the frame of the
+            first link at rest, at the beginning of each sample; 1: it does not turn.
+        bases: (whisker or 1, sample or 1, 4, 3) see `chains.inertial_forces`; 1: the same of all.
+            During a sample a frame turns with its base's angular velocity.
         way: (sample + 1, 3) where the object is at the beginning of each sample and at the end of
             the last, mm; straight in between.
         loads: (whisker, sample, 6) zeros, filled: means of force (mN) and moment (uN m) on the
@@ -131,7 +132,7 @@ def advance(
                 seen.planes[segment],
             ),
             roots[w],
-            bases,
+            bases[w if len(bases) > 1 else 0],
             way,
             loads[w],
             contacts[w],
@@ -161,7 +162,8 @@ def _advance(
     travelled, soonest = seen.travelled, seen.soonest
     links, n = len(chain.length), len(q)
     h = SAMPLE_MS / steps_per_sample
-    quiet = len(bases) == 1
+    quiet = not bases.any()
+    reach = chain.length.sum()
     if quiet and not _moves(q, v):  # perhaps nothing comes near it in all this time
         whole = 0.0
         for sample in range(len(way) - 1):
@@ -181,6 +183,7 @@ def _advance(
     ends, now = np.empty((len(segments.link), 2, 3)), np.empty((len(segments.link), 6))
     q0, v0, surface, centre = np.empty(n), np.empty(n), np.empty(3), np.empty(3)
     done, made = 0, 0.0  # for which length of a step the mass matrix is
+    here = root[0].copy()
     placed = False
     for at in range((len(way) - 1) * steps_per_sample):
         sample, within = at // steps_per_sample, at % steps_per_sample
@@ -195,11 +198,20 @@ def _advance(
             v[:] = 0.0
             placed = False
             continue
-        base = bases[0 if quiet else sample]
+        base = bases[sample if len(bases) > 1 else 0]
+        began = root[sample if len(root) > 1 else 0]
         if not placed:
-            _place(root, chain, q, pose)
+            _turned(began, base, h * within, here)
+            _place(here, chain, q, pose)
             placed = True
         parts, start = 1, travelled[0]
+        swing = 0.0  # how far the base takes the tip
+        for i in range(3):
+            swing += base[1, i] ** 2
+        swing = math.sqrt(swing) * reach * h
+        if soonest.min() - start < NEAR_MM + moves + 1.1 * swing:
+            while parts < MOST_PARTS and swing > parts * LEAP_MM:
+                parts *= 2
         q0[:] = q
         v0[:] = v
         while True:
@@ -232,7 +244,8 @@ def _advance(
                 made = h / parts
                 done += 1
                 old[:] = pose.nodes
-                _place(root, chain, q, pose)
+                _turned(began, base, h * (within + (part + 1) / parts), here)
+                _place(here, chain, q, pose)
                 moved = _furthest(old, pose.nodes)
                 if not moved <= furthest:  # also where it is no number
                     furthest = moved
@@ -250,6 +263,9 @@ def _advance(
                 return -done - 1
             if not wild and (furthest <= LEAP_MM or parts >= MOST_PARTS):
                 break
+            # what swings through air leaps as far as it likes
+            if not wild and swing > 0.0 and soonest.min() - travelled[0] >= NEAR_MM:
+                break
             # again, in parts
             if wild:
                 parts *= MOST_PARTS
@@ -263,7 +279,8 @@ def _advance(
                 travelled[0] += travelled[0] - start  # and all the way back
             q[:] = q0
             v[:] = v0
-            _place(root, chain, q, pose)
+            _turned(began, base, h * within, here)
+            _place(here, chain, q, pose)
         weight = 1.0 / (parts * steps_per_sample)
         for i in range(6):
             loads[sample, i] -= total[i] * weight
@@ -303,6 +320,24 @@ def _furthest(old: A, new: A) -> float:
         if not square <= furthest:
             furthest = square
     return math.sqrt(furthest)
+
+
+@compiled
+def _turned(root: A, base: A, t: float, here: A) -> None:
+    """Fill in a base's frame so long after a sample began (Rodrigues' rotation)."""
+    x, y, z = base[1, 0] * t, base[1, 1] * t, base[1, 2] * t
+    angle = math.sqrt(x * x + y * y + z * z)
+    here[:] = root
+    if angle == 0.0:
+        return
+    x, y, z = x / angle, y / angle, z / angle
+    c, s = math.cos(angle), math.sin(angle)
+    for k in range(3):
+        u, v, w = root[1, k], root[2, k], root[3, k]
+        onto = (x * u + y * v + z * w) * (1.0 - c)
+        here[1, k] = u * c + (y * w - z * v) * s + x * onto
+        here[2, k] = v * c + (z * u - x * w) * s + y * onto
+        here[3, k] = w * c + (x * v - y * u) * s + z * onto
 
 
 @compiled

@@ -1,0 +1,40 @@
+"""Active touch as Gymnasium environments (extra ``gym``): agents that move a whisker array.
+
+    import gymnasium
+
+    env = gymnasium.make("tactile_rt:tactile_rt/ActiveWhisking-v0", task="locate")
+
+Gymnasium imports what stands before the colon, and `tactile_rt` makes its environments known where
+Gymnasium is in use. A program that imports `tactile_rt` before Gymnasium names this package there,
+"tactile_rt.sim_backend.environments:tactile_rt/ActiveWhisking-v0".
+"""
+
+from typing import Final
+
+__all__ = ["ENVIRONMENT", "WHISKERS", "register"]
+
+ENVIRONMENT: Final = "tactile_rt/ActiveWhisking-v0"
+STEPS: Final = 40  # of 50 ms
+# The middle of a mouse's pad: three rows of three.
+WHISKERS: Final = tuple(f"{row}{column}" for row in "BCD" for column in (1, 2, 3))
+
+
+def register() -> None:
+    """Make `ENVIRONMENT` known to Gymnasium; what is known already stays as it is."""
+    from gymnasium.envs import registration
+
+    if ENVIRONMENT in registration.registry:
+        return
+    with registration.namespace("tactile_rt"):
+        registration.register(
+            id="ActiveWhisking-v0",
+            entry_point="tactile_rt.sim_backend.environments.active_whisking:ActiveWhisking",
+            max_episode_steps=STEPS,
+            kwargs={"whiskers": WHISKERS},
+        )
+
+
+try:
+    register()
+except ModuleNotFoundError:  # without the extra, nothing to be known to
+    pass

@@ -1,0 +1,286 @@
+"""`ActiveWhisking`: move a head, whisk, and say what or where the object is that one touches."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Final, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from tactile_rt.sim_backend.arrays.files import load_array
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
+from tactile_rt.sim_backend.environments.whisking_head import Stretch, WhiskingHead, place_beside
+from tactile_rt.sim_backend.objects.catalogue import promised_object
+from tactile_rt.sim_backend.sensor import Sensor
+from tactile_rt.sim_backend.sensor_model import SensorModel
+from tactile_rt.sim_backend.sweep import usual_distance, usual_size
+from tactile_rt.sim_backend.whisking_drive import Whisking
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
+from tactile_rt.stream import Chunk, ConfigError, SourceError
+
+__all__ = ["KINDS", "LOGITS", "MOTION", "ActiveWhisking"]
+
+# Kinds of the catalogue that differ in what whiskers can feel of them: edges, rims, gaps, curves.
+KINDS: Final = ("bottle", "bowl", "car", "chair", "gear", "mug", "mushroom", "table")
+FREQUENCY_HZ: Final = 8.0
+AMPLITUDE_RAD: Final = 0.45
+OFFSET_RAD: Final = 0.45
+SPEED_MM_S: Final = 60.0
+MOTION: Final = ("amplitude", "offset", "velocity x", "velocity y", "velocity z")
+LOGITS: Final = 5.0  # a guess of +1 for one kind and -1 for another sets them apart by 2 x 5
+FRAMES: Final = 5  # in which the samples of a step are averaged
+FULL_SCALE: Final = (*(5e-3,) * 3, *(2e-5,) * 3)  # N, N m: beyond, a reading saturates
+DRAWS: Final = 100  # tries to stand an object where the array meets it
+
+Floats = NDArray[np.float64]
+Observation = dict[str, NDArray[np.float32]]
+
+
+class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """Touch an object with whiskers that one moves, and say at every step what it is, or where.
+
+    At `reset` an object of one of the kinds, in any yaw, stands ahead of the array and to the side
+    to which its whiskers reach, just out of their reach at rest. In each step the head goes and
+    the whiskers whisk, 8 times a second, as the action says; both glide there, see
+    `whisking_drive`. The head stays in a box beside the object, so that it never runs into it.
+
+    **Action**, (5 + guess,) in [-1, 1]:
+
+    ==== ====================================================================================
+    0    amplitude of the whisking: -1 is 0, the whiskers held still; 1 is 0.45 rad (26 degrees)
+    1    offset of the whisking from rest, times 0.45 rad, rostral positive
+    2-4  velocity of the head in the world, times 60 mm/s for a mouse: x lateral, y rostral
+         (towards the object at first), z up
+    5-   the guess. ``classify``: a logit for each kind, times 5. ``locate``: the object's centre
+         from the head's origin, along the world's x, y and z, times `reach_mm`
+    ==== ====================================================================================
+
+    **Observation**, a dictionary of float32 arrays in SI units:
+
+    ========= =============================================================================
+    loads     (5, element, channel) means over fifths of the step of what `array_spec` says:
+              forces (N) and moments (N m) at the whiskers' bases, with the sensor's noise
+    angle     (5,) mean protraction from rest in the same times, rad
+    head      (6,) where the head is from where it started (m), and its velocity (m/s)
+    ========= =============================================================================
+
+    **Reward** of each step: ``classify``, the logarithm of the probability that the guess gives the
+    true kind, at most 0; ``locate``, minus the distance between the guess and the object's centre
+    in units of `reach_mm`.
+
+    An episode ends (terminated) when whiskers have begun to touch `touches` times, or (truncated)
+    after the number of steps with which it was registered, 40, or if whiskers jam so that the
+    simulation fails. Given the same seed and actions it is the same on every machine.
+
+    Args:
+        task: ``classify`` or ``locate``.
+        array: which array, see `files.load_array`.
+        whiskers: the names of those of the array that there are; none: all.
+        kinds: categories of objects, see `objects.catalogue`; a label is an index into them.
+        instances: the first number of an object of a kind, and the one after the last.
+        touches: how many touches end an episode; 0: none do.
+        step_ms: how long a step lasts, a multiple of 5 ms.
+        noise: of the sensor, in multiples of the rated noise of 10 uN and 0.05 uN m a sample.
+        profile: how finely to simulate, one of `world.PROFILES`.
+        render_mode: ``rgb_array`` for pictures (extra ``view``).
+
+    Attributes:
+        array_spec: The `ArraySpec` of the loads.
+        reach_mm: The distance that a guess of 1 stands for, mm.
+        speed_mm_s: The fastest that the head is told to go along an axis, mm/s.
+
+    Raises:
+        ConfigError: an argument that cannot be.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (as Gymnasium has it)
+
+    def __init__(
+        self,
+        task: Literal["classify", "locate"] = "classify",
+        array: str = "mouse",
+        whiskers: Sequence[str] = (),
+        kinds: Sequence[str] = KINDS,
+        instances: tuple[int, int] = (0, 44),
+        touches: int = 0,
+        step_ms: int = 50,
+        noise: float = 1.0,
+        profile: str = "realtime",
+        render_mode: str | None = None,
+    ) -> None:
+        if task not in ("classify", "locate"):
+            raise ConfigError(f"task must be classify or locate, not {task!r}")
+        if len(kinds) < 2:
+            raise ConfigError("kinds: name two or more, there is nothing to tell apart")
+        for kind in kinds:
+            promised_object(f"{kind}-0")  # an error if there is none
+        if not 0 <= instances[0] < instances[1]:
+            raise ConfigError(
+                f"instances must be the first and the one after the last, not {instances}"
+            )
+        if touches < 0:
+            raise ConfigError(f"touches must be 0 or more, not {touches}")
+        if step_ms < FRAMES or step_ms % FRAMES:
+            raise ConfigError(f"step_ms must be a multiple of {FRAMES}, not {step_ms}")
+        if profile not in PROFILES:
+            raise ConfigError(f"no profile {profile!r}: there are {', '.join(PROFILES)}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigError(f"render_mode must be rgb_array, not {render_mode!r}")
+        self.render_mode = render_mode
+        whole = load_array(array)
+        self._array = _some(whole, whiskers)
+        self._task, self._kinds, self._instances = task, tuple(kinds), instances
+        self._touches, self._samples = touches, round(step_ms / SAMPLE_MS)
+        self._profile = PROFILES[profile]
+        self._sensors = SensorModel(noise_force=1e-5 * noise, noise_moment=5e-8 * noise)
+        self._distance_mm = usual_distance((whole,))
+        self._size_mm = usual_size((whole,))
+        self._scale = self._distance_mm / 6.5  # of a mouse
+        self.array_spec = array_spec(self._array.whiskers, self._array.name)
+        self.reach_mm = 2 * self._size_mm
+        self.speed_mm_s = SPEED_MM_S * self._scale
+        guess = len(kinds) if task == "classify" else 3
+        self.action_space = spaces.Box(-1.0, 1.0, (len(MOTION) + guess,), np.float32)
+        loads = np.broadcast_to(
+            np.array(FULL_SCALE, dtype=np.float32), (FRAMES, *self.array_spec.shape)
+        )
+        most = np.float32(AMPLITUDE_RAD + OFFSET_RAD)
+        head = np.repeat(np.array([1.0, 2e-3 * self.speed_mm_s], dtype=np.float32), 3)
+        self._limits = {"loads": loads, "angle": np.full(FRAMES, most), "head": head}
+        self.observation_space = spaces.Dict(  # type: ignore[assignment]
+            {key: spaces.Box(-top, top, dtype=np.float32) for key, top in self._limits.items()}
+        )
+        self._head: WhiskingHead | None = None
+        self._sensor: Sensor | None = None
+        self._object = ""
+        self._label = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Stand another object there.
+
+        Args:
+            seed: as Gymnasium has it.
+            options: ``{"object": "mug-50"}`` names the object, of one of the kinds.
+
+        Raises:
+            ConfigError: no such object, or one that no whisker meets.
+        """
+        super().reset(seed=seed)
+        rng = self.np_random
+        named = (options or {}).get("object")
+        for _ in range(DRAWS):
+            kind = self._kinds[rng.integers(len(self._kinds))]
+            name = f"{kind}-{rng.integers(*self._instances)}"
+            placed = place_beside(
+                self._array,
+                str(named or name),
+                size_mm=self._size_mm,
+                yaw_deg=float(rng.uniform(0, 360)),
+                height_mm=float(rng.uniform(-8, 4)) * self._scale,
+                distance_mm=float(rng.uniform(5.5, 8)) * self._scale,
+                gap_mm=float(rng.uniform(0.5, 4)) * self._scale,
+            )
+            if placed is not None:
+                break
+        else:
+            raise ConfigError(f"no whisker meets {named or 'any object'}: take another array")
+        category = placed.name.rpartition("-")[0]
+        if category not in self._kinds:
+            raise ConfigError(f"{placed.name} is of none of the kinds {', '.join(self._kinds)}")
+        self._object, self._label = placed.name, self._kinds.index(category)
+        self._head = WhiskingHead(
+            self._array, placed, self._profile, Whisking(FREQUENCY_HZ, 0.0, 0.0)
+        )
+        self._sensor = Sensor(self._sensors, self.array_spec, int(rng.integers(1 << 62)))
+        felt = self._head.advance(self._samples)  # at rest: nothing touches
+        return self._observed(felt), self._told(felt)
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Whisk and go on for a step, and judge the guess by what is there.
+
+        Raises:
+            ConfigError: before the first `reset`, or an action that is not of `action_space`.
+        """
+        head = self._head
+        wanted = np.asarray(action, dtype=np.float64)
+        if head is None:
+            raise ConfigError("reset the environment before its first step")
+        if wanted.shape != self.action_space.shape or not np.isfinite(wanted).all():
+            raise ConfigError(
+                f"an action is {self.action_space.shape} finite numbers, see ActiveWhisking"
+            )
+        wanted = np.clip(wanted, -1.0, 1.0)
+        amplitude = (wanted[0] + 1) / 2 * AMPLITUDE_RAD
+        head.command(Whisking(FREQUENCY_HZ, float(amplitude), float(wanted[1] * OFFSET_RAD)))
+        guess = wanted[len(MOTION) :]
+        try:
+            felt = head.advance(self._samples, wanted[2:5] * self.speed_mm_s)
+            jammed = False
+        except SourceError:
+            nothing = np.zeros((self._samples, *self.array_spec.shape))
+            felt = Stretch(nothing, np.zeros(self._samples), nothing[..., 0] > 0, 0)
+            jammed = True
+        done = bool(self._touches and head.touches >= self._touches)
+        told = self._told(felt) | {"jammed": jammed}
+        return self._observed(felt), self._reward(guess), done, jammed, told
+
+    def render(self) -> Any:
+        """A picture (height, width, 3) from above and from the side, or None without a mode."""
+        if self.render_mode is None or self._head is None:
+            return None
+        from tactile_rt.sim_backend.environments.picture import picture
+
+        return picture(self._head)
+
+    def _observed(self, felt: Stretch) -> Observation:
+        assert self._head is not None and self._sensor is not None
+        n = len(felt.loads)
+        seq = np.arange(self._head.samples - n, self._head.samples)
+        t_ns = seq * round(SAMPLE_MS * 1e6)
+        valid = np.ones(felt.loads.shape[:2], dtype=np.bool_)
+        read = self._sensor.push(Chunk(seq, t_ns, felt.loads.astype(np.float32), valid))
+        assert read is not None
+        means = read.values.reshape(FRAMES, -1, *self.array_spec.shape).mean(1, dtype=np.float64)
+        head = np.concatenate([self._head.position, self._head.velocity]) * 1e-3
+        angle = felt.angle.reshape(FRAMES, -1).mean(axis=1)
+        return {
+            key: np.clip(value, -self._limits[key], self._limits[key]).astype(np.float32)
+            for key, value in (("loads", means), ("angle", angle), ("head", head))
+        }
+
+    def _told(self, felt: Stretch) -> dict[str, Any]:
+        assert self._head is not None
+        return {
+            "object": self._object,
+            "label": self._label,
+            "centre_mm": self._centre(),
+            "touches": self._head.touches,
+            "touching": felt.touching.any(axis=0),
+        }
+
+    def _centre(self) -> Floats:
+        """(3,) where the object's centre is from the head's origin, mm, along the world's axes."""
+        assert self._head is not None
+        return self._head.placed.centre - self._head.position
+
+    def _reward(self, guess: Floats) -> float:
+        if self._task == "classify":
+            logits = guess * LOGITS
+            return float(logits[self._label] - np.log(np.exp(logits).sum()))
+        return -float(np.linalg.norm(guess * self.reach_mm - self._centre())) / self.reach_mm
+
+
+def _some(array: WhiskerArray, names: Sequence[str]) -> WhiskerArray:
+    """The array with some of its whiskers; without names, all of them."""
+    if not names:
+        return array
+    known = {w.name: w for w in array.whiskers}
+    if unknown := [name for name in names if name not in known]:
+        raise ConfigError(f"array {array.name} has no whisker {unknown[0]}: {', '.join(known)}")
+    return replace(array, whiskers=tuple(w for w in array.whiskers if w.name in names))

@@ -1,0 +1,256 @@
+"""A head that goes where it is told beside an object that stands still, and whisks meanwhile.
+
+The whiskers are stepped by `rods`, whose world is that of the head: the object moves the other way,
+and whiskers feel the head's acceleration. How the bases turn is `whisking_drive`'s.
+
+The head goes after a point that moves at the commanded velocity and stays within its workspace,
+through the three lags of first order that whisking has too: position, velocity and acceleration
+never jump, and nothing takes the head out of its workspace.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from tactile_rt.sim_backend.approach import centrelines, faces_right, way_to_contact
+from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
+from tactile_rt.sim_backend.arrays.whiskers import rotation
+from tactile_rt.sim_backend.contacts import TOUCHING_SHARE
+from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
+from tactile_rt.sim_backend.rods.world import Piece, RodWorld
+from tactile_rt.sim_backend.trajectories import base_angles
+from tactile_rt.sim_backend.whisking_drive import LAG_S, Drive, Whisking
+from tactile_rt.sim_backend.world import SAMPLE_MS, Profile
+
+__all__ = ["Placed", "Stretch", "WhiskingHead", "place_beside"]
+
+Floats = NDArray[np.float64]
+
+FAR_MM = 200.0  # where the object is when the way to first contact is measured
+APART_MS = 10  # a whisker that was free for as long touches anew
+LAG_MS = LAG_S * 1e3
+BELOW_MM, ASIDE_MM, PAST_MM = 15.0, 12.0, 5.0  # a workspace, for an array of a mouse's size
+
+
+@dataclass(frozen=True)
+class Placed:
+    """An object beside an array, and where the head may go.
+
+    Attributes:
+        name: The name of the object, ``mug-3``.
+        pieces: The convex pieces of the object, about its place.
+        centre: The (3,) place of the object's centre in the world, mm.
+        low, high: The (3,) corners of the box in which the head may move, from where it starts, mm.
+    """
+
+    name: str
+    pieces: tuple[Piece, ...]
+    centre: Floats
+    low: Floats
+    high: Floats
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """What a stretch of time brought.
+
+    Attributes:
+        loads: The (sample, element, 6) base loads, N and N m, in the elements' frames, which turn.
+        angle: The (sample,) protraction from rest, mean over the sample, rad, rostral positive.
+        touching: The (sample, element) bool that tells which whiskers touched the object.
+        touches: The number of times that a whisker began to touch.
+    """
+
+    loads: Floats
+    angle: Floats
+    touching: NDArray[np.bool_]
+    touches: int
+
+
+@lru_cache(maxsize=128)
+def _object(name: str) -> TactileObject:
+    return load_object(name)
+
+
+def place_beside(
+    array: WhiskerArray,
+    name: str,
+    *,
+    size_mm: float,
+    yaw_deg: float,
+    height_mm: float,
+    distance_mm: float,
+    gap_mm: float,
+) -> Placed | None:
+    """Stand an object ahead of an array, to the side to which its whiskers reach.
+
+    Args:
+        array: the whiskers, on their head.
+        name: of the object, see `catalogue.load_object`.
+        size_mm, yaw_deg, height_mm, distance_mm, gap_mm: as in `Sweep`.
+
+    Returns:
+        Where it stands; None if the head would go past it without a touch.
+    """
+    lines = centrelines(array.whiskers, array.mount)
+    right = faces_right((array,), lines).mean() >= 0.5
+    turn = rotation("z", np.radians(yaw_deg))
+    parts = [
+        trimesh.Trimesh(p.vertices * size_mm @ turn.T, p.faces, process=False)
+        for p in _object(name).pieces
+    ]
+    corners = np.concatenate([part.vertices for part in parts])
+    face = np.mean([line[0, 0] for line in lines])
+    nearest = corners[:, 0].min() if right else corners[:, 0].max()
+    side = 1.0 if right else -1.0
+    centre = np.array([face + side * distance_mm - nearest, FAR_MM, height_mm])
+    there = [trimesh.Trimesh(p.vertices + centre, p.faces, process=False) for p in parts]
+    way, _ = way_to_contact(array.whiskers, lines, there)
+    if not np.isfinite(way):
+        return None
+    centre[1] += gap_mm - way
+    last = min(line[:, 1].min() for line in lines)
+    scale = distance_mm / 6.5
+    past = centre[1] + corners[:, 1].max() - last + PAST_MM * scale
+    aside = -side * ASIDE_MM * scale
+    low = np.array([min(aside, 0.0), 0.0, -BELOW_MM * scale])
+    high = np.array([max(aside, 0.0), past, BELOW_MM * scale])
+    return Placed(name, tuple(map(Piece.of, parts)), centre, low, high)
+
+
+class WhiskingHead:
+    """An array on a head that moves and whisks, beside an object that stands still.
+
+    Args:
+        array: the whiskers, on their head; it looks along +y of the world.
+        placed: the object, and where the head may go.
+        profile: how finely to simulate; by `rods`, whatever the profile's engine.
+        whisking: the first command.
+
+    Attributes:
+        samples: The number of samples of 1 ms simulated so far.
+        position, velocity: The (3,) place of the head from where it started, mm, and its velocity,
+            mm/s, in the world.
+        touches: The number of times that a whisker began to touch since the start.
+    """
+
+    def __init__(
+        self, array: WhiskerArray, placed: Placed, profile: Profile, whisking: Whisking
+    ) -> None:
+        self.array, self.placed = array, placed
+        self.samples = self.touches = 0
+        self._turn = array.mount.rotation
+        bases = np.array([w.base for w in array.whiskers]) @ self._turn.T + array.mount.position
+        rest = self._turn @ np.array([w.orientation for w in array.whiskers])
+        self.world = RodWorld(
+            array.whiskers,
+            np.concatenate([bases[:, None], rest], axis=1),
+            placed.pieces,
+            profile.links,
+            round(SAMPLE_MS / profile.timestep_ms),
+        )
+        self._drive = Drive(whisking)
+        self._aim = np.zeros(3)
+        self._lags = np.zeros((3, 3))  # (lag, axis), the last the head's position, mm
+        self._free = np.full(len(array.whiskers), APART_MS)
+        self.touching = np.zeros(len(array.whiskers), dtype=np.bool_)
+
+    @property
+    def position(self) -> Floats:
+        """(3,) from where it started, mm."""
+        here: Floats = self._lags[2].copy()
+        return here
+
+    @property
+    def velocity(self) -> Floats:
+        """(3,) mm/s."""
+        found: Floats = (self._lags[1] - self._lags[2]) / LAG_MS * 1e3
+        return found
+
+    @property
+    def protraction(self) -> float:
+        """How far the bases are turned from rest now, rad, rostral positive."""
+        return float(self._drive.protraction(np.array([self.samples * SAMPLE_MS * 1e-3]))[0])
+
+    def command(self, whisking: Whisking) -> None:
+        """Whisk like this from now on; the motion glides there."""
+        self._drive.command(whisking, self.samples * SAMPLE_MS * 1e-3)
+
+    def frames(self, samples: NDArray[np.int64]) -> Floats:
+        """(sample, whisker, 3, 3) frames of the elements in the world as these samples begin."""
+        times = samples.astype(np.float64) * (SAMPLE_MS * 1e-3)
+        angles = base_angles(self._drive, times, self.array.whiskers)
+        signs, offsets = np.array([1.0, -1.0, 1.0]), np.array([-np.pi / 2, 0.0, np.pi / 2])
+        euler = (angles * signs + offsets).reshape(-1, 3)
+        turned = Rotation.from_euler("ZYX", euler).as_matrix()
+        found: Floats = self._turn @ turned.reshape(*angles.shape[:2], 3, 3)
+        return found
+
+    def advance(self, samples: int, velocity_mm_s: Sequence[float] | Floats = (0, 0, 0)) -> Stretch:
+        """Go and whisk for some samples of 1 ms.
+
+        Args:
+            samples: how many.
+            velocity_mm_s: (3,) commanded to the head, mm/s, in the world.
+
+        Raises:
+            SourceError: the simulation has become unstable: whiskers jam.
+        """
+        at = np.arange(self.samples - 1, self.samples + samples + 2)
+        way, shaken = self._go(samples, np.asarray(velocity_mm_s, dtype=np.float64))
+        loads, contacts = self.world.advance(
+            self.placed.centre - way, shaken=shaken, turning=self.frames(at)
+        )
+        # At the middle of a sample: its mean, but for a part in ten thousand at 8 Hz.
+        times = (at[1:-2].astype(np.float64) + 0.5) * (SAMPLE_MS * 1e-3)
+        angle = self._drive.protraction(times)
+        touching = contacts[..., 0] > TOUCHING_SHARE
+        touches = self._begun(touching)
+        self.samples += samples
+        self.touches += touches
+        self.touching = touching[-1]
+        return Stretch(loads, angle, touching, touches)
+
+    def _begun(self, touching: NDArray[np.bool_]) -> int:
+        """How often (sample, element) a whisker began to touch that had been free for a while."""
+        at = np.arange(len(touching))[:, None]
+        last = np.maximum.accumulate(np.where(touching, at, -self._free - 1), axis=0)
+        before = np.concatenate([-self._free[None] - 1, last[:-1]])
+        self._free = len(touching) - 1 - last[-1]
+        return int((touching & (at - before > APART_MS)).sum())
+
+    def _go(self, samples: int, velocity_mm_s: Floats) -> tuple[Floats, Floats]:
+        """(sample + 1, 3) where the head is, mm, and (sample, 3) its acceleration, mm/ms^2."""
+        steps = np.arange(1, samples + 1)[:, None] * velocity_mm_s * (SAMPLE_MS * 1e-3)
+        aims = np.clip(self._aim + steps, self.placed.low, self.placed.high)
+        fading, following = _lagging(samples)
+        lags = fading @ self._lags + np.einsum("kli,ia->kla", following, aims)
+        pulls = (lags[:, 0] - 2 * lags[:, 1] + lags[:, 2]) / LAG_MS**2
+        self._aim, self._lags = aims[-1], lags[-1]
+        return lags[:, 2], (pulls[1:] + pulls[:-1]) / 2
+
+
+@lru_cache(maxsize=8)
+def _lagging(samples: int) -> tuple[Floats, Floats]:
+    """What three lags make of a course.
+
+    Returns:
+        (sample + 1, lag, lag) what is left of where the lags began, and (sample + 1, lag, sample)
+        the share of the aim that stood during each sample.
+    """
+    decay = expm((np.diag([1.0, 1.0], -1) - np.eye(3)) * SAMPLE_MS / LAG_MS)
+    fading = np.empty((samples + 1, 3, 3))
+    fading[0] = np.eye(3)
+    for k in range(samples):
+        fading[k + 1] = decay @ fading[k]
+    gained = fading @ (1.0 - decay.sum(axis=1))  # (sample + 1, lag) of an aim so long ago
+    following = np.zeros((samples + 1, 3, samples))
+    for k in range(1, samples + 1):
+        following[k, :, :k] = gained[:k][::-1].T
+    return fading, following
