@@ -30,8 +30,8 @@ from tests.helpers.source_tree import (
     why_a_fragment,
 )
 
-# What is loaded by its name when it is asked for: sources, codecs, publishers, encoders, commands,
-# rigs, and what `from tactile_rt import ...` gives.
+# What is loaded by its name when it is asked for: sources, codecs, publishers, encoders, metrics,
+# datasets, commands, rigs, and what `from tactile_rt import ...` gives.
 TABLES = {
     "tactile_rt",
     "tactile_rt.cli",
@@ -39,6 +39,8 @@ TABLES = {
     "tactile_rt.daemon.publishers",
     "tactile_rt.drivers.codec",
     "tactile_rt.models",
+    "tactile_rt.models.alignment.datasets",
+    "tactile_rt.models.alignment.metrics",
     "tactile_rt.models.ead",
     "tactile_rt.models.training",
     "tactile_rt.sources.opening",

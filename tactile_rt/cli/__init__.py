@@ -23,6 +23,7 @@ def main() -> None:
 
     from tactile_rt.cli import (  # noqa: F401
         align,
+        align_board,
         array,
         bench,
         calibrate,

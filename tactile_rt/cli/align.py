@@ -31,7 +31,9 @@ Stimuli = Annotated[
     typer.Option(help="Of `tactile-rt whisk`. Default: the mouse array's, which ships."),
 ]
 Benchmark = Annotated[Path, typer.Option(help="What `align build` wrote.")]
-Models = Annotated[list[Path], typer.Argument(help="Checkpoints (best.pt) and .onnx files.")]
+Models = Annotated[
+    list[Path], typer.Argument(help="Checkpoints (best.pt), .onnx files, and responses (.npz).")
+]
 
 
 class GateCommand(TyperCommand):
@@ -45,6 +47,37 @@ class GateCommand(TyperCommand):
             if getattr(error, "exit_code", None) == USAGE:
                 error.exit_code = INPUT_ERROR  # type: ignore[attr-defined]
             raise
+
+
+@align.command("example")
+def write_brain(
+    folder: Annotated[Path, typer.Argument(help="The folder to make.")],
+    mice: Annotated[int, typer.Option(help="How many are recorded.")] = 11,
+    trials: Annotated[int, typer.Option(help="Of each stimulus, in a session.")] = 40,
+    private: Annotated[
+        float, typer.Option(help="Share of a mouse's variance that is its own, 0 to 1.")
+    ] = 0.15,
+    seed: Annotated[int, typer.Option(help="Of every random number.")] = 0,
+) -> None:
+    """Make up a brain: recordings in NWB, and models of known truth, to try the commands on."""
+    from tactile_rt.models.alignment.example import Brain
+    from tactile_rt.models.alignment.example_files import write_example
+
+    brain = Brain(mice=mice, trials=trials, private=private)
+    console = Console(stderr=True)
+    with progress_bar(console, "recording", total=1.0) as update:
+        try:
+            recordings, models = write_example(
+                folder, brain, seed, lambda share: update(completed=share)
+            )
+        except ModuleNotFoundError as error:
+            raise needs("align", error) from None
+    names = ", ".join(sorted(path.name for path in models.iterdir()))
+    for line in (
+        f"{recordings}: {mice} mice; {models}: {names}",
+        f"next: tactile-rt align build {recordings} --out {folder / 'benchmark.json'}",
+    ):
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 @align.command("build")
@@ -157,7 +190,7 @@ def write_report(
 
 @align.command("gate", cls=GateCommand)
 def gate_model(
-    model: Annotated[Path, typer.Argument(help="What would be released: .onnx or best.pt.")],
+    model: Annotated[Path, typer.Argument(help="What would be released: .onnx, best.pt or .npz.")],
     benchmark: Annotated[
         Path | None, typer.Option(help="Tests 1 and 2: what `align build` wrote.")
     ] = None,

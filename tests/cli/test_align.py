@@ -129,3 +129,18 @@ def test_mistakes_are_one_line(call, frozen, tmp_path):
         assert code == 2, arguments
         assert said in err and err.startswith("tactile-rt: "), err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_example_is_built_from_and_scored(call, tmp_path):
+    pytest.importorskip("h5py")
+    brain, out = tmp_path / "brain", tmp_path / "scores.json"
+    code, _, err = call("align", "example", brain, "--mice", 3, "--trials", 12)
+    assert code == 0 and "another-mouse.npz" in err and "align build" in err
+    code, _, err = call(
+        "align", "build", brain / "recordings", "--out", brain / "b.json", "--bootstraps", 5
+    )
+    assert code == 0 and "animals are reliable" in " ".join(err.split())
+    model = brain / "models" / "another-mouse.npz"
+    code, text, _ = call("align", "score", model, "--benchmark", brain / "b.json", "--json", out)
+    assert code == 0 and "another-mouse" in text
+    assert call("align", "example", brain)[0] == 2

@@ -96,3 +96,20 @@ def loop(source, target, bootstraps, seed=1234):
         score = np.nan if not p > 0 or np.isclose(p, 0) else r_xy / np.sqrt(p)
         results[:, b] = r_xy, r_xx, r_yy, score
     return results
+
+
+def courses(rng, features, number, trials=24, units=60, noise=2.0, sessions=2):
+    """Animals whose units read out features (6, bin, feature) linearly, bin by bin."""
+    made = []
+    for i in range(number):
+        recorded = []
+        for k in range(sessions):
+            stimulus = rng.permutation(np.repeat(np.arange(6), trials))
+            tuned = 10 + features @ rng.normal(size=(features.shape[-1], units))
+            course = tuned[stimulus]
+            course = course + noise * rng.normal(size=course.shape)
+            recorded.append(
+                NeuralSession(f"mouse-{i}", f"{i}-{k}", course.mean(axis=1), stimulus, course)
+            )
+        made.append(Animal(f"mouse-{i}", tuple(recorded)))
+    return made

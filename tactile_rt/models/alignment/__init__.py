@@ -6,7 +6,10 @@ neural, nwb, nwb_parts, published   recordings: from NWB files, and in the publi
 strict, pooling, paper_code, building   the two protocols: recordings -> a frozen benchmark
 benchmark, benchmark_file   the frozen benchmark and its file
 scoring, statistics      a model's layers -> score, exact p-value
-stimuli_input, layers, activations, onnx_taps, onnx_activations, loading   a model -> its layers
+stimuli_input, layers, activations, onnx_taps, onnx_activations, responses_file, loading
+                          a model -> its layers
+example, example_files   a made-up brain of known truth, and its files
+metrics/, targets        more than 15 numbers: metrics in a table, layers of cortex, types of cell
 fidelity, gate, decoding, results, pictures, report   what is done with them
 """
 

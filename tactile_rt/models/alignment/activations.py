@@ -15,22 +15,31 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.models.attenders.gpt import GPT, TOKENS
 from tactile_rt.models.attenders.mamba import MambaStack
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, untrained
-from tactile_rt.models.ead import count_parameters
+from tactile_rt.models.ead import EADConfig, count_parameters
 from tactile_rt.models.encoders.graph import Graph, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 from tactile_rt.models.encoders.gru import GRUEncoder
+from tactile_rt.sensor_spec import ChannelLimits
 from tactile_rt.stream import ArraySpec
 
-__all__ = ["checkpoint_layers", "network_layers", "reach", "untrained_layers"]
+__all__ = [
+    "checkpoint_layers",
+    "network_layers",
+    "reach",
+    "untrained_card_layers",
+    "untrained_layers",
+]
 
 Traces = dict[str, Tensor]
 Change = Callable[[Tensor], Tensor]
@@ -56,6 +65,32 @@ def untrained_layers(saved: dict[str, Any], stimuli: StimuliInput, seed: int = 0
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = untrained(saved)
+    return network_layers(model, stimuli, f"untrained, seed {seed}")
+
+
+def untrained_card_layers(card: ModelCard, stimuli: StimuliInput, seed: int = 0) -> Layers | None:
+    """Layers of the network that an exported file's card describes, with random weights.
+
+    None for a card that does not say of which network it is, as one of another program might.
+
+    Raises:
+        ConfigError: the stimuli are of another array.
+    """
+    network = card.provenance.get("network")
+    if not isinstance(network, dict):
+        return None
+    scale, floor, clip = (
+        np.asarray(v, dtype=np.float32) for v in (card.scale, card.floor, card.clip)
+    )
+    spec = ArraySpec.from_json(card.spec)
+    stimuli.check(spec, card.steps, card.substeps, card.name)
+    try:
+        config = EADConfig(**network)
+    except TypeError:  # keys of a later release
+        return None
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = TactileClassifier(spec, config, ChannelLimits(scale, floor, clip, scale))
     return network_layers(model, stimuli, f"untrained, seed {seed}")
 
 

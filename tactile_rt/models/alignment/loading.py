@@ -1,4 +1,4 @@
-"""Layers of any model file: a checkpoint, a step ONNX or a window ONNX."""
+"""Layers of any model file: a checkpoint, an ONNX file, or responses computed elsewhere."""
 
 import re
 from collections.abc import Iterable
@@ -6,6 +6,7 @@ from pathlib import Path
 
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.models.alignment.layers import Layers
+from tactile_rt.models.alignment.responses_file import RESPONSES, responses_layers
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.models.checkpoint_files import describe_checkpoint
 from tactile_rt.stream import ConfigError
@@ -20,11 +21,13 @@ def check_models(paths: Iterable[Path]) -> None:
     """Refuse what is no model file before the first is scored, and before torch is loaded.
 
     Raises:
-        ModelError: one is not such a file.
+        ModelError, ConfigError: one is not such a file.
     """
     for path in paths:
         if path.suffix == CHECKPOINT:
             describe_checkpoint(path)
+        elif path.suffix == RESPONSES:
+            responses_layers(path)
         else:
             read_model(path, None)
 
@@ -41,6 +44,8 @@ def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float,
 
         layers, saved = checkpoint_layers(path, stimuli)
         return layers, _accuracy(saved.get("metrics", {}))
+    if path.suffix == RESPONSES:
+        return responses_layers(path), None
     from tactile_rt.models.alignment.onnx_activations import onnx_layers
 
     layers, card = onnx_layers(path, stimuli)
@@ -48,20 +53,29 @@ def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float,
 
 
 def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | None:
-    """Layers of a checkpoint's network before training; None for an ONNX file.
+    """Layers of a model's network before training: of the same architecture, with random weights.
+
+    An ONNX file knows its architecture by the card in its metadata. None for responses, and for a
+    card that does not name its network.
 
     Raises:
         ModelError: not such a file.
         ConfigError: a seed below 0.
     """
-    if path.suffix != CHECKPOINT:
+    if path.suffix == RESPONSES:
         return None
     if seed < 0:
         raise ConfigError(f"a seed is at least 0, not {seed}")
-    from tactile_rt.models.alignment.activations import untrained_layers
-    from tactile_rt.models.checkpoints import load_checkpoint
+    from tactile_rt.models.alignment.activations import (
+        untrained_card_layers,
+        untrained_layers,
+    )
 
-    return untrained_layers(load_checkpoint(path)[1], stimuli, seed)
+    if path.suffix == CHECKPOINT:
+        from tactile_rt.models.checkpoints import load_checkpoint
+
+        return untrained_layers(load_checkpoint(path)[1], stimuli, seed)
+    return untrained_card_layers(read_model(path, None)[0], stimuli, seed)
 
 
 def _accuracy(figures: object) -> tuple[float, str] | None:

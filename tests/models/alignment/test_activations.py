@@ -1,18 +1,21 @@
 """Layers of networks and of files, for the six stimuli."""
 
+import msgspec
 import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
-from tactile_rt.classifier.model_file import load_model, shipped_model  # noqa: E402
+from tactile_rt.classifier.model_file import load_model, read_model, shipped_model  # noqa: E402
 from tactile_rt.models.alignment.activations import (  # noqa: E402
     network_layers,
     reach,
+    untrained_card_layers,
     untrained_layers,
 )
 from tactile_rt.models.alignment.layers import first_difference  # noqa: E402
+from tactile_rt.models.alignment.loading import load_untrained  # noqa: E402
 from tactile_rt.models.alignment.onnx_activations import onnx_layers, with_outputs  # noqa: E402
 from tactile_rt.models.alignment.onnx_taps import named_taps, precision_of  # noqa: E402
 from tactile_rt.models.alignment.rdm import STIMULI, rdm  # noqa: E402
@@ -21,6 +24,7 @@ from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
 from tactile_rt.models.ead import EADConfig  # noqa: E402
 from tactile_rt.models.encoders.zhuang import zhuang_graph  # noqa: E402
 from tactile_rt.stream import ConfigError, ModelError  # noqa: E402
+from tests.helpers.source_tree import ROOT  # noqa: E402
 
 FELT = read_stimuli()
 SPEC = load_model(shipped_model())[1].array
@@ -205,3 +209,20 @@ def test_broken_files(tmp_path):
     broken.with_suffix(".npz").write_bytes(b"no array")
     with pytest.raises(ConfigError, match="no model input"):
         read_stimuli(broken.with_suffix(".npz"))
+
+
+def test_a_file_knows_the_network_that_it_was_before_training():
+    """The card's architecture gives what the checkpoint's does, bit for bit."""
+    file = load_untrained(shipped_model(), FELT, 3)
+    checkpoint = load_untrained(ROOT / "bench" / "shipped" / "mouse44.pt", FELT, 3)
+    assert file.parameters == checkpoint.parameters
+    assert list(file.traces) == list(checkpoint.traces)
+    for layer, trace in file.traces.items():
+        np.testing.assert_array_equal(trace, checkpoint.traces[layer])
+
+
+def test_a_card_that_names_no_network_has_no_control():
+    card = read_model(shipped_model())[0]
+    for network in (None, {"of": "another program"}):
+        other = msgspec.structs.replace(card, provenance={"network": network})
+        assert untrained_card_layers(other, FELT) is None

@@ -1,0 +1,184 @@
+"""`tactile-rt align board`: models by datasets by metrics."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Column, Table
+
+from tactile_rt.cli.align import align
+from tactile_rt.cli.app import check_output, needs, progress_bar
+from tactile_rt.stream import ConfigError
+
+if TYPE_CHECKING:
+    from tactile_rt.models.alignment.board import Alignments, BoardRow
+    from tactile_rt.models.alignment.layers import Layers
+    from tactile_rt.models.alignment.stimuli_input import StimuliInput
+
+
+@align.command("datasets")
+def list_datasets() -> None:
+    """List the recordings that models can be compared with: license, citation, size."""
+    from tactile_rt.models.alignment.datasets import dataset_names, find_dataset
+
+    console = Console()
+    for name in dataset_names():
+        one = find_dataset(name)
+        console.print(f"[bold]{name}[/]  {one.title}", highlight=False)
+        for line in (one.about, one.citation, one.url):
+            if line:
+                console.print(f"    {line}", highlight=False, markup=False)
+        licensed = f"license {one.license}, " if one.license else ""
+        console.print(f"    {licensed}{one.size}", highlight=False, markup=False)
+
+
+@align.command("board")
+def write_board(
+    models: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Checkpoints (best.pt), .onnx files, and responses (.npz)."),
+    ] = None,
+    data: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=PATH of recordings, `align datasets` names them; may be repeated."),
+    ] = None,
+    metric: Annotated[
+        list[str] | None, typer.Option(help="May be repeated. Default: all of them.")
+    ] = None,
+    part: Annotated[
+        list[str] | None,
+        typer.Option(help="all, L2/3, L4, L5, L6, excitatory or inhibitory; may be repeated."),
+    ] = None,
+    json: Annotated[Path | None, typer.Option(help="Write the board here.")] = None,
+    page: Annotated[Path | None, typer.Option(help="Write it as a page here, .html.")] = None,
+    stimuli: Annotated[
+        Path | None,
+        typer.Option(help="Of `tactile-rt whisk`. Default: the mouse array's, which ships."),
+    ] = None,
+    untrained: Annotated[
+        bool, typer.Option(help="A row for each network before its training too.")
+    ] = True,
+    seed: Annotated[int, typer.Option(help="Of the untrained networks.")] = 0,
+) -> None:
+    """Compare models with recordings by every metric, as shares of what noise permits."""
+    for file in (json, page):
+        check_output(file)
+    if not data:
+        raise ConfigError("name recordings: --data NAME=PATH, see `tactile-rt align datasets`")
+    try:
+        made = _board(models or [], data, metric, part or ["all"], stimuli, untrained, seed)
+    except ModuleNotFoundError as error:
+        raise needs("train", error) from None
+    if json:
+        from tactile_rt.models.alignment.board import write_board as write
+
+        write(made, json)
+    if page:
+        from tactile_rt.models.alignment.board_page import write_board_page
+
+        write_board_page(made, page)
+    _show(made)
+
+
+def _board(
+    models: list[Path],
+    data: list[str],
+    metric: list[str] | None,
+    parts: list[str],
+    stimuli: Path | None,
+    untrained: bool,
+    seed: int,
+) -> "Alignments":
+    from tactile_rt.models.alignment.board import joined, with_cells
+    from tactile_rt.models.alignment.datasets import find_dataset
+    from tactile_rt.models.alignment.loading import check_models
+    from tactile_rt.models.alignment.metrics import find_metric, metric_names
+    from tactile_rt.models.alignment.stimuli_input import read_stimuli
+    from tactile_rt.models.alignment.targets import part_of
+
+    metrics = list(dict.fromkeys(metric or metric_names()))
+    for name in metrics:
+        find_metric(name)
+    for name in parts:
+        part_of((), name)
+    named = [_named(text) for text in data]
+    datasets = [(find_dataset(name), path) for name, path in named]
+    felt = read_stimuli(stimuli)
+    check_models(models)
+    boards = []
+    console = Console(stderr=True)
+    for dataset, path in datasets:
+        with progress_bar(console, f"reading {dataset.name}", total=1.0) as update:
+            read = dataset.read([path], felt, _shown(update))
+        with progress_bar(console, f"models on {dataset.name}", max(len(models), 1)) as update:
+            rows = _rows(models, read.stimuli or felt, untrained, seed, update)
+        with progress_bar(console, f"scoring on {dataset.name}", total=1.0) as update:
+            boards.append(
+                with_cells(
+                    rows, dataset, read.animals, list(dict.fromkeys(parts)), metrics, read.notes,
+                    _shown(update),
+                )
+            )  # fmt: skip
+    return joined(boards)
+
+
+def _shown(update: Any) -> Callable[[float], None]:
+    return lambda share: update(completed=share)
+
+
+def _rows(
+    models: list[Path], felt: "StimuliInput", untrained: bool, seed: int, update: Any
+) -> list[tuple["BoardRow", Any]]:
+    from tactile_rt.models.alignment.board import BoardRow, traces_of, traces_of_stimuli
+    from tactile_rt.models.alignment.loading import load_layers, load_untrained
+
+    rows: list[tuple[BoardRow, Any]] = []
+    for path in models:
+        update(description=path.name)
+        layers: Layers = load_layers(path, felt)[0]
+        if any(layers.name == row.name for row, _ in rows):
+            layers = replace(layers, name=f"{layers.name} ({path.name})")
+        before = load_untrained(path, felt, seed) if untrained else None
+        # The same network: a file keeps some of its numbers in other places than a checkpoint.
+        size = before.parameters if before else layers.parameters
+        row = BoardRow(layers.name, "model", layers.sha256, size, layers.notes)
+        rows.append((row, traces_of(layers)))
+        if before is not None:
+            rows.append((BoardRow(before.name, "untrained", "", size), traces_of(before)))
+        update(advance=1)
+    rows.append((BoardRow("raw sensor input", "input"), traces_of_stimuli(felt)))
+    return rows
+
+
+def _named(text: str) -> tuple[str, Path]:
+    name, equals, path = text.partition("=")
+    if not equals or not name or not path:
+        raise ConfigError(f"--data is NAME=PATH, not {text!r}")
+    return name, Path(path)
+
+
+def _show(board: "Alignments") -> None:
+    console = Console()
+    places = dict.fromkeys((c.dataset, c.part) for c in board.columns)
+    for dataset, part in places:
+        columns = [k for k, c in enumerate(board.columns) if (c.dataset, c.part) == (dataset, part)]
+        heads = [board.columns[k].metric for k in columns]
+        table = Table(Column("", overflow="fold"), *heads, title=f"{dataset}, {part}")
+        for r, row in enumerate(board.rows):
+            cells = [board.cell(r, k) for k in columns]
+            table.add_row(row.name, *(_said(c.score, c.sem) for c in cells))
+        table.add_section()
+        table.add_row("ceiling", *(_said(board.columns[k].ceiling, None) for k in columns))
+        table.add_row(
+            "animals", *(f"{board.columns[k].usable}/{board.columns[k].animals}" for k in columns)
+        )
+        console.print(table)
+
+
+def _said(value: float | None, sem: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.2f}" if sem is None else f"{value:.2f} ± {sem:.2f}"

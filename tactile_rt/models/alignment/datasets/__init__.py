@@ -1,0 +1,103 @@
+"""Recordings that models are compared with, by name, each imported when it is asked for.
+
+A dataset says where its recordings come from (title, citation, license, size), and reads what its
+user downloaded: animals, and the input of the models if it is not the six stimuli that ship. Its
+six conditions stand on the axis of `STIMULI`, under names of their own. Recordings are never
+bundled. Datasets of other packages are found by the entry points ``tactile_rt.alignment_datasets``.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from importlib import import_module, metadata
+from pathlib import Path
+
+from tactile_rt.models.alignment.neural import Animal
+from tactile_rt.models.alignment.rdm import STIMULI
+from tactile_rt.models.alignment.stimuli_input import StimuliInput
+from tactile_rt.settings import no_such
+from tactile_rt.stream import ConfigError
+
+__all__ = ["DATASETS", "DatasetContents", "NeuralDataset", "dataset_names", "find_dataset"]
+
+ENTRY_POINTS = "tactile_rt.alignment_datasets"  # of other packages
+
+
+@dataclass(frozen=True, eq=False)
+class DatasetContents:
+    """What was read of a dataset.
+
+    Attributes:
+        animals: The animals, each a target of its own.
+        stimuli: The input that models get for its conditions; None for the six stimuli that ship
+            or that the user names.
+        notes: Remarks on what was left out and why, a line each.
+    """
+
+    animals: tuple[Animal, ...]
+    stimuli: StimuliInput | None = None
+    notes: tuple[str, ...] = ()
+
+
+Reader = Callable[[Sequence[Path], StimuliInput, Callable[[float], None]], DatasetContents]
+
+
+@dataclass(frozen=True, eq=False)
+class NeuralDataset:
+    """A public set of recordings, and how to read it.
+
+    Attributes:
+        name: The name that a user gives, such as the number of a DANDI set.
+        title: The title that its authors gave it.
+        citation: The words to cite it by.
+        license: The SPDX name of its license; empty for a set of the user's own.
+        url: The address of its page; empty if there is none.
+        size: The size and the number of its files, in words.
+        conditions: The names of its six conditions, in the order of the stimulus axis.
+        about: Sentences on what is compared and what that leaves out.
+        read: The function that reads downloaded files or folders. It takes them, the input of the
+            six stimuli, and a function to call with the share done, 0 to 1, and raises
+            `ConfigError` where they cannot be used.
+    """
+
+    name: str
+    title: str
+    citation: str
+    license: str
+    url: str
+    size: str
+    about: str
+    read: Reader
+    conditions: tuple[str, ...] = STIMULI
+
+
+# name: where the dataset is
+DATASETS = {
+    "000231": f"{__name__}.rodgers:DANDI_000231",
+    "000013": f"{__name__}.hires:DANDI_000013",
+    "example": f"{__name__}.rodgers:EXAMPLE",
+}
+
+
+def dataset_names() -> tuple[str, ...]:
+    """All datasets that are installed, ours first."""
+    points = metadata.entry_points(group=ENTRY_POINTS)
+    return (*DATASETS, *sorted(set(points.names) - set(DATASETS)))
+
+
+def find_dataset(name: str) -> NeuralDataset:
+    """A dataset by its name.
+
+    Raises:
+        ConfigError: no such dataset, or it cannot be loaded.
+    """
+    if name in DATASETS:
+        module, _, attribute = DATASETS[name].partition(":")
+        ours: NeuralDataset = getattr(import_module(module), attribute)
+        return ours
+    for point in metadata.entry_points(group=ENTRY_POINTS).select(name=name):
+        try:
+            theirs: NeuralDataset = point.load()
+        except Exception as error:  # another package's code
+            raise ConfigError(f"dataset {name} cannot be loaded: {error}") from None
+        return theirs
+    raise ConfigError(no_such("dataset", name, dataset_names()))

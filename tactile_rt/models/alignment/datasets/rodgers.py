@@ -1,0 +1,50 @@
+"""Shapes felt by mice: DANDI 000231 (Rodgers 2022), and recordings made up in its form."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from tactile_rt.models.alignment.datasets import DatasetContents, NeuralDataset
+from tactile_rt.models.alignment.neural import by_animal
+from tactile_rt.models.alignment.nwb import find_nwb, read_nwb
+from tactile_rt.models.alignment.stimuli_input import StimuliInput
+
+__all__ = ["DANDI_000231", "EXAMPLE"]
+
+
+def _read(
+    paths: Sequence[Path], stimuli: StimuliInput, progress: Callable[[float], None]
+) -> DatasetContents:
+    sessions, notes = read_nwb(find_nwb(paths), "contact", progress)
+    return DatasetContents(by_animal(sessions), None, tuple(notes))
+
+
+# Title, citation, license, size: dandiset.yaml of the draft, github.com/dandisets/000231.
+DANDI_000231 = NeuralDataset(
+    name="000231",
+    title="A detailed behavioral, videographic, and neural dataset on object recognition in mice",
+    citation=(
+        "Rodgers, Chris (2022). A detailed behavioral, videographic, and neural dataset on object "
+        "recognition in mice. DANDI archive. https://dandiarchive.org/dandiset/000231"
+    ),
+    license="CC0-1.0",
+    url="https://dandiarchive.org/dandiset/000231",
+    size="2.0 TB in 4,228 files of 15 mice, most of it video, which is not needed",
+    about=(
+        "Mice whisk a convex or a concave surface, close, at a medium distance or far. Rates of "
+        "correct trials count from first contact to choice."
+    ),
+    read=_read,
+)
+EXAMPLE = NeuralDataset(
+    name="example",
+    title="A made-up brain of known truth",
+    citation="made by `tactile-rt align example`: no animal",
+    license="",
+    url="",
+    size="as it was asked for",
+    about=(
+        "Recordings in the form of 000231. Units mix features that follow distance and shape and "
+        "are else drawn at random; nothing in them knows what a whisker feels."
+    ),
+    read=_read,
+)

@@ -1,0 +1,87 @@
+"""`tactile-rt align board` and `align datasets`, on a made-up brain."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tactile_rt.classifier.model_file import shipped_model
+
+pytest.importorskip("onnx")
+pytest.importorskip("torch")
+h5py = pytest.importorskip("h5py")
+
+MODEL = shipped_model()
+
+
+@pytest.fixture(scope="module")
+def brain(tmp_path_factory):
+    from tactile_rt.models.alignment.example import Brain
+    from tactile_rt.models.alignment.example_files import write_example
+
+    folder = tmp_path_factory.mktemp("board") / "brain"
+    recordings, _ = write_example(folder, Brain(mice=3, sessions=1, units=30, trials=12))
+    for path in recordings.rglob("*.nwb"):
+        with h5py.File(path, "r+") as file:
+            file["acquisition/extracellular array recording/starting_time"][()] = 0.0
+    return folder
+
+
+def test_a_board_of_a_model_its_untrained_network_and_responses(call, brain, tmp_path):
+    board, page = tmp_path / "board.json", tmp_path / "board.html"
+    code, out, err = call(
+        "align", "board", MODEL, brain / "models" / "another-mouse.npz",
+        "--data", f"example={brain / 'recordings'}", "--metric", "rsa", "--metric", "crossnobis",
+        "--part", "all", "--part", "L5", "--json", board, "--page", page,
+    )  # fmt: skip
+    assert code == 0, err
+    made = json.loads(board.read_text())
+    assert [row["kind"] for row in made["rows"]] == [
+        "model", "untrained", "model", "input", "animal"
+    ]  # fmt: skip
+    assert made["rows"][0]["parameters"] == made["rows"][1]["parameters"] > 0
+    assert [(c["part"], c["metric"]) for c in made["columns"]] == [
+        (part, metric) for part in ("all", "L5") for metric in ("rsa", "crossnobis")
+    ]
+    assert made["datasets"][0]["units"] == 90
+    assert "another animal" in out and page.read_text().startswith("<!doctype html>")
+
+
+def test_another_seed_is_another_untrained_network(call, brain, tmp_path):
+    scores = []
+    for seed in (0, 1):
+        board = tmp_path / "board.json"
+        code, _, err = call(
+            "align", "board", MODEL, "--data", f"example={brain / 'recordings'}",
+            "--metric", "rsa", "--seed", seed, "--json", board,
+        )  # fmt: skip
+        assert code == 0, err
+        made = json.loads(board.read_text())
+        scores.append([c["score"] for c in made["cells"] if c["row"] < 2])
+    assert scores[0][0] == scores[1][0] and scores[0][1] != scores[1][1]
+
+
+def test_the_datasets_are_listed(call):
+    code, out, _ = call("align", "datasets")
+    assert code == 0
+    for said in ("000231", "000013", "example", "CC-BY-4.0", "CC0-1.0", "11.4 GB"):
+        assert said in out
+
+
+def test_mistakes_are_one_line(call, brain, tmp_path):
+    data = ("--data", f"example={brain / 'recordings'}")
+    np.savez(tmp_path / "odd.npz", a=np.zeros((5, 3)))
+    for arguments, said in (
+        ((), "name recordings: --data NAME=PATH"),
+        (("--data", "example"), "--data is NAME=PATH"),
+        (("--data", "exmple=x"), "did you mean example"),
+        (("--data", f"example={tmp_path / 'none'}"), "none"),
+        ((*data, "--metric", "rsaa"), "did you mean rsa"),
+        ((*data, "--part", "L7"), "no part of cortex"),
+        ((*data, "--seed", "-1", MODEL), "a seed is at least 0"),
+        ((*data, tmp_path / "odd.npz"), "is no layer"),
+        ((*data, "--json", tmp_path / "x" / "b.json"), "no folder"),
+    ):
+        code, _, err = call("align", "board", *arguments)
+        assert code == 2, arguments
+        assert said in err and err.startswith("tactile-rt: "), err
