@@ -55,6 +55,6 @@ def added(group: str, name: str) -> Any:
             return point.load()
         except Exception as error:  # another package's code
             package = f" of the package {point.dist.name}" if point.dist else ""
-            kind = group.removeprefix("tactile_rt.").removesuffix("s")
+            kind = group.removeprefix("tactile_rt.").replace("_", " ").removesuffix("s")
             raise ConfigError(f"{kind} {name}{package} cannot be loaded: {error}") from None
     return None

@@ -13,7 +13,9 @@ from tests.helpers.followed_page import Block, blocks, check_printed, follow
 from tests.helpers.source_tree import ROOT
 
 DOCS = ROOT / "docs"
-pytestmark = pytest.mark.skipif(not DOCS.joinpath("start").exists(), reason="an archive, no docs")
+pytestmark = pytest.mark.skipif(
+    not DOCS.joinpath("start").exists(), reason="a source archive, no docs"
+)
 
 FOLLOWED = sorted([*DOCS.glob("how-to/add-a*.md"), *DOCS.glob("start/*.md")])
 # What a page needs beyond the onboard packages.
@@ -24,11 +26,15 @@ NEEDS = {
     "add-a-whisker-species": ("mujoco",),
     "stimuli-to-alignment": ("mujoco", "torch"),
 }
+LONG = ("add-a-recipe", "stimuli-to-alignment")  # they train, and whisk
 PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
 LINK = re.compile(r"(?<!`)\]\(([^)\s]+)\)|<img[^>]+src=\"([^\"]+)\"")
 
 
-@pytest.mark.parametrize("page", FOLLOWED, ids=lambda p: p.stem)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, id=p.stem, marks=[pytest.mark.slow] * (p.stem in LONG)) for p in FOLLOWED],
+)
 def test_the_page_does_what_it_says(page: Path, tmp_path, monkeypatch) -> None:
     for module in NEEDS.get(page.stem, ()):
         pytest.importorskip(module)
@@ -122,5 +128,7 @@ def test_the_site_is_built_offline_without_a_warning(tmp_path, monkeypatch, capf
         build(load_config("mkdocs.yml", strict=True, site_dir=str(tmp_path)))
     assert (tmp_path / "reference" / "api" / "face.html").stat().st_size > 20_000
     html = [p.read_text("utf-8") for p in tmp_path.rglob("*.html")]
-    fetched = {u for t in html for u in re.findall(r"(?:src|<link[^>]*href)=\"(https?://[^\"]+)", t)}
+    fetched = {
+        u for t in html for u in re.findall(r"(?:src|<link[^>]*href)=\"(https?://[^\"]+)", t)
+    }
     assert fetched == set(), "a page that is read offline fetches nothing"

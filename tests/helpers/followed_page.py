@@ -7,13 +7,15 @@
     ```text                               what the block before prints; "..." stands for anything
 
 `pip install .` does here what matters of it: the names that the folder's pyproject.toml adds are
-found, and its modules can be imported. All other languages are shown and not run.
+found, and its modules can be imported. `git clone` copies this tree. All other languages are shown
+and not run.
 """
 
 import io
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -115,7 +117,7 @@ class Reader:
         if block.title == TERMINAL:
             self._begin(block.text)
         elif block.title:
-            path = self.folder / block.title
+            path = Path(block.title)  # from where the reader is
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(block.text, "utf-8")
         elif block.language == "python":
@@ -130,7 +132,14 @@ class Reader:
     def _run(self, command: str) -> None:
         words = shlex.split(command, comments=True)
         if words[:2] == ["pip", "install"]:
-            self._install((self.folder / words[-1]).resolve())
+            self._install(Path(words[-1]).resolve())
+        elif words[0] == "cd" and len(words) == 2:
+            self._patch.chdir(words[1])
+        elif words[:2] == ["git", "clone"]:
+            kept = ("tactile_rt", "tests", "bench", "pyproject.toml")
+            for name in kept:
+                into = self.folder / Path(words[2]).name / name
+                _copy(ROOT / name, into)
         elif words[0] == "tactile-rt" and words[1] != "run" and not OF_A_SHELL.search(command):
             self._call(words)  # what runs as a daemon minds the signals of its process
         else:
@@ -182,6 +191,14 @@ class Reader:
     @staticmethod
     def _path() -> list[str]:
         return [part for part in os.environ.get("PYTHONPATH", "").split(os.pathsep) if part]
+
+
+def _copy(there: Path, here: Path) -> None:
+    here.parent.mkdir(exist_ok=True)
+    if there.is_file():
+        shutil.copy(there, here)
+    else:
+        shutil.copytree(there, here, ignore=shutil.ignore_patterns("__pycache__", "data", "*.pt"))
 
 
 def commands(text: str) -> list[str]:
