@@ -41,7 +41,7 @@ def train(
         float | None, typer.Option(help="Scales every channel count; a multiple of 1/32.")
     ] = None,
     objective: Annotated[
-        str | None, typer.Option(help="supervised, simclr, simsiam or autoencoder.")
+        str | None, typer.Option(help="supervised, simclr, simsiam, autoencoder or predictive.")
     ] = None,
     augmentation: Annotated[
         str | None, typer.Option(help="none, tactile, tactile-paper or image.")

@@ -235,11 +235,23 @@ def image(frames: Tensor, generator: Generator, colours: int = 6) -> Tensor:
 
 
 def _blurred(x: Tensor) -> Tensor:
-    kernel = torch.outer(torch.tensor(BLUR), torch.tensor(BLUR)).to(x)
-    kernel = (kernel / kernel.sum())[None, None]
-    cells = x.flatten(0, 3)[:, None]
-    padded = torch.nn.functional.pad(cells, (1, 1, 1, 1), mode="replicate")
-    return torch.nn.functional.conv2d(padded, kernel)[:, 0].view(x.shape)
+    """Frames (..., row, column) blurred, cells at an edge repeated beyond it.
+
+    One product over all cells: as a convolution of single channels it takes twenty times as long.
+    """
+    rows, columns = (_blur_along(n).to(x) for n in x.shape[-2:])
+    return (x.flatten(-2) @ torch.kron(rows, columns).T).view(x.shape)
+
+
+def _blur_along(cells: int) -> Tensor:
+    """(cell, cell) The share of each cell of a line in what another one becomes."""
+    weights = torch.tensor(BLUR) / sum(BLUR)
+    reach = len(BLUR) // 2
+    shares = torch.zeros(cells, cells)
+    for shift, weight in zip(range(-reach, reach + 1), weights, strict=True):
+        at = torch.arange(cells)
+        shares[at, (at + shift).clamp(0, cells - 1)] += weight
+    return shares
 
 
 def mask_steps(frames: Tensor, share: float, generator: Generator) -> Tensor:

@@ -36,6 +36,7 @@ __all__ = [
     "frame_of",
     "joined",
     "of_categories",
+    "partners",
     "relabelled",
     "windows",
     "with_faults",
@@ -238,6 +239,22 @@ def _noise_levels(n: int, largest: float, rng: np.random.Generator) -> NDArray[n
     return drawn
 
 
+def partners(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np.int64]:
+    """For each of some sweeps another one of the same object, any as likely; itself if alone.
+
+    objects (n,), the object of each -> (n,) indices into it.
+    """
+    order = np.lexsort((rng.random(len(objects)), objects))  # each object's, shuffled
+    in_order = objects[order]
+    begins = np.flatnonzero(np.r_[True, in_order[1:] != in_order[:-1]])
+    ends = np.r_[begins[1:], len(objects)] - 1
+    following = np.arange(1, len(objects) + 1)
+    following[ends] = begins  # the last of an object is followed by its first
+    found = np.empty(len(objects), dtype=np.int64)
+    found[order] = order[following]
+    return found
+
+
 class TrainingBatches:
     """Epochs of augmented training windows, each drawn afresh from (seed, epoch).
 
@@ -252,16 +269,24 @@ class TrainingBatches:
         batch: windows in a batch.
         seed: of all that is drawn.
         jitter: samples by which a window may begin earlier or later.
+        two_sweeps: whether the second view of a window is of another sweep of its object.
 
     Attributes:
         easy_epochs: The number of epochs in which noise, offset and drift rise to what is said: a
             network that meets them at once takes far longer to learn.
 
     Raises:
-        ConfigError: not even one batch of sweeps with a touch.
+        ConfigError: not even one batch of sweeps with a touch, or no object that has two.
     """
 
-    def __init__(self, data: SweepSet, batch: int, seed: int, jitter: int = JITTER) -> None:
+    def __init__(
+        self,
+        data: SweepSet,
+        batch: int,
+        seed: int,
+        jitter: int = JITTER,
+        two_sweeps: bool = False,
+    ) -> None:
         self._data, self._batch, self._seed, self._jitter = data, batch, seed, jitter
         self.easy_epochs = 0
         self._faults, self._refusals = data.manifest.faults, data.refusals
@@ -274,6 +299,13 @@ class TrainingBatches:
                 f"a batch of {batch} is more than the {len(self._usable)} sweeps in which a touch "
                 "was found: take a smaller batch, or make more sweeps"
             )
+        self._two_sweeps = two_sweeps
+        objects = data.sweeps.objects[self._usable]
+        if two_sweeps and len(set(objects.tolist())) == len(objects):
+            raise ConfigError(
+                'pairs of "two-sweeps": no object has two sweeps in which a touch was found; make '
+                'more of each, or take pairs of "one-sweep"'
+            )
 
     def __len__(self) -> int:
         return len(self._usable) // self._batch
@@ -281,13 +313,16 @@ class TrainingBatches:
     def epoch(self, number: int, view: int = 0) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
         """Batches of samples, offset, sigma (as `InputStage` takes them) and labels (batch,).
 
-        Every view of an epoch has the same sweeps in the same order, with an onset, noise, gains
-        and dead whiskers of its own: by those alone two views are not to be known as one sweep.
+        Every view of an epoch has the same sweeps in the same order, or others of the same objects
+        if `two_sweeps`, with an onset, noise, gains and dead whiskers of its own: by those alone
+        two views are not to be known as one sweep.
         """
         rng = np.random.default_rng([self._seed, number])
         order = rng.permutation(self._usable)
         if view:
             rng = np.random.default_rng([self._seed, number, view])
+            if self._two_sweeps:
+                order = order[partners(self._data.sweeps.objects[order], rng)]
         severity = min(1.0, number / self.easy_epochs) if self.easy_epochs else 1.0
         for i in range(len(self)):
             yield self._draw(order[i * self._batch : (i + 1) * self._batch], rng, severity)

@@ -13,6 +13,8 @@ augmentation of frames happens inside, drawn from the generator.
 - `SimCLR` (Chen et al. 2020): two views of a window are to be found among all others' views.
 - `SimSiam` (Chen and He 2021): one view predicts the other, which does not look back.
 - `Autoencoder` (Olshausen and Field 1996): sparse features of each step rebuild its frame.
+- `Predictive` (autoregressive predictive coding, Chung et al. 2019): the features of each step tell
+  the frames of steps that are still to come.
 
 At width 1 the heads and losses are those of the paper's code (neuroagents-lab,
 2025-tactile-whisking).
@@ -25,12 +27,13 @@ import torch
 from torch import Generator, Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.models.augmentation import Augmentation, Loads
+from tactile_rt.models.augmentation import Augmentation, Loads, mask_steps
 from tactile_rt.models.checkpoints import TactileClassifier
 
 __all__ = [
     "Autoencoder",
     "Objective",
+    "Predictive",
     "SimCLR",
     "SimSiam",
     "Supervised",
@@ -46,6 +49,7 @@ TEMPERATURE = 0.1  # of SimCLR
 PROJECTED, BOTTLENECK = 2048, 512  # SimSiam's projector and predictor
 NECK_SPREAD = 0.01  # standard deviation of the neck's first weights
 DECONVOLUTIONS = 3
+PREDICTED = 4  # steps from each on that `Predictive` tells
 SPARSITY = 1e-4  # of the autoencoder: weight of the mean of |features|
 
 
@@ -272,6 +276,41 @@ class Autoencoder(Objective):
         with _in_single_precision(frames):
             error = F.mse_loss(rebuilt.float(), frames.float())
             return 0.5 * error + SPARSITY * latent.float().abs().mean()
+
+
+class Predictive(Objective):
+    """From what each step has felt, a linear layer tells the frames of the next four steps.
+
+    A network never sees later steps, so all that is to come is hidden from it at every step at
+    once. The loss is the mean squared error of the normalised frames, over all that the steps that
+    can know anything tell of later ones in the window.
+
+    Args:
+        model, augmentation: as in `Objective`.
+        masking: the share of the steps, 0 to 1, that the network does not see and that are
+            predicted all the same.
+    """
+
+    def __init__(
+        self, model: TactileClassifier, augmentation: Augmentation, masking: float = 0.0
+    ) -> None:
+        super().__init__(model, augmentation)
+        self._masking = masking
+        channels, rows, columns = model.network.config.frame
+        self.head = nn.Linear(model.feature_size(), PREDICTED * channels * rows * columns)
+
+    def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
+        (loads,) = views
+        frames = self.frames(loads, generator)  # (batch, step, channel, row, column)
+        seen = mask_steps(frames, self._masking, generator) if self._masking else frames
+        told = self.head(self.model.features(seen)).unflatten(-1, (PREDICTED, -1))
+        flat, first = frames.flatten(2), self.model.network.lag
+        with _in_single_precision(frames):
+            errors = [
+                (told[:, first:-n, n - 1].float() - flat[:, first + n :].float()).square()
+                for n in range(1, PREDICTED + 1)
+            ]
+            return torch.cat(errors, dim=1).mean()
 
 
 def _in_single_precision(like: Tensor) -> torch.autocast:

@@ -58,7 +58,9 @@ def test_probe_and_grid_take_any_array(call, refused, trained, tmp_path, spec, p
     code, _, err = call("probe", best, tmp_path / "probed", "--epochs", 2)
     assert code == 0 and "validation top-1" in err
     plan = tmp_path / "grid.toml"
-    head = f'data = "{data}"\nupdates = 2\nbatch = 4\nseeds = 1\nwidth = 0.0625\n'
+    head = f'data = "{data}"\nbatch = 4\nseeds = 1\nwidth = 0.0625\n'
+    head += "search = { learning_rate = [1e-3], warmup = [0.1], updates = 2 }\n"
+    head += "growth = { first = 2, most = 2, gain = 0.01 }\n"
     cell = '[[cell]]\nencoder = "gru"\n'
     views = '[[cell]]\nencoder = "resnet18"\nobjective = "simclr"\naugmentation = "{}"\n'
     plan.write_text(head + cell + views.format("image"))

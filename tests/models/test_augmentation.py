@@ -8,7 +8,14 @@ import torch
 
 from tactile_rt.calibration.mirroring import Mirror
 from tactile_rt.models.array_symmetries import compose, symmetries
-from tactile_rt.models.augmentation import Tactile, build, image, mask_steps, tactile_paper
+from tactile_rt.models.augmentation import (
+    Tactile,
+    _blurred,
+    build,
+    image,
+    mask_steps,
+    tactile_paper,
+)
 from tactile_rt.models.training.config import AUGMENTATIONS
 from tactile_rt.stream import ConfigError
 from tests.helpers.tiny_sweeps import tiny_array
@@ -252,3 +259,18 @@ def test_every_augmentation_can_be_built(name, masking):
     y = made.frames(x, generator(4))
     assert y.shape == x.shape
     assert torch.equal(x, y) == (name in ("none", "tactile") and not masking)
+
+
+@pytest.mark.parametrize("grid", [(5, 7), (1, 4), (2, 1)])
+def test_a_blur_is_that_of_a_plain_loop_with_edges_repeated(grid):
+    frame = torch.randn(2, 3, *grid, generator=torch.Generator().manual_seed(0))
+    found = _blurred(frame)
+    weights = (0.25, 0.5, 0.25)
+    for row in range(grid[0]):
+        for column in range(grid[1]):
+            expected = 0
+            for i, a in zip((-1, 0, 1), weights, strict=True):
+                for j, b in zip((-1, 0, 1), weights, strict=True):
+                    near = min(max(row + i, 0), grid[0] - 1), min(max(column + j, 0), grid[1] - 1)
+                    expected = expected + a * b * frame[..., near[0], near[1]]
+            torch.testing.assert_close(found[..., row, column], expected)

@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.models.datasets import (
@@ -14,6 +16,7 @@ from tactile_rt.models.datasets import (
     drawn_as,
     find_onsets,
     joined,
+    partners,
     windows,
 )
 from tactile_rt.stream import ArraySpec, ConfigError
@@ -118,6 +121,34 @@ def test_two_views_of_an_epoch_share_the_sweeps_and_nothing_that_is_drawn() -> N
         )
         assert same.mean() < 0.01
         assert not np.array_equal(offset, offset2) or not np.array_equal(sigma, sigma2)
+
+
+@given(st.lists(st.integers(0, 5), min_size=1, max_size=30), st.integers(0, 2**32 - 1))
+def test_partners_are_others_of_the_same_object(objects: list[int], seed: int) -> None:
+    names = np.array([f"mug-{i}" for i in objects])
+    found = partners(names, np.random.default_rng(seed))
+    assert sorted(found) == list(range(len(names)))  # each is the partner of one
+    assert (names[found] == names).all()
+    for i, name in enumerate(names):
+        assert (found[i] == i) == ((names == name).sum() == 1)
+
+
+def test_all_others_of_an_object_are_as_likely_as_partners() -> None:
+    drawn = [partners(np.array(["a"] * 4), np.random.default_rng(i))[0] for i in range(3000)]
+    assert np.allclose(np.bincount(drawn, minlength=4) / 3000, [0, 1 / 3, 1 / 3, 1 / 3], atol=0.04)
+
+
+def test_the_second_view_is_of_another_sweep_of_the_object() -> None:
+    """Sweeps are told by their labels, each sweep's own; objects have three."""
+    data = sweeps(touches(24))
+    data.sweeps.objects[:] = [f"mug-{i // 3}" for i in range(24)]
+    batches = TrainingBatches(data, 8, seed=1, two_sweeps=True)
+    for one, other in zip(batches.epoch(3), batches.epoch(3, view=1), strict=True):
+        a, b = one[3].numpy(), other[3].numpy()
+        assert (a != b).all() and (a // 3 == b // 3).all()
+    data.sweeps.objects[:] = [f"mug-{i}" for i in range(24)]
+    with pytest.raises(ConfigError, match="no object has two sweeps"):
+        TrainingBatches(data, 8, seed=1, two_sweeps=True)
 
 
 def test_a_third_is_clean_a_third_rated_and_a_third_between() -> None:

@@ -11,6 +11,7 @@ from tactile_rt.models.checkpoints import TactileClassifier
 from tactile_rt.models.ead import ATTENDERS, ENCODERS, EADConfig
 from tactile_rt.models.objectives import (
     Autoencoder,
+    Predictive,
     SimCLR,
     SimSiam,
     Supervised,
@@ -49,6 +50,7 @@ def objectives(model):
         SimCLR(model, tactile),
         SimSiam(model, tactile),
         Autoencoder(model, plain),
+        Predictive(model, plain, 0.25),
     )
 
 
@@ -120,6 +122,40 @@ def test_the_autoencoder_rebuilds_each_step_from_its_own_features_sparsely():
     expected = 0.5 * error + 1e-4 * latent.abs().mean().item()
     found = objective([batch], torch.zeros(4), generator())
     assert found.item() == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.parametrize("encoder", ["gru", "zhuang-vanilla"])
+def test_each_step_tells_the_four_after_it_and_has_seen_none_of_them(encoder):
+    objective = Predictive(classifier(encoder), build("none", SPEC)).eval()
+    batch = loads()
+    frames = objective.model.inputs(*batch)
+    told = objective.head(objective.model.features(frames)).view(4, STEPS, 4, -1)
+    errors = []
+    for t in range(objective.model.network.lag, STEPS):
+        for ahead in range(1, 5):
+            if t + ahead < STEPS:
+                come = frames[:, t + ahead].flatten(1)
+                errors.append((told[:, t, ahead - 1] - come) ** 2)
+    found = objective([batch], torch.zeros(4), generator())
+    assert found.item() == pytest.approx(torch.cat(errors).mean().item(), rel=1e-5)
+    # What is told at a step is not changed by what comes after it.
+    other = frames.clone()
+    other[:, 3:] += 1.0
+    again = objective.head(objective.model.features(other)).view(4, STEPS, 4, -1)
+    torch.testing.assert_close(again[:, :3], told[:, :3])
+
+
+def test_what_is_masked_is_predicted_all_the_same():
+    """Of a network that is told nothing the loss is that of the untouched frames."""
+    objective = Predictive(classifier(), build("none", SPEC), masking=0.8).eval()
+    with torch.no_grad():
+        objective.head.weight.zero_()
+        objective.head.bias.zero_()
+    batch = loads()
+    frames = objective.model.inputs(*batch).flatten(2)
+    expected = torch.cat([frames[:, n:] for n in range(1, 5)], dim=1).square().mean()
+    found = objective([batch], torch.zeros(4), generator())
+    assert found.item() == pytest.approx(expected.item(), rel=1e-6)
 
 
 def test_heads_have_the_published_sizes_at_full_width():

@@ -6,6 +6,7 @@ import json
 import math
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +73,8 @@ def equal(a, b):
         ({"updates": -1}, "updates must be 0 or more"),
         ({"masking": 1.0}, r"masking must be in \[0, 1\)"),
         ({"objective": "simclr", "batch": 1}, "batch must be 2 or more"),
+        ({"objective": "simclr", "pairs": "three"}, "pairs is 'three', not one of one-sweep, two"),
+        ({"objective": "predictive", "pairs": "two-sweeps"}, "predictive has no two views"),
     ],
 )
 def test_what_cannot_be_is_refused(changed, said):
@@ -207,7 +210,7 @@ def test_cosine_annealing_comes_after_its_warm_up():
 @pytest.mark.parametrize(
     "schedule", ["step", "constant", "cosine", "cosine-annealing", "one-cycle"]
 )
-@pytest.mark.parametrize("updates", [1, 2, 3])
+@pytest.mark.parametrize("updates", [1, 2, 3, 10, 11])
 def test_a_schedule_may_be_as_short_as_one_wants(schedule, updates):
     found = rates(updates, schedule=schedule, warmup=0.1)
     assert np.isfinite(found).all()
@@ -282,7 +285,9 @@ def test_only_so_many_batches_are_drawn_ahead(no_thread_left):
 # Runs
 
 
-@pytest.mark.parametrize("objective", ["supervised", "simclr", "simsiam", "autoencoder"])
+@pytest.mark.parametrize(
+    "objective", ["supervised", "simclr", "simsiam", "autoencoder", "predictive"]
+)
 @pytest.mark.parametrize("augmentation", ["tactile", "image"])
 def test_a_run_of_every_objective_can_be_repeated(tiny, tmp_path, objective, augmentation):
     config = TrainingConfig(
@@ -301,6 +306,25 @@ def test_a_run_of_every_objective_can_be_repeated(tiny, tmp_path, objective, aug
     again = []
     train(config, tmp_path / "a", again.append)
     assert not again, "a finished run is finished"
+
+
+def test_a_contrast_is_of_two_sweeps_of_an_object(tmp_path):
+    """Trained and validated with; what has one sweep of each object is refused in a line."""
+    for sweeps, name in ((2, "two"), (1, "one")):
+        write_tiny_set(tmp_path / name, sweeps=sweeps)
+    runs = []
+    for pairs in ("two-sweeps", "one-sweep"):
+        config = TrainingConfig(
+            str(tmp_path / "two"), **SMALL, objective="simclr", augmentation="image", pairs=pairs,
+            updates=2,
+        )  # fmt: skip
+        seen = []
+        train(config, tmp_path / pairs, seen.append)
+        runs.append([p.metrics["validation_loss"] for p in seen if p.metrics])
+    assert np.isfinite(runs).all() and runs[0] != runs[1]
+    config = replace(config, data=str(tmp_path / "one"), pairs="two-sweeps")
+    with pytest.raises(ConfigError, match="no object has two sweeps"):
+        train(config, tmp_path / "refused")
 
 
 def test_training_learns(tiny, tmp_path):

@@ -181,7 +181,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         batch: The number of sweeps per update.
         search: The trials of every cell.
         growth: The lengths of training that are tried for every cell.
-        seeds: The number of seeds; all cells are trained with the first before any with the second.
+        seeds: The number of seeds of every cell that has no number of its own.
         sweeps: The number of sweeps of each object that are used, by split.
         supervised, self_supervised: Fields of `TrainingConfig` for cells of either kind.
         probe: Fields of `ProbeConfig` for cells whose features a probe reads.
@@ -236,18 +236,17 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return TrainingConfig(**options)
 
     def tasks(self) -> list[Task]:
-        """Everything to do, the first seed of all first."""
+        """Everything to do, a cell after the other: a grid that is not done has whole rows."""
         tasks = [Task(SVM, 0, None)] if self.svm else []
-        for seed in range(max([self.seeds, *(cell.seeds for cell in self.cells)])):
-            seen: set[str] = set()
-            for cell in self.cells:
-                if seed >= (cell.seeds or self.seeds):
-                    continue
+        seen: set[tuple[str, int]] = set()
+        for cell in self.cells:
+            bare = Candidate(cell.encoder, cell.attender, width=cell.width)
+            for seed in range(cell.seeds or self.seeds):
                 tasks.append(Task(cell.name, seed, cell))
-                if cell.network not in seen:
-                    seen.add(cell.network)
-                    bare = Candidate(cell.encoder, cell.attender, width=cell.width)
-                    tasks.append(Task(f"{RANDOM} {cell.network}", seed, bare))
+                random = Task(f"{RANDOM} {cell.network}", seed, bare)
+                if (random.name, seed) not in seen:
+                    seen.add((random.name, seed))
+                    tasks.append(random)
         return tasks
 
     def needs(self, task: Task) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ __all__ = [
     "LOSSES",
     "OBJECTIVES",
     "OPTIMIZERS",
+    "PAIRS",
     "PRECISIONS",
     "SCHEDULES",
     "WINDOWS",
@@ -29,7 +30,7 @@ __all__ = [
     "manifests_of",
 ]
 
-OBJECTIVES = ("supervised", "simclr", "simsiam", "autoencoder")
+OBJECTIVES = ("supervised", "simclr", "simsiam", "autoencoder", "predictive")
 AUGMENTATIONS = ("none", "tactile", "tactile-paper", "image", "image-paper", "image-paper-weak")
 LOSSES = ("anytime", "last")
 OPTIMIZERS = ("sgd", "adam", "adamw", "lars", "lars-paper")
@@ -38,6 +39,7 @@ PRECISIONS = ("bf16", "fp32")
 FIRST_WEIGHTS = ("kaiming", "paper")
 RATES_PER = ("update", "epoch")
 WINDOWS = ("onset", "sweep")
+PAIRS = ("one-sweep", "two-sweeps")
 
 
 @dataclass(frozen=True)
@@ -61,11 +63,14 @@ class TrainingConfig:
         faults: The sensor's faults that are drawn each time that a sweep is taken; None: those that
             the set's recipe says.
         objective: The objective: "supervised", or self-supervised "simclr", "simsiam",
-            "autoencoder".
+            "autoencoder", "predictive".
         loss: The loss of the supervised objective: "anytime" (half of it on the last step, half on
             all steps that can know anything) or "last" (the paper's: the last step alone).
-        augmentation: The augmentation, a name that `augmentation.build` takes; self-supervised
-            views differ by this alone.
+        augmentation: The augmentation, a name that `augmentation.build` takes; two views of a
+            window differ by this, by onset and by what is wrong with the sensor.
+        pairs: What the two views of "simclr" and "simsiam" are of: "one-sweep", the same window
+            twice, or "two-sweeps", windows of two sweeps of the same object, as a robot has them
+            that touches a thing twice.
         masking: The share of the steps of a window that is blanked, from 0 to less than 1.
         optimizer, schedule: Names of the optimizer and of the schedule of its rate, as in
             `optimizers`.
@@ -114,6 +119,7 @@ class TrainingConfig:
     objective: str = "supervised"
     loss: str = "anytime"
     augmentation: str = "none"
+    pairs: str = "one-sweep"
     masking: float = 0.0
     optimizer: str = "adamw"
     schedule: str = "one-cycle"
@@ -143,6 +149,7 @@ class TrainingConfig:
             ("schedule", SCHEDULES),
             ("rate_per", RATES_PER),
             ("window", WINDOWS),
+            ("pairs", PAIRS),
             ("first_weights", FIRST_WEIGHTS),
             ("precision", PRECISIONS),
         ):
@@ -161,6 +168,8 @@ class TrainingConfig:
             raise ConfigError(
                 f"{self.objective} compares sweeps of a batch: batch must be 2 or more"
             )
+        if self.pairs != "one-sweep" and self.objective not in ("simclr", "simsiam"):
+            raise ConfigError(f"pairs are of simclr and simsiam: {self.objective} has no two views")
         if self.schedule == "one-cycle" and self.rate_per == "epoch":
             raise ConfigError("schedule one-cycle changes the rate per update, not per epoch")
         if not 0 <= self.seed < 2**32:

@@ -35,7 +35,14 @@ from tactile_rt.models.datasets import (
     relabelled,
 )
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
-from tactile_rt.models.objectives import Autoencoder, Objective, SimCLR, SimSiam, Supervised
+from tactile_rt.models.objectives import (
+    Autoencoder,
+    Objective,
+    Predictive,
+    SimCLR,
+    SimSiam,
+    Supervised,
+)
 from tactile_rt.models.training.config import Progress, TrainingConfig, manifests_of
 from tactile_rt.models.training.devices import is_first, launched
 from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
@@ -106,7 +113,8 @@ def _train(
         _begin_run(config, folder)
 
     share = Share(fabric.global_rank, fabric.world_size)
-    batches = TrainingBatches(training, config.batch, config.seed, config.jitter)
+    two_sweeps = config.pairs == "two-sweeps"
+    batches = TrainingBatches(training, config.batch, config.seed, config.jitter, two_sweeps)
     if config.easy:
         updates = config.updates or config.epochs * len(batches)
         batches.easy_epochs = round(config.easy * updates / len(batches))
@@ -234,10 +242,14 @@ def build_objective(config: TrainingConfig, training: SweepSet) -> Objective:
     model = TactileClassifier(manifest.spec, network, manifest.limits)
     if config.first_weights == "paper" and isinstance(model.network.encoder, GraphEncoder):
         draw_as_published(model.network.encoder)
-    augmentation = build(config.augmentation, manifest.spec, config.masking)
+    predictive = config.objective == "predictive"
+    masking = 0.0 if predictive else config.masking  # what it predicts is not blanked
+    augmentation = build(config.augmentation, manifest.spec, masking)
     if config.objective == "supervised":
         return Supervised(model, augmentation, config.loss, config.label_smoothing)
     model.network.decoder.requires_grad_(False)  # it has no part in these
+    if predictive:
+        return Predictive(model, augmentation, config.masking)
     kinds: dict[str, type[Any]] = {
         "simclr": SimCLR,
         "simsiam": SimSiam,

@@ -142,7 +142,8 @@ def build_schedule(
             optimizer,
             [group["lr"] for group in optimizer.param_groups],
             total_steps=updates,
-            pct_start=config.warmup,
+            # of a warm-up of one update torch makes a division by zero
+            pct_start=config.warmup if config.warmup * updates != 1 else 0.0,
             cycle_momentum=False,
         )
     unit = per_epoch if config.rate_per == "epoch" else 1  # updates

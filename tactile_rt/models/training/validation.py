@@ -4,10 +4,11 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
-from tactile_rt.models.augmentation import Augmentation
+from tactile_rt.models.augmentation import Augmentation, Loads
 from tactile_rt.models.checkpoints import run_on
-from tactile_rt.models.datasets import SweepSet, windows
+from tactile_rt.models.datasets import SweepSet, partners, windows
 from tactile_rt.models.evaluation import among, hits, predict
 from tactile_rt.models.objectives import Objective
 from tactile_rt.models.training.config import TrainingConfig
@@ -49,7 +50,11 @@ class Validation:
         self._measure: Callable[[Objective], Score] = self._top1 if supervised else self._loss
         if not supervised:
             self._found = data.onsets(data.sweeps.values)
-            self._usable = np.flatnonzero(self._found.start >= 0)
+            usable = self._usable = np.flatnonzero(self._found.start >= 0)
+            self._other = np.arange(len(data.sweeps))  # what the second view is of
+            if config.pairs == "two-sweeps":
+                rng = np.random.default_rng([config.seed, VIEWS])
+                self._other[usable] = usable[partners(data.sweeps.objects[usable], rng)]
 
     def __call__(self, objective: Objective) -> Score:
         """Metrics by name, and the score: the higher the better."""
@@ -65,6 +70,13 @@ class Validation:
         metrics = {"validation_top1": float(clean), "validation_top1_noisy": float(noisy)}
         return metrics, float(clean + noisy) / 2 if data.manifest.faults.noise else float(clean)
 
+    def _cut(self, at: NDArray[np.int64]) -> Loads:
+        """This device's share of some sweeps' windows, as `InputStage` takes them."""
+        cut = windows(self._data.sweeps.values[at], self._found.start[at], self._data.timing)
+        arrays = cut, self._found.offset[at], self._found.sigma[at]
+        samples, offset, sigma = (self._share.of(torch.from_numpy(a)) for a in arrays)
+        return samples, offset, sigma
+
     @torch.inference_mode()
     def _loss(self, objective: Objective) -> Score:
         data, config = self._data, self._config
@@ -72,14 +84,11 @@ class Validation:
         parts = max(len(self._usable) // config.batch, 1)
         total = torch.zeros((), device=self._device)
         for index, at in enumerate(np.array_split(self._usable, parts)):
-            cut = windows(data.sweeps.values[at], self._found.start[at], data.timing)
-            arrays = cut, self._found.offset[at], self._found.sigma[at]
-            samples, offset, sigma = (self._share.of(torch.from_numpy(a)) for a in arrays)
             place = index, self._share.rank
             drawn = generator_of(torch.device("cpu"), config.seed, VIEWS, *place)
             views = [
-                self._augmentation.loads((samples, offset, sigma), drawn)
-                for _ in range(objective.views)
+                self._augmentation.loads(self._cut(one), drawn)
+                for one in (at, self._other[at])[: objective.views]
             ]
             views = [
                 (a.to(self._device), b.to(self._device), c.to(self._device)) for a, b, c in views
