@@ -58,6 +58,7 @@ def test_measuring_runs_the_command_itself(monkeypatch) -> None:
             file.write(printed)
         assert words[-5:-1] == ["bench", "align", "--quick", "--json"]
 
+    monkeypatch.setattr(benchmarks, "described", lambda: "a machine")
     monkeypatch.setattr(benchmarks.subprocess, "run", run)
     found = benchmarks.measure("align", quick=True)
     assert found.command == "tactile-rt bench align --quick"
