@@ -163,7 +163,8 @@ def _spikes(
         ),
     ]
     times: Floats = np.sort(np.round(np.concatenate(parts) * SAMPLING_HZ) / SAMPLING_HZ)
-    return times[times >= BEGIN_S]
+    kept: Floats = times[times >= BEGIN_S]
+    return kept
 
 
 def _drawn(rng: np.random.Generator, begin: Floats, length: Floats, rate: Floats) -> Floats:
