@@ -163,14 +163,14 @@ def _spikes(
         ),
     ]
     times: Floats = np.sort(np.round(np.concatenate(parts) * SAMPLING_HZ) / SAMPLING_HZ)
-    kept: Floats = times[times >= BEGIN_S]
-    return kept
+    return times[times >= BEGIN_S]
 
 
 def _drawn(rng: np.random.Generator, begin: Floats, length: Floats, rate: Floats) -> Floats:
     """Poisson spikes at given rates in windows, (window,) each."""
     number = rng.poisson(rate * length)
-    return np.repeat(begin, number) + rng.random(number.sum()) * np.repeat(length, number)
+    spikes: Floats = np.repeat(begin, number) + rng.random(number.sum()) * np.repeat(length, number)
+    return spikes
 
 
 # NWB 2, as far as its readers need it.
