@@ -10,7 +10,10 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 PYTEST := $(BIN)/python -m pytest
 PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test check check-export bench fuzz captures format clean
+# What `make quick` looks at: a package under tactile_rt, as P=drivers.
+P ?= stream
+
+.PHONY: demo test quick lint check docs check-export bench fuzz captures format clean
 
 demo: $(VENV)/.sim
 	$(BIN)/tactile-rt demo --sweeps 12
@@ -18,11 +21,25 @@ demo: $(VENV)/.sim
 test: $(VENV)/.dev
 	$(PYTEST) $(PARALLEL)
 
-check: $(VENV)/.dev
+quick: $(VENV)/.dev
+	@test -e tactile_rt/$(P) -o -e tactile_rt/$(P).py || { echo "no package tactile_rt/$(P)"; exit 2; }
+	$(BIN)/ruff format --check tactile_rt tests
+	$(BIN)/ruff check tactile_rt tests
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(PYTEST) $(PARALLEL) -m "not slow and not hardware and not lengthy" $(wildcard tests/$(P) tests/test_$(P).py)
+
+docs: $(VENV)/.dev
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+
+# What needs no test to be run.
+lint: $(VENV)/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+check: lint
 	$(PYTEST) $(PARALLEL)
 	$(PYTEST) -m slow
 	$(BIN)/python -m bench.checks.wheel
@@ -44,7 +61,7 @@ format: $(VENV)/.dev
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf $(VENV) dist
+	rm -rf $(VENV) dist site
 
 $(VENV)/.sim: pyproject.toml $(PINS)
 	$(PYTHON) -m venv $(VENV)
@@ -53,5 +70,5 @@ $(VENV)/.sim: pyproject.toml $(PINS)
 
 $(VENV)/.dev: pyproject.toml $(PINS)
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) --editable '.[sim,gym,train,view,dbc,record,import,publish,ros2,lerobot,ui,test,dev]'
+	$(INSTALL) --editable '.[sim,gym,train,view,dbc,record,import,publish,ros2,lerobot,ui,test,docs,dev]'
 	touch $@ $(VENV)/.sim

@@ -2,6 +2,7 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 # Before numpy, torch and onnxruntime start their pools: on a shared machine more threads than one
 # make small tests slower, not faster.
@@ -21,6 +22,18 @@ sys.dont_write_bytecode = False
 # tests gets the same examples, so a pass stays a pass.
 settings.register_profile("tactile_rt", deadline=None, derandomize=True)
 settings.load_profile("tactile_rt")
+
+
+LENGTHY = Path(__file__).with_name("lengthy.txt")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that take more than their share of a quick look; see the file."""
+    lines = LENGTHY.read_text("utf-8").splitlines()
+    names = tuple(line for line in lines if line and not line.startswith("#"))
+    for item in items:
+        if item.nodeid.removeprefix("tests/").startswith(names):
+            item.add_marker(pytest.mark.lengthy)
 
 
 @pytest.fixture

@@ -4,5 +4,5 @@ policies    how the array is moved: passive sweeps, a script, a policy that was 
 episodes    what a policy feels of objects, on all cores
 recogniser  what was felt becomes a kind, step by step
 learning    the cross-entropy method, judged by recognisers of objects that they did not see
-__main__    all of it, and the table of docs/active-touch.md
+__main__    all of it, and the table of docs/explain/active-touch.md
 """

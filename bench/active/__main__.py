@@ -20,7 +20,7 @@ from bench.active.policies import Passive, Policy, Scripted
 from bench.active.recogniser import log_likelihoods, trained
 from tactile_rt.sim_backend.environments.active_whisking import KINDS
 
-FOLDER, PAGE = Path("data/active"), Path("docs/active-touch.md")
+FOLDER, PAGE = Path("data/active"), Path("docs/explain/active-touch.md")
 TAUGHT, UNSEEN = (0, 44), (48, 61)  # instances, the first and the one after the last
 TRAINING, SWEEPS, NETWORKS, RESAMPLED = 500, 2, 3, 2000
 MARKS = "<!-- table: written by python -m bench.active -->", "<!-- end table -->"

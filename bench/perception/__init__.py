@@ -1,1 +1,4 @@
-"""realtouch: what a model makes of real things that it never touched. See `docs/benchmark.md`."""
+"""realtouch: what a model makes of real things that it never touched.
+
+See `docs/reference/realtouch.md`.
+"""

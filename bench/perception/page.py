@@ -1,4 +1,6 @@
-"""The benchmark's page, `docs/benchmark.md`: what is measured, on what, and every figure."""
+"""The page of the benchmark, `docs/reference/realtouch.md`: what is measured, on what, and every
+figure.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -22,7 +24,7 @@ from tactile_rt.sweep_set import OUTLIERS, WITHHELD
 
 __all__ = ["PAGE", "write_page"]
 
-PAGE = Path("docs/benchmark.md")
+PAGE = Path("docs/reference/realtouch.md")
 CONSTANT = ("chance", "most frequent kind")
 ABOUT = {
     OBJECTS: "Objects that no method has touched, of the kinds that it was taught, from sources of "

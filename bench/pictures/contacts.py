@@ -1,4 +1,5 @@
-"""Draw docs/contacts.png: error of contact distance against the force, clean and at rated noise.
+"""Draw docs/pictures/contacts.png: error of contact distance against the force, clean and at rated
+noise.
 
 python -m bench.pictures.contacts runs/locate/best.pt data/contacts
 """
@@ -54,7 +55,7 @@ def main(checkpoint: Path, folder: Path) -> None:
         axis.spines[["top", "right"]].set_visible(False)
     axes[0].set_ylabel("median error (% of whisker length)")
     axes[1].legend(frameon=False, fontsize=8)
-    figure.savefig(DOCS / "contacts.png", dpi=130)
+    figure.savefig(DOCS / "pictures" / "contacts.png", dpi=130)
 
 
 if __name__ == "__main__":

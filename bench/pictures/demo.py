@@ -1,4 +1,4 @@
-"""Draw docs/demo.svg: the demonstration's view in the middle of a real, seeded run.
+"""Draw docs/pictures/demo.svg: the demonstration's view in the middle of a real, seeded run.
 
 Run: python -m bench.pictures.demo [--model FILE] [--out FILE]
 """
@@ -46,6 +46,6 @@ def main(model: Path, out: Path) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--model", type=Path, default=shipped_model())
-    parser.add_argument("--out", type=Path, default=Path("docs/demo.svg"))
+    parser.add_argument("--out", type=Path, default=Path("docs/pictures/demo.svg"))
     chosen = parser.parse_args()
     main(chosen.model, chosen.out)

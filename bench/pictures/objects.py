@@ -1,5 +1,5 @@
-"""Draw docs/objects.png: three instances of every category, to see that each is what it says; and
-docs/objects-varied.png: six of each of any plan.
+"""Draw docs/pictures/objects.png: three instances of every category, to see that each is what it
+says; and docs/pictures/objects-varied.png: six of each of any plan.
 
 Orthographic view from above and to one side, z-buffered here because a painter's sort
 (matplotlib's) tears pieces that touch. Run: python -m bench.pictures.objects
@@ -107,8 +107,8 @@ def sheet(out: Path, kinds: dict[str, str], instances: int, across: int) -> None
 def main() -> None:
     """Draw both sheets."""
     known = {c: c for c in CATEGORIES}
-    sheet(Path("docs/objects.png"), known | {c: f"{c} (withheld)" for c in WITHHELD}, 3, 4)
-    sheet(Path("docs/objects-varied.png"), {VARIED + c: c for c in CATEGORIES}, 6, 2)
+    sheet(Path("docs/pictures/objects.png"), known | {c: f"{c} (withheld)" for c in WITHHELD}, 3, 4)
+    sheet(Path("docs/pictures/objects-varied.png"), {VARIED + c: c for c in CATEGORIES}, 6, 2)
 
 
 if __name__ == "__main__":

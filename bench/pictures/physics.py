@@ -1,4 +1,4 @@
-"""Measure the physics, draw its pictures and write the tables of docs/physics.md.
+"""Measure the physics, draw its pictures and write the tables of docs/explain/physics.md.
 
 python -m bench.pictures.physics              # everything: some 3 minutes of CPU
 python -m bench.pictures.physics --json FILE  # the figures of `tactile-rt bench sim --json FILE`
@@ -36,8 +36,8 @@ BOTH = ("dataset", "realtime")
 
 
 def write_table(name: str, lines: list[str]) -> None:
-    """Replace what stands between the markers of a table in docs/physics.md."""
-    path = DOCS / "physics.md"
+    """Replace what stands between the markers of a table in docs/explain/physics.md."""
+    path = DOCS / "explain" / "physics.md"
     text = path.read_text(encoding="utf-8")
     start, end = f"<!-- {name}: written by bench/pictures/physics.py -->", f"<!-- end {name} -->"
     if text.count(start) != 1 or text.count(end) != 1:
@@ -111,7 +111,7 @@ def peg() -> None:
         "Whiskers pressed and slid over a peg: the simulation beside the elastica",
         x=0.012, y=0.965, ha="left", fontsize=15, weight="bold", color=INK,
     )  # fmt: skip
-    figure.savefig(DOCS / "physics_peg.png")
+    figure.savefig(DOCS / "pictures" / "physics_peg.png")
 
 
 def draw_bent(axes: Axes, cases: list[Press]) -> None:
@@ -221,7 +221,7 @@ def cost() -> None:
     axes.set_title("What accuracy costs: an icosphere, a mug, a chair and a gear, against 0.05 ms",
                    fontsize=10.5, loc="left")  # fmt: skip
     axes.spines[["top", "right"]].set_visible(False)
-    figure.savefig(DOCS / "physics_cost.png")
+    figure.savefig(DOCS / "pictures" / "physics_cost.png")
 
 
 def main() -> None:

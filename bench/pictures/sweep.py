@@ -1,4 +1,4 @@
-"""Draw docs/sweep.png: a mug swept past the whisker array, and what the whiskers feel.
+"""Draw docs/pictures/sweep.png: a mug swept past the whisker array, and what the whiskers feel.
 
 Above, the simulation at two moments, each whisker in the colour of the force on its base, beside
 the 5 x 7 map of the same forces. Below, the forces over the whole sweep.
@@ -78,5 +78,5 @@ def draw(out: Path) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/sweep.png"))
+    parser.add_argument("--out", type=Path, default=Path("docs/pictures/sweep.png"))
     draw(parser.parse_args().out)

@@ -33,6 +33,7 @@ def show(json: Json = None) -> None:
     """
     try:
         with starting():
+            from tactile_rt import extensions
             from tactile_rt.sim_backend.arrays.files import load_animals
             from tactile_rt.sim_backend.arrays.robots import ROBOTS
             from tactile_rt.sim_backend.arrays.species import SPECIES
@@ -40,7 +41,7 @@ def show(json: Json = None) -> None:
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
     found = []
-    for name in (*SPECIES, *ROBOTS):
+    for name in (*SPECIES, *ROBOTS, *extensions.added_names(extensions.ARRAYS)):
         spec = device_spec(load_animals(name))
         found.append(
             {

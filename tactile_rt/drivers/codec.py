@@ -12,13 +12,14 @@ import difflib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
-from importlib import import_module, metadata
+from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt import extensions
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
 __all__ = [
@@ -35,7 +36,6 @@ __all__ = [
     "six_axis",
 ]
 
-ENTRY_POINTS = "tactile_rt.codecs"  # names "serial.NAME" and "can.NAME"
 _HERE = "tactile_rt.drivers.codecs"
 
 # (wire, name): where the class is; imported when used
@@ -353,12 +353,12 @@ def codec_class(wire: str, name: str) -> type[Codec[Any]]:
                 f"codec {name} needs {error.name}, which is not installed: pip install {error.name}"
             ) from None
         return found
-    points = metadata.entry_points(group=ENTRY_POINTS)
-    for point in points.select(name=f"{wire}.{name}"):
-        loaded: type[Codec[Any]] = point.load()
-        return loaded
+    theirs: type[Codec[Any]] | None = extensions.added(extensions.CODECS, f"{wire}.{name}")
+    if theirs is not None:
+        return theirs
     known = {n for w, n in CODECS if w == wire}
-    known |= {n.partition(".")[2] for n in points.names if n.startswith(f"{wire}.")}
+    added = extensions.added_names(extensions.CODECS)
+    known |= {n.partition(".")[2] for n in added if n.startswith(f"{wire}.")}
     other = {n for w, n in CODECS if w != wire} - known
     if name in other:
         elsewhere = "can" if wire == "serial" else "serial"

@@ -20,7 +20,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tactile_rt.models import attenders, decoders
-from tactile_rt.models.ead_config import ATTENDERS, DECODERS, ENCODERS, READOUTS, EADConfig
+from tactile_rt.models.ead_config import (
+    ATTENDERS,
+    DECODERS,
+    ENCODERS,
+    READOUTS,
+    EADConfig,
+    encoder_class,
+)
 from tactile_rt.models.encoders.cells import Cell
 from tactile_rt.stream import ConfigError
 
@@ -135,7 +142,7 @@ class EAD(nn.Module):
 
 
 def _encoder(config: EADConfig) -> Any:
-    module, name = ENCODERS[config.encoder]
+    module, name = encoder_class(config.encoder)
     kind = getattr(import_module(f"tactile_rt.models.encoders.{module}"), name)
     if config.encoder == "graph":
         from tactile_rt.models.encoders.graph_files import parse_graph

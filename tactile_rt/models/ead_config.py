@@ -3,10 +3,12 @@
 import math
 from dataclasses import dataclass
 
+from tactile_rt import extensions
 from tactile_rt.stream import ConfigError
 
 __all__ = [
     "ATTENDERS",
+    "CELLS",
     "DECODERS",
     "ENCODERS",
     "MAX_STEPS",
@@ -14,6 +16,8 @@ __all__ = [
     "PREPROCESSINGS",
     "READOUTS",
     "EADConfig",
+    "added_cells",
+    "encoder_class",
 ]
 
 # of `encoders.cells`
@@ -22,9 +26,10 @@ CELLS = (
     "ugrnn-ln", "intersection", "intersection-ln", "gru", "gru-ln", "lstm", "lstm-ln",
     "lstm-ln-published",
 )  # fmt: skip
+ZHUANG = ("zhuang", "ZhuangEncoder")
 # name: (module in `encoders`, class), imported when a network needs it
 ENCODERS: dict[str, tuple[str, str]] = {
-    **{f"zhuang-{cell}": ("zhuang", "ZhuangEncoder") for cell in CELLS},
+    **{f"zhuang-{cell}": ZHUANG for cell in CELLS},
     "resnet18": ("resnet", "ResNet18Encoder"),
     "s4": ("s4", "S4Encoder"),
     "mamba": ("mamba", "MambaEncoder"),
@@ -33,12 +38,29 @@ ENCODERS: dict[str, tuple[str, str]] = {
 }
 ATTENDERS = ("gpt", "mamba", "none")
 DECODERS = ("linear", "mlp", "mlp-all")
+LN = ("", "-ln")  # a cell, and the same with layer norm
 READOUTS = ("last", "mean")
 PREPROCESSINGS = ("log", "paper")
 MAX_STEPS = 32  # of an episode: the GPT has positions for no more
 MOUSE_FRAME = (30, 5, 7)  # five sub-steps of six loads, on the grid of a mouse's whiskers
 WIDTH_UNIT = 32  # every channel count is a multiple of this at width 1
 WIDEST = 4  # sixteen times the paper's parameters, a billion
+
+
+def added_cells() -> tuple[str, ...]:
+    """Names of the cells that other packages add, each plain and, with "-ln", normalised."""
+    return tuple(f"{cell}{ln}" for cell in extensions.added_names(extensions.CELLS) for ln in LN)
+
+
+def encoder_class(name: str) -> tuple[str, str]:
+    """The module in `encoders` and the class of an encoder that exists."""
+    return ENCODERS.get(name, ZHUANG)
+
+
+def _encoders(asked: str) -> tuple[str, ...]:
+    """Names of all encoders; what is not installed is not looked for if `asked` is ours."""
+    ours = tuple(ENCODERS)
+    return ours if asked in ours else (*ours, *(f"zhuang-{cell}" for cell in added_cells()))
 
 
 @dataclass(frozen=True)
@@ -66,7 +88,7 @@ class EADConfig:
 
     def __post_init__(self) -> None:
         for field, known in (
-            ("encoder", tuple(ENCODERS)),
+            ("encoder", _encoders(self.encoder)),
             ("attender", ATTENDERS),
             ("decoder", DECODERS),
             ("readout", READOUTS),

@@ -30,7 +30,7 @@ from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
-from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
+from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, added_categories
 from tactile_rt.sim_backend.sweep import Sweep, usual_distance, usual_size
 from tactile_rt.sim_backend.transducer import device_spec, sensor_of
 from tactile_rt.sim_backend.world import PROFILES
@@ -214,9 +214,10 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
         described = _described(array) if array else example.read_text("utf-8")
         animals = load_animals(array) if array else read_animals(example)
     spec = device_spec(animals)
+    known = (*CATEGORIES, *added_categories())
     for kind in kinds:
-        if kind not in CATEGORIES:
-            raise ConfigError(no_such("category", kind, tuple(CATEGORIES)))
+        if kind not in known:
+            raise ConfigError(no_such("category", kind, known))
     if len(set(kinds)) < len(kinds) or len(kinds) < 2:
         raise ConfigError("--kinds takes two or more categories, each once")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

@@ -35,8 +35,8 @@ def convert(path: str | Path, output: str | Path, episode: int = 0) -> int:
     LeRobot dataset that was made of recordings, as another of them or a recording again.
 
     All forms hold samples, description, decisions, events and health, and the chunks in which the
-    samples came; raw packets stay behind. They are laid out in docs/recording.md. What is written
-    appears whole or not at all.
+    samples came; raw packets stay behind. They are laid out in
+    docs/reference/recording.md. What is written appears whole or not at all.
 
     Returns:
         Number of samples.

@@ -82,7 +82,10 @@ class Recording:
         return self._decoded(WIRE, lambda raw: (decode_packet(raw.data, wire), raw.t_ns))
 
     def health(self) -> Iterator[dict[str, Any]]:
-        """How source and recorder were, whenever it changed; fields as in docs/recording.md."""
+        """How source and recorder were, whenever it changed.
+
+        The fields are those of docs/reference/recording.md.
+        """
         return self._decoded(HEALTH, _fields)
 
     def decisions(self) -> Iterator[dict[str, Any]]:
@@ -94,7 +97,10 @@ class Recording:
         return self._decoded(EVENTS, _fields)
 
     def skips(self, model: str) -> list[dict[str, Any]]:
-        """The stretches that a model skipped as it was behind, fields as in docs/messages.md."""
+        """The stretches that a model skipped as it was behind.
+
+        The fields are those of docs/reference/messages.md.
+        """
         return [e for e in self.events() if e.get("type") == "skip" and e.get("model") == model]
 
     def raw(self, *topics: str) -> Generator[Raw, None, None]:

@@ -1,26 +1,27 @@
 """Open a source by its URL: ``scheme:target?option=value&option=value``.
 
 Schemes are looked up in one table, imported when used, so that a robot without MuJoCo never
-imports it; then among the entry points of group ``tactile_rt.sources``, where other packages add
-theirs. What can be told of a URL without opening anything is told by `check_source`, in the words
-of `open_source`: both go through `_prepared`.
+imports it; then among what other packages add (`extensions`). What can be told of a URL without
+opening anything is told by `check_source`, in the words of `open_source`: both go through
+`_prepared`.
 
 One option is of every source: ``array=FILE`` says what array it is, by a file that `read_array`
 reads. See `calibration.declare`.
 """
 
 from functools import partial
-from importlib import import_module, metadata
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from tactile_rt import extensions
 from tactile_rt.calibration import load_calibration
 from tactile_rt.classifier.array_file import read_array
 from tactile_rt.drivers.opening import Prepared
 from tactile_rt.settings import nearest, parse_options, split_url
 from tactile_rt.stream import ArraySpec, ConfigError, Source, SpecMismatch
 
-__all__ = ["ENTRY_POINTS", "SCHEMES", "check_model", "check_source", "open_source"]
+__all__ = ["SCHEMES", "check_model", "check_source", "open_source"]
 
 # scheme: (module, name, extra that it needs). The name is of a class of the target and an `Options`
 # dataclass that it names, which may have a `check` of both for what can be told without opening,
@@ -36,8 +37,6 @@ SCHEMES = {
     "combined": ("tactile_rt.sources.combined", "prepare_combined", ""),
 }
 ASKED = ("serial", "can")  # where a device may be asked what array it is, and so must be told
-# Of other packages: a class as above, or a function of target and options that returns the source.
-ENTRY_POINTS = "tactile_rt.sources"
 
 
 def open_source(url: str, *, calibration: str = "", array: str = "") -> Source:
@@ -129,9 +128,9 @@ def _of_scheme(
 
 
 def _of_another_package(url: str, scheme: str) -> Any:
-    points = metadata.entry_points(group=ENTRY_POINTS)
-    for point in points.select(name=scheme):
-        return point.load()
-    known = sorted(f"{s}:" for s in {*SCHEMES, *points.names})
+    found = extensions.added(extensions.SOURCES, scheme)
+    if found is not None:
+        return found
+    known = sorted(f"{s}:" for s in {*SCHEMES, *extensions.added_names(extensions.SOURCES)})
     near = nearest(f"{scheme}:" if scheme else url, known)
     raise ConfigError(f"{url!r:.80} is no source; {near}")

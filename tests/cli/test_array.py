@@ -19,7 +19,7 @@ from tests.helpers.plucked import plucked
 from tests.helpers.recordings import write
 from tests.helpers.source_tree import ROOT
 
-PAGE = ROOT / "docs" / "your-array.md"
+PAGE = ROOT / "docs" / "how-to" / "your-array.md"
 pytestmark = pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
 
 

@@ -26,7 +26,7 @@ from tests.helpers.labelled import ARRAY, record_touches, touched
 from tests.helpers.source_tree import ROOT
 from tests.helpers.tiny_sweeps import LEAD, SAMPLES, plate, write_tiny_set
 
-PAGE = ROOT / "docs" / "labelling.md"
+PAGE = ROOT / "docs" / "how-to" / "labelling.md"
 SOUND = {"noise": 1.0, "gain": 0.0, "dead": 0.0}
 SMALL = ("--encoder", "gru", "--attender", "none", "--decoder", "linear", "--width", 1 / 32)
 

@@ -265,7 +265,7 @@ def test_keys_are_orders(tmp_path):
     assert "too few to learn from: two of a class are needed" in said[-1]
 
 
-PAGE = ROOT / "docs" / "teaching.md"
+PAGE = ROOT / "docs" / "how-to" / "teaching.md"
 FIVE = ("press", "slide", "double", "push", "twist")
 
 

@@ -1,4 +1,4 @@
-"""What docs/messages.md and docs/daemon.md show does what they say."""
+"""What docs/reference/messages.md and docs/reference/daemon.md show does what they say."""
 
 import contextlib
 import re
@@ -32,7 +32,7 @@ from tests.helpers.published import (
 
 DOCS = Path(__file__).parents[2] / "docs"
 pytestmark = pytest.mark.skipif(
-    not (DOCS / "messages.md").exists(), reason="a source archive, without docs"
+    not (DOCS / "reference" / "messages.md").exists(), reason="a source archive, without docs"
 )
 
 
@@ -41,7 +41,7 @@ def blocks(page, language):
 
 
 def example(kind):
-    (text,) = [b for b in blocks("messages.md", "python") if b.startswith(f"# {kind}: ")]
+    (text,) = [b for b in blocks("reference/messages.md", "python") if b.startswith(f"# {kind}: ")]
     return text
 
 
@@ -110,13 +110,13 @@ def test_examples_are_short():
 
 
 def test_the_example_configuration_is_right(tmp_path):
-    (text,) = blocks("daemon.md", "toml")
+    (text,) = blocks("reference/daemon.md", "toml")
     (tmp_path / "robot.toml").write_text(text)
     check_config(load_config(tmp_path / "robot.toml"))
 
 
 def test_every_metric_and_exit_code_is_in_the_table():
-    guide = (DOCS / "daemon.md").read_text("utf-8")
+    guide = (DOCS / "reference" / "daemon.md").read_text("utf-8")
     names = re.findall(r"# TYPE tactile_(\S+) ", exposition(busy_snapshot()).decode())
     for name in names:
         shown = re.sub(r"^(model|consumer)_queue_.*", r"\1_queue_*", name)

@@ -1,4 +1,4 @@
-"""What docs/drivers.md shows does what it says."""
+"""What docs/reference/drivers.md shows does what it says."""
 
 import re
 import tomllib
@@ -16,7 +16,7 @@ from tactile_rt.sources.combined import _File
 from tests.helpers.codec_contract import CodecCase, CodecContract
 
 ROOT = Path(__file__).parents[2]
-GUIDE = (ROOT / "docs" / "drivers.md").read_text(encoding="utf-8")
+GUIDE = (ROOT / "docs" / "reference" / "drivers.md").read_text(encoding="utf-8")
 NUMBERS = {2: "two", 21: "twenty-one", 23: "twenty-three"}
 
 

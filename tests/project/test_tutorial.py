@@ -1,4 +1,6 @@
-"""docs/your-array.md, done as it says: from eight whiskers on a plate to a robot that decides."""
+"""docs/how-to/your-array.md, done as it says: from eight whiskers on a plate to a robot that
+decides.
+"""
 
 import json
 import re
@@ -24,7 +26,7 @@ from tactile_rt.stream import ConfigError
 from tactile_rt.sweep_set import SweepManifest, read_skipped
 from tests.helpers.source_tree import ROOT
 
-PAGE = ROOT / "docs" / "your-array.md"
+PAGE = ROOT / "docs" / "how-to" / "your-array.md"
 pytestmark = pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
 CLI = [
     sys.executable,

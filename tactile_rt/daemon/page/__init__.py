@@ -70,7 +70,8 @@ class Page(Consumer):
         if not is_loopback(options.host):
             view.report(
                 self._name, "exposed",
-                "the token and all data cross the network unencrypted: see docs/security.md",
+                "the token and all data cross the network unencrypted: "
+                "see docs/explain/security.md",
                 "warning",
             )  # fmt: skip
 

@@ -1,8 +1,9 @@
 """Publishers: consumers that send `messages` to others, each imported when it is asked for."""
 
-from importlib import import_module, metadata
+from importlib import import_module
 from typing import Any
 
+from tactile_rt import extensions
 from tactile_rt.settings import no_such
 from tactile_rt.stream import ConfigError
 
@@ -16,7 +17,6 @@ PUBLISHERS = {
     "foxglove": (f"{__name__}.foxglove:FoxglovePublisher", "publish"),
     "ros2": (f"{__name__}.ros2:Ros2Publisher", "ros2"),
 }
-ENTRY_POINTS = "tactile_rt.publishers"  # of other packages
 
 
 def publisher_class(kind: str) -> Any:
@@ -28,13 +28,11 @@ def publisher_class(kind: str) -> Any:
     if kind in PUBLISHERS:
         where, extra = PUBLISHERS[kind]
         return load_class(where, f"publisher {kind}", extra)
-    points = metadata.entry_points(group=ENTRY_POINTS)
-    for point in points.select(name=kind):
-        try:
-            return point.load()
-        except Exception as error:  # another package's code
-            raise ConfigError(f"publisher {kind} cannot be loaded: {error}") from None
-    raise ConfigError(no_such("publisher", kind, sorted({*PUBLISHERS, *points.names})))
+    found = extensions.added(extensions.PUBLISHERS, kind)
+    if found is not None:
+        return found
+    known = {*PUBLISHERS, *extensions.added_names(extensions.PUBLISHERS)}
+    raise ConfigError(no_such("publisher", kind, sorted(known)))
 
 
 def load_class(where: str, what: str, extra: str) -> Any:

@@ -1,4 +1,6 @@
-"""The native protocol over a serial line: our own reference format, see docs/native-protocol.md.
+"""The native protocol over a serial line: our own reference format.
+
+It is specified in docs/reference/native-protocol.md.
 
 A frame is a header of 20 bytes with its own CRC-16/XMODEM, a payload, and a CRC-32 of both, all
 little-endian. The header's checksum means that a length is believed only if it is true, so a false

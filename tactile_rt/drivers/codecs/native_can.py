@@ -1,4 +1,4 @@
-"""The native protocol over CAN and CAN FD: see docs/native-protocol.md.
+"""The native protocol over CAN and CAN FD: see docs/reference/native-protocol.md.
 
     base      host     command: type u8, payload
     base + 1  device   ACK: type u8 (6), type acknowledged u8, 0 or an error number u8

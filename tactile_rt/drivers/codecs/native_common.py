@@ -1,4 +1,4 @@
-"""What the native protocol says on every line: see docs/native-protocol.md."""
+"""What the native protocol says on every line: see docs/reference/native-protocol.md."""
 
 from dataclasses import dataclass
 from typing import Final

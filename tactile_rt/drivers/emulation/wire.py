@@ -2,7 +2,7 @@
 
 Sources: the frame of a UART (a start bit, eight bits, the lowest first, a parity bit if there is
 one, a stop bit); ISO 11898-1 for the bits of a CAN frame, without stuff bits, as in the tables of
-docs/native-protocol.md.
+docs/reference/native-protocol.md.
 """
 
 import math

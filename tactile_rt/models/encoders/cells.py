@@ -20,7 +20,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt import extensions
 from tactile_rt.models.encoders.convolution import Convolution, convolve
+from tactile_rt.stream import ConfigError
 
 __all__ = [
     "CELLS",
@@ -35,6 +37,7 @@ __all__ = [
     "UGRNNCell",
     "VanillaCell",
     "VanillaELUCell",
+    "make_cell",
 ]
 
 FORGET_BIAS = 1.0
@@ -247,3 +250,22 @@ CELLS: dict[str, Callable[[int], Cell]] = {
     for suffix in ("", "-ln")
 }
 CELLS["lstm-ln-published"] = partial(PublishedLSTMCell, layer_norm=True)
+
+
+def make_cell(name: str, channels: int) -> Cell:
+    """A cell of so many channels: one of `CELLS`, or one that another package adds.
+
+    Args:
+        name: of the cell; of an added one as its entry point is called, or with "-ln" after it.
+        channels: of its node.
+
+    Raises:
+        ConfigError: there is none, or what the package adds is no `Cell`.
+    """
+    if name in CELLS:
+        return CELLS[name](channels)
+    base = name.removesuffix("-ln")
+    found = extensions.added(extensions.CELLS, base)
+    if not (isinstance(found, type) and issubclass(found, Cell)):
+        raise ConfigError(f"cell {base}: {found} is no class of encoders.cells.Cell")
+    return found(channels, layer_norm=name != base)

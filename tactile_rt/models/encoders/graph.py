@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from tactile_rt.models.encoders.cells import CELLS
+from tactile_rt.models.ead_config import CELLS, added_cells
 from tactile_rt.stream import ConfigError
 
 __all__ = ["FUSIONS", "KINDS", "Edge", "Graph", "Input", "Node"]
@@ -166,7 +166,7 @@ class Graph:
 def _check_node(node: Node, names: list[str]) -> None:
     for what, value, known in (
         ("kind", node.kind, KINDS),
-        ("cell", node.cell, (("none", *CELLS) if node.kind != "dense" else DENSE_CELLS)),
+        ("cell", node.cell, _cells(node)),
         *(("reads", edge.source, tuple(names)) for edge in node.reads),
         *(("fusion", edge.fusion, FUSIONS) for edge in node.reads),
     ):
@@ -177,6 +177,13 @@ def _check_node(node: Node, names: list[str]) -> None:
         raise ConfigError(f"{node.name}: the first edge that it reads must be concatenated")
     if len(set(sources)) < len(sources):
         raise ConfigError(f"{node.name}: reads the same node twice")
+
+
+def _cells(node: Node) -> tuple[str, ...]:
+    if node.kind == "dense":
+        return DENSE_CELLS
+    ours = ("none", *CELLS)
+    return ours if node.cell in ours else (*ours, *added_cells())
 
 
 def _less(node: Node, rows: int, columns: int) -> tuple[int, int]:

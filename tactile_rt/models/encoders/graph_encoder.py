@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.models.encoders.cells import CELLS, Cell
+from tactile_rt.models.encoders.cells import Cell, make_cell
 from tactile_rt.models.encoders.convolution import Convolution, convolve, convolve_valid
 from tactile_rt.models.encoders.graph import Graph, Input, Node
 
@@ -83,7 +83,7 @@ class GraphEncoder(nn.Module):
             else:
                 self.convs[node.name] = Convolution(base, node.channels)
             if node.cell != "none":
-                self.cells[node.name] = CELLS[node.cell](node.channels)
+                self.cells[node.name] = make_cell(node.cell, node.channels)
             added = [e for e in node.reads if e.fusion != "concatenate"]
             if added:
                 self.fusions[node.name] = Fusion(

@@ -1,4 +1,4 @@
-"""Arrays by name: a species', a robot's, or a file's, a table in CSV or in TOML with more to it.
+"""Arrays by name: a species', a robot's, another package's, or a file's, in CSV or in TOML.
 
 Both kinds of file have the columns of ``data/mouse.csv`` and may add those of `whiskers.OPTIONAL`;
 see ``docs/arrays/robot.toml`` and ``robot.csv`` for one array in both. In TOML::
@@ -32,6 +32,7 @@ from typing import Any
 
 import msgspec
 
+from tactile_rt import extensions
 from tactile_rt.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec
 from tactile_rt.settings import (
     SettingNode,
@@ -98,8 +99,8 @@ def load_array(name: str) -> WhiskerArray:
     """The one array of a name.
 
     Args:
-        name: of an animal and side, see `species_array`, or of a robot, see `ROBOTS`; or a path
-            to a .csv or .toml file.
+        name: of an animal and side, see `species_array`, of a robot, see `ROBOTS`, or of another
+            package's array; or a path to a .csv or .toml file.
 
     Raises:
         ConfigError: no such array, several, or a file with a mistake.
@@ -121,7 +122,8 @@ def load_animals(name: str) -> tuple[WhiskerArray, ...]:
         return read_animals(path)
     if name in ROBOTS:
         return read_animals(Path(f"{name}.toml"), robot_text(name))
-    return (species_array(name),)
+    file = extensions.added(extensions.ARRAYS, name)
+    return (species_array(name),) if file is None else read_animals(Path(file))
 
 
 def read_animals(path: Path, text: str | None = None) -> tuple[WhiskerArray, ...]:

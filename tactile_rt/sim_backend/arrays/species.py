@@ -11,6 +11,7 @@ from importlib import resources
 
 import numpy as np
 
+from tactile_rt import extensions
 from tactile_rt.sim_backend.arrays.robots import ROBOTS
 from tactile_rt.sim_backend.arrays.whisker_array import (
     MOUNT,
@@ -64,7 +65,7 @@ def species_array(name: str) -> WhiskerArray:
     animal, _, side = name.partition("-")
     known = [*SPECIES, *(f"{a}-{s}" for a in SPECIES for s in SIDES)]
     if name not in known:
-        known += ROBOTS
+        known += [*ROBOTS, *extensions.added_names(extensions.ARRAYS)]
         near = difflib.get_close_matches(name, known, 1)
         raise ConfigError(
             f"no simulated array {name!r}: "

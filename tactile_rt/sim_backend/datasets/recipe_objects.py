@@ -36,7 +36,10 @@ class ShapeObjects:
     @cached_property
     def categories(self) -> tuple[str, ...]:
         """Names of the classes, in the order of their labels."""
-        _check(self.choice.categories, (*shapes.CATEGORIES, *shapes.WITHHELD))
+        _check(
+            self.choice.categories,
+            (*shapes.CATEGORIES, *shapes.WITHHELD, *shapes.added_categories()),
+        )
         unknown = (*self.choice.withheld, *self.choice.outliers)
         known = (c for c in shapes.CATEGORIES if c not in unknown)
         return self.choice.categories or tuple(known)
@@ -45,7 +48,8 @@ class ShapeObjects:
     def withheld(self) -> tuple[str, ...]:
         """Names of the categories that training never sees."""
         unknown = (*self.choice.withheld, *self.choice.outliers)
-        _check(unknown, (*shapes.CATEGORIES, *shapes.WITHHELD, *shapes.OUTLIERS))
+        known = (*shapes.CATEGORIES, *shapes.WITHHELD, *shapes.OUTLIERS)
+        _check(unknown, (*known, *shapes.added_categories()))
         return self.choice.withheld or (shapes.WITHHELD if self.choice.per_withheld else ())
 
     @cached_property

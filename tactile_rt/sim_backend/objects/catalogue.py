@@ -1,7 +1,8 @@
 """What is swept past the whiskers: a named thing made of convex pieces.
 
 `make_object` draws the n-th mug, bottle, ...; `load_object` also takes a mesh file. "mug-17" is of
-the one plan that its kind has; "varied-mug-17" is of any plan, see `shapes.varied`.
+the one plan that its kind has; "varied-mug-17" is of any plan, see `shapes.varied`. Other packages
+may add categories (`extensions`): of one plan, and known by their names only.
 """
 
 import difflib
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from tactile_rt import extensions
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh
@@ -35,6 +37,7 @@ __all__ = [
     "VARIED",
     "WITHHELD",
     "TactileObject",
+    "added_categories",
     "load_object",
     "make_object",
     "promised_object",
@@ -94,6 +97,11 @@ WITHHELD: tuple[str, ...] = tuple(sorted(_UNKNOWN))  # never trained: what is ne
 OUTLIERS: tuple[str, ...] = tuple(_OUTLIERS)  # of no kind: what a model may learn to refuse
 
 
+def added_categories() -> tuple[str, ...]:
+    """Names of the categories that other packages add."""
+    return extensions.added_names(extensions.OBJECTS)
+
+
 def make_object(category: str, index: int) -> TactileObject:
     """Instance `index` (0 or more) of a category: the same one every time, everywhere.
 
@@ -107,7 +115,7 @@ def make_object(category: str, index: int) -> TactileObject:
     kind = _check(category, index)
     # crc32 because hash() of a string differs from one process to the next
     rng = np.random.default_rng([zlib.crc32(category.encode()), index])
-    build = _BUILDERS[kind]
+    build: _Builder = _BUILDERS.get(kind) or extensions.added(extensions.OBJECTS, kind)
     if kind == category:
         pieces = build(rng)
     else:
@@ -139,13 +147,14 @@ def promised_object(target: str, detail: MeshDetail = STANDARD) -> Callable[[], 
 def _check(category: str, index: int) -> str:
     """The kind of thing of a category, which must exist."""
     kind = category.removeprefix(VARIED)
-    if kind not in _BUILDERS:
-        near = difflib.get_close_matches(kind, _BUILDERS, n=1, cutoff=0.3)
+    if kind not in _BUILDERS and kind not in (added := added_categories()):
+        near = difflib.get_close_matches(kind, (*_BUILDERS, *added), n=1, cutoff=0.3)
         prefix = VARIED if category.startswith(VARIED) else ""
         hint = f" (did you mean {prefix + near[0]!r}?)" if near else ""
         raise ConfigError(
             f"no object called {category!r}{hint}; there are {', '.join(CATEGORIES)}; "
             f"{', '.join(WITHHELD)} (withheld from training); {', '.join(OUTLIERS)} (of no kind); "
+            f"{', '.join(added)}{' (of other packages); ' if added else ''}"
             f"each also with {VARIED!r} before it; "
             f"and mesh files ending in {', '.join(MESH_SUFFIXES)}"
         )

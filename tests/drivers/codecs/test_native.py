@@ -34,9 +34,9 @@ class TestInt16(CodecContract):
     case = CodecCase(lambda: native(format="int16"), signal, (0.1 / 32767, 1e-3 / 32767))
 
 
-# Made by hand from docs/native-protocol.md; the checksums bit by bit from the parameters of
-# https://reveng.sourceforge.io/crc-catalogue. One element, fy = 1.5 N and mz = -2 N m, counter 7,
-# 1,234,567 us ...
+# Made by hand from docs/reference/native-protocol.md; the checksums bit by bit from the parameters
+# of https://reveng.sourceforge.io/crc-catalogue. One element, fy = 1.5 N and mz = -2 N m, counter
+# 7, 1,234,567 us ...
 GOLDEN = bytes.fromhex(
     "5452 10 00 0900 0000 07000000 87d61200 01 02 40ac"  # TR, sample, float32 ... header's CRC
     "01 0000c03f 000000c0 88d0d33c"

@@ -440,7 +440,7 @@ def test_no_frame_leads_astray(sanitized: Path) -> None:
 
 def fenced(language: str = "") -> list[str]:
     """The blocks of the protocol's document."""
-    text = (FIRMWARE.parent / "native-protocol.md").read_text()
+    text = (FIRMWARE.parent / "reference" / "native-protocol.md").read_text()
     return [b.partition("\n")[2] for b in text.split("```")[1::2] if b.startswith(language + "\n")]
 
 
@@ -467,7 +467,7 @@ def test_the_documents_frames_and_description_are_the_codecs() -> None:
 
 
 def test_the_documents_rates_are_those_of_the_frames() -> None:
-    text = (FIRMWARE.parent / "native-protocol.md").read_text().replace(",", "")
+    text = (FIRMWARE.parent / "reference" / "native-protocol.md").read_text().replace(",", "")
     rows = re.findall(r"^\| (\d+) .*x (\d).*\n\| \| int16 .*", text, re.M)
     assert len(rows) == 4
     for match in re.finditer(r"^\| (\d+) .*x (\d).* \| float32 (.*)\n\| \| int16 (.*)", text, re.M):

@@ -1,0 +1,61 @@
+"""Hooks of the documentation's site, see mkdocs.yml.
+
+Pages are read in two places. In the repository a link may lead to any file of the tree; on the site
+it leads there, too, by the repository's address in pyproject.toml. And the decisions are listed by
+their titles as they are in their folder, so that a new one needs no line anywhere.
+"""
+
+import os
+import re
+import tomllib
+from pathlib import Path
+from typing import Any
+
+__all__ = ["on_config", "on_page_markdown"]
+
+ROOT = Path(__file__).parents[2]
+LINK = re.compile(r"(!?)\[((?:[^][]|\[[^][]*\])*)\]\(([^)\s]+)\)")
+
+
+def on_config(config: Any) -> Any:
+    """Add the decisions to the navigation, and the address of the repository."""
+    config.repo_url = repository()
+    docs = Path(config.docs_dir)
+    pages = sorted(docs.glob("decisions/*.md"))
+    listed = [{title(page): page.relative_to(docs).as_posix()} for page in pages]
+    config.nav = [*config.nav, {"Decisions": listed}]
+    return config
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
+    """Let links out of `docs/` lead into the repository, or be words where it has no address."""
+    here = Path(page.file.abs_src_path).parent
+
+    def led(match: re.Match[str]) -> str:
+        picture, words, target = match.groups()
+        path = target.partition("#")[0]
+        there = Path(os.path.normpath(here / path))
+        if not path or "://" in path or there.is_relative_to(config.docs_dir):
+            return match[0]
+        if picture or not there.exists():
+            return match[0]  # the build says that it leads nowhere
+        if not config.repo_url:
+            return words
+        kind = "tree" if there.is_dir() else "blob"
+        return f"[{words}]({config.repo_url}/{kind}/main/{there.relative_to(ROOT).as_posix()})"
+
+    return LINK.sub(led, markdown)
+
+
+def repository() -> str:
+    """The address of the source in pyproject.toml; empty if it has none."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    urls = {key.lower(): url for key, url in project.get("urls", {}).items()}
+    found = next((urls[key] for key in ("source", "repository") if key in urls), "")
+    return str(found).rstrip("/")
+
+
+def title(page: Path) -> str:
+    """The first heading of a page; its file's name if it has none."""
+    heading = re.search(r"^# (.+)$", page.read_text("utf-8"), re.M)
+    return heading[1] if heading else page.stem

@@ -1,0 +1,65 @@
+"""The page of all measured figures holds what commands printed, and nothing else."""
+
+import json
+import re
+from dataclasses import asdict
+
+import pytest
+
+pytest.importorskip("mujoco")
+
+from bench.pages import benchmarks
+from bench.pages.benchmarks import PAGE, Measurement, read, row, section, written
+from tactile_rt.cli.bench import AREAS
+from tactile_rt.evidence.records import Record
+
+pytestmark = pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
+
+
+def test_the_page_is_made_of_what_is_kept() -> None:
+    assert PAGE.read_text("utf-8") == written(), "python -m bench.pages.benchmarks writes it anew"
+
+
+def test_every_area_is_told() -> None:
+    page = PAGE.read_text("utf-8")
+    assert re.findall(r"^## (\w+)$", page, re.M) == list(AREAS)
+    for area in AREAS:
+        assert (f"`tactile-rt bench {area}" in page) or read(area) is not None
+
+
+def test_what_is_kept_has_its_command_machine_and_day() -> None:
+    kept = [found for area in AREAS if (found := read(area)) is not None]
+    assert kept
+    for found in kept:
+        assert found.command.startswith("tactile-rt bench ")
+        assert re.fullmatch(r"\d{4}-\d\d-\d\d", found.day)
+        assert "cores" in found.machine and found.records
+
+
+def test_a_figure_is_told_beside_its_bar() -> None:
+    assert row(Record("a.b", 3.0, "ms", "<= 2", "a rival", "once")) == (
+        "| `a.b` | 3 ms | <= 2 | 1.50 | **MISSED** | a rival; once |"
+    )
+    assert row(Record("a.c", 0.0, "", "== 0")) == "| `a.c` | 0  | == 0 |  | met |  |"
+
+
+def test_a_quick_look_is_marked_and_what_is_not_measured_says_so() -> None:
+    looked = Measurement("tactile-rt bench sim --quick", "1", "2026-01-01", "m", ())
+    assert "not a figure to quote" in section("sim", looked)
+    assert "Not measured yet" in section("sim", None)
+
+
+def test_measuring_runs_the_command_itself(monkeypatch) -> None:
+    figure = Record("a.b", 1, "s")
+    printed = json.dumps([{**asdict(figure), "met": None}])
+
+    def run(words, **_):
+        with open(words[-1], "w") as file:
+            file.write(printed)
+        assert words[-5:-1] == ["bench", "align", "--quick", "--json"]
+
+    monkeypatch.setattr(benchmarks, "described", lambda: "a machine")
+    monkeypatch.setattr(benchmarks.subprocess, "run", run)
+    found = benchmarks.measure("align", quick=True)
+    assert found.command == "tactile-rt bench align --quick"
+    assert found.records == (figure,)

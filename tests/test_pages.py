@@ -1,0 +1,134 @@
+"""Every page that says how something is done is followed, so that it cannot rot; and no link in any
+page leads nowhere."""
+
+import os
+import re
+import warnings
+from pathlib import Path
+
+import pytest
+
+import tactile_rt
+from tests.helpers.followed_page import Block, blocks, check_printed, follow
+from tests.helpers.source_tree import ROOT
+
+DOCS = ROOT / "docs"
+pytestmark = pytest.mark.skipif(
+    not DOCS.joinpath("start").exists(), reason="a source archive, no docs"
+)
+
+FOLLOWED = sorted([*DOCS.glob("how-to/add-a*.md"), *DOCS.glob("start/*.md")])
+# What a page needs beyond the onboard packages.
+NEEDS = {
+    "add-a-network-cell": ("torch",),
+    "add-a-recipe": ("mujoco", "torch"),
+    "add-an-object-category": ("mujoco", "trimesh"),
+    "add-a-whisker-species": ("mujoco",),
+    "stimuli-to-alignment": ("mujoco", "torch"),
+}
+LONG = ("add-a-recipe", "stimuli-to-alignment")  # they train, and whisk
+PAGES = sorted([*ROOT.glob("*.md"), *DOCS.rglob("*.md")])
+LINK = re.compile(r"(?<!`)\]\(([^)\s]+)\)|<img[^>]+src=\"([^\"]+)\"")
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, id=p.stem, marks=[pytest.mark.slow] * (p.stem in LONG)) for p in FOLLOWED],
+)
+def test_the_page_does_what_it_says(page: Path, tmp_path, monkeypatch) -> None:
+    for module in NEEDS.get(page.stem, ()):
+        pytest.importorskip(module)
+    here = tmp_path / "here"
+    here.mkdir()
+    follow(page, here, monkeypatch)
+
+
+def test_a_page_that_lies_is_caught(tmp_path, monkeypatch) -> None:
+    page = ROOT / "docs" / "start" / "of-a-test.md"
+    for text, said in (
+        ("```python\nprint(1 + 1)\n```\n\n```text\n3\n```\n", "of-a-test.md:5: AssertionError"),
+        ("```python\nraise ValueError(7)\n```\n", "of-a-test.md:1: ValueError: 7"),
+        ("```sh\nfalse\n```\n", "of-a-test.md:1"),
+        ("```sh\ntactile-rt no-such-command\n```\n", "exit code 2"),
+    ):
+        here = tmp_path / str(abs(hash(text)))
+        here.mkdir()
+        monkeypatch.setattr(Path, "read_text", lambda self, *a, text=text: text)
+        with monkeypatch.context() as patch, pytest.raises(AssertionError, match=said):
+            follow(page, here, patch)
+
+
+def test_what_is_printed_is_compared_word_by_word() -> None:
+    check_printed("one  two\nthree", "one two three\n")
+    check_printed("took 0.3 s\n", "took ... s")
+    with pytest.raises(AssertionError, match="but this is printed"):
+        check_printed("one two", "one")
+
+
+def test_blocks_are_found_with_their_titles() -> None:
+    page = '# A\n```toml title="a.toml"\nx = 1\n```\ntext\n```sh\nls\n```\n'
+    assert blocks(page) == [Block("toml", "a.toml", "x = 1\n", 2), Block("sh", "", "ls\n", 6)]
+
+
+# links
+
+
+def anchors(page: Path) -> set[str]:
+    """What headings of a page are linked by, as GitHub makes it of their words."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.M | re.S)
+    headings = re.findall(r"^#+ (.+)$", text, re.M)
+    plain = (re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", h) for h in headings)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).strip().replace(" ", "-") for h in plain}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.relative_to(ROOT).as_posix())
+def test_no_link_leads_nowhere(page: Path) -> None:
+    text = re.sub(r"^```.*?^```$", "", page.read_text("utf-8"), flags=re.M | re.S)
+    dead = []
+    for match in LINK.finditer(text):
+        target = match[1] or match[2]
+        if "://" in target or target.startswith("mailto:"):
+            continue
+        path, _, anchor = target.partition("#")
+        there = Path(os.path.normpath(page.parent / path)) if path else page
+        if not there.exists():
+            dead.append(target)
+        elif anchor and there.suffix == ".md" and anchor not in anchors(there):
+            dead.append(target)
+    assert dead == []
+
+
+# the site
+
+
+def test_every_page_is_in_the_site_s_navigation() -> None:
+    listed = set(re.findall(r": ([\w/.-]+\.md)$", (ROOT / "mkdocs.yml").read_text("utf-8"), re.M))
+    there = {p.relative_to(DOCS).as_posix() for p in DOCS.rglob("*.md")}
+    assert {p for p in there if not p.startswith("decisions/")} == listed
+
+
+def test_the_face_is_told_whole() -> None:
+    page = (DOCS / "reference" / "api" / "face.md").read_text("utf-8")
+    told = {name.rpartition(".")[2] for name in re.findall(r"^::: (\S+)$", page, re.M)}
+    told |= set(re.findall(r"`(\w+)`", page))
+    assert set(tactile_rt.__all__) <= told
+
+
+def test_the_site_is_built_offline_without_a_warning(tmp_path, monkeypatch, capfd) -> None:
+    """Its own checks: pages, links and anchors, names of the API, arguments in docstrings."""
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("mkdocstrings")
+    pytest.importorskip("material")
+    from mkdocs.commands.build import build
+    from mkdocs.config import load_config
+
+    monkeypatch.setenv("NO_MKDOCS_2_WARNING", "1")
+    monkeypatch.chdir(ROOT)
+    with warnings.catch_warnings(action="ignore"):  # of its plugins
+        build(load_config("mkdocs.yml", strict=True, site_dir=str(tmp_path)))
+    assert (tmp_path / "reference" / "api" / "face.html").stat().st_size > 20_000
+    html = [p.read_text("utf-8") for p in tmp_path.rglob("*.html")]
+    fetched = {
+        u for t in html for u in re.findall(r"(?:src|<link[^>]*href)=\"(https?://[^\"]+)", t)
+    }
+    assert fetched == set(), "a page that is read offline fetches nothing"
