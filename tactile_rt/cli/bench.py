@@ -12,7 +12,8 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needs
-from tactile_rt.cli.tables import print_table
+from tactile_rt.cli.progress import working
+from tactile_rt.cli.tables import Json, show_records
 from tactile_rt.stream import ConfigError
 
 CHECKOUT = Path(__file__).parents[2]
@@ -34,7 +35,7 @@ def bench(
     quick: Annotated[
         bool, typer.Option("--quick", help="Fewer repetitions: a look, not a figure.")
     ] = False,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
+    json: Json = None,
     faults: Annotated[
         bool, typer.Option("--faults", help="Of daemon: cause each fault of its world 40 times.")
     ] = False,
@@ -43,8 +44,6 @@ def bench(
     ] = None,
 ) -> None:
     """Measure speed and accuracy, each figure beside its bar and what it is compared to."""
-    from tactile_rt.evidence.records import as_table, write
-
     if area is not None and area not in AREAS:
         raise ConfigError(f"no benchmark area {area!r}: there are {', '.join(AREAS)}")
     if faults and area != "daemon":
@@ -52,9 +51,9 @@ def bench(
     if resume is not None and not faults:
         raise ConfigError("--resume goes with --faults")
     check_output(json)
-    progress, records = Console(stderr=True), []
+    console, records = Console(stderr=True), []
     for name in [area] if area else AREAS:
-        with progress.status(f"measuring {name}"):
+        with working(console, f"measuring {name}"):
             try:
                 if faults:
                     rig = _rig(name, "faults")
@@ -63,11 +62,10 @@ def bench(
                     records += _rig(name).run(quick)
             except ModuleNotFoundError as error:
                 raise needs(AREAS[name], error) from None
-    print_table(as_table(records))
+    if show_records(records, json):
+        return
     bars = [r for r in records if r.bar]
     typer.echo(f"{sum(bool(r.met) for r in bars)} of {len(bars)} bars met")
-    if json:
-        write(records, json)
 
 
 def _rig(area: str, module: str = "area") -> Any:

@@ -1,16 +1,17 @@
 """`tactile-rt hil`: hardware in the loop, with an emulated device."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import parse_qsl
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli.app import INTERRUPTED, app, leaving, needs, starting
+from tactile_rt.cli.app import INTERRUPTED, app, check_output, leaving, needs, starting
 from tactile_rt.cli.emulate import codec_options
-from tactile_rt.cli.tables import print_table
+from tactile_rt.cli.progress import working
+from tactile_rt.cli.tables import Json, print_table, told_as_json
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ def hil(
     project: Annotated[
         Path | None, typer.Option(help="A folder of `tactile-rt make`: its array and its model.")
     ] = None,
+    json: Json = None,
 ) -> None:
     """Run a simulated array through an emulated device and its real driver.
 
@@ -70,6 +72,7 @@ def hil(
     from tactile_rt.evidence.hil import Loop, check_line
     from tactile_rt.sources.opening import open_source
 
+    check_output(json)
     fields = codec_options(option or [])
     if project is not None:
         source, model, wire, codec, fields = _of_project(
@@ -97,10 +100,17 @@ def hil(
     except BaseException:
         opened.close()
         raise
-    with leaving(None), console.status(f"{wire}, {codec}"):
+    with leaving(None), working(console, f"{codec} over {wire}"):
         loop.run()
     report = loop.report()
-    print_table(_table(report, source, f"{codec} over {wire}"))
+    told = {
+        "source": source, "wire": wire, "codec": codec, "complete": loop.complete,
+        "failure": report.failure, **vars(report),
+        "latency_s": _percentiles(report.latency_s),
+        "stamp_error_s": _percentiles(report.stamp_error_s),
+    }  # fmt: skip
+    if not told_as_json(told, json):
+        print_table(_table(report, source, f"{codec} over {wire}"))
     if not loop.complete:
         typer.echo("interrupted: what was on its way is missing above", err=True)
         raise typer.Exit(INTERRUPTED)
@@ -171,10 +181,17 @@ def _table(report: "LoopReport", source: str, title: str) -> Table:
     return table
 
 
-def _spread(values: object, scale: float, unit: str) -> str:
+def _percentiles(values: Any) -> dict[str, float] | None:
     import numpy as np
 
     if values is None:
+        return None
+    p50, p99, worst = np.percentile(values, (50, 99, 100))
+    return {"p50": float(p50), "p99": float(p99), "worst": float(worst)}
+
+
+def _spread(values: Any, scale: float, unit: str) -> str:
+    found = _percentiles(values)
+    if found is None:
         return ""
-    p50, p99, worst = np.percentile(values, (50, 99, 100)) * scale  # type: ignore[call-overload]
-    return f"p50 {p50:.2f}, p99 {p99:.2f}, worst {worst:.2f} {unit}"
+    return ", ".join(f"{name} {scale * value:.2f}" for name, value in found.items()) + f" {unit}"

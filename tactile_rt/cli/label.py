@@ -7,7 +7,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, progress_bar
+from tactile_rt.cli.app import app, check_output
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import ConfigError, RecordingError
 
 
@@ -33,6 +35,7 @@ def label(
     ] = "0.7,0.15,0.15",
     seed: Annotated[int, typer.Option(min=0, help="Of the split.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Replace a set that is there.")] = False,
+    json: Json = None,
 ) -> None:
     """Make a sweep set of recordings, to train and evaluate on.
 
@@ -52,6 +55,7 @@ def label(
 
     if (labels is not None) + by_name + unlabelled > 1:
         raise ConfigError("--labels, --by-name and --unlabelled exclude one another: give one")
+    check_output(json)
     shares = _shares(split)
     _check_out(folder, force)
     if twice := [one for one in recordings if recordings.count(one) > 1]:
@@ -81,6 +85,14 @@ def label(
     counts = {
         c: sum(used.interval.label == c for used in touches.used) for c in manifest.categories
     }
+    told_as_json(
+        {
+            "set": folder, "touches": touches.found.total(), "used": len(touches.used),
+            "classes": counts, "objects": {name: len(manifest.split[name]) for name in SPLITS},
+            "left_out": list(touches.left_out),
+        },
+        json,
+    )  # fmt: skip
     told = ", ".join(f"{name} {n}" for name, n in counts.items())
     console.print(
         f"{folder}: {len(touches.used)} of {touches.found.total()} touches ({told}); "

@@ -8,7 +8,8 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needs
-from tactile_rt.cli.tables import print_table
+from tactile_rt.cli.progress import progress_bar, working
+from tactile_rt.cli.tables import Json, show_records, told_as_json
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.contact_point import WhiskerShapes
@@ -26,11 +27,13 @@ def train(
     hidden: Annotated[int, typer.Option(min=1, help="Units of the recurrent layer.")] = 48,
     seed: Annotated[int, typer.Option(help="Of weights and noise.")] = 0,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    json: Json = None,
 ) -> None:
     """Train the contact network on the simulator's own contacts."""
     from tactile_rt.sweep_set import SweepManifest
 
-    check_output(checkpoint)
+    for file in (checkpoint, json):
+        check_output(file)
     SweepManifest.read(data)
     try:
         import torch
@@ -42,16 +45,23 @@ def train(
     torch.set_num_threads(threads)
     console = Console(stderr=True)
     sets = [SweepSet.read(data, split) for split in ("train", "validation")]
-    regression.train_contacts(
-        sets[0],
-        sets[1],
-        _shapes(sets[0].manifest),
-        regression.ContactConfig(hidden=hidden, epochs=epochs, seed=seed),
-        checkpoint,
-        lambda epoch, loss, error: console.print(
-            f"epoch {epoch}/{epochs}: loss {loss:.4f}, validation {error:.4f}"
-        ),
-    )
+    history: list[dict[str, float]] = []
+    with progress_bar(console, "training", epochs) as update:
+
+        def show(epoch: int, loss: float, error: float) -> None:
+            history.append({"epoch": epoch, "loss": loss, "validation": error})
+            update(advance=1)
+            console.print(f"epoch {epoch}/{epochs}: loss {loss:.4f}, validation {error:.4f}")
+
+        regression.train_contacts(
+            sets[0],
+            sets[1],
+            _shapes(sets[0].manifest),
+            regression.ContactConfig(hidden=hidden, epochs=epochs, seed=seed),
+            checkpoint,
+            show,
+        )
+    told_as_json(history, json)
     console.print(f"best network: {checkpoint}")
 
 
@@ -59,21 +69,17 @@ def train(
 def evaluate(
     checkpoint: Annotated[Path, typer.Argument(help="What `locate train` wrote.")],
     data: Annotated[Path, typer.Argument(help="A sweep set made with --contacts.")],
-    json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
+    json: Json = None,
 ) -> None:
     """Measure it on the test objects, beside the classical estimates from moment and force."""
     try:
         from tactile_rt.evidence.locating import contact_records
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
-    from tactile_rt.evidence.records import as_table, write
-
     check_output(json)
-    with Console(stderr=True).status("evaluating"):
+    with working(Console(stderr=True), "evaluating"):
         records = contact_records(checkpoint, data)
-    print_table(as_table(records))
-    if json:
-        write(records, json)
+    show_records(records, json)
 
 
 def _shapes(manifest: "SweepManifest") -> "WhiskerShapes":

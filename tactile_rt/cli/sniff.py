@@ -9,6 +9,7 @@ from urllib.parse import quote, urlencode
 import typer
 
 from tactile_rt.cli.app import app, leaving, starting
+from tactile_rt.cli.tables import print_table
 from tactile_rt.stream import ConfigError, RecordingError
 
 if TYPE_CHECKING:
@@ -264,7 +265,6 @@ def _sniff_text(path: Path, data: bytes) -> bool:
 
 
 def _sniff_bag(path: Path) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     from tactile_rt.recording import Recording
@@ -283,7 +283,7 @@ def _sniff_bag(path: Path) -> None:
     table = Table("topic", "type", "messages", "columns", box=None, header_style="bold")
     for topic in topics:
         table.add_row(topic.name, topic.type, str(topic.messages), topic.columns)
-    Console(soft_wrap=True).print(table)
+    print_table(table)
     known = [t for t in topics if t.columns or t.type == messages.SAMPLES]
     if not known:
         _nothing(f"{path}: of no topic is known what is what", "`import` takes it with --columns")
@@ -296,7 +296,6 @@ def _sniff_bag(path: Path) -> None:
 
 
 def _show(fits: "list[CodecFit]", speeds: list[str] | None = None) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     names = ["codec", "options", *(["baud"] if speeds else []), "intact", "corrupt", "explains"]
@@ -308,7 +307,7 @@ def _show(fits: "list[CodecFit]", speeds: list[str] | None = None) -> None:
             str(fit.corrupt), f"{fit.explained:.0%}",
             f"{fit.proof:.0%}" if fit.wire == "serial" else "by CAN",
         )  # fmt: skip
-    Console(soft_wrap=True, width=None).print(table)
+    print_table(table)
 
 
 def _show_identifiers(frames: "list[Any]") -> None:

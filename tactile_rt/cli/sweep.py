@@ -7,7 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, needs, progress_bar, starting
+from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -52,13 +54,17 @@ def sweep(
     verify: Annotated[
         bool, typer.Option("--verify", help="Make nothing: check the set's checksums.")
     ] = False,
+    json: Json = None,
 ) -> None:
     """Sweep simulated objects past the whisker array and store what it feels."""
+    check_output(json)
     console = Console(stderr=True, soft_wrap=True)
     if verify:
         from tactile_rt.sim_backend.datasets.inventory import check_sums
 
-        console.print(f"{folder}: {check_sums(folder)} files are as they were written")
+        files = check_sums(folder)
+        told_as_json({"set": folder, "files": files}, json)
+        console.print(f"{folder}: {files} files are as they were written")
         return
     try:
         with starting():
@@ -91,6 +97,13 @@ def sweep(
         for k, name in enumerate(made):  # those that were there first
             update(advance=int(k >= there), description=name)
     found = tally(folder, names, len(chosen.sweeps))
+    told_as_json(
+        {
+            "set": folder, "sweeps": found.sweeps, "profile": chosen.profile,
+            "shortcomings": found.shortcomings,
+        },
+        json,
+    )  # fmt: skip
     but = f"; {found.shortcomings}" if found.shortcomings else ""
     console.print(f"{folder}: {found.sweeps} sweeps at profile {chosen.profile}{but}")
     if card:

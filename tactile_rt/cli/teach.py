@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from tactile_rt.cli.app import Seconds, app, leaving, starting
+from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
+from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError, SpecMismatch
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def teach(
         typer.Option(help="Teach this model further classes: an .onnx file, or `shipped`."),
     ] = "",
     seconds: Seconds = None,
+    json: Json = None,
 ) -> None:
     """Touch it ten times a class, and it knows the classes: FOLDER/model.onnx.
 
@@ -63,6 +65,7 @@ def teach(
     from tactile_rt.teaching.teacher import Teacher
 
     need_mcap()
+    check_output(json)
     wanted = [name.strip() for name in labels.split(",") if name.strip()]
     at = _address(page) if page else None
     _check_labels(wanted)
@@ -86,6 +89,18 @@ def teach(
     for line in (*buttons.teacher.summary(), *_losses(opened)):
         typer.echo(line)
     learnt = lesson.taught_enough
+    told = {
+        "model": folder / MODEL,
+        "classes": card.classes,
+        "touches": {name: lesson.count(name) for name in learnt},
+        "left_out_touches_right": {
+            name: {"right": good, "of": count}
+            for name, count, good in buttons.teacher.progress.classes
+        },
+        "corrupt": opened.stats.corrupt,
+        "missing": opened.stats.missing,
+    }
+    told_as_json(told, json)
     others = len(card.classes) - len(learnt)
     knows = ", ".join(learnt) + (f" beside {others} others" if others else "")
     typer.echo(

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, needs, progress_bar
-from tactile_rt.cli.tables import Json, show_table
+from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.progress import progress_bar, working
+from tactile_rt.cli.tables import Json, show_table, told_as_json
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -68,12 +69,14 @@ def train(
         bool, typer.Option("--tensorboard", help="Write logs for TensorBoard, too.")
     ] = False,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    json: Json = None,
 ) -> None:
     """Train an Encoder-Attender-Decoder network on a sweep set."""
     from tactile_rt.models.checkpoint_files import network_of
     from tactile_rt.models.training.config import manifests_of
     from tactile_rt.models.training.recipes import read_recipe
 
+    check_output(json)
     asked = {
         "encoder": encoder,
         "graph": None if graph is None else _text(graph),
@@ -108,6 +111,7 @@ def train(
     torch.set_num_threads(threads)
     # Under torchrun every process has the same to say.
     console = Console(stderr=True, quiet=os.environ.get("RANK", "0") != "0")
+    history: list[dict[str, Any]] = []
     with progress_bar(console, "finding onsets") as update:
 
         def show(at: "Progress") -> None:
@@ -117,12 +121,15 @@ def train(
                 description=f"epoch {at.epoch}/{at.epochs} loss {at.loss:.3f}",
             )
             if at.metrics:
+                history.append({"epoch": at.epoch, "update": at.update, **at.metrics})
                 console.print(_in_words(at))
 
         try:
             best = training.train(config, folder, show, tensorboard=tensorboard, device=device)
         except ModuleNotFoundError as error:
             raise needs("train", error) from None
+    if not console.quiet:
+        told_as_json({"best": best, "epochs": history}, json)
     console.print(f"best network: {best}")
 
 
@@ -176,12 +183,14 @@ def probe(
         str, typer.Option(help="last: the last step (the paper); mean: the mean of all steps.")
     ] = "last",
     seed: Annotated[int, typer.Option(help="Of the layer and the windows.")] = 0,
+    json: Json = None,
 ) -> None:
     """Fit a linear layer on a frozen network's features: how much of the category do they hold?"""
     from tactile_rt.models.checkpoint_files import describe_checkpoint
     from tactile_rt.models.data_checks import probed_on
     from tactile_rt.models.training.config import ProbeConfig
 
+    check_output(json)
     config = ProbeConfig(
         data=str(data or ""),
         epochs=epochs,
@@ -196,10 +205,16 @@ def probe(
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     console = Console(stderr=True)
-    with console.status("probing"):
-        shown: list[Progress] = []
-        best = fit(checkpoint, folder, config, shown.append)
+    shown: list[Progress] = []
+    with progress_bar(console, "probing") as update:
+
+        def show(at: "Progress") -> None:
+            shown.append(at)
+            update(total=at.updates, completed=at.update)
+
+        best = fit(checkpoint, folder, config, show)
     m = shown[-1].metrics
+    told_as_json({"best": best, **m}, json)
     console.print(
         f"{best}: validation top-1 {100 * m['validation_top1']:.1f} % clean, "
         f"{100 * m['validation_top1_noisy']:.1f} % at rated noise"
@@ -224,13 +239,14 @@ def export(
             "several, all."
         ),
     ] = None,
+    json: Json = None,
 ) -> None:
     """Export a trained network as a streaming ONNX step, with everything needed to run it."""
     from tactile_rt.models.checkpoint_files import describe_checkpoint
     from tactile_rt.models.data_checks import trained_on
 
-    if model.is_dir():
-        raise ConfigError(f"{model} is a folder: name a file to write")
+    for file in (model, json):
+        check_output(file)
     trained_on(checkpoint, describe_checkpoint(checkpoint), data or ())
     try:
         from tactile_rt.export.precision import PRECISIONS
@@ -245,7 +261,7 @@ def export(
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     console = Console(stderr=True)
-    with console.status("calibrating, exporting and checking parity"):
+    with working(console, "calibrating, exporting and checking parity"):
         card = release(
             checkpoint,
             model,
@@ -254,8 +270,13 @@ def export(
             "window" if kind == "window" else "step",
             data or (),
         )
+    megabytes = model.stat().st_size / 1e6
+    told_as_json(
+        {"model": model, "megabytes": megabytes, "temperature": card.temperature, **card.figures},
+        json,
+    )
     console.print(
-        f"{model}: {model.stat().st_size / 1e6:.1f} MB, parity {card.figures['parity']:.1e}, "
+        f"{model}: {megabytes:.1f} MB, parity {card.figures['parity']:.1e}, "
         f"temperature {card.temperature:.2f}"
     )
     if precision != "fp32":

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, progress_bar, starting
+from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.progress import progress_bar
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:

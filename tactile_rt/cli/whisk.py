@@ -9,7 +9,9 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, progress_bar, starting
+from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import ConfigError
 
 
@@ -55,13 +57,14 @@ def whisk(
     profile: Annotated[
         str, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
     ] = "dataset",
+    json: Json = None,
 ) -> None:
     """Whisk against surfaces and write what the array feels from first contact on."""
     if out.suffix != ".npz":
         raise ConfigError(f"{out}: name a file that ends in .npz")
     if target is not None and stimulus is not None:
         raise ConfigError("--object and --stimulus exclude each other: name one of them")
-    for file in (out, out.with_suffix(".json")):
+    for file in (out, out.with_suffix(".json"), json):
         check_output(file)
     try:
         with starting():
@@ -145,10 +148,17 @@ def whisk(
         base_angles(moves, times, animal.whiskers),
         parameters,
     )
-    for name, what in felt.items():
-        touched = int(what.touch.any(axis=0).sum())
+    told = [
+        {
+            "stimulus": name, "first_ms": what.first_ms,
+            "whiskers": int(what.touch.any(axis=0).sum()),
+        }
+        for name, what in felt.items()
+    ]  # fmt: skip
+    told_as_json(told, json)
+    for one in told:
         console.print(
-            f"{name}: first contact at {what.first_ms} ms, {touched} of "
+            f"{one['stimulus']}: first contact at {one['first_ms']} ms, {one['whiskers']} of "
             f"{len(animal.whiskers)} whiskers touch it"
         )
     console.print(f"{out} and {out.with_suffix('.json')}: {len(felt)} stimuli")
