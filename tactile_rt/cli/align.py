@@ -12,9 +12,10 @@ from rich.console import Console
 from rich.table import Column, Table
 from typer.core import TyperCommand
 
-from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.app import app, check_output, needs, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, print_table, told_as_json
+from tactile_rt.settings import take_sets
 from tactile_rt.stream import ConfigError, TactileError
 
 if TYPE_CHECKING:
@@ -53,18 +54,16 @@ class GateCommand(TyperCommand):
 @align.command("example")
 def write_brain(
     folder: Annotated[Path, typer.Argument(help="The folder to make.")],
-    mice: Annotated[int, typer.Option(help="How many are recorded.")] = 11,
-    trials: Annotated[int, typer.Option(help="Of each stimulus, in a session.")] = 40,
-    private: Annotated[
-        float, typer.Option(help="Share of a mouse's variance that is its own, 0 to 1.")
-    ] = 0.15,
     seed: Annotated[int, typer.Option(help="Of every random number.")] = 0,
+    sets: Annotated[
+        list[str] | None, set_option("Of the brain: mice=6, trials=60, private=0.3")
+    ] = None,
 ) -> None:
     """Make up a brain: recordings in NWB, and models of known truth, to try the commands on."""
     from tactile_rt.models.alignment.example import Brain
     from tactile_rt.models.alignment.example_files import write_example
 
-    brain = Brain(mice=mice, trials=trials, private=private)
+    (brain,) = take_sets("align example", sets or (), Brain)
     console = Console(stderr=True)
     with progress_bar(console, "recording", total=1.0) as update:
         try:
@@ -75,7 +74,7 @@ def write_brain(
             raise needs("align", error) from None
     names = ", ".join(sorted(path.name for path in models.iterdir()))
     for line in (
-        f"{recordings}: {mice} mice; {models}: {names}",
+        f"{recordings}: {brain.mice} mice; {models}: {names}",
         f"next: tactile-rt align build {recordings} --out {folder / 'benchmark.json'}",
     ):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
@@ -150,7 +149,7 @@ def score_models(
     models: Models,
     benchmark: Benchmark,
     json: Json = None,
-    page: Annotated[Path | None, typer.Option(help="Write the report here, .html.")] = None,
+    html: Annotated[Path | None, typer.Option(help="Write the report here, .html.")] = None,
     stimuli: Stimuli = None,
     untrained: Annotated[
         bool, typer.Option(help="Score each checkpoint's network before training too.")
@@ -162,7 +161,7 @@ def score_models(
     ] = None,
 ) -> None:
     """Score every layer of some models against a benchmark."""
-    for file in (json, page):
+    for file in (json, html):
         check_output(file)
     given = _performances(performance, len(models))
     with _train():
@@ -189,8 +188,8 @@ def score_models(
                 done.append(model_result(frozen, layers, before, told or own)[0])
                 update(advance=1)
     results = results_of(frozen, felt, done)
-    if page:
-        write_page(results, page)
+    if html:
+        write_page(results, html)
     if not told_as_json(results, json):
         _show_scores(results)
 

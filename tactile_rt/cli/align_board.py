@@ -64,7 +64,7 @@ def write_board(
         typer.Option(help="all, L1, L2/3, L4, L5, L6, excitatory or inhibitory; may be repeated."),
     ] = None,
     json: Json = None,
-    page: Annotated[Path | None, typer.Option(help="Write it as a page here, .html.")] = None,
+    html: Annotated[Path | None, typer.Option(help="Write it as a page here, .html.")] = None,
     stimuli: Annotated[
         Path | None,
         typer.Option(help="Of `tactile-rt whisk`. Default: the mouse array's, which ships."),
@@ -75,7 +75,7 @@ def write_board(
     seed: Annotated[int, typer.Option(help="Of the untrained networks.")] = 0,
 ) -> None:
     """Compare models with recordings by every metric, as shares of what noise permits."""
-    for file in (json, page):
+    for file in (json, html):
         check_output(file)
     if not data:
         raise ConfigError("name recordings: --data NAME=PATH, see `tactile-rt align datasets`")
@@ -83,10 +83,10 @@ def write_board(
         made = _board(models or [], data, metric, part or ["all"], stimuli, untrained, seed)
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
-    if page:
+    if html:
         from tactile_rt.models.alignment.board_page import write_board_page
 
-        write_board_page(made, page)
+        write_board_page(made, html)
     if not told_as_json(made, json):
         _show(made)
 

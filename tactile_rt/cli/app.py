@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -19,11 +19,13 @@ __all__ = [
     "INTERRUPTED",
     "USER_ERROR",
     "Model",
+    "Pace",
     "Seconds",
     "app",
     "check_output",
     "leaving",
     "needs",
+    "set_option",
     "starting",
 ]
 
@@ -36,6 +38,18 @@ Model = Annotated[
 Seconds = Annotated[
     float | None, typer.Option(min=0.001, max=1e9, help="Leave after so many seconds.")
 ]
+
+Pace = Annotated[bool, typer.Option("--fast/--realtime", help="As fast as it goes; in real time.")]
+
+
+def set_option(help: str) -> Any:
+    """The option ``--set KEY=VALUE`` of a command, which may be given again.
+
+    Args:
+        help: of what, with an example.
+    """
+    return typer.Option("--set", metavar="KEY=VALUE", help=f"{help}; may be repeated.")
+
 
 app = typer.Typer(
     name="tactile-rt",

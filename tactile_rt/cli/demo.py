@@ -17,7 +17,7 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 
-from tactile_rt.cli.app import Model, Seconds, app, check_output, leaving, needs, starting
+from tactile_rt.cli.app import Model, Pace, Seconds, app, check_output, leaving, needs, starting
 from tactile_rt.cli.demonstration import Demonstration, SweepOutcome
 from tactile_rt.cli.tables import STDOUT, Json, told_as_json
 from tactile_rt.stream import ConfigError
@@ -53,9 +53,7 @@ def demo(
     seconds: Seconds = None,
     model: Model = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the drawn objects and sweeps.")] = 0,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="As fast as it simulates, not in real time.")
-    ] = False,
+    fast: Pace = False,
     recorded: Annotated[
         bool, typer.Option("--recorded", help="Play the recording, also if there is MuJoCo.")
     ] = False,

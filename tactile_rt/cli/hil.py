@@ -8,7 +8,16 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli.app import INTERRUPTED, app, check_output, leaving, needs, starting
+from tactile_rt.cli.app import (
+    INTERRUPTED,
+    Pace,
+    app,
+    check_output,
+    leaving,
+    needs,
+    set_option,
+    starting,
+)
 from tactile_rt.cli.emulate import codec_options
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import Json, print_table, told_as_json
@@ -33,10 +42,7 @@ def hil(
     codec: Annotated[
         str | None, typer.Option(help="What the device speaks. Default: native, or a project's.")
     ] = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option(help="Of the codec: NAME=VALUE, e.g. format=int16; may be repeated."),
-    ] = None,
+    sets: Annotated[list[str] | None, set_option("An option of the codec: format=int16")] = None,
     faults: Annotated[Path | None, typer.Option(help="A .toml of what goes wrong.")] = None,
     sweeps: Annotated[
         int | None, typer.Option(min=1, help=f"Of sim:, how many objects pass. Default: {SWEEPS}.")
@@ -45,9 +51,7 @@ def hil(
         float | None, typer.Option(min=0.001, max=1e9, help="Leave after so much of the stream.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the default source.")] = 0,
-    realtime: Annotated[
-        bool, typer.Option("--realtime", help="In real time, not as fast as it goes.")
-    ] = False,
+    fast: Pace = True,
     clock: Annotated[
         str, typer.Option(help="Time of the driver's samples: device; host (in real time).")
     ] = "device",
@@ -73,7 +77,7 @@ def hil(
     from tactile_rt.sources.opening import open_source
 
     check_output(json)
-    fields = codec_options(option or [])
+    fields = codec_options(sets or [])
     if project is not None:
         source, model, wire, codec, fields = _of_project(
             project, source, model, wire, codec, fields, seed
@@ -86,7 +90,7 @@ def hil(
         unseen = load_model(file)[1].provenance.get("unseen_objects", [])
         source = f"sim:mouse?seed={seed}" + (f"&objects={','.join(unseen)}" if unseen else "")
     if source.startswith(("sim:", "whisking:")):
-        source = _with(source, "pace", "realtime" if realtime else "fast")
+        source = _with(source, "pace", "fast" if fast else "realtime")
     if source.startswith("sim:"):
         if sweeps is not None or seconds is None:
             source = _with(source, "sweeps", str(sweeps or SWEEPS))

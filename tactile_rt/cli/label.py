@@ -30,7 +30,7 @@ def label(
         Path | None,
         typer.Option(help="A sweep set or model of the array: its sensor and sample period."),
     ] = None,
-    split: Annotated[
+    shares: Annotated[
         str, typer.Option(help="Shares of the objects: train,validation,test.")
     ] = "0.7,0.15,0.15",
     seed: Annotated[int, typer.Option(min=0, help="Of the split.")] = 0,
@@ -56,7 +56,7 @@ def label(
     if (labels is not None) + by_name + unlabelled > 1:
         raise ConfigError("--labels, --by-name and --unlabelled exclude one another: give one")
     check_output(json)
-    shares = _shares(split)
+    parts = _shares(shares)
     _check_out(folder, force)
     if twice := [one for one in recordings if recordings.count(one) > 1]:
         raise ConfigError(f"{twice[0]} is named twice: name it once")
@@ -72,10 +72,10 @@ def label(
             recordings, intervals, like,
             lambda one, seconds: update(description=f"{one.name} {seconds:.0f} s"),
         )  # fmt: skip
-    given = {"--labels": labels, "--like": like, "--split": split, "--seed": seed}
+    given = {"--labels": labels, "--like": like, "--shares": shares, "--seed": seed}
     words = [w for k, v in given.items() if v is not None for w in (k, str(v))]
     words += [k for k, v in {"--by-name": by_name, "--unlabelled": unlabelled}.items() if v]
-    manifest = write_set(folder, touches, shares, seed, shlex.join(words), write_sums)
+    manifest = write_set(folder, touches, parts, seed, shlex.join(words), write_sums)
     for line in touches.left_out:
         console.print(line, markup=False)
     for name, some in (("validation", "to train"), ("test", "for `tactile-rt eval`")):
@@ -107,7 +107,7 @@ def _shares(text: str) -> tuple[float, ...]:
         shares = tuple(map(float, text.split(",")))
     except ValueError:
         raise ConfigError(
-            f"--split is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15, not {text!r}"
+            f"--shares is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15, not {text!r}"
         ) from None
     check_shares(shares)
     return shares

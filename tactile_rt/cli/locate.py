@@ -7,9 +7,10 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.app import app, check_output, needs, set_option
 from tactile_rt.cli.progress import progress_bar, working
 from tactile_rt.cli.tables import Json, show_records, told_as_json
+from tactile_rt.settings import take_sets
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.contact_point import WhiskerShapes
@@ -24,8 +25,10 @@ def train(
     data: Annotated[Path, typer.Argument(help="A sweep set made with --contacts.")],
     checkpoint: Annotated[Path, typer.Argument(help="The file to write.")],
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the training split.")] = 12,
-    hidden: Annotated[int, typer.Option(min=1, help="Units of the recurrent layer.")] = 48,
     seed: Annotated[int, typer.Option(help="Of weights and noise.")] = 0,
+    sets: Annotated[
+        list[str] | None, set_option("Of the training: hidden=64, batch=256, learning_rate=0.002")
+    ] = None,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
     json: Json = None,
 ) -> None:
@@ -42,22 +45,24 @@ def train(
         from tactile_rt.models.datasets import SweepSet
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
+    usual = {"epochs": epochs, "seed": seed}
+    (config,) = take_sets("locate train", sets or (), regression.ContactConfig, usual=usual)
     torch.set_num_threads(threads)
     console = Console(stderr=True)
-    sets = [SweepSet.read(data, split) for split in ("train", "validation")]
+    known, held = (SweepSet.read(data, split) for split in ("train", "validation"))
     history: list[dict[str, float]] = []
-    with progress_bar(console, "training", epochs) as update:
+    with progress_bar(console, "training", config.epochs) as update:
 
         def show(epoch: int, loss: float, error: float) -> None:
             history.append({"epoch": epoch, "loss": loss, "validation": error})
             update(advance=1)
-            console.print(f"epoch {epoch}/{epochs}: loss {loss:.4f}, validation {error:.4f}")
+            console.print(f"epoch {epoch}/{config.epochs}: loss {loss:.4f}, validation {error:.4f}")
 
         regression.train_contacts(
-            sets[0],
-            sets[1],
-            _shapes(sets[0].manifest),
-            regression.ContactConfig(hidden=hidden, epochs=epochs, seed=seed),
+            known,
+            held,
+            _shapes(known.manifest),
+            config,
             checkpoint,
             show,
         )

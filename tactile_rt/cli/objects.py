@@ -26,7 +26,7 @@ def get(
     folder: Annotated[Path, typer.Argument(help="Where they are put: FOLDER/CATEGORY/NAME.ply.")],
     clones: Annotated[
         Path | None,
-        typer.Option("--from", help="A folder of clones, instead of GitHub."),
+        typer.Option(help="A folder of clones of the repositories, instead of GitHub."),
     ] = None,
     json: Json = None,
 ) -> None:

@@ -16,7 +16,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-__all__ = ["LINE_S", "progress_bar", "working"]
+__all__ = ["progress_bar", "working"]
 
 A_DAY_S = 86_400.0
 LINE_S = 10.0  # between lines where there is no terminal

@@ -1,6 +1,5 @@
 """`tactile-rt record`, `recover` and `convert`: streams at rest."""
 
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -9,7 +8,7 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
-from tactile_rt.cli.progress import LINE_S, working
+from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.settings import no_such
 from tactile_rt.stream import ConfigError, EndOfStream, Source
@@ -46,8 +45,8 @@ def record(
 ) -> None:
     """Record a source's samples and, of a device, its raw packets and health.
 
-    A line a second goes to stderr, in a log file one in ten seconds. Ctrl-C
-    ends it; what is in the file then is whole. Of a recorder that was killed, `tactile-rt recover`
+    A line a second goes to stderr. Ctrl-C ends it; what is in the file
+    then is whole. Of a recorder that was killed, `tactile-rt recover`
     makes a whole file, too.
     """
     from tactile_rt.recording import StreamWriter
@@ -88,8 +87,7 @@ def record(
 
 def _copy(source: Source, writer: "StreamWriter") -> None:
     """Record until the stream ends, and tell how it goes."""
-    every = TELL_S if sys.stderr.isatty() else LINE_S
-    tell_at = time.monotonic() + every
+    tell_at = time.monotonic() + TELL_S
     while True:
         try:
             chunk = source.read(POLL_S)
@@ -98,7 +96,7 @@ def _copy(source: Source, writer: "StreamWriter") -> None:
         if chunk is not None:
             writer.push(chunk)
         if time.monotonic() >= tell_at:
-            tell_at += every
+            tell_at += TELL_S
             typer.echo(_told(source, writer), err=True)
 
 

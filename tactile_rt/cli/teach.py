@@ -38,7 +38,7 @@ def teach(
     folder: Annotated[
         Path, typer.Argument(help="Where the lesson is kept; one that is there goes on.")
     ],
-    labels: Annotated[
+    classes: Annotated[
         str, typer.Option(help="What is to be touched, comma-separated; more may come by key.")
     ] = "",
     touches: Annotated[int, typer.Option(min=2, max=1000, help="Of each.")] = 10,
@@ -66,7 +66,7 @@ def teach(
 
     need_mcap()
     check_output(json)
-    wanted = [name.strip() for name in labels.split(",") if name.strip()]
+    wanted = [name.strip() for name in classes.split(",") if name.strip()]
     at = _address(page) if page else None
     _check_labels(wanted)
     if folder.exists() and not folder.is_dir():
@@ -186,7 +186,7 @@ def _check_labels(names: list[str]) -> None:
     for name in names:
         check_label(name)
         if names.count(name) > 1:
-            raise ConfigError(f"--labels names {name!r} twice")
+            raise ConfigError(f"--classes names {name!r} twice")
 
 
 def _address(given: str) -> tuple[str, int]:

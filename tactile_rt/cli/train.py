@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.app import app, check_output, needs, set_option
 from tactile_rt.cli.progress import progress_bar, working
 from tactile_rt.cli.tables import Json, show_table, told_as_json
+from tactile_rt.settings import take_sets
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -32,39 +33,22 @@ def train(
     recipe: Annotated[
         str, typer.Option(help="See `tactile-rt recipes`; or a TOML file. Options override it.")
     ] = "default",
-    encoder: Annotated[str | None, typer.Option(help="zhuang-CELL, resnet18, s4, ...")] = None,
-    graph: Annotated[
-        Path | None, typer.Option(help="TOML file of nodes and edges, for --encoder graph.")
+    encoder: Annotated[
+        str | None,
+        typer.Option(help="zhuang-CELL, resnet18, s4, ...; or a TOML file of nodes and edges."),
     ] = None,
     attender: Annotated[str | None, typer.Option(help="gpt, mamba or none.")] = None,
     decoder: Annotated[str | None, typer.Option(help="linear, mlp or mlp-all.")] = None,
-    width: Annotated[
-        float | None, typer.Option(help="Scales every channel count; a multiple of 1/32.")
-    ] = None,
-    objective: Annotated[
-        str | None, typer.Option(help="supervised, simclr, simsiam, autoencoder or predictive.")
-    ] = None,
-    augmentation: Annotated[
-        str | None, typer.Option(help="none, tactile, tactile-paper or image.")
-    ] = None,
-    masking: Annotated[float | None, typer.Option(help="Share of steps to blank.")] = None,
-    optimizer: Annotated[
-        str | None, typer.Option(help="sgd, adam, adamw, lars or lars-paper.")
-    ] = None,
-    schedule: Annotated[
-        str | None, typer.Option(help="step, constant, cosine, cosine-annealing or one-cycle.")
-    ] = None,
     epochs: Annotated[
         int | None, typer.Option(min=1, help="Passes over the training split.")
     ] = None,
-    updates: Annotated[
-        int | None, typer.Option(min=0, help="Stop after so many updates instead; 0: epochs.")
-    ] = None,
     batch: Annotated[int | None, typer.Option(min=1, help="Sweeps per update.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(help="The peak.")] = None,
-    precision: Annotated[str | None, typer.Option(help="bf16 or fp32.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of weights, windows and noise.")] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda ...")] = "auto",
+    sets: Annotated[
+        list[str] | None,
+        set_option("Any key of the recipe: width=0.25, objective=simclr, learning_rate=0.01"),
+    ] = None,
+    accelerator: Annotated[str, typer.Option(help="auto, cpu, cuda ...")] = "auto",
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Write logs for TensorBoard, too.")
     ] = False,
@@ -79,28 +63,20 @@ def train(
     check_output(json)
     asked = {
         "encoder": encoder,
-        "graph": None if graph is None else _text(graph),
         "attender": attender,
         "decoder": decoder,
-        "width": width,
-        "objective": objective,
-        "augmentation": augmentation,
-        "masking": masking,
-        "optimizer": optimizer,
-        "schedule": schedule,
         "epochs": epochs,
-        "updates": updates,
         "batch": batch,
-        "learning_rate": learning_rate,
-        "precision": precision,
         "seed": seed,
     }
+    if encoder is not None and encoder.endswith(".toml"):
+        asked |= {"encoder": "graph", "graph": _text(Path(encoder))}
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     if also:
         given["also"] = tuple(map(str, also))
     if begin is not None:
         given = {**network_of(begin), **given, "begin": str(begin)}
-    config = read_recipe(recipe, str(data), **given)
+    config = read_recipe(recipe, str(data), sets or (), **given)
     manifests_of(config)  # what cannot be is refused before torch has taken its seconds
     try:
         import torch
@@ -125,7 +101,7 @@ def train(
                 console.print(_in_words(at))
 
         try:
-            best = training.train(config, folder, show, tensorboard=tensorboard, device=device)
+            best = training.train(config, folder, show, tensorboard=tensorboard, device=accelerator)
         except ModuleNotFoundError as error:
             raise needs("train", error) from None
     if not console.quiet:
@@ -175,14 +151,11 @@ def probe(
         Path | None, typer.Option(help="Sweep set; default: the one it was trained on.")
     ] = None,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the features.")] = 100,
-    learning_rate: Annotated[float, typer.Option(help="Of SGD.")] = 0.1,
-    standardise: Annotated[
-        bool, typer.Option(help="Fit on standardised features; the paper did not.")
-    ] = True,
-    readout: Annotated[
-        str, typer.Option(help="last: the last step (the paper); mean: the mean of all steps.")
-    ] = "last",
     seed: Annotated[int, typer.Option(help="Of the layer and the windows.")] = 0,
+    sets: Annotated[
+        list[str] | None,
+        set_option("How it is fitted: readout=mean, standardise=false, learning_rate=0.01"),
+    ] = None,
     json: Json = None,
 ) -> None:
     """Fit a linear layer on a frozen network's features: how much of the category do they hold?"""
@@ -191,14 +164,8 @@ def probe(
     from tactile_rt.models.training.config import ProbeConfig
 
     check_output(json)
-    config = ProbeConfig(
-        data=str(data or ""),
-        epochs=epochs,
-        learning_rate=learning_rate,
-        standardise=standardise,
-        readout=readout,
-        seed=seed,
-    )
+    usual = {"data": str(data or ""), "epochs": epochs, "seed": seed}
+    (config,) = take_sets("probe", sets or (), ProbeConfig, usual=usual)
     probed_on(checkpoint, describe_checkpoint(checkpoint), folder, config.data)
     try:
         from tactile_rt.models.training.probing import probe as fit
