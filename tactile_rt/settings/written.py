@@ -120,9 +120,7 @@ def take_sets(
     for kind in kinds:
         values = {k: v for k, v in (usual or {}).items() if k in types_of(kind)}
         nodes = make_node(values, what, 0, Path.cwd())
-        mine = [
-            s for s in sets if known.get(s.partition("=")[0].partition(".")[0], kinds[0]) is kind
-        ]
+        mine = [s for s in sets if known.get(re.split("[=.]", s)[0], kinds[0]) is kind]
         made.append(convert(set_keys(nodes, mine, kind, list(known)), kind))
     return tuple(made)
 
