@@ -1,10 +1,22 @@
-"""Run a tactile_rt model file with numpy and onnxruntime alone: python plain_onnxruntime.py FILE"""
+"""Run a tactile_rt model file with numpy and onnxruntime alone.
+
+    python plain_onnxruntime.py MODEL.onnx
+
+It prints what the model makes of a made-up touch, step by step; the samples of your array go where
+they are made up. `tactile-rt export` writes such files, and one ships with the package:
+
+    python -c "from tactile_rt.classifier.model_file import shipped_model; print(shipped_model())"
+"""
 
 import json
 import sys
 
 import numpy as np
 import onnxruntime as ort
+
+if len(sys.argv) != 2 or sys.argv[1] in ("-h", "--help"):
+    print(__doc__, file=sys.stderr)  # noqa: T201
+    sys.exit(2)
 
 session = ort.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
 card = json.loads(session.get_modelmeta().custom_metadata_map["tactile_rt"])

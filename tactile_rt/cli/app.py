@@ -122,7 +122,7 @@ def check_output(file: Path | None) -> None:
     """Refuse a file that cannot be written, now rather than after minutes of work.
 
     Raises:
-        ConfigError: it is a folder, or the folder that it goes into is not there.
+        ConfigError: it is a folder, or the folder that it goes into is not there or not writable.
     """
     if file is None:
         return
@@ -130,6 +130,8 @@ def check_output(file: Path | None) -> None:
         raise ConfigError(f"no folder {file.parent} to write {file.name} in")
     if file.is_dir():
         raise ConfigError(f"{file} is a folder: name a file to write")
+    if not os.access(file.parent, os.W_OK):
+        raise ConfigError(f"{file.parent} cannot be written in: name a file elsewhere")
 
 
 def needs(extra: str, error: ModuleNotFoundError) -> TactileError:

@@ -60,3 +60,12 @@ def test_it_runs_alone_and_decides_as_we_do() -> None:
 
 def test_it_is_short() -> None:
     assert len(EXAMPLE.read_text(encoding="utf-8").splitlines()) <= 40
+
+
+def test_without_a_file_it_says_what_it_is_and_how_to_get_one() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE, EXAMPLE], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "python plain_onnxruntime.py MODEL.onnx" in done.stderr
+    assert "shipped_model" in done.stderr and "Traceback" not in done.stderr

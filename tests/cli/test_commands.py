@@ -143,7 +143,7 @@ def _ready(words, monkeypatch):
     if words[0] == "align":
         pytest.importorskip("sklearn")
     if words[0] == "top":
-        line = msgspec.json.encode(StateMessage(t_ns=1, snapshot=busy_snapshot()))
+        line = msgspec.json.encode(StateMessage(t_ns=1, utc_ns=1, snapshot=busy_snapshot()))
         monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(line + b"\n")))
 
 
