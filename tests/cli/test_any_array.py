@@ -13,8 +13,8 @@ for module in ("torch", "lightning", "onnx", "matplotlib"):
     pytest.importorskip(module)
 
 ROBOT = plate(2, 4)
-TINY = ("--encoder", "gru", "--attender", "none", "--width", "0.0625", "--epochs", 1, "--batch", 4,
-        "--precision", "fp32")  # fmt: skip
+TINY = ("--encoder", "gru", "--attender", "none", "--epochs", 1, "--batch", 4,
+        "--set", "width=0.0625", "--set", "precision=fp32")  # fmt: skip
 
 
 @pytest.fixture
