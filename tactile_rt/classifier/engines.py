@@ -7,6 +7,7 @@ and state are explicit, nothing is kept between steps but what the buffers hold.
 ``onnxruntime`` is imported when it is chosen, never before.
 """
 
+import importlib
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -31,6 +32,7 @@ __all__ = [
     "OnnxruntimeNetwork",
     "Tensor",
     "check_engine",
+    "import_engine",
     "open_network",
 ]
 
@@ -100,11 +102,13 @@ class Network(Protocol):
         batch: The number of lanes that the graph is fixed to; None if it takes any.
         device: Where its tensors are to be: ``cpu`` or ``cuda``.
         in_place: Whether a cache may be input and output in one memory.
+        providers: Names of onnxruntime's execution providers in use; of other engines none.
     """
 
     batch: int | None
     device: str
     in_place: bool
+    providers: tuple[str, ...]
 
     def bind(
         self, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]
@@ -122,8 +126,9 @@ class OnnxruntimeNetwork:
         batch = session.get_inputs()[0].shape[0]
         self.batch = batch if isinstance(batch, int) else None
         self.device = device_of(session)
+        self.providers = tuple(session.get_providers())
         # How other providers than onnxruntime's own write rows is not known.
-        self.in_place = session.get_providers() == [PROVIDERS["cpu"]]
+        self.in_place = self.providers == (PROVIDERS["cpu"],)
 
     def bind(
         self, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]
@@ -152,6 +157,11 @@ def check_engine(name: str) -> str:
             f"pip install {engine.package} (or the extra tactile-rt[{engine.extra}])"
         )
     return name
+
+
+def import_engine(name: str) -> None:
+    """Import the package of an engine, which may take a second."""
+    importlib.import_module(ENGINES[name].package)
 
 
 def open_network(
