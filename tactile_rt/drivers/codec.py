@@ -187,6 +187,9 @@ class Codec(abc.ABC, Generic[Packet]):
             device's side.
         complaint: Why what came last is no sample, for the user, where the codec can tell; else
             empty.
+        full_scale: The largest load that a sample can tell, (channel,), SI; None where a frame
+            proves by itself whose it is. `sniffing` takes samples near it for those of another
+            device.
     """
 
     wire: ClassVar[str]
@@ -197,6 +200,7 @@ class Codec(abc.ABC, Generic[Packet]):
     status_bits: ClassVar[dict[int, str]] = {}
     cannot_detect: ClassVar[str] = ""
     complaint = ""
+    full_scale: ClassVar[tuple[float, ...] | None] = None
     greeting: ClassVar[Any] = None
     commanded_hz: float | None = None
     measures = False
