@@ -224,6 +224,9 @@ def export(
             "several, all."
         ),
     ] = None,
+    license: Annotated[
+        str, typer.Option(help="Under which the file may be used, as Apache-2.0; to be stored.")
+    ] = "",
 ) -> None:
     """Export a trained network as a streaming ONNX step, with everything needed to run it."""
     from tactile_rt.models.checkpoint_files import describe_checkpoint
@@ -253,6 +256,7 @@ def export(
             precision,
             "window" if kind == "window" else "step",
             data or (),
+            license,
         )
     console.print(
         f"{model}: {model.stat().st_size / 1e6:.1f} MB, parity {card.figures['parity']:.1e}, "
