@@ -13,9 +13,6 @@ from tests.helpers.followed_page import Block, blocks, check_printed, follow
 from tests.helpers.source_tree import ROOT
 
 DOCS = ROOT / "docs"
-pytestmark = pytest.mark.skipif(
-    not DOCS.joinpath("start").exists(), reason="a source archive, no docs"
-)
 
 FOLLOWED = sorted([*DOCS.glob("how-to/add-a*.md"), *DOCS.glob("start/*.md")])
 # What a page needs beyond the onboard packages.
