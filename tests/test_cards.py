@@ -36,7 +36,8 @@ def test_the_citation_is_of_this_release() -> None:
 
 def test_every_address_of_the_project_is_the_same() -> None:
     owner = SOURCE.removeprefix("https://github.com/")
-    for file in (ROOT / "pyproject.toml", ROOT / "CITATION.cff"):
+    template = ROOT / ".github" / "ISSUE_TEMPLATE" / "config.yml"
+    for file in (ROOT / "pyproject.toml", ROOT / "CITATION.cff", template):
         text = file.read_text("utf-8")
         named = re.findall(r"(?:github|githubusercontent)\.com/(tactile[\w-]*/\w+)", text)
         assert set(named) == {owner}, file
