@@ -1,4 +1,4 @@
-"""Draw docs/pictures/active-touch.png: a head that whisks past a gear, from above and from the side.
+"""Draw docs/pictures/active-touch.png: a head whisks past a gear, from above and from the side.
 
 What the environment draws of itself at the step of an episode in which most whiskers touch.
 Run: python -m bench.pictures.active_touch [--out FILE]
