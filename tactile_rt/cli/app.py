@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+from tactile_rt.extras import lacking
 from tactile_rt.stream import ConfigError, TactileError
 from tactile_rt.version import VERSION
 
@@ -134,8 +135,4 @@ def check_output(file: Path | None) -> None:
 
 def needs(extra: str, error: ModuleNotFoundError) -> TactileError:
     """The error to raise when a command's import fails: which extra brings it."""
-    if (error.name or "").startswith("tactile_rt"):
-        raise error
-    return ConfigError(
-        f"this needs {error.name}, which is not installed: pip install 'tactile-rt[{extra}]'"
-    )
+    return lacking("this needs", extra, error)

@@ -5,14 +5,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from tactile_rt.classifier.model_card import decided
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.stepper import Stepper
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "plain_onnxruntime.py"
-pytestmark = pytest.mark.skipif(not EXAMPLE.exists(), reason="a source archive, without docs")
 
 # Anything else is as if it were not installed.
 ALONE = """
