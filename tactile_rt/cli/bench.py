@@ -23,7 +23,7 @@ AREAS = {
     "models": "train",
     "inference": "",
     "daemon": "train",
-    "align": "",
+    "align": "train,test",
     "perception": "sim,train",
 }
 
