@@ -2,8 +2,8 @@
 
 python -m bench.active [FOLDER] [--page FILE]
 
-FOLDER (data/active) keeps the policy that was learnt, and the figures. It takes some ten minutes
-on two cores that have nothing else to do.
+FOLDER (data/active) keeps what was felt, the policy that was learnt, and the figures; a run that
+was stopped goes on from there. It takes some ten minutes on two cores that have nothing else to do.
 """
 
 import argparse
@@ -43,16 +43,19 @@ def main() -> int:
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
     policies: dict[str, Policy] = {"passive": Passive(), "scripted": Scripted()}
-    known = {name: _felt(policy, 10_000 * i) for i, (name, policy) in enumerate(policies.items())}
+    known = {
+        name: _felt(policy, 10_000 * i, given.folder / name)
+        for i, (name, policy) in enumerate(policies.items())
+    }
     _say("passive sweeps and script are felt")
-    learnt, course = learn(joined(list(known.values())), TAUGHT, len(KINDS), 0, _say)
+    learnt, course = learn(joined(list(known.values())), TAUGHT, len(KINDS), 0, _say, given.folder)
     kept = {"weights": learnt.weights.tolist(), "course": course}
     (given.folder / "learnt.json").write_text(json.dumps(kept))
     policies["learnt"] = learnt
-    known["learnt"] = _felt(learnt, 20_000)
+    known["learnt"] = _felt(learnt, 20_000, given.folder / "learnt")
     right = {}
     for name, policy in policies.items():
-        right[name] = _measured(policy, known[name])
+        right[name] = _measured(policy, known[name], given.folder / f"{name}-unseen")
         _say(f"{name}: {np.round(right[name][0].mean(axis=1), 3)}")
     table = _table(right)
     (given.folder / "table.md").write_text(table)
@@ -68,15 +71,15 @@ def _say(what: str) -> None:
     print(what, flush=True)  # noqa: T201
 
 
-def _felt(policy: Policy, seed: int) -> Episodes:
+def _felt(policy: Policy, seed: int, kept: Path) -> Episodes:
     """What a policy feels of objects of which recognisers may learn."""
-    return joined(feel([(policy, TAUGHT, seed + i, "") for i in range(TRAINING)]))
+    return feel([(policy, TAUGHT, seed + i, "") for i in range(TRAINING)], kept)
 
 
-def _measured(policy: Policy, known: Episodes) -> tuple[Floats, Floats, Floats]:
+def _measured(policy: Policy, known: Episodes, kept: Path) -> tuple[Floats, Floats, Floats]:
     """(budget, object) share of unseen objects named rightly; (budget,) touches, and seconds."""
     names = [f"{kind}-{i}" for kind in KINDS for i in range(*UNSEEN)]
-    new = joined(feel([(policy, UNSEEN, 5_000_000 + s, n) for n in names for s in range(SWEEPS)]))
+    new = feel([(policy, UNSEEN, 5_000_000 + s, n) for n in names for s in range(SWEEPS)], kept)
     said = sum(np.exp(log_likelihoods(trained(known, len(KINDS), s), new)) for s in range(NETWORKS))
     right = (np.argmax(said, axis=2) == new.labels).reshape(len(BUDGETS), -1, SWEEPS).mean(axis=2)
     return right, *_taken(new)

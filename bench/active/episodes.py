@@ -3,9 +3,10 @@
 import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from multiprocessing import get_context
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,12 @@ from bench.active.policies import Policy
 
 __all__ = ["BUDGETS", "STEPS", "Episodes", "feel", "joined"]
 
+Task = tuple[
+    Policy, tuple[int, int], int, str
+]  # instances; seed; object's name, empty: a drawn one
+
 STEPS = 60  # 3 s
+BLOCK = 50  # episodes that are kept together
 BUDGETS = (4, 8, 16)  # touches
 FORCE_N, MOMENT_NM = 2e-5, 1e-7  # loads are given to networks in these, their size tamed by asinh
 
@@ -116,7 +122,7 @@ def _one(policy: Policy, instances: tuple[int, int], seed: int, name: str = "") 
     )
 
 
-def _work(task: tuple[Policy, tuple[int, int], int, str]) -> Episodes:
+def _work(task: Task) -> Episodes:
     return _one(*task)
 
 
@@ -125,6 +131,23 @@ def _pool() -> ProcessPoolExecutor:
     return ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn"))
 
 
-def feel(tasks: Sequence[tuple[Policy, tuple[int, int], int, str]]) -> list[Episodes]:
-    """One episode of each (policy, instances, seed, object's name; empty: a drawn one)."""
-    return list(_pool().map(_work, tasks, chunksize=max(1, min(16, len(tasks) // 8))))
+def feel(tasks: Sequence[Task], kept: Path) -> Episodes:
+    """One episode of each task, in order.
+
+    Args:
+        tasks: what is to be felt.
+        kept: what was felt is kept in files that begin so, and not simulated again.
+    """
+    parts = []
+    for at in range(0, len(tasks), BLOCK):
+        path = kept.with_name(f"{kept.name}-{at}.npz")
+        if path.exists():
+            with np.load(path) as there:
+                parts.append(Episodes(**there))
+            continue
+        block = joined(list(_pool().map(_work, tasks[at : at + BLOCK], chunksize=5)))
+        whole = path.with_suffix(".part.npz")
+        np.savez_compressed(whole, **asdict(block))
+        whole.replace(path)
+        parts.append(block)
+    return joined(parts)

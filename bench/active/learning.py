@@ -7,6 +7,7 @@ at each of the `BUDGETS`, that a recogniser gives which never felt that object.
 """
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +25,9 @@ SPREAD, LEAST_SPREAD = 0.4, 0.1
 
 
 def learn(
-    known: Episodes, instances: tuple[int, int], kinds: int, seed: int, say: Callable[[str], None]
-) -> tuple[Learnt, list[float]]:
+    known: Episodes, instances: tuple[int, int], kinds: int, seed: int, say: Callable[[str], None],
+    kept: Path,
+) -> tuple[Learnt, list[float]]:  # fmt: skip
     """Learn a policy.
 
     Args:
@@ -34,6 +36,7 @@ def learn(
         kinds: how many there are.
         seed: of all that is drawn.
         say: told how it goes.
+        kept: a folder that keeps what was felt.
 
     Returns:
         The policy, and the mean worth of the candidates of every round.
@@ -45,7 +48,7 @@ def learn(
         weights = mean + spread * rng.standard_normal((CANDIDATES, *WEIGHTS))
         seeds = rng.integers(1 << 31, size=EPISODES)
         tasks = [(Learnt(w), instances, int(s), "") for w in weights for s in seeds]
-        played = joined(feel(tasks))
+        played = feel(tasks, kept / f"round{turn + 1}")
         known = joined([known, played])
         worth = _worth(known, played, kinds, seed).reshape(CANDIDATES, EPISODES).mean(axis=1)
         best = weights[np.argsort(worth)[-BEST:]]

@@ -1,4 +1,4 @@
-"""`tactile-rt align board`: models by datasets by metrics."""
+"""`tactile-rt align board`: models by datasets by metrics; the datasets, and how they are got."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -44,6 +44,60 @@ def list_datasets(json: Json = None) -> None:
                 console.print(f"    {line}", highlight=False, markup=False)
         licensed = f"license {one.license}, " if one.license else ""
         console.print(f"    {licensed}{one.size}", highlight=False, markup=False)
+
+
+@align.command("fetch")
+def fetch_recordings(
+    name: Annotated[str, typer.Argument(help="Of a dataset, 000231; see `align datasets`.")],
+    folder: Annotated[
+        Path | None, typer.Argument(help="Where small NWB files are written to, a session each.")
+    ] = None,
+    session: Annotated[
+        list[str] | None, typer.Option(help="Only sessions whose name has this; * and ? fit any.")
+    ] = None,
+    listed: Annotated[
+        bool, typer.Option("--list", help="List sizes in bytes, SHA-256 and names; fetch nothing.")
+    ] = False,
+) -> None:
+    """Get what is needed of published recordings, some MB of hundreds of GB, from their archive."""
+    from tactile_rt.models.alignment.datasets import find_dataset
+    from tactile_rt.models.alignment.datasets.fetching import counted, fetch, published_files
+    from tactile_rt.models.alignment.selection import Selection
+
+    dataset = find_dataset(name)
+    if not dataset.listing:
+        raise ConfigError(f"{name} cannot be fetched: download it, see `align datasets`")
+    every = published_files(dataset.listing)
+    wanted = Selection(sessions=tuple(session or ()))
+    files = [file for file in every if wanted.takes(file.name)]
+    if not files:
+        raise ConfigError(f"no session of {len(every)} is of {wanted}: --list names them")
+    console = Console(stderr=True)
+    if listed:
+        for file in files:
+            typer.echo(f"{file.size:11} {file.sha256} {file.path}")
+        return
+    if folder is None:
+        raise ConfigError("name a folder to write to, or give --list")
+    try:
+        with progress_bar(console, "fetching", total=1.0) as update:
+            done = fetch(files, folder, _shown(update))
+        mice, units, notes = counted([folder / file.name for file in files])
+    except ModuleNotFoundError as error:
+        raise needs("align", error) from None
+    for note in notes:
+        console.print(note, highlight=False, markup=False)
+    size = sum(file.size for file in files)
+    console.print(
+        f"{folder}: {done.files} sessions ({done.new} new), {mice} mice, {units} units with valid "
+        f"trials; {done.transferred / 1e6:.0f} MB of {size / 1e9:.0f} GB were read",
+        highlight=False, soft_wrap=True,
+    )  # fmt: skip
+    if len(files) == len(every) and dataset.counts not in (None, (mice, units)):
+        console.print(
+            "WARNING: the published analysis is of {} mice and {} units".format(*dataset.counts),
+            style="bold red", highlight=False,
+        )  # fmt: skip
 
 
 @align.command("board")

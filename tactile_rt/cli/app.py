@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+from tactile_rt.extras import lacking
 from tactile_rt.stream import ConfigError, TactileError
 from tactile_rt.version import VERSION
 
@@ -100,8 +101,11 @@ def starting() -> Iterator[None]:
 
 @contextmanager
 def leaving(seconds: float | None) -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM, a closed output pipe or the clock end the block, and go on after it."""
-    alike = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+    """Let Ctrl-C, SIGTERM, a closed terminal or output pipe, or the clock end the block, and go on
+    after it."""
+    alike = [signal.SIGINT, signal.SIGTERM, signal.SIGALRM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup has it
+        alike.append(signal.SIGHUP)
     before = [signal.signal(s, signal.default_int_handler) for s in alike]
     # A timer, not a look at the stream's clock: a silent device must not keep us waiting.
     signal.setitimer(signal.ITIMER_REAL, seconds or 0)
@@ -122,7 +126,7 @@ def check_output(file: Path | None) -> None:
     """Refuse a file that cannot be written, now rather than after minutes of work.
 
     Raises:
-        ConfigError: it is a folder, or the folder that it goes into is not there or not writable.
+        ConfigError: it is a folder, or the folder that it goes into is not there or not one's own.
     """
     if file is None:
         return
@@ -130,14 +134,10 @@ def check_output(file: Path | None) -> None:
         raise ConfigError(f"no folder {file.parent} to write {file.name} in")
     if file.is_dir():
         raise ConfigError(f"{file} is a folder: name a file to write")
-    if not os.access(file.parent, os.W_OK):
-        raise ConfigError(f"{file.parent} cannot be written in: name a file elsewhere")
+    if not os.access(file.parent, os.W_OK | os.X_OK):
+        raise ConfigError(f"{file} cannot be written: {file.parent} may not be written into")
 
 
 def needs(extra: str, error: ModuleNotFoundError) -> TactileError:
     """The error to raise when a command's import fails: which extra brings it."""
-    if (error.name or "").startswith("tactile_rt"):
-        raise error
-    return ConfigError(
-        f"this needs {error.name}, which is not installed: pip install 'tactile-rt[{extra}]'"
-    )
+    return lacking("this needs", extra, error)

@@ -24,7 +24,7 @@ AREAS = {
     "models": "train",
     "inference": "",
     "daemon": "train",
-    "align": "",
+    "align": "train,test",
     "perception": "sim,train",
 }
 

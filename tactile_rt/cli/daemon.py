@@ -100,6 +100,7 @@ def ros2_messages(
     """Write tactile_rt_msgs, the ROS 2 package of what recordings and the publisher ros2 say."""
     import shutil
 
+    from tactile_rt.files import whole_folder
     from tactile_rt.ros2.definitions import PACKAGE
 
     made = folder / PACKAGE.name
@@ -107,7 +108,8 @@ def ros2_messages(
         raise ConfigError(f"no folder {folder}")
     if made.exists():
         raise ConfigError(f"{made} is there already")
-    shutil.copytree(PACKAGE, made)
+    with whole_folder(made) as there:
+        shutil.copytree(PACKAGE, there, dirs_exist_ok=True)
     typer.echo(f"{made} is written; build it with: colcon build --packages-select {PACKAGE.name}")
 
 
@@ -119,8 +121,14 @@ def _give(text: str, output: Path | None, then: str) -> None:
         return
     if output.exists():
         raise ConfigError(f"{output} is there already: name another file")
-    output.write_text(text)
+    _write(output, text)
     typer.echo(f"{output} is written; {then}")
+
+
+def _write(path: Path, text: str) -> None:
+    from tactile_rt.files import write_whole
+
+    write_whole(path, lambda file: file.write(text.encode()))
 
 
 @app.command("install-service")
@@ -153,9 +161,9 @@ def install_service(
     again = [*program, "install-service", path, "--user", user]
     script = install_script(UNIT, again, loaded.config, user)
     out.mkdir(parents=True, exist_ok=True)
-    (out / UNIT).write_text(unit)
-    (out / "99-tactile.rules").write_text(udev_rules(serial_ports()))
-    (out / "install.sh").write_text(script)
+    _write(out / UNIT, unit)
+    _write(out / "99-tactile.rules", udev_rules(serial_ports()))
+    _write(out / "install.sh", script)
     typer.echo(f"{out}: {UNIT}, 99-tactile.rules, install.sh are written")
     for name in (program[0], path):
         if name.startswith(HOMES):

@@ -20,6 +20,7 @@ from rich.text import Text
 from tactile_rt.cli.app import Model, Pace, Seconds, app, check_output, leaving, needs, starting
 from tactile_rt.cli.demonstration import Demonstration, SweepOutcome
 from tactile_rt.cli.tables import STDOUT, Json, told_as_json
+from tactile_rt.extras import install_extra
 from tactile_rt.stream import ConfigError
 
 __all__ = ["WIDTH", "draw", "watch"]
@@ -73,7 +74,7 @@ def demo(
     console = Console(stderr=json == STDOUT)
     recorded |= not (find_spec("mujoco") and find_spec("trimesh"))
     if recorded and (fast or seed):
-        raise ConfigError("--fast and --seed are for a simulation: install tactile-rt[sim]")
+        raise ConfigError(f"--fast and --seed are for a simulation: {install_extra('sim')}")
     try:
         with starting(), console.status("building the array and the objects"):
             demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)

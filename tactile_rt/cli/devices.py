@@ -75,8 +75,6 @@ def codecs(
     json: Json = None,
 ) -> None:
     """Show what devices can speak: a line a codec; of one, its options and what it cannot show."""
-    import inspect
-
     from tactile_rt.drivers.codec import CODECS, codec_class
     from tactile_rt.stream import ConfigError
 
@@ -105,7 +103,7 @@ def codecs(
             {
                 "codec": name,
                 "wire": wire,
-                "device": (inspect.getdoc(kind) or "").partition("\n")[0].replace("``", ""),
+                "device": _about(kind),
                 "options": list(kind.Options.__dataclass_fields__),
                 "cannot_detect": kind.cannot_detect,
             }
@@ -116,6 +114,11 @@ def codecs(
             options = ", ".join(one.get("options", ())) or "none"
             typer.echo(f"\noptions over {one['wire']}: {options}")
             typer.echo(f"cannot detect: {one.get('cannot_detect', 'unknown')}")
+
+
+def _about(kind: type) -> str:
+    """The first line of a class's own docstring; under ``python -OO`` it has none."""
+    return (kind.__doc__ or "").strip().partition("\n")[0].replace("``", "")
 
 
 @app.command()

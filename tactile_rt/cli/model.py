@@ -66,6 +66,7 @@ def show(file: File, json: Json = None) -> None:
         "candidates": "\n".join(map(_candidates, card.candidates)),
         "loads": ", ".join(card.loads),
         "figures": _pairs(card.figures),
+        "licence": card.license,
         "probe": "stored" if card.probe else "none stored",
         "hashes": _pairs(card.hashes),
         "made by": _pairs({k: v for k, v in card.provenance.items() if isinstance(v, str)}),

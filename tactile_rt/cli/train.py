@@ -206,6 +206,9 @@ def export(
             "several, all."
         ),
     ] = None,
+    license: Annotated[
+        str, typer.Option(help="Under which the file may be used, as Apache-2.0; to be stored.")
+    ] = "",
     json: Json = None,
 ) -> None:
     """Export a trained network as a streaming ONNX step, with everything needed to run it."""
@@ -236,6 +239,7 @@ def export(
             precision,
             "window" if kind == "window" else "step",
             data or (),
+            license,
         )
     megabytes = model.stat().st_size / 1e6
     told_as_json(

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt import extensions
+from tactile_rt.extras import lacking
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
 __all__ = [
@@ -187,6 +188,9 @@ class Codec(abc.ABC, Generic[Packet]):
             device's side.
         complaint: Why what came last is no sample, for the user, where the codec can tell; else
             empty.
+        full_scale: The largest load that a sample can tell, (channel,), SI; None where a frame
+            proves by itself whose it is. `sniffing` takes samples near it for those of another
+            device.
     """
 
     wire: ClassVar[str]
@@ -197,6 +201,7 @@ class Codec(abc.ABC, Generic[Packet]):
     status_bits: ClassVar[dict[int, str]] = {}
     cannot_detect: ClassVar[str] = ""
     complaint = ""
+    full_scale: ClassVar[tuple[float, ...] | None] = None
     greeting: ClassVar[Any] = None
     commanded_hz: float | None = None
     measures = False
@@ -347,11 +352,8 @@ def codec_class(wire: str, name: str) -> type[Codec[Any]]:
                 return described
             found: type[Codec[Any]] = getattr(there, attribute)
         except ModuleNotFoundError as error:
-            if (error.name or "").startswith("tactile_rt"):
-                raise
-            raise ConfigError(
-                f"codec {name} needs {error.name}, which is not installed: pip install {error.name}"
-            ) from None
+            # Of ours only those of DBC files need an extra.
+            raise lacking(f"codec {name} needs", "dbc", error) from None
         return found
     theirs: type[Codec[Any]] | None = extensions.added(extensions.CODECS, f"{wire}.{name}")
     if theirs is not None:

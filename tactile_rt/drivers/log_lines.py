@@ -1,21 +1,30 @@
-"""One line of a log of text: what `tactile-rt dump`, candump and dumps in hexadecimal print."""
+"""One line of a log of text: what `tactile-rt dump`, candump, SavvyCAN, slcan adapters and dumps in
+hexadecimal print."""
 
 import re
 from typing import Any, Final
 
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.ascii_text import in_seconds
+from tactile_rt.drivers.slcan import SlcanDecoder
 from tactile_rt.stream import NS_PER_S
 
-__all__ = ["of_candump", "of_dump", "of_dump_can", "of_hex"]
+__all__ = ["of_candump", "of_dump", "of_dump_can", "of_gvret", "of_hex", "of_slcan"]
 
 _CANDUMP: Final = re.compile(
     r"\s*(?:\((?P<t>[^)]*)\)\s*)?(?P<bus>[A-Za-z]\w*)\s+(?:[TR]X\s+\S+\s+\S+\s+)?"
     r"(?:(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
     r"(?:#(?P<fd>#[0-9A-Fa-f])?(?P<rtr>[Rr]\d?)?(?P<hex>(?:[0-9A-Fa-f]{2}\.?)*)(?:\s+[TR])?"
-    r"|\s+\[(?P<n>\d+)\](?P<spaced>(?:\s+[0-9A-Fa-f]{2})*|\s+remote request)(?:\s+'.*')?)"
+    r"|\s+\[(?P<n>\d+)\](?:(?P<spaced>(?:\s+[0-9A-Fa-f]{2})*|\s+remote request)"
+    r"|\s+(?P<swapped>[0-9A-Fa-f]{2}(?:`[0-9A-Fa-f]{2})*)|(?P<bits>(?:\s+[01]{8})+))(?:\s+'.*')?)"
     r"|(?P<error>[0-9A-Fa-f]{8}\s+\[\d+\].*ERRORFRAME.*))\s*"
 )
+_COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
+_GVRET: Final = re.compile(  # what SavvyCAN saves
+    r"(?P<us>\d+),(?P<id>[0-9A-Fa-f]{3,8}),(?P<extended>true|false),(?:[RT]x,)?(?P<bus>\d+),"
+    r"(?P<n>\d+)(?P<hex>(?:,[0-9A-Fa-f]{2})*),*\s*"
+)
+_SLCAN: Final = re.compile(r"(?:[tr][0-7][0-9A-Fa-f]{2}|[TR][01][0-9A-Fa-f]{7}|[dDbB])[0-9A-Fa-f]+")
 _DUMP: Final = re.compile(
     r" *(?P<t>\d+\.\d{3}) ms  (?P<hex>[0-9a-f]{2}(?: [0-9a-f]{2}){0,15}) *  .*"
 )
@@ -38,7 +47,7 @@ Found = tuple[str, Any, int | None] | None  # bus, packet (None: an error frame)
 
 def of_candump(line: str) -> Found:
     """A line of candump, of any of its forms."""
-    found = _CANDUMP.fullmatch(line)
+    found = _CANDUMP.fullmatch(_COLOUR.sub("", line) if "\x1b" in line else line)
     if found is None:
         return None
     if found["error"]:
@@ -52,10 +61,39 @@ def of_candump(line: str) -> Found:
     remote = found["rtr"] is not None or (found["spaced"] or "").strip() == "remote request"
     text = "" if remote else found["hex"] or found["spaced"] or ""
     data = bytes.fromhex(text.replace(".", ""))
+    if found["swapped"]:
+        data = bytes.fromhex(found["swapped"].replace("`", ""))[::-1]
+    elif found["bits"]:
+        data = bytes(int(b, 2) for b in found["bits"].split())
     if len(data) > 64 or (found["n"] and not remote and int(found["n"]) != len(data)):
         return None
     fd = fd or len(data) > 8
     return found["bus"], [CanFrame(number & _EXTENDED, data, extended, fd, remote)], t_ns
+
+
+def of_gvret(line: str) -> Found:
+    """A line of what SavvyCAN saves (GVRET)."""
+    found = _GVRET.fullmatch(line)
+    if found is None:
+        return None
+    data, number = bytes.fromhex(found["hex"].replace(",", "")), int(found["id"], 16)
+    extended = found["extended"] == "true"
+    if (
+        len(data) != int(found["n"])
+        or len(data) > 64
+        or number > (_EXTENDED if extended else 0x7FF)
+    ):
+        return None
+    frame = CanFrame(number, data, extended, len(data) > 8)
+    return found["bus"], [frame], _time(found["us"], NS_PER_S // 1_000_000)
+
+
+def of_slcan(line: str) -> Found:
+    """A line of what an slcan adapter sends."""
+    if _SLCAN.fullmatch(line) is None:
+        return None
+    frames = SlcanDecoder().feed(line.encode("ascii") + b"\r")
+    return ("", frames, None) if frames else None
 
 
 def of_dump(line: str) -> Found:

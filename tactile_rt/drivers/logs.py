@@ -1,6 +1,6 @@
 """What somebody kept of a line: bytes, hexadecimal text, or a log of a CAN bus, as packets again.
 
-    log = read_log(Path("can.log"))       # candump, asc, blf, trc; bytes, `tactile-rt dump`, hex
+    log = read_log(Path("can.log"))       # candump, asc, blf, ...; bytes, `tactile-rt dump`, hex
     for packet, t_ns in log.packets(): ...  # t_ns is None where the log has no times
 
 Which form a file has is told by how it begins, whatever its name; gzip is unpacked. Logs end
@@ -12,24 +12,35 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from io import BufferedReader, RawIOBase, TextIOWrapper
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, Final, cast
 
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.drivers.log_lines import of_candump, of_dump, of_dump_can, of_hex
+from tactile_rt.drivers.log_lines import (
+    of_candump,
+    of_dump,
+    of_dump_can,
+    of_gvret,
+    of_hex,
+    of_slcan,
+)
 from tactile_rt.files import open_regular
 from tactile_rt.stream import NS_PER_S, ConfigError
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 
 SERIAL_FORMS: Final = ("raw", "dump", "hex")
-CAN_FORMS: Final = ("candump", "dump-can", "asc", "blf", "trc")
+CAN_FORMS: Final = ("candump", "dump-can", "slcan", "gvret", "asc", "blf", "trc", "csv")
 FORMS: Final = (*SERIAL_FORMS, *CAN_FORMS)
 PIECE: Final = 256
 HEAD: Final = 16_384  # bytes that tell the form
 MOSTLY: Final = 0.8  # of the lines at the beginning are of the form
 BLF: Final = b"LOGG"
 GZIP: Final = b"\x1f\x8b"
+OF_PYTHON_CAN: Final = "timestamp,arbitration_id,extended,remote,error,dlc,data"
+OF_SAVVYCAN: Final = "time stamp,id,extended,"
+FALLING: Final = 0.2  # of the times of candump -td are less than the one before
 
 Timed = tuple[Any, int | None]  # a packet, and when it came, ns
 
@@ -79,9 +90,9 @@ class LineLog:
 
     def _read(self, file: "LogFile") -> Iterator[Timed]:
         read: Callable[[LogFile], Iterator[Timed]] = {
-            "raw": self._raw, "dump": self._text, "hex": self._text, "candump": self._text,
-            "dump-can": self._text, "asc": self._logged, "blf": self._logged, "trc": self._logged,
-        }[self.form]  # fmt: skip
+            "raw": self._raw, "asc": self._logged, "blf": self._logged, "trc": self._logged,
+            "csv": self._logged,
+        }.get(self.form, self._text)  # fmt: skip
         yield from read(file)
         if getattr(file.raw, "broken", False):
             self.notes.append("it is cut short or damaged: what unpacks of it was read")
@@ -95,8 +106,10 @@ class LineLog:
     def _text(self, file: LogFile) -> Iterator[Timed]:
         parse = {
             "candump": of_candump, "dump-can": of_dump_can, "dump": of_dump, "hex": of_hex,
+            "gvret": of_gvret, "slcan": of_slcan,
         }[self.form]  # fmt: skip
-        others, errors, buses = 0, 0, Counter[str]()
+        others, errors, buses = -(self.form == "gvret"), 0, Counter[str]()  # its first line: names
+        apart, now = self.form == "candump" and _times_are_apart(self.path), 0
         with TextIOWrapper(file, "utf-8", "replace") as lines:
             for line in lines:
                 found = parse(line.rstrip("\r\n"))
@@ -107,6 +120,8 @@ class LineLog:
                 if packet is None:
                     errors += 1
                     continue
+                if apart:
+                    t_ns = now = now + (t_ns or 0)
                 buses[bus] += 1
                 if not self._bus or bus == self._bus:
                     yield packet, t_ns
@@ -115,7 +130,7 @@ class LineLog:
     # what python-can reads
 
     def _logged(self, file: LogFile) -> Iterator[Timed]:
-        from can.io import ASCReader, BLFReader, TRCReader
+        from can.io import ASCReader, BLFReader, CSVReader, TRCReader
 
         logging.getLogger("can").addHandler(logging.NullHandler())  # it tells us, not the terminal
         made: Any
@@ -126,8 +141,10 @@ class LineLog:
                 made = BLFReader(file)
             elif self.form == "asc":
                 made = ASCReader(cast(Any, lines), relative_timestamp=False)
-            else:
+            elif self.form == "trc":
                 made = TRCReader(cast(Any, lines))
+            else:
+                made = CSVReader(cast(Any, lines))
             for message in made:
                 n += 1
                 bus = "" if message.channel is None else str(message.channel)
@@ -256,24 +273,47 @@ class _Lines:
         self._file.close()
 
 
-def _form(path: Path) -> str:
+def _head(path: Path) -> bytes:
     with open_log_file(path) as file:
-        head = file.read(HEAD)
+        return file.read(HEAD)
+
+
+def _lines(head: bytes) -> list[str]:
+    lines = [x for x in head.decode("utf-8", "replace").splitlines() if x.strip()]
+    return lines[:-1] if len(head) == HEAD else lines  # the last one was cut
+
+
+def _times_are_apart(path: Path) -> bool:
+    """Whether the times of candump are differences (-td): from 0 on, up and down."""
+    found = [of_candump(line) for line in _lines(_head(path))]
+    times = [one[2] for one in found if one is not None and one[2] is not None]
+    if len(times) < 3 or times[0]:
+        return False
+    falling = sum(b < a for a, b in pairwise(times[1:]))
+    return falling > FALLING * len(times) or (times[1] > 0 and len(set(times[1:])) == 1)
+
+
+def _form(path: Path) -> str:
+    head = _head(path)
     if head.startswith(BLF):
         return "blf"
     if b"\0" in head:
         return "raw"
-    lines = [x for x in head.decode("utf-8", "replace").splitlines() if x.strip()]
-    if len(head) == HEAD:
-        del lines[-1:]  # it was cut
+    lines = _lines(head)
     if not lines:
         return "raw"
     if lines[0].startswith(";$FILEVERSION"):
         return "trc"
+    if lines[0].startswith(OF_PYTHON_CAN):
+        return "csv"
+    if lines[0].lower().startswith(OF_SAVVYCAN):
+        return "gvret"
     begins = [x.strip().lower() for x in lines[:6]]
     if any(x.startswith("date ") for x in begins) and any(x.startswith("base ") for x in begins):
         return "asc"
-    for form, parse in (("dump", of_dump), ("dump-can", of_dump_can), ("candump", of_candump)):
+    for form, parse in (
+        ("dump", of_dump), ("dump-can", of_dump_can), ("candump", of_candump), ("slcan", of_slcan),
+    ):  # fmt: skip
         if sum(parse(x) is not None for x in lines) >= MOSTLY * len(lines):
             return form
     # A table of numbers of two digits is hexadecimal, too: only letters tell that it is bytes.

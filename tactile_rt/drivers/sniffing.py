@@ -6,7 +6,9 @@ of a device with a protocol that is checked or hardly so; and none where nothing
 The plan. Every codec is fed with all of it, also with the options that change what its device sends
 (`Codec.variants`). A codec fits if it found frames, made samples of them, and left little beside.
 If several do, the one whose frames prove more is right: the same bytes are fed once more with a bit
-in every so many turned over, and whoever does not notice had no reason to believe them before.
+in every so many turned over, and whoever does not notice had no reason to believe them before. On a
+bus two identifiers in a row prove little; there it counts that a sensor hardly ever measures the
+most that it can.
 """
 
 from collections import Counter
@@ -15,8 +17,9 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tactile_rt.drivers.codec import CODECS, CanFrame, Codec, codec_class
+from tactile_rt.drivers.codec import CODECS, CanFrame, Codec, Samples, codec_class
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.stream import ConfigError
 
@@ -40,6 +43,7 @@ EXPLAINED_UNPROVED: Final = 0.95  # by frames in which no damage is noticed
 PROVED: Final = 0.1
 OF_THE_BUS: Final = 0.02  # of its frames: other devices may be on it
 COMPLETE: Final = 0.5  # of the samples
+BORNE: Final = 0.9  # of the full scale: a load is less, but for a blow
 DAMAGE_EVERY: Final = 24  # bytes
 NEEDS_A_FILE: Final = ("mapping", "columns")  # options without which there is no such codec
 LENGTHS: Final = range(4, 1025)  # bytes of a frame that nobody has described
@@ -82,17 +86,23 @@ class CodecFit:
         return {"codec": self.codec, **self.options}
 
 
-def sniff_bytes(data: bytes, further: Iterable[Tried] = ()) -> list[CodecFit]:
+def sniff_bytes(data: bytes, further: Sequence[Tried] = ()) -> list[CodecFit]:
     """The codecs that fit what came over a serial line, the best first; none where none does.
 
     Args:
-        data: bytes as they came, cut anywhere; the first 64 kB are looked at.
+        data: bytes as they came, cut anywhere; the first 64 kB are looked at, and where nothing
+            fits them, the second half of these.
         further: codecs with options to try besides those that need none.
 
     Raises:
         ConfigError: one of `further` cannot be.
     """
     data = data[:LOOK_BYTES]
+    # what comes first may be a device that starts, or the line before it was plugged in
+    return _fitting(data, further) or _fitting(data[len(data) // 2 :], further)
+
+
+def _fitting(data: bytes, further: Sequence[Tried]) -> list[CodecFit]:
     if any(data == (data[:p] * (len(data) // p + 1))[: len(data)] for p in (1, 2, 3, 4)):
         return []  # nothing is said in it
     pieces = [data[at : at + PIECE] for at in range(0, len(data), PIECE)]
@@ -188,11 +198,13 @@ def _fed(
 ) -> CodecFit:
     codec: Codec[Any] = make_codec(wire, name, dict(options))
     samples, valid = 0, 0.0
+    limit = None if codec.full_scale is None else BORNE * np.array(codec.full_scale)
     for packet in packets:
         found = codec.feed(packet, 0)
         if found is not None:
             samples += len(found)
-            valid += float(found.valid.mean()) * len(found)
+            good = found.valid if limit is None else _borne(found, limit)
+            valid += float(good.mean()) * len(found)
     stats = codec.stats
     whole = samples - stats.incomplete if stats.incomplete else samples
     described = codec.spec is not None
@@ -204,6 +216,12 @@ def _fed(
         max(0.0, 1.0 - stats.skipped / max(1, total)), described=described,
         likely=stats.intact >= LEAST and (samples >= LEAST - 1 or silent),
     )  # fmt: skip
+
+
+def _borne(found: Samples, limit: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(sample, element) the valid loads that are within the limit of each channel."""
+    within: NDArray[np.bool_] = (np.abs(found.values) <= limit).all(axis=2)
+    return found.valid & within
 
 
 def _damaged(data: bytes) -> bytes:

@@ -43,6 +43,7 @@ def release(
     precision: Precision = "fp32",
     kind: Kind = "step",
     data: Sequence[Path] = (),
+    licence: str = "",
 ) -> ModelCard:
     """Fit the temperature on the validation split, then export.
 
@@ -50,6 +51,7 @@ def release(
 
     Args:
         data: where the sweep sets that it was trained on lie now; default: where they lay.
+        licence: `ModelCard.license`.
 
     Raises:
         ModelError, RecordingError: the checkpoint or its sweep set cannot be read.
@@ -92,6 +94,7 @@ def release(
         precision=precision,
         kind=kind,
         data=folders,
+        licence=licence,
     )
     if precision == "fp32":
         return card

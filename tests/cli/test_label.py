@@ -73,7 +73,6 @@ def lines_of(call, *words):
     return out, err
 
 
-@pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
 def test_the_tutorial_does_what_it_says(here, call, monkeypatch):
     monkeypatch.chdir(here)
     said = {}

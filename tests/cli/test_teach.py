@@ -269,7 +269,6 @@ PAGE = ROOT / "docs" / "how-to" / "teaching.md"
 FIVE = ("press", "slide", "double", "push", "twist")
 
 
-@pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
 def test_the_tutorial_does_what_it_says(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = PAGE.read_text("utf-8")

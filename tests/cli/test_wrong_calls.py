@@ -128,4 +128,4 @@ def test_a_wrong_call_is_one_line_and_leaves_nothing(call, place, name):
 def test_a_place_that_takes_no_file_is_told_before_the_work(refused, place, monkeypatch):
     monkeypatch.setattr("os.access", lambda path, how: False)
     said = refused("eval", "missing", "missing", "--json", "folder/figures.json")
-    assert "folder cannot be written in" in said
+    assert "folder may not be written into" in said

@@ -13,7 +13,7 @@ from tactile_rt.stream import ConfigError
 
 T0 = 1_700_000_000.5
 N = 60
-WRITERS = {".log": "candump", ".asc": "asc", ".blf": "blf", ".trc": "trc"}
+WRITERS = {".log": "candump", ".asc": "asc", ".blf": "blf", ".trc": "trc", ".csv": "csv"}
 
 
 def messages():
@@ -103,6 +103,11 @@ LINES = [
     ("(0.1) can0 123#11.22.33 T", 0x123, "112233", 100_000_000),
     ("  slcan0  7FF   [2]  01 02   '..'", 0x7FF, "0102", None),
     ("       1.250 ms  710   [3] 01 02 03", 0x710, "010203", 1_250_000),
+    ("\x1b[32m  can0\x1b[0m  \x1b[1m201\x1b[0m   [2]  \x1b[34m0B 0F\x1b[0m", 0x201, "0b0f", None),
+    ("  can0  201   [3]  03`02`01", 0x201, "010203", None),
+    ("  can0  201   [2]  00001011 00001111", 0x201, "0b0f", None),
+    ("t20120B0F", 0x201, "0b0f", None),
+    ("T00ABCDEF10B1F2C", 0xABCDEF, "0b", None),
 ]
 
 
@@ -113,6 +118,32 @@ def test_a_line_of_a_can_log(tmp_path, line, number, data, t_ns):
     ((frame,), at), *_ = read_log(path).packets()
     assert (frame.id, frame.data.hex(), at) == (number, data, t_ns)
     assert frame.extended == (number > 0x7FF) and frame.fd == ("##" in line)
+
+
+def test_what_savvycan_saved_is_read(tmp_path):
+    path = tmp_path / "run.csv"
+    path.write_text(
+        "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n"
+        "166064000,0000021A,false,Rx,0,3,FE,36,12,\n"
+        "166065500,00ABCDEF,true,Rx,1,1,0C,\n"
+    )
+    log = read_log(path)
+    assert [(bytes(p[0].data), p[0].id, p[0].extended, t) for p, t in log.packets()] == [
+        (b"\xfe\x36\x12", 0x21A, False, 166_064_000_000),
+        (b"\x0c", 0xABCDEF, True, 166_065_500_000),
+    ]
+    assert log.notes == ["frames of several buses: 0 (1), 1 (1); --bus takes those of one"]
+
+
+@pytest.mark.parametrize(
+    ("apart", "times"),
+    [("0 .5 .25 .75 .125 .5", "0 .5 .75 1.5 1.625 2.125"), ("0 .5 .5 .5", "0 .5 1 1.5"),
+     ("0 .5 .75 1.5", "0 .5 .75 1.5"), ("7 .5 .25 .75", "7 7 7 7")],
+)  # fmt: skip
+def test_times_since_the_frame_before_are_added_up(tmp_path, apart, times):
+    path = tmp_path / "td.log"
+    path.write_text("".join(f" ({float(t):010.6f})  can0  123   [1]  AA\n" for t in apart.split()))
+    assert [t / 1e9 for _, t in read_log(path).packets()] == [float(t) for t in times.split()]
 
 
 HEX = [

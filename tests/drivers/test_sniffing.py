@@ -105,6 +105,26 @@ def test_a_device_among_others_on_a_bus_is_known():
     assert sniff_frames(mixed)[0].codec == "aft200"
 
 
+@pytest.mark.parametrize(
+    ("name", "share"), [("anyskin", 0.3), ("flexitac", 0.2), ("native", 0.3), ("bota", 0.3)]
+)
+def test_noise_before_it_leaves_it_known(name, share):
+    came = a_second("serial", name, {})
+    noise = random.Random(7).randbytes(int(share * len(came)))
+    assert sniff_bytes(noise + came[7:])[0].codec == name
+
+
+def test_a_car_has_no_sensor():
+    # two identifiers in a row that come as often as each other, as cars have them
+    draw = random.Random(5)
+    frames = []
+    for k in range(500):
+        frames.append(CanFrame(0x1CF, bytes([0x80, 5, 0, 0, 0, k % 256])))
+        frames += [CanFrame(draw.randrange(0x300, 0x600), draw.randbytes(8)) for _ in range(5)]
+        frames.append(CanFrame(0x1D0, bytes(7) + bytes([10])))
+    assert sniff_frames(frames) == []
+
+
 @pytest.mark.parametrize("size", [10, 3000, 30_000])
 def test_nothing_fits_random_bytes(size):
     data = random.Random(size).randbytes(size)

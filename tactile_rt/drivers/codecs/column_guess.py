@@ -246,9 +246,15 @@ def _place_time(
             if rising or (steps >= 0).mean() > MOSTLY:
                 return k, f"time:{_time_unit(names[k], v)}"
         elif rising and (steps > 0).mean() > 0.5 and not names and not (steps == 1).all():
-            if np.std(steps) <= np.mean(steps):  # a ramp of a measurement is as steady hardly ever
+            # a ramp of a measurement is as steady hardly ever, and from 1970 none counts
+            if np.std(steps) <= np.mean(steps) or _is_utc(v):
                 return k, f"time:{_time_unit('', v)}"
     return None
+
+
+def _is_utc(v: NDArray[np.float64]) -> bool:
+    """Whether these are times from 1970 on, of 2001 to 2065, in s, ms, us or ns."""
+    return any(1e9 * unit <= v[0] <= v[-1] <= 3e9 * unit for unit in (1, 1e3, 1e6, 1e9))
 
 
 def _time_unit(name: str, v: NDArray[np.float64]) -> str:

@@ -37,7 +37,7 @@ class ProposedColumns:
 def line_columns(data: bytes) -> tuple[str, int] | None:
     """The columns of lines that a board prints, in words, and how many lines are samples by them;
     None: there are none."""
-    guess = guess_line_columns(data)
+    guess = guess_line_columns(data) or guess_line_columns(data[len(data) // 2 :])
     if guess is None:
         return None
     columns = compress_columns(guess[0])

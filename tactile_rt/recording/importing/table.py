@@ -240,7 +240,7 @@ def _number(cell: Any) -> float:
 
 
 def _whole(cell: Any) -> int:
-    value = float(cell)
+    value = _number(cell)
     if not value.is_integer() or abs(value) >= 2.0**53:
         raise ValueError(f"{cell!r:.40} is no count")
     return int(value)

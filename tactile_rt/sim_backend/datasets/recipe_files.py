@@ -273,7 +273,10 @@ def _usual_lengths(period_ms: float) -> tuple[float, float]:
 
 def _absolute(path: str, folder: Path | None) -> str:
     """Whoever makes a part of the set may do so from another folder."""
-    return str(((folder or Path()) / Path(path).expanduser()).absolute())
+    try:
+        return str(((folder or Path()) / Path(path).expanduser()).absolute())
+    except RuntimeError:  # no such user, or one without a home
+        raise ConfigError(f"{path} is no path of a user here") from None
 
 
 def _choice(nodes: SettingNode, name: str, sweeps: _Sweeps, usual: Choice) -> Choice:
