@@ -77,7 +77,7 @@ def check_sdist(out: Path) -> None:
     tree = out / archive.name.removesuffix(".tar.gz")
     pytest = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"]
     here = {**os.environ, "PYTHONPATH": str(tree)}  # before a checkout that is installed
-    for more in (["--collect-only"], [*OF_THE_SDIST, "-k", "not built_offline"]):
+    for more in (["--collect-only"], [*OF_THE_SDIST, "-k", "not built_offline and not does_what"]):
         done = subprocess.run([*pytest, *more], cwd=tree, env=here, capture_output=True, text=True)
         assert done.returncode == 0, done.stdout[-2000:]
         sys.stdout.write(f"{archive.name}: {done.stdout.strip().splitlines()[-1].strip('= ')}\n")

@@ -22,6 +22,7 @@ from numpy.typing import DTypeLike, NDArray
 from tactile_rt.classifier import model_file
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.runtime import PROVIDERS, device_of
+from tactile_rt.extras import install_extra
 from tactile_rt.stream import ConfigError
 
 __all__ = [
@@ -154,7 +155,7 @@ def check_engine(name: str) -> str:
     if not engine.version:
         raise ConfigError(
             f"engine {name!r} needs the package {engine.package}, which is not installed: "
-            f"pip install {engine.package} (or the extra tactile-rt[{engine.extra}])"
+            + install_extra(engine.extra)
         )
     return name
 
