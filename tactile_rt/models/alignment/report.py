@@ -150,7 +150,8 @@ def _summary(results: Results) -> str:
             f"<tr><td>{escape(model.name)}</td><td><b>{_said(model.score)}</b> ± {_said(model.sem)}"
             f"</td><td>{_p(model.p)}</td><td>{_said(model.null_95)}</td>"
             f"<td>{_said(untrained.score) if untrained else ''}</td>"
-            f"<td>{model.parameters:,}</td><td>{_verdict(model)}</td></tr>"
+            f"<td>{f'{model.parameters:,}' if model.parameters else ''}</td>"
+            f"<td>{_verdict(model)}</td></tr>"
         )
     return (
         '<div class="scroll"><table><tr><th>model</th><th>score ± s.e.m.</th><th>p</th>'
@@ -166,7 +167,8 @@ def _summary(results: Results) -> str:
         "layer chosen anew each time. Where the raw input or the untrained network scores as high, "
         "it is not training that made it fit. The Turing test asks whether a model fits single "
         "animals as another animal would: it fails what is worse, and passes what is shown to be "
-        "near. <em>Power</em>: what it finds among these animals themselves.</p>"
+        "near. Its fits weigh dissimilarities by how they vary together: they are not the scores "
+        "above. <em>Power</em>: what it finds among these animals themselves.</p>"
         f"{_reasons(results)}"
     )
 
