@@ -28,7 +28,7 @@ DANDI_000231 = NeuralDataset(
     citation=(
         "Rodgers, Chris (2022). A detailed behavioral, videographic, and neural dataset on object "
         "recognition in mice (version 0.220904.1554). DANDI archive. "
-        "https://doi.org/10.48324/dandi.000231/0.220904.1554"
+        "https://dandiarchive.org/dandiset/000231/0.220904.1554"
     ),
     license="CC0-1.0",
     url="https://dandiarchive.org/dandiset/000231",
