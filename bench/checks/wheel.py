@@ -25,6 +25,7 @@ OF_THE_SDIST = ("tests/test_package.py", "tests/test_pages.py", "tests/test_word
 
 
 def main() -> None:
+    os.environ.pop("PYTHONPATH", None)  # a checkout's package is not the installed one
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         build = [sys.executable, "-m", "build", "--outdir", str(out / "dist"), str(ROOT)]

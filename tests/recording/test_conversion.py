@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
 from tactile_rt.calibration import Calibration
+from tactile_rt.extras import install_extra
 from tactile_rt.recording import Description, Recording, recover
 from tactile_rt.recording.conversion import convert, outputs_of
 from tactile_rt.recording.layout import encode_samples
@@ -305,7 +306,9 @@ def test_a_recording_without_samples_is_refused(form, tmp_path):
 def test_without_the_extra_it_says_what_to_install(path, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     for one, other in ((path, tmp_path / "x.h5"), (tmp_path / "x.h5", tmp_path / "y.npz")):
-        with pytest.raises(ConfigError, match=r"HDF5 needs h5py, .*'tactile-rt\[hdf5\]'"):
+        with pytest.raises(
+            ConfigError, match=f"HDF5 needs h5py, .*: {re.escape(install_extra('hdf5'))}"
+        ):
             convert(one, other)
     assert convert(path, tmp_path / "x.npz")
 

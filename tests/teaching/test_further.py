@@ -4,6 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
+pytest.importorskip("onnx")
+
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_card import EmbeddingStatistics
 from tactile_rt.classifier.model_file import load_model, shipped_model
