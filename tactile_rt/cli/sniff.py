@@ -221,13 +221,16 @@ def _sniff_file(path: Path, further: "list[Tried]") -> None:
     if fits:
         _show(fits)
         _import(path, fits[0])
-    elif log.form != "raw" or not _sniff_text(path, bytes(data)):
+    elif log.form not in ("raw", "terminal") or not _sniff_text(path, bytes(data), log.form):
         _nothing(f"nothing fits {path}", _hint(bytes(data)))
 
 
 def _form(form: str) -> str:
-    return {"raw": "bytes as they are", "hex": "bytes in hexadecimal", "dump": "a dump of a line"
-            }.get(form, f"a CAN log ({form})")  # fmt: skip
+    told = {
+        "raw": "bytes as they are", "hex": "bytes in hexadecimal", "dump": "a dump of a line",
+        "terminal": "lines of text and when each came",
+    }  # fmt: skip
+    return told.get(form, f"a CAN log ({form})")
 
 
 def _import(path: Path, fit: "CodecFit") -> None:
@@ -242,11 +245,11 @@ def _import(path: Path, fit: "CodecFit") -> None:
     typer.echo(f"tactile-rt import {shlex.quote(str(path))} --as {told}")
 
 
-def _sniff_text(path: Path, data: bytes) -> bool:
+def _sniff_text(path: Path, data: bytes, form: str) -> bool:
     """Propose the columns of a table, or of what a board prints; whether there are any."""
-    from tactile_rt.recording.importing.proposing import propose_columns
+    from tactile_rt.recording.importing.proposing import propose_columns, propose_line_columns
 
-    proposed = propose_columns(path, data)
+    proposed = propose_columns(path, data) if form == "raw" else propose_line_columns(data)
     if proposed is None:
         return False
     typer.echo(f"{proposed.said}: names and units are for you to say")
@@ -268,7 +271,7 @@ def _sniff_bag(path: Path) -> None:
     from rich.table import Table
 
     from tactile_rt.recording import Recording
-    from tactile_rt.recording.importing.bag import bag_topics
+    from tactile_rt.recording.importing.bag import bag_topics, proposed_columns
     from tactile_rt.ros2 import messages
 
     try:
@@ -286,7 +289,16 @@ def _sniff_bag(path: Path) -> None:
     Console(soft_wrap=True).print(table)
     known = [t for t in topics if t.columns or t.type == messages.SAMPLES]
     if not known:
-        _nothing(f"{path}: of no topic is known what is what", "`import` takes it with --columns")
+        told = [(columns, t.name) for t in topics if (columns := proposed_columns(path, t))]
+        if not told:
+            _nothing(f"{path}: no message holds a number")
+        columns, name = max(told, key=lambda one: len(one[0]))
+        typer.echo(f"of no topic is known what is what; {name}: names and units are for you to say")
+        typer.echo(
+            f"tactile-rt import {shlex.quote(str(path))} --topic {shlex.quote(name)} --columns "
+            f"{shlex.quote(columns)}"
+        )
+        return
     best = max(known, key=lambda t: t.messages)
     only = "" if len(known) == 1 else f" --topic {shlex.quote(best.name)}"
     typer.echo(f"tactile-rt import {shlex.quote(str(path))}{only}")

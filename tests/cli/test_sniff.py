@@ -58,6 +58,28 @@ FILES = {
         lambda: b"".join(b"%d %d %d.5\r\n" % (10 * k, k * k % 7, k % 5) for k in range(40)),
         "--columns time:ms,T{0..1}.value",
     ),
+    "names in a plotter's lines": (
+        lambda: b"".join(b"Fx:%d,Fy:%d\n" % (k * k % 7, k % 5) for k in range(40)),
+        "--as codec=ascii_line&columns=Fx%3DS.fx:N,Fy%3DS.fy:N",
+    ),
+    "lines and when a terminal had them": (
+        lambda: b"".join(
+            b"12:00:%02d.%03d -> X: %d Y: %d\n" % (k // 50, k % 50 * 20, k * k % 7, k % 5)
+            for k in range(90)
+        ),
+        "--as codec=ascii_line&columns=X%3DS.x:1,Y%3DS.y:1",
+    ),
+    "units below": (
+        lambda: b"Zeit,Fx\n[s],[mN]\n" + b"".join(b"%d,%d\n" % (k, k * k % 7) for k in range(40)),
+        "--columns Zeit=time:s,Fx=S.fx:mN",
+    ),
+    "seconds and the rest": (
+        lambda: b"".join(
+            b"%d,%d,ft,%d\n" % (1_700_000_000 + k // 4, k % 4 * 250_000_000, k * k % 7)
+            for k in range(40)
+        ),
+        "--columns time:s,time:ns,-,T0.value",
+    ),
     "names": (
         lambda: b"".join(b"Fx: %d N\r\nFy: %d N\r\n" % (k * k % 7, k % 5) for k in range(40)),
         "--as codec=ascii_line&columns=Fy%3DS.fy:N,Fx%3DS.fx:N",
