@@ -107,15 +107,13 @@ def _sniff_port(
     if not found and ask:
         typer.echo("asking for samples as each codec does", err=True)
 
-        def connect(codec: Any) -> SerialLink:
-            return SerialLink(port, codec.baud, codec.parity, dtr)
+        for speed in bauds or [0]:  # 0: each codec's own
 
-        for fit in (
-            fit
-            for _, data in ask_devices("serial", connect, seconds)
-            for fit in sniff_bytes(data, further)
-        ):
-            found.append((fit, _usual_baud(fit)))
+            def connect(codec: Any, speed: int = speed) -> SerialLink:
+                return SerialLink(port, speed or codec.baud, codec.parity, dtr)
+
+            for _, data in ask_devices("serial", connect, seconds):
+                found += [(fit, speed or _usual_baud(fit)) for fit in sniff_bytes(data, further)]
     found.sort(
         key=lambda one: (
             one[0].explained * (1 + one[0].proof), one[1] == _usual_baud(one[0]), one[0].intact

@@ -167,6 +167,17 @@ def test_a_device_that_must_be_asked_is_asked_only_if_it_is_allowed(call, monkey
     assert code == 0 and next_command(said) == ["run", "--source", f"{url}?codec=xela"]
 
 
+def test_it_is_asked_at_the_speed_that_is_named(call, monkeypatch):
+    monkeypatch.setattr(listening, "FIRST_S", 0.2)
+    monkeypatch.setattr(device_source, "ATTEMPTS", 1)
+    with open_source("synthetic:5x6") as signal, EmulatedSerial(
+        signal, "ft300", options={"baud": "57600"}, log=False
+    ) as device:  # fmt: skip
+        code, said, _ = call("sniff", device.port, "--baud", "57600", "--ask", "--seconds", "0.2")
+    url = f"serial://{device.port}?codec=ft300&baud=57600"
+    assert code == 0 and next_command(said) == ["run", "--source", url]
+
+
 def test_what_is_nothing_at_all_is_one_line(refused, here):
     assert "is no port, bus or file" in refused("sniff", "nix")
     assert "is a folder" in refused("sniff", ".")
