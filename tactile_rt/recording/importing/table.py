@@ -134,7 +134,7 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     if rate_hz:
         mapping = msgspec.structs.replace(mapping, rate_hz=rate_hz)
     parts = _parts_of_seconds(parsed)
-    spec = array_of(mapping, [c for k, c in enumerate(parsed) if k not in parts], where)
+    spec = array_of(mapping, tuple(c for k, c in enumerate(parsed) if k not in parts), where)
     if not rate_hz and table.times_ns is None and not any(c.kind in NS for c in parsed):
         raise ConfigError(f"{table.path}: no column is a time: give --rate, in Hz")
     read = _read(table, parsed, places, spec)
