@@ -2,9 +2,9 @@
 
 import errno
 import os
+import secrets
 import shutil
 import stat
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -58,17 +58,31 @@ def sync_folder(folder: Path) -> None:
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Let `write(file)` fill a file that appears under its name only when complete.
 
-    Until then it is hidden: ``.NAME.XXXXXXXX`` in the same folder.
+    Until then it is hidden: ``.NAME.XXXXXXXX`` in the same folder. If it fails, nothing has
+    changed.
+
+    Raises:
+        OSError: naming `path`: its folder cannot be written into, or the medium is full.
     """
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    hidden = _hidden(path)
     try:
-        with os.fdopen(handle, "wb") as file:
+        with hidden.open("x+b") as file:
             write(file)
-        os.chmod(name, 0o644)  # a temporary file is its owner's alone; a set is for others too
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
+        os.replace(hidden, path)
+    except BaseException as error:
+        hidden.unlink(missing_ok=True)
+        _name(error, hidden, path)
         raise
+
+
+def _hidden(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+
+
+def _name(error: BaseException, hidden: Path, path: Path) -> None:
+    """Let a failure of what is hidden, or of no file that is named, be one of `path`."""
+    if isinstance(error, OSError) and error.errno and error.filename in (None, str(hidden)):
+        raise OSError(error.errno, os.strerror(error.errno), str(path)) from None
 
 
 @contextmanager
@@ -100,18 +114,22 @@ def whole_folder(path: Path) -> Iterator[Path]:
     """A folder to fill, which takes its name, and the place of what had it, when the block ends.
 
     Until then it is hidden: ``.NAME.XXXXXXXX`` beside it. If the block fails, nothing has changed.
+
+    Raises:
+        OSError: naming `path`, where it is of no file in it: the medium is full, for one.
     """
-    made = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+    made = _hidden(path)
     try:
+        made.mkdir()
         yield made
-        made.chmod(0o755)  # a temporary folder is its owner's alone
         if path.exists():
-            old = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.")) / path.name
+            old = _hidden(path)
             path.rename(old)
             made.rename(path)
-            shutil.rmtree(old.parent)
+            shutil.rmtree(old)
         else:
             made.rename(path)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(made, ignore_errors=True)
+        _name(error, made, path)
         raise

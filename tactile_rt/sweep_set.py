@@ -298,7 +298,7 @@ def contacts_of(sweeps: Sweeps) -> NDArray[np.float32]:
     """
     if sweeps.contacts is None:
         raise ConfigError(
-            "the sweep set holds no contacts: make one with `tactile-rt sweep --contacts`"
+            "the sweep set holds no contacts: make one with `tactile-rt sweep --set contacts=true`"
         )
     return sweeps.contacts
 

@@ -56,7 +56,6 @@ def test_nothing_is_told_to_the_maker_of_the_runtime(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.skipif(not README.exists(), reason="a source archive, without README")
 def test_the_readme_s_program_needs_one_import() -> None:
     (program, *_) = re.findall(r"```python\n(.*?)```", README.read_text("utf-8"), re.S)
     assert len(re.findall(r"^(?:from|import) ", program, re.M)) == 1

@@ -64,6 +64,18 @@ def test_the_names_at_the_top_are_links_that_point_inward(name: str) -> None:
     assert (link / "__init__.py").is_file()
 
 
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no clone")
+def test_a_source_archive_is_the_whole_tree() -> None:
+    """But for the links, what runs the tests where this is developed, and what is no file of it."""
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("git does not list this tree")
+    there = {name.partition("/")[0] for name in listed.stdout.splitlines()}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    archived = project["tool"]["hatch"]["build"]["targets"]["sdist"]["only-include"]
+    assert set(archived) == there - {*LINKS, ".ci", ".gitignore"}
+
+
 def test_it_is_typed() -> None:
     assert (PACKAGE / "py.typed").is_file()
 

@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.align import truth
+from bench.align import oracles, truth
 from tactile_rt.evidence.records import Record
 from tactile_rt.models.alignment import load_benchmark, save_benchmark, score
 from tactile_rt.models.alignment.neural import pad
@@ -45,7 +45,7 @@ DRAWS = 2000
 
 def run(quick: bool = False) -> list[Record]:
     """Measure speed on synthetic animals of the recordings' size, and errors on a made-up brain."""
-    return [*_speed(quick), *truth.run(quick)]
+    return [*_speed(quick), *oracles.run(quick), *truth.run(quick)]
 
 
 def _speed(quick: bool) -> list[Record]:

@@ -1,6 +1,6 @@
 """Is every fault told, rightly, soon, and no longer than it lasts; and nothing else?
 
-tactile-rt bench daemon --faults [--resume faults.json]
+tactile-rt bench faults [--resume faults.json]
 python -m bench.daemon.faults [--times 40] [--only NAME ...] [--resume faults.json]
 
 Each fault is caused by real means in a daemon under way with two arrays. Another thread asks

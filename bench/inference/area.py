@@ -16,6 +16,7 @@ from tactile_rt.classifier.session import Session
 from tactile_rt.evidence.model_steps import Subject, measure_model
 from tactile_rt.evidence.records import Record
 from tactile_rt.evidence.roofline import measure_machine
+from tactile_rt.extras import install_extra
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
 __all__ = ["Pulses", "run"]
@@ -108,7 +109,7 @@ def _full_size(quick: bool) -> list[Record]:
         try:
             from bench.inference.full_size import full_size
         except ModuleNotFoundError as error:
-            why = f"full size: needs {error.name} (pip install 'tactile-rt[train]')"
+            why = f"full size: needs {error.name} ({install_extra('train')})"
         else:
             with tempfile.TemporaryDirectory() as folder:
                 for subject in full_size(Path(folder)):

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.model_file import ModelCard, load_model, read_model, shipped_model
 from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.evidence.records import Record
+from tactile_rt.extras import install_extra
 
 if TYPE_CHECKING:  # a robot has no torch
     from tactile_rt.models.training import TactileClassifier
@@ -43,7 +44,7 @@ def window_speed(quick: bool) -> list[Record]:
         torch: Any = importlib.import_module("torch")
         making: Any = importlib.import_module("bench.inference.full_size")
     except ModuleNotFoundError as error:
-        why = f"needs {error.name} (pip install 'tactile-rt[train]')"
+        why = f"needs {error.name} ({install_extra('train')})"
         return [Record(f"{NAME}.measured", 0, "of 4", how=why)]
     from tactile_rt.models.ead import EADConfig
 

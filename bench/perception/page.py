@@ -42,6 +42,18 @@ ABOUT = {
     ALL: "For those that have learnt from generated objects alone, all real objects of these kinds "
     "are new: more of them, and narrower intervals.",
 }
+CARD = """\
+---
+# Of a data card, as Hugging Face reads it.
+pretty_name: {name}, what whiskers feel of real things
+license: apache-2.0 # of the loads; those of the meshes that were swept are below
+task_categories: [other]
+tags: [tactile, whisker, time-series, robotics, simulation]
+size_categories: ["1K<n<10K"] # sweeps
+source_datasets: [original]
+annotations_creators: [expert-generated]
+---
+"""
 INTRODUCTION = """\
 Whiskers are swept past real things, models that other people made for other purposes, and a method
 says what each is. What it has learnt from is its own affair, but for the splits. The loads of the
@@ -76,6 +88,7 @@ def write_page(results: BenchmarkResults, path: Path) -> None:
     """Write it."""
     data = results.data
     lines = [
+        CARD.format(name=f"{NAME} {VERSION}"),
         f"# {NAME} {VERSION}: what is this, by touch?",
         "",
         "*This page is written by `python -m bench.perception`; do not edit it.*",

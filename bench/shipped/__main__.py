@@ -65,7 +65,7 @@ def main() -> int:
     best = max(runs, key=_validated)
     weights = given.folder / f"{given.name}.pt"
     _write_weights(best, weights)
-    release(weights, weights.with_suffix(".onnx"), given.name, "fp16")
+    release(weights, weights.with_suffix(".onnx"), given.name, "fp16", licence="Apache-2.0")
     return 0
 
 

@@ -1,4 +1,6 @@
-"""Run a tactile_rt model file with numpy and onnxruntime alone: python plain_onnxruntime.py FILE"""
+"""Run a tactile_rt model file with numpy and onnxruntime alone: python plain_onnxruntime.py FILE
+
+A file ships: python -c 'from tactile_rt.classifier.model_file import *; print(shipped_model())'"""
 
 import json
 import sys
@@ -6,11 +8,11 @@ import sys
 import numpy as np
 import onnxruntime as ort
 
-session = ort.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
+file = sys.argv[1] if len(sys.argv) == 2 else sys.exit(__doc__)
+session = ort.InferenceSession(file, providers=["CPUExecutionProvider"])
 card = json.loads(session.get_modelmeta().custom_metadata_map["tactile_rt"])
 elements, channels = len((spec := json.loads(card["spec"]))["elements"]), len(spec["channels"])
 names = [output.name for output in session.get_outputs()]
-
 # The tare: mean and noise of each element while nothing is touched, here made up. SI units.
 floor = np.array(card["floor"], dtype=np.float32)
 rng = np.random.default_rng(0)
@@ -19,10 +21,8 @@ offset, sigma = quiet.mean(axis=0)[None], np.maximum(quiet.std(axis=0), floor)[N
 
 # An episode begins at contact, with a state of zeros.
 state = {s["name"]: np.zeros((1, *s["shape"]), dtype=s["dtype"]) for s in card["state"]}
-
 for step in range(card["steps"]):
-    # Here your array's samples, one every card["period_ns"], with its elements in the order of
-    # spec["elements"]; made up: a touch ten times stronger than noise.
+    # Your samples, one each card["period_ns"], as spec["elements"]; made up: ten times the noise.
     samples = rng.normal(size=(1, card["substeps"], elements, channels)).astype(np.float32)
     samples *= 10 * floor
     feed = {"samples": samples, "offset": offset, "sigma": sigma, **state}

@@ -112,7 +112,12 @@ def save_calibration(calibration: Calibration, path: Path | None = None) -> Path
 def _folder() -> Path:
     configured = os.environ.get("XDG_CONFIG_HOME", "")
     # The specification has relative paths ignored.
-    home = Path(configured) if os.path.isabs(configured) else Path.home() / ".config"
+    try:
+        home = Path(configured) if os.path.isabs(configured) else Path.home() / ".config"
+    except RuntimeError:  # neither HOME nor a line in /etc/passwd
+        raise ConfigError(
+            "this user has no home to keep calibrations in: set XDG_CONFIG_HOME, or name a file"
+        ) from None
     return home / "tactile_rt" / "calibration"
 
 

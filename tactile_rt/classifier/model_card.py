@@ -138,6 +138,8 @@ class ModelCard(msgspec.Struct, frozen=True):
             (element, channel), SI.
         embeddings: Where touches of the known classes lie, so that others can be told from them
             without the data; None if it is not told.
+        license: Under which the file may be used, as an SPDX expression such as "Apache-2.0"; empty
+            if it is not told.
     """
 
     name: str
@@ -168,6 +170,7 @@ class ModelCard(msgspec.Struct, frozen=True):
     candidates: tuple[CandidateRule, ...] = ()
     loads: dict[str, tuple[tuple[float, ...], ...]] = {}
     embeddings: EmbeddingStatistics | None = None
+    license: str = ""
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -277,6 +280,8 @@ def parse_card(path: Path, text: str) -> ModelCard:
         raise damaged(f"labels must be 1 to {MAX_NAME} printable characters")
     if len(card.name) > MAX_NAME:
         raise damaged(f"a name of {len(card.name)} characters")
+    if card.license and not named(card.license):
+        raise damaged(f"a licence must be at most {MAX_NAME} printable characters")
     for what in LISTS:
         if not isinstance(card.provenance.get(what, []), list):
             raise damaged(f"{what} of the provenance must be a list")

@@ -18,7 +18,7 @@ channel)``, no state, and gives ``logits`` and ``embedding`` with a step axis af
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +46,7 @@ __all__ = [
     "METADATA_KEY",
     "ModelCard",
     "StateTensor",
+    "check_graph",
     "element_order",
     "fit_source",
     "hash_of",
@@ -56,6 +57,7 @@ __all__ = [
 
 METADATA_KEY = "tactile_rt"
 MESSAGE = 300  # characters of what a file, or onnxruntime, has us say
+Described = tuple[tuple[Any, ...], str]
 SHIPPED = Path(__file__).parents[1] / "assets" / "mouse44.onnx"
 
 
@@ -161,13 +163,30 @@ def load_model(
     unused = [p for p in providers if p not in session.get_providers()]
     if unused:
         raise ConfigError(f"onnxruntime cannot use {', '.join(unused)} on this machine")
-    return session, _checked(card, session, path)
+    inputs = {i.name: (tuple(i.shape), i.type) for i in session.get_inputs()}
+    outputs = {o.name: (tuple(o.shape), o.type) for o in session.get_outputs()}
+    check_graph(card, inputs, outputs, path)
+    return session, card
 
 
-def _checked(card: ModelCard, session: ort.InferenceSession, path: Path) -> ModelCard:
+def check_graph(
+    card: ModelCard, inputs: Mapping[str, Described], outputs: Mapping[str, Described], path: Path
+) -> None:
+    """Compare a graph with the card of its file.
+
+    Args:
+        card: of the file.
+        inputs: shape and type of each, the latter as onnxruntime writes it, ``tensor(float)``; an
+            axis that is not known is no int, and a shape that is not known is empty.
+        outputs: likewise.
+        path: of the file, for the message.
+
+    Raises:
+        ModelError: they disagree; names where.
+    """
     window = card.kind == "window"
     # (shape without the batch axis, element type) of everything the classifier will feed
-    inputs = {i.name: (tuple(i.shape[1:]), i.type) for i in session.get_inputs()}
+    without_batch = {name: (shape[1:], kind) for name, (shape, kind) in inputs.items()}
     elements, channels = card.array.shape
     sample = (card.substeps, elements, channels)
     expected: dict[str, tuple[tuple[Any, ...], str]] = {
@@ -176,32 +195,31 @@ def _checked(card: ModelCard, session: ort.InferenceSession, path: Path) -> Mode
         "sigma": ((elements, channels), _onnx_type("float32")),
         **{s.name: (s.shape, _onnx_type(s.dtype)) for s in card.state},
     }
-    if window and "samples" in inputs and not isinstance((inputs["samples"][0] or (0,))[0], int):
-        # A window may be made for any number of steps.
-        expected["samples"] = ((inputs["samples"][0][0], *sample), _onnx_type("float32"))
-    wrong = {k for k in inputs | expected if inputs.get(k) != expected.get(k)}
-    wrong |= {i.name for i in session.get_inputs() if not i.shape}  # not even a batch
+    if window and "samples" in inputs:
+        steps = (without_batch["samples"][0] or (0,))[0]
+        if not isinstance(steps, int):  # a window may be made for any number of them
+            expected["samples"] = ((steps, *sample), _onnx_type("float32"))
+    wrong = {k for k in without_batch | expected if without_batch.get(k) != expected.get(k)}
+    wrong |= {name for name, (shape, _) in inputs.items() if not shape}  # not even a batch
     if wrong:
         raise _disagree(path, sorted(wrong))
-    batches = {i.shape[0] for i in session.get_inputs()}
+    batches = {shape[0] for shape, _ in inputs.values()}
     if any(isinstance(batch, int) and batch != 1 for batch in batches):
         raise ModelError(f"{path}: the graph's batch size is fixed to another than 1")
-    outputs = {o.name: (tuple(o.shape[1:]), o.type) for o in session.get_outputs()}
     sizes = {"logits": (len(card.labels), "classes")}
     if card.embedding:
         sizes["embedding"] = (card.embedding, "units")
     for name, (size, what) in sizes.items():
         shape, kind = outputs.get(name, ((), ""))
-        if shape[-1:] != (size,) or len(shape) != 1 + window or kind != "tensor(float)":
+        if shape[-1:] != (size,) or len(shape) != 2 + window or kind != "tensor(float)":
             raise ModelError(f"{path}: no output `{name}` of {size} {what}")
     for state in card.state:
         shape, kind = outputs.get(f"{state.name}_next", ((), ""))
         # onnxruntime may not know every size before it runs.
-        axes = zip(shape, state.shape, strict=False)
+        axes = zip(shape[1:], state.shape, strict=False)
         same = all(a == b or not isinstance(a, int) for a, b in axes)
-        if not same or len(shape) != len(state.shape) or kind != _onnx_type(state.dtype):
+        if not same or len(shape) != 1 + len(state.shape) or kind != _onnx_type(state.dtype):
             raise ModelError(f"{path}: no output `{state.name}_next` like `{state.name}`")
-    return card
 
 
 def _disagree(path: Path, wrong: Sequence[str]) -> ModelError:

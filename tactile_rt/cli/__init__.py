@@ -3,20 +3,45 @@
 A user's mistake is one clear line on stderr and exit code 2; Ctrl-C leaves quietly.
 """
 
+import io
 import os
+import signal
 import sys
-from typing import Any, NoReturn
+from types import FrameType
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 __all__ = ["main"]
 
 
 def main() -> None:
     """Run the command line."""
+    _open_streams()
     if sys.argv[1:2] == ["run"] and not any(a.startswith("--source") for a in sys.argv):
         # It is to be the daemon: a signal that comes before all else is imported counts, too.
         from tactile_rt.daemon.process import note_signals
 
         note_signals()
+    # Who is told to leave does so as by Ctrl-C: what is half-written is taken away.
+    ours = [s for s in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(s) == signal.SIG_DFL]
+    for number in ours:
+        signal.signal(number, _leave)
+    try:
+        _run()
+    except KeyboardInterrupt:
+        _leave(signal.SIGINT)
+    finally:
+        for number in ours:
+            signal.signal(number, signal.SIG_DFL)
+
+
+def _leave(number: int, frame: FrameType | None = None) -> NoReturn:
+    sys.exit(128 + number)
+
+
+def _run() -> None:
     # Each module adds its commands; what a command needs is imported when it runs, so that
     # `--help` is instant and a robot never imports torch.
     import typer
@@ -51,7 +76,7 @@ def main() -> None:
         view,
         whisk,
     )
-    from tactile_rt.cli.app import INTERRUPTED, app
+    from tactile_rt.cli.app import app
     from tactile_rt.stream import TactileError
 
     # Typer brings a copy of click since 0.29: whose these are depends on its release.
@@ -73,9 +98,35 @@ def main() -> None:
         # Folders are made where there is none, so what exists all the same is a file.
         _empty_stdout()
         why = "is not a folder" if isinstance(error, FileExistsError) else error.strerror
-        _give_up(f"cannot use {error.filename}: {why}" if error.filename else str(error))
-    except KeyboardInterrupt:
-        sys.exit(INTERRUPTED)
+        _give_up(f"cannot use {error.filename}: {why}" if error.filename else why or str(error))
+
+
+class _Told(io.FileIO):
+    """The error output: where it can take no more, as the disk of a log is full, work goes on."""
+
+    def write(self, data: "ReadableBuffer") -> int | None:
+        try:
+            return super().write(data)
+        except OSError:
+            return memoryview(data).nbytes
+
+
+def _open_streams() -> None:
+    """Have a standard input, output and error output, whatever we were started with."""
+    for descriptor in range(3):
+        try:
+            os.fstat(descriptor)
+        except OSError:  # closed: the next file that is opened would be taken for it
+            os.open(os.devnull, os.O_RDWR)
+    if sys.stdin is None:
+        sys.stdin = open(0, closefd=False)
+    if sys.stdout is None:
+        sys.stdout = open(1, "w", closefd=False)
+    if sys.stderr is not sys.__stderr__:  # somebody listens in
+        return
+    told = io.BufferedWriter(_Told(2, "w", closefd=False))
+    coding = getattr(sys.stderr, "encoding", None)
+    sys.stderr = io.TextIOWrapper(told, coding, "backslashreplace", line_buffering=True)
 
 
 def _misused(error: Any) -> NoReturn:

@@ -4,7 +4,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +12,10 @@ from rich.console import Console
 from rich.table import Column, Table
 from typer.core import TyperCommand
 
-from tactile_rt.cli.app import app, check_output, needs, progress_bar
+from tactile_rt.cli.app import app, check_output, needs, set_option
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.tables import Json, print_table, told_as_json
+from tactile_rt.settings import take_sets
 from tactile_rt.stream import ConfigError, TactileError
 
 if TYPE_CHECKING:
@@ -52,18 +54,16 @@ class GateCommand(TyperCommand):
 @align.command("example")
 def write_brain(
     folder: Annotated[Path, typer.Argument(help="The folder to make.")],
-    mice: Annotated[int, typer.Option(help="How many are recorded.")] = 11,
-    trials: Annotated[int, typer.Option(help="Of each stimulus, in a session.")] = 40,
-    private: Annotated[
-        float, typer.Option(help="Share of a mouse's variance that is its own, 0 to 1.")
-    ] = 0.15,
     seed: Annotated[int, typer.Option(help="Of every random number.")] = 0,
+    sets: Annotated[
+        list[str] | None, set_option("Of the brain: mice=6, trials=60, private=0.3")
+    ] = None,
 ) -> None:
     """Make up a brain: recordings in NWB, and models of known truth, to try the commands on."""
     from tactile_rt.models.alignment.example import Brain
     from tactile_rt.models.alignment.example_files import write_example
 
-    brain = Brain(mice=mice, trials=trials, private=private)
+    (brain,) = take_sets("align example", sets or (), Brain)
     console = Console(stderr=True)
     with progress_bar(console, "recording", total=1.0) as update:
         try:
@@ -74,7 +74,7 @@ def write_brain(
             raise needs("align", error) from None
     names = ", ".join(sorted(path.name for path in models.iterdir()))
     for line in (
-        f"{recordings}: {mice} mice; {models}: {names}",
+        f"{recordings}: {brain.mice} mice; {models}: {names}",
         f"next: tactile-rt align build {recordings} --out {folder / 'benchmark.json'}",
     ):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
@@ -105,12 +105,14 @@ def build_benchmark(
     ] = None,
     bootstraps: Annotated[int, typer.Option(help="Splits of the trials.")] = 1000,
     seed: Annotated[int, typer.Option(help="Of the splits.")] = 1234,
+    json: Json = None,
 ) -> None:
     """Freeze recordings into a small benchmark, so that nobody else needs them."""
     from tactile_rt.models.alignment import build, save_benchmark
     from tactile_rt.models.alignment.selection import Selection
 
-    check_output(out)
+    for file in (out, json):
+        check_output(file)
     console = Console(stderr=True)
     selection = Selection.of(task, session or (), depth, cells)
     with progress_bar(console, "building", total=1.0) as update:
@@ -127,6 +129,11 @@ def build_benchmark(
         except ModuleNotFoundError as error:
             raise needs("align", error) from None
     save_benchmark(made, out)
+    told = {
+        "benchmark": out, "animals": len(made.targets), "reliable": len(made.reliable),
+        "animal_to_animal": made.a2a.mean, "sem": made.a2a.sem, "notes": made.notes,
+    }  # fmt: skip
+    told_as_json(told, json)
     for note in made.notes:
         colour = "bold red" if note.startswith("WARNING") else None
         console.print(note, highlight=False, markup=False, style=colour)
@@ -141,8 +148,8 @@ def build_benchmark(
 def score_models(
     models: Models,
     benchmark: Benchmark,
-    json: Annotated[Path | None, typer.Option(help="Write the scores here.")] = None,
-    page: Annotated[Path | None, typer.Option(help="Write the report here, .html.")] = None,
+    json: Json = None,
+    html: Annotated[Path | None, typer.Option(help="Write the report here, .html.")] = None,
     stimuli: Stimuli = None,
     untrained: Annotated[
         bool, typer.Option(help="Score each checkpoint's network before training too.")
@@ -154,7 +161,7 @@ def score_models(
     ] = None,
 ) -> None:
     """Score every layer of some models against a benchmark."""
-    for file in (json, page):
+    for file in (json, html):
         check_output(file)
     given = _performances(performance, len(models))
     with _train():
@@ -165,7 +172,6 @@ def score_models(
             ModelResult,
             model_result,
             results_of,
-            write_results,
         )
         from tactile_rt.models.alignment.stimuli_input import read_stimuli
 
@@ -182,11 +188,10 @@ def score_models(
                 done.append(model_result(frozen, layers, before, told or own)[0])
                 update(advance=1)
     results = results_of(frozen, felt, done)
-    if json:
-        write_results(results, json)
-    if page:
-        write_page(results, page)
-    _show_scores(results)
+    if html:
+        write_page(results, html)
+    if not told_as_json(results, json):
+        _show_scores(results)
 
 
 @align.command("report")
@@ -227,7 +232,7 @@ def gate_model(
         typer.Option(help="Test 4: the checkpoint (or .onnx) that the model was exported from."),
     ] = None,
     stimuli: Stimuli = None,
-    json: Annotated[Path | None, typer.Option(help="Write checks and figures here.")] = None,
+    json: Json = None,
 ) -> None:
     """Test a model before its release. Exit code: 0 pass, 1 fail, 2 inconclusive, 3 input error."""
     try:
@@ -252,7 +257,7 @@ def decode_stimuli(
     paper: Annotated[
         bool, typer.Option(help="Also the paper's variant: one stimulus held out at a time.")
     ] = False,
-    json: Annotated[Path | None, typer.Option(help="Write the table here.")] = None,
+    json: Json = None,
 ) -> None:
     """Decode shape and distance of the stimuli from every layer, with permutation chance."""
     check_output(json)
@@ -294,9 +299,9 @@ def decode_stimuli(
         Console(stderr=True).print(note, highlight=False, markup=False)
     for target in targets:
         rows.append((target.name, "", decode_rdm(target.chosen.rdm)))
-    _show_decoded(rows)
-    if json:
-        _write(json, [{"name": n, "variant": v or "balanced", **_plain(d)} for n, v, d in rows])
+    told = [{"name": n, "variant": v or "balanced", **asdict(d)} for n, v, d in rows]
+    if not told_as_json(told, json):
+        _show_decoded(rows)
 
 
 def _gate(
@@ -339,14 +344,14 @@ def _gate(
             checks = [*neural_checks(score(frozen, ours.patterns), frozen, before), *checks]
     code = exit_code(checks)
     colours = {"pass": "green", "fail": "bold red", "inconclusive": "yellow"}
-    console = Console()
+    told = [{"name": c.name, "verdict": c.verdict, "why": c.why} for c in checks]
+    taps = [asdict(row) for row in rows]
+    if told_as_json({"exit_code": code, "checks": told, "taps": taps}, json):
+        return code
+    console = Console(soft_wrap=True)
     for check in checks:
         word = f"[{colours[check.verdict]}]{check.verdict}[/]"
         console.print(f"{check.name}: {word}: {check.why}", highlight=False)
-    if json:
-        told = [{"name": c.name, "verdict": c.verdict, "why": c.why} for c in checks]
-        taps = [_plain(row) for row in rows]
-        _write(json, {"exit_code": code, "checks": told, "taps": taps})
     return code
 
 
@@ -398,7 +403,7 @@ def _show_scores(results: Any) -> None:
     table.add_row("raw sensor input", f"{_said(raw.score)} ± {_said(raw.sem)}", _said(raw.p, 4))
     table.add_row("animal to animal", f"{_said(b.a2a_mean)} ± {_said(b.a2a_sem)}")
     table.add_row("its highest", _said(b.a2a_highest))
-    Console().print(table)
+    print_table(table)
 
 
 def _show_decoded(rows: list[tuple[str, str, Any]]) -> None:
@@ -410,25 +415,8 @@ def _show_decoded(rows: list[tuple[str, str, Any]]) -> None:
             *(_said(v) for v in (d.shape, d.shape_chance)), _said(d.shape_p, 3),
             *(_said(v) for v in (d.distance, d.distance_chance)), _said(d.distance_p, 3),
         )  # fmt: skip
-    Console().print(table)
+    print_table(table)
 
 
 def _said(value: float | None, digits: int = 2) -> str:
     return "-" if value is None or value != value else f"{value:.{digits}f}"
-
-
-def _plain(record: Any) -> dict[str, Any]:
-    """A dataclass without the numbers that JSON does not know."""
-    return {
-        key: None if isinstance(value, float) and not isfinite(value) else value
-        for key, value in asdict(record).items()
-    }
-
-
-def _write(path: Path, what: Any) -> None:
-    import msgspec
-
-    from tactile_rt.files import write_whole
-
-    text = msgspec.json.format(msgspec.json.encode(what), indent=1)
-    write_whole(path, lambda file: file.write(text + b"\n"))

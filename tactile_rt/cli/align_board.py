@@ -1,4 +1,4 @@
-"""`tactile-rt align board`: models by datasets by metrics."""
+"""`tactile-rt align board`: models by datasets by metrics; the datasets, and how they are got."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,7 +10,9 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from tactile_rt.cli.align import align
-from tactile_rt.cli.app import check_output, needs, progress_bar
+from tactile_rt.cli.app import check_output, needs
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.tables import Json, print_table, told_as_json
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -20,19 +22,82 @@ if TYPE_CHECKING:
 
 
 @align.command("datasets")
-def list_datasets() -> None:
+def list_datasets(json: Json = None) -> None:
     """List the recordings that models can be compared with: license, citation, size."""
     from tactile_rt.models.alignment.datasets import dataset_names, find_dataset
 
-    console = Console()
-    for name in dataset_names():
-        one = find_dataset(name)
+    found = {name: find_dataset(name) for name in dataset_names()}
+    told = [
+        {
+            "name": name, "title": one.title, "about": one.about, "citation": one.citation,
+            "url": one.url, "license": one.license, "size": one.size,
+        }
+        for name, one in found.items()
+    ]  # fmt: skip
+    if told_as_json(told, json):
+        return
+    console = Console(soft_wrap=True)
+    for name, one in found.items():
         console.print(f"[bold]{name}[/]  {one.title}", highlight=False)
         for line in (one.about, one.citation, one.url):
             if line:
                 console.print(f"    {line}", highlight=False, markup=False)
         licensed = f"license {one.license}, " if one.license else ""
         console.print(f"    {licensed}{one.size}", highlight=False, markup=False)
+
+
+@align.command("fetch")
+def fetch_recordings(
+    name: Annotated[str, typer.Argument(help="Of a dataset, 000231; see `align datasets`.")],
+    folder: Annotated[
+        Path | None, typer.Argument(help="Where small NWB files are written to, a session each.")
+    ] = None,
+    session: Annotated[
+        list[str] | None, typer.Option(help="Only sessions whose name has this; * and ? fit any.")
+    ] = None,
+    listed: Annotated[
+        bool, typer.Option("--list", help="List sizes in bytes, SHA-256 and names; fetch nothing.")
+    ] = False,
+) -> None:
+    """Get what is needed of published recordings, some MB of hundreds of GB, from their archive."""
+    from tactile_rt.models.alignment.datasets import find_dataset
+    from tactile_rt.models.alignment.datasets.fetching import counted, fetch, published_files
+    from tactile_rt.models.alignment.selection import Selection
+
+    dataset = find_dataset(name)
+    if not dataset.listing:
+        raise ConfigError(f"{name} cannot be fetched: download it, see `align datasets`")
+    every = published_files(dataset.listing)
+    wanted = Selection(sessions=tuple(session or ()))
+    files = [file for file in every if wanted.takes(file.name)]
+    if not files:
+        raise ConfigError(f"no session of {len(every)} is of {wanted}: --list names them")
+    console = Console(stderr=True)
+    if listed:
+        for file in files:
+            typer.echo(f"{file.size:11} {file.sha256} {file.path}")
+        return
+    if folder is None:
+        raise ConfigError("name a folder to write to, or give --list")
+    try:
+        with progress_bar(console, "fetching", total=1.0) as update:
+            done = fetch(files, folder, _shown(update))
+        mice, units, notes = counted([folder / file.name for file in files])
+    except ModuleNotFoundError as error:
+        raise needs("align", error) from None
+    for note in notes:
+        console.print(note, highlight=False, markup=False)
+    size = sum(file.size for file in files)
+    console.print(
+        f"{folder}: {done.files} sessions ({done.new} new), {mice} mice, {units} units with valid "
+        f"trials; {done.transferred / 1e6:.0f} MB of {size / 1e9:.0f} GB were read",
+        highlight=False, soft_wrap=True,
+    )  # fmt: skip
+    if len(files) == len(every) and dataset.counts not in (None, (mice, units)):
+        console.print(
+            "WARNING: the published analysis is of {} mice and {} units".format(*dataset.counts),
+            style="bold red", highlight=False,
+        )  # fmt: skip
 
 
 @align.command("board")
@@ -52,8 +117,8 @@ def write_board(
         list[str] | None,
         typer.Option(help="all, L1, L2/3, L4, L5, L6, excitatory or inhibitory; may be repeated."),
     ] = None,
-    json: Annotated[Path | None, typer.Option(help="Write the board here.")] = None,
-    page: Annotated[Path | None, typer.Option(help="Write it as a page here, .html.")] = None,
+    json: Json = None,
+    html: Annotated[Path | None, typer.Option(help="Write it as a page here, .html.")] = None,
     stimuli: Annotated[
         Path | None,
         typer.Option(help="Of `tactile-rt whisk`. Default: the mouse array's, which ships."),
@@ -64,7 +129,7 @@ def write_board(
     seed: Annotated[int, typer.Option(help="Of the untrained networks.")] = 0,
 ) -> None:
     """Compare models with recordings by every metric, as shares of what noise permits."""
-    for file in (json, page):
+    for file in (json, html):
         check_output(file)
     if not data:
         raise ConfigError("name recordings: --data NAME=PATH, see `tactile-rt align datasets`")
@@ -72,15 +137,12 @@ def write_board(
         made = _board(models or [], data, metric, part or ["all"], stimuli, untrained, seed)
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
-    if json:
-        from tactile_rt.models.alignment.board import write_board as write
-
-        write(made, json)
-    if page:
+    if html:
         from tactile_rt.models.alignment.board_page import write_board_page
 
-        write_board_page(made, page)
-    _show(made)
+        write_board_page(made, html)
+    if not told_as_json(made, json):
+        _show(made)
 
 
 def _board(
@@ -161,7 +223,6 @@ def _named(text: str) -> tuple[str, Path]:
 
 
 def _show(board: "Alignments") -> None:
-    console = Console()
     places = dict.fromkeys((c.dataset, c.part) for c in board.columns)
     for dataset, part in places:
         columns = [k for k, c in enumerate(board.columns) if (c.dataset, c.part) == (dataset, part)]
@@ -177,7 +238,7 @@ def _show(board: "Alignments") -> None:
         table.add_row(
             "animals", *(f"{board.columns[k].usable}/{board.columns[k].animals}" for k in columns)
         )
-        console.print(table)
+        print_table(table)
 
 
 def _said(value: float | None) -> str:

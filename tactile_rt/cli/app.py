@@ -4,17 +4,15 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from tactile_rt.extras import lacking
 from tactile_rt.stream import ConfigError, TactileError
 from tactile_rt.version import VERSION
 
@@ -22,17 +20,17 @@ __all__ = [
     "INTERRUPTED",
     "USER_ERROR",
     "Model",
+    "Pace",
     "Seconds",
     "app",
     "check_output",
     "leaving",
     "needs",
-    "progress_bar",
+    "set_option",
     "starting",
 ]
 
 USER_ERROR, INTERRUPTED = 2, 130  # exit codes
-A_DAY_S = 86_400.0
 SLOW_WORK = "tactile_rt.sim_backend.objects"  # a logger
 
 Model = Annotated[
@@ -41,6 +39,18 @@ Model = Annotated[
 Seconds = Annotated[
     float | None, typer.Option(min=0.001, max=1e9, help="Leave after so many seconds.")
 ]
+
+Pace = Annotated[bool, typer.Option("--fast/--realtime", help="As fast as it goes; in real time.")]
+
+
+def set_option(help: str) -> Any:
+    """The option ``--set KEY=VALUE`` of a command, which may be given again.
+
+    Args:
+        help: of what, with an example.
+    """
+    return typer.Option("--set", metavar="KEY=VALUE", help=f"{help}; may be repeated.")
+
 
 app = typer.Typer(
     name="tactile-rt",
@@ -91,8 +101,11 @@ def starting() -> Iterator[None]:
 
 @contextmanager
 def leaving(seconds: float | None) -> Iterator[None]:
-    """Let Ctrl-C, SIGTERM, a closed output pipe or the clock end the block, and go on after it."""
-    alike = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+    """Let Ctrl-C, SIGTERM, a closed terminal or output pipe, or the clock end the block, and go on
+    after it."""
+    alike = [signal.SIGINT, signal.SIGTERM, signal.SIGALRM]
+    if signal.getsignal(signal.SIGHUP) != signal.SIG_IGN:  # as nohup has it
+        alike.append(signal.SIGHUP)
     before = [signal.signal(s, signal.default_int_handler) for s in alike]
     # A timer, not a look at the stream's clock: a silent device must not keep us waiting.
     signal.setitimer(signal.ITIMER_REAL, seconds or 0)
@@ -109,51 +122,11 @@ def leaving(seconds: float | None) -> Iterator[None]:
             signal.signal(s, handler)
 
 
-@contextmanager
-def progress_bar(
-    console: Console,
-    what: str,
-    total: float | None = None,
-    completed: int = 0,
-    counted: bool = False,
-) -> Iterator[Callable[..., None]]:
-    """A bar with the time left, gone when it is done or fails: an error is one line alone.
-
-    Where the console is no terminal nothing is shown: a log file keeps clean.
-
-    Args:
-        console: where.
-        what: is going on.
-        total: of the work; None until it is known.
-        completed: was done before, and says nothing about the time left.
-        counted: say how many of the total are done.
-
-    Yields:
-        What to call as the work goes on: rich's `Progress.update` without the task
-        (``advance=1``, ``completed=7``, ``total=9``, ``description="mug-1"``).
-    """
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        *((MofNCompleteColumn(),) if counted else ()),
-        TimeRemainingColumn(),
-    )
-    # Of rich's usual 30 s: a step may last minutes, and a rate takes two of them.
-    with Progress(
-        *columns,
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-        speed_estimate_period=A_DAY_S,
-    ) as progress:
-        yield partial(progress.update, progress.add_task(what, total=total, completed=completed))
-
-
 def check_output(file: Path | None) -> None:
     """Refuse a file that cannot be written, now rather than after minutes of work.
 
     Raises:
-        ConfigError: it is a folder, or the folder that it goes into is not there.
+        ConfigError: it is a folder, or the folder that it goes into is not there or not one's own.
     """
     if file is None:
         return
@@ -161,12 +134,10 @@ def check_output(file: Path | None) -> None:
         raise ConfigError(f"no folder {file.parent} to write {file.name} in")
     if file.is_dir():
         raise ConfigError(f"{file} is a folder: name a file to write")
+    if not os.access(file.parent, os.W_OK | os.X_OK):
+        raise ConfigError(f"{file} cannot be written: {file.parent} may not be written into")
 
 
 def needs(extra: str, error: ModuleNotFoundError) -> TactileError:
     """The error to raise when a command's import fails: which extra brings it."""
-    if (error.name or "").startswith("tactile_rt"):
-        raise error
-    return ConfigError(
-        f"this needs {error.name}, which is not installed: pip install 'tactile-rt[{extra}]'"
-    )
+    return lacking("this needs", extra, error)

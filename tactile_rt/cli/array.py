@@ -1,7 +1,7 @@
 """`tactile-rt array`: arrays by name; a device measured, and its description brought to that."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output, needs, starting
-from tactile_rt.cli.tables import Json, print_table, show_table
+from tactile_rt.cli.tables import STDOUT, Json, print_table, show_table, told_as_json
 from tactile_rt.stream import ConfigError, concatenate
 
 if TYPE_CHECKING:
@@ -75,6 +75,7 @@ def fit(
     seconds: Annotated[
         float, typer.Option(min=1, max=3600, help="Read at most so many seconds.")
     ] = 600.0,
+    json: Json = None,
 ) -> None:
     """Measure an array from rest and plucks; show how far it is from its description.
 
@@ -83,7 +84,8 @@ def fit(
     """
     if in_place and out:
         raise ConfigError("--out and --in-place: choose one of the two")
-    check_output(out)
+    for file in (out, json):
+        check_output(file)
     loads = [_known(text) for text in known or ()]
     try:
         with starting():
@@ -102,13 +104,17 @@ def fit(
         read_described(described, source.spec)  # a mistake is told before the reading
         chunks = record(source, seconds)
         fitted = fit_array(described, source.spec, concatenate(chunks), loads)
-    _show(fitted.findings, Console())
+    if not told_as_json([_record(f) for f in fitted.findings], json):
+        _show(fitted.findings, Console())
     if target := described if in_place else out:
         write_whole(target, lambda file: file.write(fitted.text.encode()))
         values = sum(len(f.edits) for f in fitted.findings)
-        typer.echo(f"{target}: {values} values brought to what was measured")
+        typer.echo(f"{target}: {values} values brought to what was measured", err=json == STDOUT)
     else:
-        typer.echo("not written: --in-place changes the array's file, --out FILE makes another")
+        typer.echo(
+            "not written: --in-place changes the array's file, --out FILE makes another",
+            err=json == STDOUT,
+        )
     keep_fit(described, recording, fitted.findings, in_place)
 
 
@@ -123,6 +129,16 @@ def _known(text: str) -> "KnownLoad":
         raise ConfigError(
             f"--known {text}: write WHISKER=NEWTON@MM, A0=0.001@20 for a mN, 20 mm from the base"
         ) from None
+
+
+def _record(found: "ArrayFinding") -> dict[str, Any]:
+    return {
+        "what": found.what,
+        "unit": found.unit,
+        "described": found.described,
+        "measured": found.measured,
+        "note": found.note,
+    }
 
 
 def _show(findings: "list[ArrayFinding]", console: Console) -> None:

@@ -12,7 +12,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output, starting
-from tactile_rt.cli.tables import print_table
+from tactile_rt.cli.progress import working
+from tactile_rt.cli.tables import STDOUT, Json, print_table, told_as_json
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError, Source, concatenate
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ def tare(
     seconds: Annotated[float, typer.Option(min=0.01, max=3600, help="How long to read.")] = 2.0,
     device: Device = "",
     out: Out = None,
+    json: Json = None,
 ) -> None:
     """Measure what an untouched array reads, and store it as the zero of its device.
 
@@ -50,7 +52,8 @@ def tare(
     from tactile_rt.calibration import tare as measure
     from tactile_rt.sources.opening import open_source
 
-    check_output(out)
+    for file in (out, json):
+        check_output(file)
     with starting():
         opened = open_source(source)
     with opened:
@@ -63,7 +66,7 @@ def tare(
         path = out or calibration_path(name)
         known = _existing(path, device) or before or Calibration.of(name, raw.spec)
         known.output_spec(raw.spec)  # refuses another array now, not after the reading
-        with Console(stderr=True).status(f"do not touch {raw.spec.name}"):
+        with working(Console(stderr=True), f"do not touch {raw.spec.name}"):
             measured = measure(raw, seconds)
     untared = set(measured.untared)
     tared = [i for i, e in enumerate(raw.spec.elements) if e not in untared]
@@ -76,7 +79,13 @@ def tare(
         noise={**known.noise, **noise},
     )
     save_calibration(known, path if out else None)
-    _show_tare(measured, Console())
+    told = {
+        "device": known.device, "file": path, "seconds": measured.seconds,
+        "channels": raw.spec.channels, "units": raw.spec.units, "offset": new, "noise": noise,
+        "untared": measured.untared, "louder": louder,
+    }  # fmt: skip
+    if not told_as_json(told, json):
+        _show_tare(measured, Console())
     if untared:
         typer.echo(f"not tared, for want of valid samples: {', '.join(measured.untared)}", err=True)
     if louder:
@@ -86,7 +95,7 @@ def tare(
             err=True,
         )
     _show_uncalibrated(known)
-    typer.echo(f"tare of {known.device} written to {path}")
+    typer.echo(f"tare of {known.device} written to {path}", err=json == STDOUT)
 
 
 @app.command()
@@ -103,6 +112,7 @@ def calibrate(
     device: Device = "",
     unit: Annotated[str, typer.Option(help="Of the readings, for a device not yet known.")] = "1",
     out: Out = None,
+    json: Json = None,
 ) -> None:
     """Fit an element's matrix to known loads by least squares; show how well it fits.
 
@@ -117,7 +127,8 @@ def calibrate(
     )
     from tactile_rt.calibration import calibrate as fit_loads
 
-    check_output(out)
+    for file in (out, json):
+        check_output(file)
     loads = read_loads(table)
     path = out or (calibration_path(device) if device else None)
     known = _existing(path, device) if path else None
@@ -150,12 +161,18 @@ def calibrate(
     if path:
         made = _with_fit(target, element, fit, loads, table)
         save_calibration(made, path if out else None)
-    _show_fit(fit, loads, Console())
+    told = {
+        "device": target.device, "element": element, "file": path, "units": loads.units,
+        "lines": loads.lines, **vars(fit),
+    }  # fmt: skip
+    if not told_as_json(told, json):
+        _show_fit(fit, loads, Console())
     if made:
         _show_uncalibrated(made)
-        typer.echo(f"matrix of {made.device}, element {element}, written to {path}")
+        said = f"matrix of {made.device}, element {element}, written to {path}"
     else:
-        typer.echo("not written: name a --device or a file (--out)")
+        said = "not written: name a --device or a file (--out)"
+    typer.echo(said, err=json == STDOUT)
 
 
 def _own_id(source: Source) -> str:

@@ -8,16 +8,14 @@ from typing import Annotated
 
 import typer
 
-from tactile_rt.cli.app import app, check_output
+from tactile_rt.cli.app import app, check_output, set_option
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Settings", "serve"]
 
 Settings = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set", help="Override a key: page.port=9000, source.whiskers.url=...; may be repeated."
-    ),
+    set_option("A key of the configuration: page.port=9000, source.whiskers.url=..."),
 ]
 UNIT = "tactile-rt.service"
 HOMES = ("/home/", "/root/")
@@ -102,6 +100,7 @@ def ros2_messages(
     """Write tactile_rt_msgs, the ROS 2 package of what recordings and the publisher ros2 say."""
     import shutil
 
+    from tactile_rt.files import whole_folder
     from tactile_rt.ros2.definitions import PACKAGE
 
     made = folder / PACKAGE.name
@@ -109,7 +108,8 @@ def ros2_messages(
         raise ConfigError(f"no folder {folder}")
     if made.exists():
         raise ConfigError(f"{made} is there already")
-    shutil.copytree(PACKAGE, made)
+    with whole_folder(made) as there:
+        shutil.copytree(PACKAGE, there, dirs_exist_ok=True)
     typer.echo(f"{made} is written; build it with: colcon build --packages-select {PACKAGE.name}")
 
 
@@ -121,16 +121,22 @@ def _give(text: str, output: Path | None, then: str) -> None:
         return
     if output.exists():
         raise ConfigError(f"{output} is there already: name another file")
-    output.write_text(text)
+    _write(output, text)
     typer.echo(f"{output} is written; {then}")
+
+
+def _write(path: Path, text: str) -> None:
+    from tactile_rt.files import write_whole
+
+    write_whole(path, lambda file: file.write(text.encode()))
 
 
 @app.command("install-service")
 def install_service(
     file: Annotated[Path, typer.Argument(help="The configuration, e.g. /etc/tactile/robot.toml.")],
-    to: Annotated[Path, typer.Option(help="Folder to write into; it must be new or empty.")] = Path(
-        "tactile-service"
-    ),
+    out: Annotated[
+        Path, typer.Option(help="Folder to write into; it must be new or empty.")
+    ] = Path("tactile-service"),
     user: Annotated[str, typer.Option(help="Name that the service runs under.")] = "tactile",
 ) -> None:
     """Write a systemd unit, udev rules for what is plugged in, and a script that installs them.
@@ -148,21 +154,21 @@ def install_service(
     if not USER.fullmatch(user):
         raise ConfigError(f"--user {user!r} is not a name that a user can have")
     check_folders(loaded, user)
-    if to.exists() and (not to.is_dir() or any(to.iterdir())):
-        raise ConfigError(f"{to} is there already: name a new folder with --to")
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError(f"{out} is there already: name a new folder with --out")
     program, path = _program(), str(file.absolute())
     unit = unit_text([*program, "run", path], loaded.config, user)
     again = [*program, "install-service", path, "--user", user]
     script = install_script(UNIT, again, loaded.config, user)
-    to.mkdir(parents=True, exist_ok=True)
-    (to / UNIT).write_text(unit)
-    (to / "99-tactile.rules").write_text(udev_rules(serial_ports()))
-    (to / "install.sh").write_text(script)
-    typer.echo(f"{to}: {UNIT}, 99-tactile.rules, install.sh are written")
+    out.mkdir(parents=True, exist_ok=True)
+    _write(out / UNIT, unit)
+    _write(out / "99-tactile.rules", udev_rules(serial_ports()))
+    _write(out / "install.sh", script)
+    typer.echo(f"{out}: {UNIT}, 99-tactile.rules, install.sh are written")
     for name in (program[0], path):
         if name.startswith(HOMES):
             typer.echo(f"{name}: the user {user} must be able to read it; better /opt or /etc")
-    typer.echo(f"read them, then: sudo sh {shlex.quote(str(to / 'install.sh'))}")
+    typer.echo(f"read them, then: sudo sh {shlex.quote(str(out / 'install.sh'))}")
 
 
 def _program() -> list[str]:

@@ -17,8 +17,10 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 
-from tactile_rt.cli.app import Model, Seconds, app, leaving, needs, starting
+from tactile_rt.cli.app import Model, Pace, Seconds, app, check_output, leaving, needs, starting
 from tactile_rt.cli.demonstration import Demonstration, SweepOutcome
+from tactile_rt.cli.tables import STDOUT, Json, told_as_json
+from tactile_rt.extras import install_extra
 from tactile_rt.stream import ConfigError
 
 __all__ = ["WIDTH", "draw", "watch"]
@@ -52,15 +54,14 @@ def demo(
     seconds: Seconds = None,
     model: Model = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the drawn objects and sweeps.")] = 0,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="As fast as it simulates, not in real time.")
-    ] = False,
+    fast: Pace = False,
     recorded: Annotated[
         bool, typer.Option("--recorded", help="Play the recording, also if there is MuJoCo.")
     ] = False,
     plain: Annotated[
         bool, typer.Option("--plain", help="One line per object instead of the view.")
     ] = False,
+    json: Json = None,
 ) -> None:
     """Sweep objects that the model never saw past whiskers, and keep the score.
 
@@ -69,23 +70,31 @@ def demo(
     """
     from tactile_rt.classifier.model_file import shipped_model
 
-    console = Console()
+    check_output(json)
+    console = Console(stderr=json == STDOUT)
     recorded |= not (find_spec("mujoco") and find_spec("trimesh"))
     if recorded and (fast or seed):
-        raise ConfigError("--fast and --seed are for a simulation: install tactile-rt[sim]")
+        raise ConfigError(f"--fast and --seed are for a simulation: {install_extra('sim')}")
     try:
         with starting(), console.status("building the array and the objects"):
             demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)
     except ModuleNotFoundError as error:
         raise needs("record" if recorded else "sim", error) from None
     with leaving(seconds), demonstration:
-        if plain or not console.is_terminal or console.is_dumb_terminal:
+        narrow = console.width < WIDTH
+        if plain or narrow or not console.is_terminal or console.is_dumb_terminal:
             for settled in demonstration.run():
                 for outcome in settled:
-                    typer.echo(outcome.line())
+                    typer.echo(outcome.line(), err=json == STDOUT)
         else:
             watch(demonstration, console)
-    typer.echo(demonstration.summary())
+    told = {
+        "outcomes": demonstration.outcomes, "right": demonstration.right,
+        "latency_p50_ms": demonstration.latency_ms(50),
+        "latency_p99_ms": demonstration.latency_ms(99), "dropped": demonstration.dropped,
+    }  # fmt: skip
+    if not told_as_json(told, json):
+        typer.echo(demonstration.summary())
 
 
 def watch(demo: Demonstration, console: Console) -> None:

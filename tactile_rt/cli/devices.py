@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
-from tactile_rt.cli.tables import Json, show_table
+from tactile_rt.cli.tables import STDOUT, Json, show_table, told_as_json
 
 Url = Annotated[str, typer.Argument(help="URL of a source, e.g. serial:///dev/ttyUSB0?codec=bota.")]
 WINDOW_S = 1.0
@@ -34,6 +34,7 @@ def list_devices(json: Json = None) -> None:
 @app.command()
 def doctor(
     udev: Annotated[Path | None, typer.Option(help="Write udev rules for what is there.")] = None,
+    json: Json = None,
 ) -> None:
     """Look for what may keep devices from being opened or being fast; say what to do.
 
@@ -45,11 +46,13 @@ def doctor(
     from tactile_rt.drivers.discovery import can_buses, diagnose, serial_ports, udev_rules
     from tactile_rt.files import write_whole
 
-    check_output(udev)
+    for file in (udev, json):
+        check_output(file)
     ports = serial_ports()
-    console = Console(soft_wrap=True, highlight=False)
     findings = diagnose(ports, can_buses())
-    for finding in findings:
+    alone = told_as_json(findings, json)
+    console = Console(stderr=alone, soft_wrap=True, highlight=False)
+    for finding in () if alone else findings:
         mark = "[green]ok [/]" if finding.good else "[red]bad[/]"
         console.print(f"{mark} [bold]{escape(finding.what)}[/]: {escape(finding.says)}")
         if finding.do:
@@ -72,8 +75,6 @@ def codecs(
     json: Json = None,
 ) -> None:
     """Show what devices can speak: a line a codec; of one, its options and what it cannot show."""
-    import inspect
-
     from tactile_rt.drivers.codec import CODECS, codec_class
     from tactile_rt.stream import ConfigError
 
@@ -102,7 +103,7 @@ def codecs(
             {
                 "codec": name,
                 "wire": wire,
-                "device": (inspect.getdoc(kind) or "").partition("\n")[0].replace("``", ""),
+                "device": _about(kind),
                 "options": list(kind.Options.__dataclass_fields__),
                 "cannot_detect": kind.cannot_detect,
             }
@@ -113,6 +114,11 @@ def codecs(
             options = ", ".join(one.get("options", ())) or "none"
             typer.echo(f"\noptions over {one['wire']}: {options}")
             typer.echo(f"cannot detect: {one.get('cannot_detect', 'unknown')}")
+
+
+def _about(kind: type) -> str:
+    """The first line of a class's own docstring; under ``python -OO`` it has none."""
+    return (kind.__doc__ or "").strip().partition("\n")[0].replace("``", "")
 
 
 @app.command()
@@ -157,19 +163,21 @@ def echo(source: Url, seconds: Seconds = None) -> None:
 
 
 @app.command()
-def hz(source: Url, seconds: Seconds = None) -> None:
+def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
     """Print once a second: the rate, the jitter of arrival, what was lost, the device's state."""
     import numpy as np
 
     from tactile_rt.sources.opening import open_source
     from tactile_rt.stream import EndOfStream
 
+    check_output(json)
     with starting():
         opened = open_source(source)
+    looks: list[dict[str, Any]] = []
     with opened, leaving(seconds):
         spec = opened.spec
         shape = f"{spec.shape[0]} elements x {spec.shape[1]} channels"
-        typer.echo(f"{spec.name}: {shape}, nominally {spec.rate_hz:g} Hz")
+        typer.echo(f"{spec.name}: {shape}, nominally {spec.rate_hz:g} Hz", err=json == STDOUT)
         while True:
             began, n, late = time.monotonic(), 0, []
             try:
@@ -179,7 +187,7 @@ def hz(source: Url, seconds: Seconds = None) -> None:
                         n += len(chunk)
                         late.append((time.monotonic_ns() - int(chunk.t_ns[-1])) / 1e6)
             except EndOfStream:
-                return
+                break
             rate = n / (time.monotonic() - began)
             spread = np.quantile(late, (0.5, 0.99)) - min(late) if late else (0.0, 0.0)
             stats = opened.stats
@@ -190,8 +198,18 @@ def hz(source: Url, seconds: Seconds = None) -> None:
             typer.echo(
                 f"{rate:8.1f} Hz, jitter p50 {spread[0]:.2f} p99 {spread[1]:.2f} ms, "
                 f"missing {stats.missing}, corrupt {stats.corrupt}, "
-                f"duplicates {stats.duplicates}{state}"
+                f"duplicates {stats.duplicates}{state}",
+                err=json == STDOUT,
             )
+            looks.append(
+                {
+                    "rate_hz": rate, "jitter_p50_ms": spread[0], "jitter_p99_ms": spread[1],
+                    "missing": stats.missing, "corrupt": stats.corrupt,
+                    "duplicates": stats.duplicates,
+                    "state": health.state if health else None,
+                }
+            )  # fmt: skip
+    told_as_json(looks, json)
 
 
 @app.command()

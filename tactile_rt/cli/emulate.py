@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, leaving, needs, starting
+from tactile_rt.cli.app import Pace, app, leaving, needs, set_option, starting
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -39,13 +39,11 @@ def emulate(
         str | None, typer.Option(help="For --wire can: INTERFACE:CHANNEL, e.g. socketcan:vcan0.")
     ] = None,
     faults: Annotated[Path | None, typer.Option(help="A .toml of what goes wrong.")] = None,
-    option: Annotated[
+    sets: Annotated[
         list[str] | None,
-        typer.Option(help="Of codec or line (baud, bitrate; 0: no speed): NAME=VALUE; repeated."),
+        set_option("An option of codec or line: format=int16, baud=9600, bitrate=0 (no speed)"),
     ] = None,
-    fast: Annotated[
-        bool, typer.Option("--fast", help="As fast as the host reads, not in real time.")
-    ] = False,
+    fast: Pace = False,
     seconds: Annotated[
         float | None,
         typer.Option(min=0.001, max=1e9, help="Send so many seconds of samples, then leave."),
@@ -67,7 +65,7 @@ def emulate(
     from tactile_rt.drivers.opening import make_codec
     from tactile_rt.sources.opening import open_source
 
-    fields = codec_options(option or [])
+    fields = codec_options(sets or [])
     if project is not None:
         codec, source, wire, link, fields = _of_project(project, codec, source, wire, link, fields)
     elif codec is None:
@@ -138,14 +136,14 @@ def _of_project(
 
 
 def codec_options(given: list[str]) -> dict[str, str]:
-    """``NAME=VALUE`` options of a codec, as fields."""
+    """``KEY=VALUE`` options of a codec, as fields."""
     fields = {}
     for pair in given:
         name, equals, value = pair.partition("=")
         if not equals or not name:
-            raise ConfigError(f"--option is NAME=VALUE, not {pair!r}")
+            raise ConfigError(f"--set {pair}: an option is KEY=VALUE")
         if name in fields:
-            raise ConfigError(f"--option {name} is given twice")
+            raise ConfigError(f"--set {name}=... is given twice")
         fields[name] = value
     return fields
 

@@ -7,7 +7,8 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needs
-from tactile_rt.cli.tables import print_table
+from tactile_rt.cli.progress import working
+from tactile_rt.cli.tables import Json, show_records
 
 
 @app.command(name="eval")
@@ -24,7 +25,7 @@ def evaluate(
     quick: Annotated[
         bool, typer.Option(help="Two sweeps of each object: to compare by, not to quote.")
     ] = False,
-    json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
+    json: Json = None,
 ) -> None:
     """Measure a model on the test objects of a sweep set: accuracy, fusion, calibration, noise
     and what else goes wrong with a sensor."""
@@ -37,11 +38,6 @@ def evaluate(
         from tactile_rt.evidence.classification import evaluate_model
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
-    from tactile_rt.evidence.records import as_table, write
-
-    console = Console(stderr=True)
-    with console.status("evaluating"):
+    with working(Console(stderr=True), "evaluating"):
         records = evaluate_model(model, data, accurate, svm, pictures, quick)
-    print_table(as_table(records))
-    if json:
-        write(records, json)
+    show_records(records, json)

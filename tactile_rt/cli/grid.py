@@ -7,6 +7,8 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.tables import Json, told_as_json
 
 
 @app.command()
@@ -18,6 +20,7 @@ def grid(
         Path | None,
         typer.Option(help="Train nothing: write the table of what is done into this page."),
     ] = None,
+    json: Json = None,
 ) -> None:
     """Train encoder x attender x objective, each tuned alike, and draw how well they do.
 
@@ -28,27 +31,36 @@ def grid(
     from tactile_rt.models.grid.plan import read_grid
     from tactile_rt.sweep_set import SweepManifest
 
-    check_output(report)
+    for file in (report, json):
+        check_output(file)
     wanted = read_grid(plan)
     if report is None and waiting_tasks(wanted, folder):
         SweepManifest.read(Path(wanted.data))
     try:
         from tactile_rt.models.grid.picture import draw_curves, draw_grid
         from tactile_rt.models.grid.pool import run_grid
-        from tactile_rt.models.grid.results import gather, put_into, table, write_results
+        from tactile_rt.models.grid.results import (
+            GridResults,
+            gather,
+            put_into,
+            table,
+            write_results,
+        )
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     console = Console(stderr=True)
 
-    def conclude() -> None:
+    def conclude() -> GridResults:
         results = gather(wanted, folder)
         write_results(results, folder)
         draw_grid(results, folder / "task_performance.png")
         draw_curves(results, folder / "learning_curves.png")
         if report is not None:
             put_into(report, table(results))
+        return results
 
     def show(found: Outcome, done: int, total: int) -> None:
+        update(completed=done, total=total)
         right = found.right()
         said = found.failed or f"top-1 {100 * right.mean():.1f} %"
         console.print(
@@ -60,6 +72,8 @@ def grid(
 
     per_seed = -(-len(wanted.tasks()) // wanted.seeds)
     if report is None:
-        run_grid(wanted, folder, processes, show)
-    conclude()
+        done = len(wanted.tasks()) - len(waiting_tasks(wanted, folder))
+        with progress_bar(console, "tasks", len(wanted.tasks()), done, counted=True) as update:
+            run_grid(wanted, folder, processes, show)
+    told_as_json(conclude(), json)
     console.print(f"{folder}: its tables and pictures")

@@ -1,16 +1,26 @@
 """`tactile-rt hil`: hardware in the loop, with an emulated device."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 from urllib.parse import parse_qsl
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli.app import INTERRUPTED, app, leaving, needs, starting
+from tactile_rt.cli.app import (
+    INTERRUPTED,
+    Pace,
+    app,
+    check_output,
+    leaving,
+    needs,
+    set_option,
+    starting,
+)
 from tactile_rt.cli.emulate import codec_options
-from tactile_rt.cli.tables import print_table
+from tactile_rt.cli.progress import working
+from tactile_rt.cli.tables import Json, print_table, told_as_json
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -32,10 +42,7 @@ def hil(
     codec: Annotated[
         str | None, typer.Option(help="What the device speaks. Default: native, or a project's.")
     ] = None,
-    option: Annotated[
-        list[str] | None,
-        typer.Option(help="Of the codec: NAME=VALUE, e.g. format=int16; may be repeated."),
-    ] = None,
+    sets: Annotated[list[str] | None, set_option("An option of the codec: format=int16")] = None,
     faults: Annotated[Path | None, typer.Option(help="A .toml of what goes wrong.")] = None,
     sweeps: Annotated[
         int | None, typer.Option(min=1, help=f"Of sim:, how many objects pass. Default: {SWEEPS}.")
@@ -44,9 +51,7 @@ def hil(
         float | None, typer.Option(min=0.001, max=1e9, help="Leave after so much of the stream.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the default source.")] = 0,
-    realtime: Annotated[
-        bool, typer.Option("--realtime", help="In real time, not as fast as it goes.")
-    ] = False,
+    fast: Pace = True,
     clock: Annotated[
         str, typer.Option(help="Time of the driver's samples: device; host (in real time).")
     ] = "device",
@@ -56,6 +61,7 @@ def hil(
     project: Annotated[
         Path | None, typer.Option(help="A folder of `tactile-rt make`: its array and its model.")
     ] = None,
+    json: Json = None,
 ) -> None:
     """Run a simulated array through an emulated device and its real driver.
 
@@ -70,7 +76,8 @@ def hil(
     from tactile_rt.evidence.hil import Loop, check_line
     from tactile_rt.sources.opening import open_source
 
-    fields = codec_options(option or [])
+    check_output(json)
+    fields = codec_options(sets or [])
     if project is not None:
         source, model, wire, codec, fields = _of_project(
             project, source, model, wire, codec, fields, seed
@@ -83,7 +90,7 @@ def hil(
         unseen = load_model(file)[1].provenance.get("unseen_objects", [])
         source = f"sim:mouse?seed={seed}" + (f"&objects={','.join(unseen)}" if unseen else "")
     if source.startswith(("sim:", "whisking:")):
-        source = _with(source, "pace", "realtime" if realtime else "fast")
+        source = _with(source, "pace", "fast" if fast else "realtime")
     if source.startswith("sim:"):
         if sweeps is not None or seconds is None:
             source = _with(source, "sweeps", str(sweeps or SWEEPS))
@@ -97,10 +104,17 @@ def hil(
     except BaseException:
         opened.close()
         raise
-    with leaving(None), console.status(f"{wire}, {codec}"):
+    with leaving(None), working(console, f"{codec} over {wire}"):
         loop.run()
     report = loop.report()
-    print_table(_table(report, source, f"{codec} over {wire}"))
+    told = {
+        "source": source, "wire": wire, "codec": codec, "complete": loop.complete,
+        "failure": report.failure, **vars(report),
+        "latency_s": _percentiles(report.latency_s),
+        "stamp_error_s": _percentiles(report.stamp_error_s),
+    }  # fmt: skip
+    if not told_as_json(told, json):
+        print_table(_table(report, source, f"{codec} over {wire}"))
     if not loop.complete:
         typer.echo("interrupted: what was on its way is missing above", err=True)
         raise typer.Exit(INTERRUPTED)
@@ -171,10 +185,17 @@ def _table(report: "LoopReport", source: str, title: str) -> Table:
     return table
 
 
-def _spread(values: object, scale: float, unit: str) -> str:
+def _percentiles(values: Any) -> dict[str, float] | None:
     import numpy as np
 
     if values is None:
+        return None
+    p50, p99, worst = np.percentile(values, (50, 99, 100))
+    return {"p50": float(p50), "p99": float(p99), "worst": float(worst)}
+
+
+def _spread(values: Any, scale: float, unit: str) -> str:
+    found = _percentiles(values)
+    if found is None:
         return ""
-    p50, p99, worst = np.percentile(values, (50, 99, 100)) * scale  # type: ignore[call-overload]
-    return f"p50 {p50:.2f}, p99 {p99:.2f}, worst {worst:.2f} {unit}"
+    return ", ".join(f"{name} {scale * value:.2f}" for name, value in found.items()) + f" {unit}"

@@ -5,8 +5,11 @@ from typing import Annotated
 from urllib.parse import parse_qsl
 
 import typer
+from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, starting
+from tactile_rt.cli.progress import working
+from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import ConfigError
 
 
@@ -39,6 +42,7 @@ def import_file(
         str, typer.Option(help="Of samples of ours in a bag: a file that says what they are of.")
     ] = "",
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    json: Json = None,
 ) -> None:
     """Make a recording of what is on the disk; `tactile-rt sniff` tells how.
 
@@ -56,12 +60,13 @@ def import_file(
     output = output or Path(f"{log.name.partition('.')[0] or 'import'}.mcap")
     if output.suffix != ".mcap":
         raise ConfigError(f"{output}: a recording is a .mcap; `tactile-rt convert` makes others")
-    check_output(output)
+    for file in (output, json):
+        check_output(file)
     if output.exists() and not force:
         raise ConfigError(f"{output} is there already: name another file, or give --force")
     if decimal not in ("", ",", "."):
         raise ConfigError(f"--decimal is , or ., not {decimal!r}")
-    with starting():
+    with starting(), working(Console(stderr=True), f"reading {log}"):
         from tactile_rt.drivers.logs import read_log
         from tactile_rt.recording.importing.bag import import_bag, is_bag
         from tactile_rt.recording.importing.csv import csv_form, read_table
@@ -87,7 +92,8 @@ def import_file(
             )
     for note in made.notes:
         typer.echo(f"{log}: {note}", err=True)
-    typer.echo(f"{output}: {made.line()}")
+    if not told_as_json({"file": output, **vars(made)}, json):
+        typer.echo(f"{output}: {made.line()}")
 
 
 def codec_fields(text: str, option: str) -> dict[str, str]:

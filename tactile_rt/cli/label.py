@@ -7,7 +7,9 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, progress_bar
+from tactile_rt.cli.app import app, check_output
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import ConfigError, RecordingError
 
 
@@ -28,11 +30,12 @@ def label(
         Path | None,
         typer.Option(help="A sweep set or model of the array: its sensor and sample period."),
     ] = None,
-    split: Annotated[
+    shares: Annotated[
         str, typer.Option(help="Shares of the objects: train,validation,test.")
     ] = "0.7,0.15,0.15",
     seed: Annotated[int, typer.Option(min=0, help="Of the split.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Replace a set that is there.")] = False,
+    json: Json = None,
 ) -> None:
     """Make a sweep set of recordings, to train and evaluate on.
 
@@ -52,7 +55,8 @@ def label(
 
     if (labels is not None) + by_name + unlabelled > 1:
         raise ConfigError("--labels, --by-name and --unlabelled exclude one another: give one")
-    shares = _shares(split)
+    check_output(json)
+    parts = _shares(shares)
     _check_out(folder, force)
     if twice := [one for one in recordings if recordings.count(one) > 1]:
         raise ConfigError(f"{twice[0]} is named twice: name it once")
@@ -68,10 +72,10 @@ def label(
             recordings, intervals, like,
             lambda one, seconds: update(description=f"{one.name} {seconds:.0f} s"),
         )  # fmt: skip
-    given = {"--labels": labels, "--like": like, "--split": split, "--seed": seed}
+    given = {"--labels": labels, "--like": like, "--shares": shares, "--seed": seed}
     words = [w for k, v in given.items() if v is not None for w in (k, str(v))]
     words += [k for k, v in {"--by-name": by_name, "--unlabelled": unlabelled}.items() if v]
-    manifest = write_set(folder, touches, shares, seed, shlex.join(words), write_sums)
+    manifest = write_set(folder, touches, parts, seed, shlex.join(words), write_sums)
     for line in touches.left_out:
         console.print(line, markup=False)
     for name, some in (("validation", "to train"), ("test", "for `tactile-rt eval`")):
@@ -81,6 +85,14 @@ def label(
     counts = {
         c: sum(used.interval.label == c for used in touches.used) for c in manifest.categories
     }
+    told_as_json(
+        {
+            "set": folder, "touches": touches.found.total(), "used": len(touches.used),
+            "classes": counts, "objects": {name: len(manifest.split[name]) for name in SPLITS},
+            "left_out": list(touches.left_out),
+        },
+        json,
+    )  # fmt: skip
     told = ", ".join(f"{name} {n}" for name, n in counts.items())
     console.print(
         f"{folder}: {len(touches.used)} of {touches.found.total()} touches ({told}); "
@@ -95,7 +107,7 @@ def _shares(text: str) -> tuple[float, ...]:
         shares = tuple(map(float, text.split(",")))
     except ValueError:
         raise ConfigError(
-            f"--split is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15, not {text!r}"
+            f"--shares is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15, not {text!r}"
         ) from None
     check_shares(shares)
     return shares

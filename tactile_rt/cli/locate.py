@@ -7,8 +7,10 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs
-from tactile_rt.cli.tables import print_table
+from tactile_rt.cli.app import app, check_output, needs, set_option
+from tactile_rt.cli.progress import progress_bar, working
+from tactile_rt.cli.tables import Json, show_records, told_as_json
+from tactile_rt.settings import take_sets
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.contact_point import WhiskerShapes
@@ -23,14 +25,18 @@ def train(
     data: Annotated[Path, typer.Argument(help="A sweep set made with --contacts.")],
     checkpoint: Annotated[Path, typer.Argument(help="The file to write.")],
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the training split.")] = 12,
-    hidden: Annotated[int, typer.Option(min=1, help="Units of the recurrent layer.")] = 48,
     seed: Annotated[int, typer.Option(help="Of weights and noise.")] = 0,
+    sets: Annotated[
+        list[str] | None, set_option("Of the training: hidden=64, batch=256, learning_rate=0.002")
+    ] = None,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    json: Json = None,
 ) -> None:
     """Train the contact network on the simulator's own contacts."""
     from tactile_rt.sweep_set import SweepManifest
 
-    check_output(checkpoint)
+    for file in (checkpoint, json):
+        check_output(file)
     SweepManifest.read(data)
     try:
         import torch
@@ -39,19 +45,28 @@ def train(
         from tactile_rt.models.datasets import SweepSet
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
+    usual = {"epochs": epochs, "seed": seed}
+    (config,) = take_sets("locate train", sets or (), regression.ContactConfig, usual=usual)
     torch.set_num_threads(threads)
     console = Console(stderr=True)
-    sets = [SweepSet.read(data, split) for split in ("train", "validation")]
-    regression.train_contacts(
-        sets[0],
-        sets[1],
-        _shapes(sets[0].manifest),
-        regression.ContactConfig(hidden=hidden, epochs=epochs, seed=seed),
-        checkpoint,
-        lambda epoch, loss, error: console.print(
-            f"epoch {epoch}/{epochs}: loss {loss:.4f}, validation {error:.4f}"
-        ),
-    )
+    known, held = (SweepSet.read(data, split) for split in ("train", "validation"))
+    history: list[dict[str, float]] = []
+    with progress_bar(console, "training", config.epochs) as update:
+
+        def show(epoch: int, loss: float, error: float) -> None:
+            history.append({"epoch": epoch, "loss": loss, "validation": error})
+            update(advance=1)
+            console.print(f"epoch {epoch}/{config.epochs}: loss {loss:.4f}, validation {error:.4f}")
+
+        regression.train_contacts(
+            known,
+            held,
+            _shapes(known.manifest),
+            config,
+            checkpoint,
+            show,
+        )
+    told_as_json(history, json)
     console.print(f"best network: {checkpoint}")
 
 
@@ -59,21 +74,17 @@ def train(
 def evaluate(
     checkpoint: Annotated[Path, typer.Argument(help="What `locate train` wrote.")],
     data: Annotated[Path, typer.Argument(help="A sweep set made with --contacts.")],
-    json: Annotated[Path | None, typer.Option(help="Write the figures here too.")] = None,
+    json: Json = None,
 ) -> None:
     """Measure it on the test objects, beside the classical estimates from moment and force."""
     try:
         from tactile_rt.evidence.locating import contact_records
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
-    from tactile_rt.evidence.records import as_table, write
-
     check_output(json)
-    with Console(stderr=True).status("evaluating"):
+    with working(Console(stderr=True), "evaluating"):
         records = contact_records(checkpoint, data)
-    print_table(as_table(records))
-    if json:
-        write(records, json)
+    show_records(records, json)
 
 
 def _shapes(manifest: "SweepManifest") -> "WhiskerShapes":

@@ -4,14 +4,14 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
-import msgspec
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tactile_rt.cli.app import app
-from tactile_rt.cli.tables import STDOUT, Json, print_table, write_json
+from tactile_rt.cli.app import app, check_output
+from tactile_rt.cli.progress import working
+from tactile_rt.cli.tables import STDOUT, Json, print_table, show_records, told_as_json
 from tactile_rt.stream import ModelError
 
 model = typer.Typer(help="Look into a model file, check it, time it.", no_args_is_help=True)
@@ -29,10 +29,8 @@ def show(file: File, json: Json = None) -> None:
     from tactile_rt.stream import NS_PER_S
 
     card, contents, data = read_model(file)
-    if json is not None:
-        write_json(msgspec.to_builtins(card), json)
-        if json == STDOUT:
-            return
+    if told_as_json(card, json):
+        return
     spec = card.array
     period_ms = card.period_ns / NS_PER_S * 1e3
     rest = f", ... {card.classes[-1]}" if len(card.classes) > MANY else ""
@@ -68,6 +66,7 @@ def show(file: File, json: Json = None) -> None:
         "candidates": "\n".join(map(_candidates, card.candidates)),
         "loads": ", ".join(card.loads),
         "figures": _pairs(card.figures),
+        "licence": card.license,
         "probe": "stored" if card.probe else "none stored",
         "hashes": _pairs(card.hashes),
         "made by": _pairs({k: v for k, v in card.provenance.items() if isinstance(v, str)}),
@@ -85,7 +84,7 @@ def show(file: File, json: Json = None) -> None:
 
 
 @model.command()
-def verify(file: File) -> None:
+def verify(file: File, json: Json = None) -> None:
     """Whether a file is whole, and computes here what it did where it was made.
 
     Reads it within bounds, checks its metadata against its graph, tries it in a
@@ -98,37 +97,50 @@ def verify(file: File) -> None:
     from tactile_rt.classifier.model_runs import verify_model
     from tactile_rt.classifier.trial import try_model
 
-    _, contents, data = read_model(file)
-    typer.echo(f"sha256 {hashlib.sha256(data).hexdigest()}")
-    typer.echo(f"structure: {sum(contents.operators.values())} operators, nothing outside the file")
-    if read_model(file)[0].kind == "step":
+    check_output(json)
+    card, contents, data = read_model(file)
+    told: dict[str, str] = {}
+
+    def tell(what: str, says: str) -> None:
+        told[what] = says
+        if json != STDOUT:
+            typer.echo(f"{what}: {says}")
+
+    tell("sha256", hashlib.sha256(data).hexdigest())
+    operators = sum(contents.operators.values())
+    tell("structure", f"{operators} operators, nothing outside the file")
+    if card.kind == "step":
         found = try_model(file)
-        typer.echo(
-            f"trial: warm after {found.load_s:.2f} s, {found.memory_mb:.0f} MB, "
-            f"{1e3 * found.step_s:.2f} ms a step"
+        tell(
+            "trial",
+            f"warm after {found.load_s:.2f} s, {found.memory_mb:.0f} MB, "
+            f"{1e3 * found.step_s:.2f} ms a step",
         )
     _, card = load_model(file, kind=None)
-    typer.echo(f"metadata: version {card.version}, agrees with the graph")
+    tell("metadata", f"version {card.version}, agrees with the graph")
     for line in verify_model(file):
-        typer.echo(line)
+        what, _, says = line.partition(": ")
+        tell(what, says)
+    told_as_json(told, json)
 
 
 @model.command()
 def bench(
     file: File,
     steps: Annotated[int, typer.Option(min=10, max=1_000_000, help="Steps to time.")] = 2000,
+    json: Json = None,
 ) -> None:
     """How fast it is here: size, loading, memory, CPU time of a step, and the machine's limit."""
     from tactile_rt.classifier.model_file import read_model
     from tactile_rt.evidence.model_steps import Subject, measure_model
-    from tactile_rt.evidence.records import as_table
 
     card, _, _ = read_model(file)
     if card.kind != "step":
         raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
-    with Console(stderr=True).status("measuring"):
+    check_output(json)
+    with working(Console(stderr=True), "measuring"):
         records = measure_model(Subject("model", file), steps)
-    print_table(as_table(records))
+    show_records(records, json)
 
 
 def _channels(spec: Any, values: tuple[float, ...]) -> str:

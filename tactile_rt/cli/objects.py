@@ -7,8 +7,9 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from tactile_rt.cli.app import app, needs, progress_bar, starting
-from tactile_rt.cli.tables import Json, show_table
+from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.tables import Json, show_table, told_as_json
 
 objects = typer.Typer(help="Objects that others made.", no_args_is_help=True)
 app.add_typer(objects, name="objects")
@@ -25,8 +26,9 @@ def get(
     folder: Annotated[Path, typer.Argument(help="Where they are put: FOLDER/CATEGORY/NAME.ply.")],
     clones: Annotated[
         Path | None,
-        typer.Option("--from", help="A folder of clones, instead of GitHub."),
+        typer.Option(help="A folder of clones of the repositories, instead of GitHub."),
     ] = None,
+    json: Json = None,
 ) -> None:
     """Get the objects of a list into a folder, every file checked by its hash.
 
@@ -37,6 +39,7 @@ def get(
             from tactile_rt.sim_backend.objects.object_lists import get_objects, read_list
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
+    check_output(json)
     listed = read_list(wanted)
     console = Console(stderr=True)
     with progress_bar(console, "getting", total=len(listed), counted=True) as update:
@@ -45,6 +48,12 @@ def get(
         console.print(f"[red]{escape(name)}[/]: {escape(why)}", soft_wrap=True, highlight=False)
     licences = sorted({thing.files[0].licence for thing in listed})
     kinds = len({thing.files[0].category for thing in listed})
+    told = {
+        "folder": folder, "objects": len(listed), "kinds": kinds, "missing": missing,
+        "licences": licences,
+    }  # fmt: skip
+    if told_as_json(told, json):
+        raise typer.Exit(1 if missing else 0)
     typer.echo(
         f"{len(listed) - len(missing)} of {len(listed)} objects of {kinds} kinds are in {folder}; "
         f"licences: {', '.join(licences)}, see objects.csv"

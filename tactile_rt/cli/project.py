@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, needs, progress_bar, starting
+from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.tables import Json, told_as_json
 
 if TYPE_CHECKING:
     from tactile_rt.project.making import MakeProgress
@@ -41,14 +43,17 @@ def make(
     minutes: Annotated[
         float, typer.Option(help="For all of it; less time makes a smaller model.")
     ] = 60.0,
+    json: Json = None,
 ) -> None:
     """Make a project's model: sweeps, training, export, evaluation, report.
 
     What is there is not made again; what was interrupted goes on.
     """
+    check_output(json)
     console = Console(stderr=True, soft_wrap=True)
     try:
         with starting():
+            from tactile_rt.evidence.records import as_dicts
             from tactile_rt.project.folder import Project
             from tactile_rt.project.making import make as make_project
     except ModuleNotFoundError as error:
@@ -70,6 +75,7 @@ def make(
                 console.print(f"{stage.name} ({left})")
 
         records = make_project(project, minutes, tell)
+    told_as_json(as_dicts(records), json)
     for record in records:
         if record.name.removeprefix("models.") in ABOUT:
             console.print(

@@ -2,11 +2,14 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
 
 from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
+from tactile_rt.cli.progress import working
+from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.settings import no_such
 from tactile_rt.stream import ConfigError, EndOfStream, Source
 
@@ -38,6 +41,7 @@ def record(
         typer.Option(min=0, help="What a power cut may take, s; 0: all that is not written yet."),
     ] = 1.0,
     force: Force = False,
+    json: Json = None,
 ) -> None:
     """Record a source's samples and, of a device, its raw packets and health.
 
@@ -50,7 +54,8 @@ def record(
     from tactile_rt.sources.opening import open_source
 
     need_mcap()
-    check_output(output)
+    for file in (output, json):
+        check_output(file)
     rotated = rotate_mb or rotate_s  # which writes over nothing
     if output.exists() and not force and not rotated:  # before a device is opened and started
         raise ConfigError(f"{output} is there already: name another file, or give --force")
@@ -69,7 +74,15 @@ def record(
     files = (
         f"{output.with_stem(f'{output.stem}-*')} ({writer.files} of them)" if rotated else output
     )
-    typer.echo(f"{files}: {_told(opened, writer)}")
+    told = {
+        "file": output, "files": writer.files, "samples": writer.stats.samples,
+        "packets": writer.stats.packets, "bytes": writer.stats.bytes,
+        "corrupt": opened.stats.corrupt, "missing": opened.stats.missing,
+        "dropped_samples": writer.stats.dropped_samples,
+        "dropped_packets": writer.stats.dropped_packets,
+    }  # fmt: skip
+    if not told_as_json(told, json):
+        typer.echo(f"{files}: {_told(opened, writer)}")
 
 
 def _copy(source: Source, writer: "StreamWriter") -> None:
@@ -117,25 +130,32 @@ def _notes(given: list[str]) -> dict[str, str]:
 @app.command()
 def recover(
     recording: Annotated[Path, typer.Argument(help="One that was cut short, or is damaged.")],
-    output: Annotated[
+    out: Annotated[
         Path | None, typer.Option(help="Where to; default: beside it, NAME.recovered.mcap.")
     ] = None,
     force: Force = False,
+    json: Json = None,
 ) -> None:
     """Make a whole recording of what is left of one; the old file stays."""
     from tactile_rt.recording import Recording
     from tactile_rt.recording import recover as recovered
 
-    check_output(output)
-    made = recovered(recording, output, force)
-    if made == recording:
-        typer.echo(f"{recording} is whole: nothing to do")
+    for file in (out, json):
+        check_output(file)
+    with working(Console(stderr=True), f"reading {recording}"):
+        made = recovered(recording, out, force)
+        n, first, last = 0, 0, 0
+        for chunk in Recording(made):
+            first = first if n else int(chunk.t_ns[0])
+            n, last = n + len(chunk), int(chunk.t_ns[-1])
+    whole = made == recording
+    told = {"file": made, "whole": whole, "samples": n, "seconds": (last - first) / 1e9}
+    if told_as_json(told, json):
         return
-    n, first, last = 0, 0, 0
-    for chunk in Recording(made):
-        first = first if n else int(chunk.t_ns[0])
-        n, last = n + len(chunk), int(chunk.t_ns[-1])
-    typer.echo(f"{made}: {n} samples, {(last - first) / 1e9:.1f} s")
+    if whole:
+        typer.echo(f"{recording} is whole: nothing to do")
+    else:
+        typer.echo(f"{made}: {n} samples, {(last - first) / 1e9:.1f} s")
 
 
 @app.command()
@@ -163,6 +183,7 @@ def convert(
     ] = None,
     episode: Annotated[int, typer.Option(min=0, help="Which one of a LeRobot dataset.")] = 0,
     force: Force = False,
+    json: Json = None,
 ) -> None:
     """Write a recording as arrays (.npz, .h5), text (.csv), bag or dataset, or make it one again.
 
@@ -174,8 +195,12 @@ def convert(
     from tactile_rt.recording.conversion import convert as converted
     from tactile_rt.recording.conversion import outputs_of
 
+    check_output(json)
+    console = Console(stderr=True)
     if to:
-        typer.echo(_as_folder(to, files, fps, task, video or [], force))
+        with working(console, f"writing for {to}"):
+            told = _as_folder(to, files, fps, task, video or [], force)
+        _tell(told, json)
         return
     if len(files) != 2:
         raise ConfigError("name a recording and what to write, or say what --to")
@@ -184,7 +209,16 @@ def convert(
         check_output(file)
         if file.exists() and not force:
             raise ConfigError(f"{file} is there already: name another file, or give --force")
-    typer.echo(f"{output}: {converted(recording, output, episode)} samples")
+    with working(console, f"converting {recording}"):
+        samples = converted(recording, output, episode)
+    _tell({"output": output, "samples": samples}, json)
+
+
+def _tell(told: dict[str, Any], json: Path | None) -> None:
+    """Say how much was written, and where."""
+    if not told_as_json(told, json):
+        said = ", ".join(f"{n} {what}" for what, n in told.items() if what != "output")
+        typer.echo(f"{told['output']}: {said}")
 
 
 # What a folder of each form has, which may be replaced.
@@ -193,7 +227,7 @@ MARKS = {"ros2": "metadata.yaml", "lerobot": "meta/info.json"}
 
 def _as_folder(
     to: str, files: list[Path], fps: int, task: str, video: list[str], force: bool
-) -> str:
+) -> dict[str, Any]:
     """Write a bag or a dataset; what to say of it."""
     from tactile_rt.recording import Recording
     from tactile_rt.recording.as_lerobot import write_dataset
@@ -216,7 +250,7 @@ def _as_folder(
     if to == "ros2":
         if task or video:
             raise ConfigError("--task and --video go with --to lerobot")
-        return f"{output}: {write_bag(read, output)} samples"
+        return {"output": output, "samples": write_bag(read, output)}
     films = [film_of(one) for one in video]
     n = write_dataset(read, output, fps, task, films)
-    return f"{output}: {n} samples, {len(read)} episodes"
+    return {"output": output, "samples": n, "episodes": len(read)}

@@ -66,9 +66,12 @@ def run(
         opened = open_source(source)
     with opened:
         try:
-            session = Session(opened, Classifier(file, opened.spec))
+            classifier = Classifier(file, opened.spec)
         except SpecMismatch as error:
             raise SpecMismatch(f"{source}: {error}") from None
+        if classifier.remark:
+            typer.echo(classifier.remark, err=True)
+        session = Session(opened, classifier)
         with leaving(seconds), session:
             for chunk, decisions in session:
                 samples += len(chunk)

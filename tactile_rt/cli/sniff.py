@@ -3,12 +3,13 @@
 import shlex
 import stat
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 from urllib.parse import quote, urlencode
 
 import typer
 
-from tactile_rt.cli.app import app, leaving, starting
+from tactile_rt.cli.app import app, check_output, leaving, starting
+from tactile_rt.cli.tables import STDOUT, Json, print_table, told_as_json
 from tactile_rt.stream import ConfigError, RecordingError
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ def sniff(
     dtr: Annotated[
         bool, typer.Option("--dtr/--no-dtr", help="Assert DTR, at which many boards reset.")
     ] = True,
+    json: Json = None,
 ) -> None:
     """Find out what a device speaks, from half a second of it.
 
@@ -53,6 +55,8 @@ def sniff(
     """
     from tactile_rt.cli.importing import codec_fields
 
+    check_output(json)
+    told = _Told(target, json)
     tried = [codec_fields(text, "--try") for text in further or []]
     candidates: list[Tried] = [
         (f["codec"], {k: v for k, v in f.items() if k != "codec"}) for f in tried
@@ -60,16 +64,56 @@ def sniff(
     path = Path(target.removeprefix("serial://").removeprefix("serial:"))
     with starting(), leaving(None):
         if target.startswith("can:"):
-            _sniff_bus(target, seconds, candidates, ask)
+            _sniff_bus(target, seconds, candidates, ask, told)
         elif target.startswith(("serial:", "socket:", "rfc2217:")) or _is_port(path):
             port = str(path) if path.exists() else target.removeprefix("serial:")
-            _sniff_port(port, seconds, baud, candidates, ask, dtr)
+            _sniff_port(port, seconds, baud, candidates, ask, dtr, told)
         elif path.exists():
-            _sniff_file(path, candidates)
+            _sniff_file(path, candidates, told)
         else:
             raise ConfigError(
                 f"{target} is no port, bus or file: `tactile-rt list` shows what is plugged in"
             )
+
+
+class _Told:
+    """What is found, told as it comes, or as JSON at the end.
+
+    Args:
+        target: what is looked at.
+        json: where `Json` says.
+
+    Attributes:
+        alone: Whether JSON goes to stdout, and nothing else.
+    """
+
+    def __init__(self, target: str, json: Path | None) -> None:
+        self._json = json
+        self.alone = json == STDOUT
+        self._all: dict[str, Any] = {"target": target, "fits": [], "said": [], "command": None}
+
+    def keep(self, what: str, value: Any) -> None:
+        """Something for the JSON."""
+        self._all[what] = value
+
+    def say(self, text: str) -> None:
+        """A line."""
+        self._all["said"].append(text)
+        if not self.alone:
+            typer.echo(text)
+
+    def go_on(self, command: str) -> None:
+        """The last line: how to go on."""
+        self._all["command"] = command
+        if not self.alone:
+            typer.echo(command)
+        told_as_json(self._all, self._json)
+
+    def nothing(self, what: str, hint: str = "") -> NoReturn:
+        """The last line: there is nothing; leave."""
+        self.say(f"{what}{f': {hint}' if hint else ''}")
+        told_as_json(self._all, self._json)
+        raise typer.Exit(NOTHING)
 
 
 def _is_port(path: Path) -> bool:
@@ -89,6 +133,7 @@ def _sniff_port(
     further: "list[Tried]",
     ask: bool,
     dtr: bool,
+    told: _Told,
 ) -> None:
     from tactile_rt.drivers.links import SerialLink
     from tactile_rt.drivers.listening import ask_devices, hear_port, line_speeds
@@ -122,28 +167,30 @@ def _sniff_port(
     )  # fmt: skip
     url = f"serial://{port}" if "://" not in port else f"serial:{port}"
     if found:
-        _show([fit for fit, _ in found], [str(baud) for _, baud in found])
+        _show([fit for fit, _ in found], told, [str(baud) for _, baud in found])
         fit, baud = found[0]
         # what USB brings is the same at every speed
         usual = any(b == _usual_baud(fit) for one, b in found if one.codec == fit.codec)
-        _run(url, fit, {} if usual else {"baud": str(baud)})
+        _run(url, fit, {} if usual else {"baud": str(baud)}, told)
         return
     proposed = [
-        (told[1], baud, told[0]) for baud, data in texts if (told := line_columns(data)) is not None
+        (seen[1], baud, seen[0]) for baud, data in texts if (seen := line_columns(data)) is not None
     ]
     if proposed:
         n, baud, columns = max(proposed)
-        typer.echo(f"{n} lines at {baud} bit/s are samples: names and units are for you to say")
+        told.say(f"{n} lines at {baud} bit/s are samples: names and units are for you to say")
         fields = {"codec": "ascii_line", "columns": columns}
         fields |= {} if baud == 115_200 else {"baud": str(baud)}
-        typer.echo(f"tactile-rt run --source {shlex.quote(f'{url}?{_query(fields)}')}")
+        told.go_on(f"tactile-rt run --source {shlex.quote(f'{url}?{_query(fields)}')}")
         return
     if not came:
-        _nothing(f"nothing came from {port}", "" if ask else "try --ask: it may have to be started")
-    _nothing(f"nothing fits what came from {port}", _hint(max((d for _, d in texts), key=len)))
+        told.nothing(
+            f"nothing came from {port}", "" if ask else "try --ask: it may have to be started"
+        )
+    told.nothing(f"nothing fits what came from {port}", _hint(max((d for _, d in texts), key=len)))
 
 
-def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool) -> None:
+def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool, told: _Told) -> None:
     from tactile_rt.drivers.listening import ask_devices, hear_bus
     from tactile_rt.drivers.opening import open_line
     from tactile_rt.drivers.sniffing import sniff_frames
@@ -156,22 +203,22 @@ def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool) -> N
             fits += sniff_frames(heard, further)
     if not fits:
         if not frames:
-            _nothing(
+            told.nothing(
                 f"nothing came from {url}",
                 "is the bit rate right?" + ("" if ask else " or try --ask: it may wait to be told"),
             )
-        _show_identifiers(frames)
-        _nothing(f"no codec fits what came from {url}", "with a DBC file of it: codec=can-dbc")
-    _show(fits)
-    _run(url, fits[0], {})
+        _show_identifiers(frames, told)
+        told.nothing(f"no codec fits what came from {url}", "with a DBC file of it: codec=can-dbc")
+    _show(fits, told)
+    _run(url, fits[0], {}, told)
 
 
-def _run(url: str, fit: "CodecFit", further: dict[str, str]) -> None:
+def _run(url: str, fit: "CodecFit", further: dict[str, str], told: _Told) -> None:
     fields = fit.fields | further
     if not fit.described:
-        typer.echo("it has not described its array here; it does when it is started")
+        told.say("it has not described its array here; it does when it is started")
     sign = "&" if "?" in url else "?"
-    typer.echo(f"tactile-rt run --source {shlex.quote(f'{url}{sign}{_query(fields)}')}")
+    told.go_on(f"tactile-rt run --source {shlex.quote(f'{url}{sign}{_query(fields)}')}")
 
 
 def _usual_baud(fit: "CodecFit") -> int:
@@ -185,13 +232,13 @@ def _usual_baud(fit: "CodecFit") -> int:
 # files
 
 
-def _sniff_file(path: Path, further: "list[Tried]") -> None:
+def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
     from tactile_rt.drivers.logs import read_log
     from tactile_rt.drivers.sniffing import LOOK_BYTES, LOOK_FRAMES, sniff_bytes, sniff_frames
     from tactile_rt.recording.importing.bag import is_bag
 
     if is_bag(path):
-        _sniff_bag(path)
+        _sniff_bag(path, told)
         return
     if path.is_dir():
         raise ConfigError(f"{path} is a folder, and no bag: name a file")
@@ -205,10 +252,12 @@ def _sniff_file(path: Path, further: "list[Tried]") -> None:
                 break
         fits = sniff_frames(frames, further)
         if not fits:
-            _show_identifiers(frames)
-            _nothing(f"no codec fits {path}", "with a DBC file of it: --as codec=can-dbc&mapping=")
-        _show(fits)
-        _import(path, fits[0])
+            _show_identifiers(frames, told)
+            told.nothing(
+                f"no codec fits {path}", "with a DBC file of it: --as codec=can-dbc&mapping="
+            )
+        _show(fits, told)
+        _import(path, fits[0], told)
         return
     data = bytearray()
     for packet, _ in log.packets():
@@ -217,10 +266,10 @@ def _sniff_file(path: Path, further: "list[Tried]") -> None:
             break
     fits = sniff_bytes(bytes(data), further)
     if fits:
-        _show(fits)
-        _import(path, fits[0])
-    elif log.form not in ("raw", "terminal") or not _sniff_text(path, bytes(data), log.form):
-        _nothing(f"nothing fits {path}", _hint(bytes(data)))
+        _show(fits, told)
+        _import(path, fits[0], told)
+    elif log.form not in ("raw", "terminal") or not _sniff_text(path, bytes(data), log.form, told):
+        told.nothing(f"nothing fits {path}", _hint(bytes(data)))
 
 
 def _form(form: str) -> str:
@@ -231,41 +280,40 @@ def _form(form: str) -> str:
     return told.get(form, f"a CAN log ({form})")
 
 
-def _import(path: Path, fit: "CodecFit") -> None:
+def _import(path: Path, fit: "CodecFit", told: _Told) -> None:
     fields = fit.fields
     if not fit.described:
-        typer.echo(
+        told.say(
             "it has not described its array here: array=FILE.json, as `tactile-rt describe` writes "
             "it, says what it is"
         )
         fields["array"] = "FILE.json"
-    told = shlex.quote(_query(fields)) if len(fields) > 1 else _query(fields)
-    typer.echo(f"tactile-rt import {shlex.quote(str(path))} --as {told}")
+    quoted = shlex.quote(_query(fields)) if len(fields) > 1 else _query(fields)
+    told.go_on(f"tactile-rt import {shlex.quote(str(path))} --as {quoted}")
 
 
-def _sniff_text(path: Path, data: bytes, form: str) -> bool:
+def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
     """Propose the columns of a table, or of what a board prints; whether there are any."""
     from tactile_rt.recording.importing.proposing import propose_columns, propose_line_columns
 
     proposed = propose_columns(path, data) if form == "raw" else propose_line_columns(data)
     if proposed is None:
         return False
-    typer.echo(f"{proposed.said}: names and units are for you to say")
+    told.say(f"{proposed.said}: names and units are for you to say")
     quoted = shlex.quote(str(path))
     if not proposed.table:
         fields = _query({"codec": "ascii_line", "columns": proposed.columns})
-        typer.echo(f"tactile-rt import {quoted} --as {shlex.quote(fields)}")
+        told.go_on(f"tactile-rt import {quoted} --as {shlex.quote(fields)}")
         return True
     rate = ""
     if not proposed.timed:
-        typer.echo(f"no column is a time: --rate says how many came in a second, not {GUESSED_HZ}")
+        told.say(f"no column is a time: --rate says how many came in a second, not {GUESSED_HZ}")
         rate = f" --rate {GUESSED_HZ}"
-    typer.echo(f"tactile-rt import {quoted} --columns {shlex.quote(proposed.columns)}{rate}")
+    told.go_on(f"tactile-rt import {quoted} --columns {shlex.quote(proposed.columns)}{rate}")
     return True
 
 
-def _sniff_bag(path: Path) -> None:
-    from rich.console import Console
+def _sniff_bag(path: Path, told: _Told) -> None:
     from rich.table import Table
 
     from tactile_rt.recording import Recording
@@ -277,38 +325,45 @@ def _sniff_bag(path: Path) -> None:
     except (RecordingError, ConfigError):
         about = None
     if about is not None:
-        typer.echo(f"{path}: a recording of {about.spec.name}, {about.spec.rate_hz:g} Hz")
-        typer.echo(f"tactile-rt run --source {shlex.quote(f'replay:{path}')}")
+        told.say(f"{path}: a recording of {about.spec.name}, {about.spec.rate_hz:g} Hz")
+        told.go_on(f"tactile-rt run --source {shlex.quote(f'replay:{path}')}")
         return
     topics = bag_topics(path)
     table = Table("topic", "type", "messages", "columns", box=None, header_style="bold")
     for topic in topics:
         table.add_row(topic.name, topic.type, str(topic.messages), topic.columns)
-    Console(soft_wrap=True).print(table)
+    told.keep("topics", topics)
+    if not told.alone:
+        print_table(table)
     known = [t for t in topics if t.columns or t.type == messages.SAMPLES]
     if not known:
-        told = [(columns, t.name) for t in topics if (columns := proposed_columns(path, t))]
-        if not told:
-            _nothing(f"{path}: no message holds a number")
-        columns, name = max(told, key=lambda one: len(one[0]))
-        typer.echo(f"of no topic is known what is what; {name}: names and units are for you to say")
-        typer.echo(
+        proposed = [(columns, t.name) for t in topics if (columns := proposed_columns(path, t))]
+        if not proposed:
+            told.nothing(f"{path}: no message holds a number")
+        columns, name = max(proposed, key=lambda one: len(one[0]))
+        told.say(f"of no topic is known what is what; {name}: names and units are for you to say")
+        told.go_on(
             f"tactile-rt import {shlex.quote(str(path))} --topic {shlex.quote(name)} --columns "
             f"{shlex.quote(columns)}"
         )
         return
     best = max(known, key=lambda t: t.messages)
     only = "" if len(known) == 1 else f" --topic {shlex.quote(best.name)}"
-    typer.echo(f"tactile-rt import {shlex.quote(str(path))}{only}")
+    told.go_on(f"tactile-rt import {shlex.quote(str(path))}{only}")
 
 
 # what is said
 
 
-def _show(fits: "list[CodecFit]", speeds: list[str] | None = None) -> None:
-    from rich.console import Console
+def _show(fits: "list[CodecFit]", told: _Told, speeds: list[str] | None = None) -> None:
     from rich.table import Table
 
+    found = [dict(vars(fit)) for fit in fits[:SHOWN]]
+    if speeds:
+        found = [{**one, "baud": int(speed)} for one, speed in zip(found, speeds, strict=False)]
+    told.keep("fits", found)
+    if told.alone:
+        return
     names = ["codec", "options", *(["baud"] if speeds else []), "intact", "corrupt", "explains"]
     table = Table(*names, "notices damage", box=None, header_style="bold")
     for k, fit in enumerate(fits[:SHOWN]):
@@ -318,15 +373,15 @@ def _show(fits: "list[CodecFit]", speeds: list[str] | None = None) -> None:
             str(fit.corrupt), f"{fit.explained:.0%}",
             f"{fit.proof:.0%}" if fit.wire == "serial" else "by CAN",
         )  # fmt: skip
-    Console(soft_wrap=True, width=None).print(table)
+    print_table(table)
 
 
-def _show_identifiers(frames: "list[Any]") -> None:
+def _show_identifiers(frames: "list[Any]", told: _Told) -> None:
     from collections import Counter
 
     counts = Counter((f.id, f.extended, len(f.data)) for f in frames)
     for (number, extended, length), n in counts.most_common(12):
-        typer.echo(f"{number:0{8 if extended else 3}X}  {n} frames of {length} bytes")
+        told.say(f"{number:0{8 if extended else 3}X}  {n} frames of {length} bytes")
 
 
 def _hint(data: bytes) -> str:
@@ -334,11 +389,6 @@ def _hint(data: bytes) -> str:
 
     hint = frame_hint(data)
     return f"{hint}: describe one for codec=binary_frame" if hint else ""
-
-
-def _nothing(what: str, hint: str = "") -> None:
-    typer.echo(f"{what}{f': {hint}' if hint else ''}")
-    raise typer.Exit(NOTHING)
 
 
 def _query(fields: dict[str, str]) -> str:

@@ -1,13 +1,14 @@
 """`tactile-rt sweep`: make a sweep set in simulation."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, needs, progress_bar, starting
+from tactile_rt.cli.app import app, check_output, needs, set_option, starting
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -21,29 +22,24 @@ def sweep(
         str | None,
         typer.Option(
             help="What to make: wide24, default24, mouse12, paper-lowvar-highfi, "
-            "paper-highvar-lowfi, or a TOML file. Without it the folder's own, or else wide24. The "
-            "paper's come to 16 and 312 sweeps of an object, as its code does; its table's totals "
-            "are other numbers."
+            "paper-highvar-lowfi, or a TOML file. Default: the folder's own, or else wide24."
         ),
     ] = None,
-    objects: Annotated[int | None, typer.Option(help="Objects of every category.")] = None,
-    validation: Annotated[float | None, typer.Option(help="Of these, held out to tune on.")] = None,
-    test: Annotated[float | None, typer.Option(help="Of these, held out to test on.")] = None,
-    sweeps: Annotated[int | None, typer.Option(help="Sweeps drawn of every object.")] = None,
     profile: Annotated[
         str | None, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Of the drawn sweep parameters.")] = None,
-    contacts: Annotated[
-        bool, typer.Option("--contacts", help="Store where along each whisker it touches, too.")
-    ] = False,
+    sets: Annotated[
+        list[str] | None,
+        set_option("Any key of the recipe: objects.per_category=10, sweeps.draws=2, contacts=true"),
+    ] = None,
     split: Annotated[
         str | None, typer.Option(help="Only these splits, comma-separated: test,withheld.")
     ] = None,
     processes: Annotated[int, typer.Option(min=0, help="At a time; 0: one per core.")] = 0,
-    engine: Annotated[str, typer.Option(help="processes, or ray for a cluster.")] = "processes",
-    address: Annotated[
-        str | None, typer.Option(help="Of the Ray cluster; without it this machine's, or a new one")
+    ray: Annotated[
+        str | None,
+        typer.Option(help="On a Ray cluster: its address; auto: the one that runs here, or none."),
     ] = None,
     card: Annotated[
         bool,
@@ -52,13 +48,17 @@ def sweep(
     verify: Annotated[
         bool, typer.Option("--verify", help="Make nothing: check the set's checksums.")
     ] = False,
+    json: Json = None,
 ) -> None:
     """Sweep simulated objects past the whisker array and store what it feels."""
+    check_output(json)
     console = Console(stderr=True, soft_wrap=True)
     if verify:
         from tactile_rt.sim_backend.datasets.inventory import check_sums
 
-        console.print(f"{folder}: {check_sums(folder)} files are as they were written")
+        files = check_sums(folder)
+        told_as_json({"set": folder, "files": files}, json)
+        console.print(f"{folder}: {files} files are as they were written")
         return
     try:
         with starting():
@@ -73,24 +73,33 @@ def sweep(
             from tactile_rt.sim_backend.world import PROFILES
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
-    chosen = _override(
-        _recipe(folder, recipe),
-        {"per_category": objects, "validation": validation, "test": test},
-        {"draws": sweeps},
-        {"profile": profile, "seed": seed, "contacts": contacts or None},
-    )
+    asked = {"profile": profile, "seed": seed}
+    given = [f"{key}={value}" for key, value in asked.items() if value is not None]
+    chosen = _recipe(folder, recipe, [*given, *(sets or ())])
     splits = tuple(dict.fromkeys(s.strip() for s in split.split(","))) if split else ()
-    if address is not None and engine != "ray":
-        raise ConfigError("--address is that of a Ray cluster: give --engine ray, too")
     names = describe_set(chosen).names(splits)
     if line := ringing(load_animals(chosen.array), PROFILES[chosen.profile]):
         console.print(line)
     there = len(finished_objects(folder, names))
-    made = make_sweeps(chosen, folder, processes or None, splits, engine, address)
+    made = make_sweeps(
+        chosen,
+        folder,
+        processes or None,
+        splits,
+        engine="processes" if ray is None else "ray",
+        address=None if ray == "auto" else ray,
+    )
     with progress_bar(console, "objects", len(names), there, counted=True) as update:
         for k, name in enumerate(made):  # those that were there first
             update(advance=int(k >= there), description=name)
     found = tally(folder, names, len(chosen.sweeps))
+    told_as_json(
+        {
+            "set": folder, "sweeps": found.sweeps, "profile": chosen.profile,
+            "shortcomings": found.shortcomings,
+        },
+        json,
+    )  # fmt: skip
     but = f"; {found.shortcomings}" if found.shortcomings else ""
     console.print(f"{folder}: {found.sweeps} sweeps at profile {chosen.profile}{but}")
     if card:
@@ -110,7 +119,8 @@ def _write_card(folder: Path) -> None:
     write_card(folder, fit)
 
 
-def _recipe(folder: Path, name: str | None) -> "SweepRecipe":
+def _recipe(folder: Path, name: str | None, sets: list[str]) -> "SweepRecipe":
+    """The recipe of a set that is there or to be made, with what is set otherwise."""
     from tactile_rt.sim_backend.datasets.recipe_files import (
         DEFAULT_RECIPE,
         read_recipe,
@@ -122,24 +132,5 @@ def _recipe(folder: Path, name: str | None) -> "SweepRecipe":
         manifest = SweepManifest.read(folder)
         if manifest.recorded:
             raise ConfigError(f"{folder} is made of recordings, by `tactile-rt label`")
-        return recipe_of_set(manifest.recipe, manifest.categories)
-    return read_recipe(name or DEFAULT_RECIPE)
-
-
-def _override(
-    recipe: "SweepRecipe",
-    objects: dict[str, object],
-    sweeps: dict[str, object],
-    top: dict[str, object],
-) -> "SweepRecipe":
-    """The recipe with the options that were given."""
-
-    def given(options: dict[str, object]) -> dict[str, Any]:
-        return {name: value for name, value in options.items() if value is not None}
-
-    return replace(
-        recipe,
-        objects=replace(recipe.objects, **given(objects)),
-        sweeps=replace(recipe.sweeps, **given(sweeps)),
-        **given(top),
-    )
+        return recipe_of_set(manifest.recipe, manifest.categories, sets)
+    return read_recipe(name or DEFAULT_RECIPE, sets=sets)

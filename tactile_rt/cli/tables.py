@@ -1,14 +1,12 @@
 """Tables that survive a pipe, a narrow terminal, and a program that reads them."""
 
-import math
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 import typer
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
@@ -17,11 +15,22 @@ from rich.text import Text
 from tactile_rt.cli.app import check_output
 from tactile_rt.files import write_whole
 
-__all__ = ["STDOUT", "Json", "print_table", "show_table", "write_json"]
+if TYPE_CHECKING:
+    from tactile_rt.evidence.records import Record
+
+__all__ = [
+    "STDOUT",
+    "Json",
+    "fitting",
+    "print_table",
+    "show_records",
+    "show_table",
+    "told_as_json",
+]
 
 Json = Annotated[
     Path | None,
-    typer.Option("--json", help="Write it as JSON to this file; - prints that and nothing else."),
+    typer.Option("--json", help="Write what is told as JSON, too; - prints that alone."),
 ]
 STDOUT = Path("-")
 WIDE = 10_000  # columns: more than any table has
@@ -40,53 +49,84 @@ def show_table(
     Raises:
         ConfigError: the file cannot be written.
     """
-    if json is not None:
-        write_json(list(records), json)
-        if json == STDOUT:
-            return
+    if told_as_json(list(records), json):
+        return
     table = Table(*headings.values(), box=None, header_style="bold", pad_edge=False)
     for record in records:
         table.add_row(*(escape(_text(record[key])) for key in headings))
     print_table(table)
 
 
-def print_table(table: Table, console: Console | None = None) -> None:
-    """Print a table: whole where nobody looks at it, one fact a line where it does not fit."""
-    console = console or Console()
-    needs = Measurement.get(console, console.options.update(max_width=WIDE), table)
-    if not console.is_terminal:
-        Console(file=console.file, width=max(needs.maximum, console.width)).print(table)
-    elif needs.minimum <= console.width:
-        console.print(table)
-    else:
-        _print_facts(table, console)
+def show_records(records: "list[Record]", json: Path | None) -> bool:
+    """Print figures beside their bars, or write them as JSON.
 
-
-def write_json(what: Any, path: Path) -> None:
-    """Write what msgspec can encode, a whole file or nothing; ``-`` is stdout.
+    Returns:
+        Whether stdout took the JSON, and nothing else may go there.
 
     Raises:
         ConfigError: the file cannot be written.
     """
-    text = msgspec.json.format(msgspec.json.encode(_plain(what)), indent=1) + b"\n"
-    if path == STDOUT:
-        sys.stdout.write(text.decode())
-    else:
-        check_output(path)
-        write_whole(path, lambda file: file.write(text))
+    from tactile_rt.evidence.records import as_dicts, as_table
+
+    if told_as_json(as_dicts(records), json):
+        return True
+    print_table(as_table(records))
+    return False
 
 
-def _print_facts(table: Table, console: Console) -> None:
+def print_table(table: Table, console: Console | None = None) -> None:
+    """Print a table: whole where nobody looks at it, one fact a line where it does not fit."""
+    console = console or Console()
+    if console.is_terminal:
+        console.print(fitting(table, console))
+        return
+    needs = Measurement.get(console, console.options.update(max_width=WIDE), table)
+    Console(file=console.file, width=max(needs.maximum, console.width)).print(table)
+
+
+def fitting(table: Table, console: Console) -> RenderableType:
+    """The table, or where a terminal is too narrow for its longest words, a fact a line."""
+    needs = Measurement.get(console, console.options.update(max_width=WIDE), table)
+    return table if needs.minimum <= console.width else _facts(table)
+
+
+def told_as_json(what: Any, json: Path | None) -> bool:
+    """Write what a command has to tell as JSON, where that is asked for: whole or not at all.
+
+    Args:
+        what: structs, dataclasses, mappings, sequences, arrays; a number that is none becomes null.
+        json: where `Json` says; None: nowhere.
+
+    Returns:
+        Whether it went to stdout, where nothing else may go then.
+
+    Raises:
+        ConfigError: the file cannot be written.
+    """
+    if json is None:
+        return False
+    text = msgspec.json.format(msgspec.json.encode(what, enc_hook=_plain), indent=1) + b"\n"
+    if json == STDOUT:
+        typer.echo(text, nl=False)
+        return True
+    check_output(json)
+    write_whole(json, lambda file: file.write(text))
+    return False
+
+
+def _facts(table: Table) -> Text:
     """Each row as lines "heading: cell"."""
     columns = [(str(column.header), list(column.cells)) for column in table.columns]
+    lines = [Text(str(table.title), style="bold")] if table.title else []
     for row in range(table.row_count):
         for heading, cells in columns:
             cell = cells[row]
             text = cell if isinstance(cell, Text) else Text.from_markup(str(cell))
             if text.plain:
                 name = ((f"{heading}: ", "bold"),) if heading else ()
-                console.print(Text.assemble(*name, text), overflow="fold")
-        console.print()
+                lines.append(Text.assemble(*name, text))
+        lines.append(Text())
+    return Text("\n", overflow="fold").join(lines)
 
 
 def _text(value: Any) -> str:
@@ -101,11 +141,9 @@ def _text(value: Any) -> str:
 
 
 def _plain(value: Any) -> Any:
-    """As JSON has it, which knows no NaN."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
+    """As JSON has it what msgspec does not know."""
+    if isinstance(value, Path):
+        return str(value)
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    return value
+        return dict(value)
+    return value.tolist()  # of numpy

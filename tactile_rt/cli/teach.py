@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from tactile_rt.cli.app import Seconds, app, leaving, starting
+from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
+from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError, SpecMismatch
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def teach(
     folder: Annotated[
         Path, typer.Argument(help="Where the lesson is kept; one that is there goes on.")
     ],
-    labels: Annotated[
+    classes: Annotated[
         str, typer.Option(help="What is to be touched, comma-separated; more may come by key.")
     ] = "",
     touches: Annotated[int, typer.Option(min=2, max=1000, help="Of each.")] = 10,
@@ -49,6 +50,7 @@ def teach(
         typer.Option(help="Teach this model further classes: an .onnx file, or `shipped`."),
     ] = "",
     seconds: Seconds = None,
+    json: Json = None,
 ) -> None:
     """Touch it ten times a class, and it knows the classes: FOLDER/model.onnx.
 
@@ -63,7 +65,8 @@ def teach(
     from tactile_rt.teaching.teacher import Teacher
 
     need_mcap()
-    wanted = [name.strip() for name in labels.split(",") if name.strip()]
+    check_output(json)
+    wanted = [name.strip() for name in classes.split(",") if name.strip()]
     at = _address(page) if page else None
     _check_labels(wanted)
     if folder.exists() and not folder.is_dir():
@@ -86,6 +89,18 @@ def teach(
     for line in (*buttons.teacher.summary(), *_losses(opened)):
         typer.echo(line)
     learnt = lesson.taught_enough
+    told = {
+        "model": folder / MODEL,
+        "classes": card.classes,
+        "touches": {name: lesson.count(name) for name in learnt},
+        "left_out_touches_right": {
+            name: {"right": good, "of": count}
+            for name, count, good in buttons.teacher.progress.classes
+        },
+        "corrupt": opened.stats.corrupt,
+        "missing": opened.stats.missing,
+    }
+    told_as_json(told, json)
     others = len(card.classes) - len(learnt)
     knows = ", ".join(learnt) + (f" beside {others} others" if others else "")
     typer.echo(
@@ -171,7 +186,7 @@ def _check_labels(names: list[str]) -> None:
     for name in names:
         check_label(name)
         if names.count(name) > 1:
-            raise ConfigError(f"--labels names {name!r} twice")
+            raise ConfigError(f"--classes names {name!r} twice")
 
 
 def _address(given: str) -> tuple[str, int]:

@@ -12,7 +12,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from tactile_rt.cli.app import app
+from tactile_rt.cli.app import app, check_output
+from tactile_rt.cli.tables import Json, fitting, print_table, told_as_json
 from tactile_rt.stream import ConfigError, SourceError
 
 if TYPE_CHECKING:
@@ -35,20 +36,38 @@ def top(
     ] = "http://127.0.0.1:9464",
     every: Annotated[float, typer.Option(min=0.1, max=60, help="Seconds between looks.")] = 1.0,
     once: Annotated[bool, typer.Option("--once", help="Look once, and print.")] = False,
+    json: Json = None,
 ) -> None:
     """Show sources, models, consumers, losses and latencies of a running daemon.
 
     It asks for /state of [metrics]. Without that, let a jsonl publisher have state_s = 1:
     tactile-rt run robot.toml | tactile-rt top -
     """
+    if json is not None and not once:
+        raise ConfigError("--json is of one look: give --once, too")
+    check_output(json)
     console = Console()
     if once:
-        console.print(picture(next(_looks(where, every)), None))
+        found = next(_looks(where, every))
+        if not told_as_json(found, json):
+            for part in picture(found, None).renderables:
+                if isinstance(part, Table):
+                    print_table(part, console)
+                else:
+                    console.print(part, soft_wrap=True)
         return
     before = None
     with Live(console=console, screen=console.is_terminal, auto_refresh=False) as live:
         for snapshot in _looks(where, every):
-            live.update(picture(snapshot, before), refresh=True)
+            live.update(
+                Group(
+                    *(
+                        fitting(part, console) if isinstance(part, Table) else part
+                        for part in picture(snapshot, before).renderables
+                    )
+                ),
+                refresh=True,
+            )
             before = snapshot
 
 
@@ -121,8 +140,8 @@ def _looks(where: str, every: float) -> "Iterator[Snapshot]":
             continue  # it is being restarted; what was true last stays on the screen
 
 
-def picture(now: "Snapshot", before: "Snapshot | None") -> RenderableType:
-    """All of it as tables.
+def picture(now: "Snapshot", before: "Snapshot | None") -> Group:
+    """All of it, lines and tables, one below the other.
 
     Args:
         now: what to show.

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, needs, progress_bar
-from tactile_rt.cli.tables import Json, show_table
+from tactile_rt.cli.app import app, check_output, needs, set_option
+from tactile_rt.cli.progress import progress_bar, working
+from tactile_rt.cli.tables import Json, show_table, told_as_json
+from tactile_rt.settings import take_sets
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -31,73 +33,50 @@ def train(
     recipe: Annotated[
         str, typer.Option(help="See `tactile-rt recipes`; or a TOML file. Options override it.")
     ] = "default",
-    encoder: Annotated[str | None, typer.Option(help="zhuang-CELL, resnet18, s4, ...")] = None,
-    graph: Annotated[
-        Path | None, typer.Option(help="TOML file of nodes and edges, for --encoder graph.")
+    encoder: Annotated[
+        str | None,
+        typer.Option(help="zhuang-CELL, resnet18, s4, ...; or a TOML file of nodes and edges."),
     ] = None,
     attender: Annotated[str | None, typer.Option(help="gpt, mamba or none.")] = None,
     decoder: Annotated[str | None, typer.Option(help="linear, mlp or mlp-all.")] = None,
-    width: Annotated[
-        float | None, typer.Option(help="Scales every channel count; a multiple of 1/32.")
-    ] = None,
-    objective: Annotated[
-        str | None, typer.Option(help="supervised, simclr, simsiam, autoencoder or predictive.")
-    ] = None,
-    augmentation: Annotated[
-        str | None, typer.Option(help="none, tactile, tactile-paper or image.")
-    ] = None,
-    masking: Annotated[float | None, typer.Option(help="Share of steps to blank.")] = None,
-    optimizer: Annotated[
-        str | None, typer.Option(help="sgd, adam, adamw, lars or lars-paper.")
-    ] = None,
-    schedule: Annotated[
-        str | None, typer.Option(help="step, constant, cosine, cosine-annealing or one-cycle.")
-    ] = None,
     epochs: Annotated[
         int | None, typer.Option(min=1, help="Passes over the training split.")
     ] = None,
-    updates: Annotated[
-        int | None, typer.Option(min=0, help="Stop after so many updates instead; 0: epochs.")
-    ] = None,
     batch: Annotated[int | None, typer.Option(min=1, help="Sweeps per update.")] = None,
-    learning_rate: Annotated[float | None, typer.Option(help="The peak.")] = None,
-    precision: Annotated[str | None, typer.Option(help="bf16 or fp32.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of weights, windows and noise.")] = None,
-    device: Annotated[str, typer.Option(help="auto, cpu, cuda ...")] = "auto",
+    sets: Annotated[
+        list[str] | None,
+        set_option("Any key of the recipe: width=0.25, objective=simclr, learning_rate=0.01"),
+    ] = None,
+    accelerator: Annotated[str, typer.Option(help="auto, cpu, cuda ...")] = "auto",
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Write logs for TensorBoard, too.")
     ] = False,
     threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    json: Json = None,
 ) -> None:
     """Train an Encoder-Attender-Decoder network on a sweep set."""
     from tactile_rt.models.checkpoint_files import network_of
     from tactile_rt.models.training.config import manifests_of
     from tactile_rt.models.training.recipes import read_recipe
 
+    check_output(json)
     asked = {
         "encoder": encoder,
-        "graph": None if graph is None else _text(graph),
         "attender": attender,
         "decoder": decoder,
-        "width": width,
-        "objective": objective,
-        "augmentation": augmentation,
-        "masking": masking,
-        "optimizer": optimizer,
-        "schedule": schedule,
         "epochs": epochs,
-        "updates": updates,
         "batch": batch,
-        "learning_rate": learning_rate,
-        "precision": precision,
         "seed": seed,
     }
+    if encoder is not None and encoder.endswith(".toml"):
+        asked |= {"encoder": "graph", "graph": _text(Path(encoder))}
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     if also:
         given["also"] = tuple(map(str, also))
     if begin is not None:
         given = {**network_of(begin), **given, "begin": str(begin)}
-    config = read_recipe(recipe, str(data), **given)
+    config = read_recipe(recipe, str(data), sets or (), **given)
     manifests_of(config)  # what cannot be is refused before torch has taken its seconds
     try:
         import torch
@@ -108,6 +87,7 @@ def train(
     torch.set_num_threads(threads)
     # Under torchrun every process has the same to say.
     console = Console(stderr=True, quiet=os.environ.get("RANK", "0") != "0")
+    history: list[dict[str, Any]] = []
     with progress_bar(console, "finding onsets") as update:
 
         def show(at: "Progress") -> None:
@@ -117,12 +97,15 @@ def train(
                 description=f"epoch {at.epoch}/{at.epochs} loss {at.loss:.3f}",
             )
             if at.metrics:
+                history.append({"epoch": at.epoch, "update": at.update, **at.metrics})
                 console.print(_in_words(at))
 
         try:
-            best = training.train(config, folder, show, tensorboard=tensorboard, device=device)
+            best = training.train(config, folder, show, tensorboard=tensorboard, device=accelerator)
         except ModuleNotFoundError as error:
             raise needs("train", error) from None
+    if not console.quiet:
+        told_as_json({"best": best, "epochs": history}, json)
     console.print(f"best network: {best}")
 
 
@@ -168,38 +151,37 @@ def probe(
         Path | None, typer.Option(help="Sweep set; default: the one it was trained on.")
     ] = None,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the features.")] = 100,
-    learning_rate: Annotated[float, typer.Option(help="Of SGD.")] = 0.1,
-    standardise: Annotated[
-        bool, typer.Option(help="Fit on standardised features; the paper did not.")
-    ] = True,
-    readout: Annotated[
-        str, typer.Option(help="last: the last step (the paper); mean: the mean of all steps.")
-    ] = "last",
     seed: Annotated[int, typer.Option(help="Of the layer and the windows.")] = 0,
+    sets: Annotated[
+        list[str] | None,
+        set_option("How it is fitted: readout=mean, standardise=false, learning_rate=0.01"),
+    ] = None,
+    json: Json = None,
 ) -> None:
     """Fit a linear layer on a frozen network's features: how much of the category do they hold?"""
     from tactile_rt.models.checkpoint_files import describe_checkpoint
     from tactile_rt.models.data_checks import probed_on
     from tactile_rt.models.training.config import ProbeConfig
 
-    config = ProbeConfig(
-        data=str(data or ""),
-        epochs=epochs,
-        learning_rate=learning_rate,
-        standardise=standardise,
-        readout=readout,
-        seed=seed,
-    )
+    check_output(json)
+    usual = {"data": str(data or ""), "epochs": epochs, "seed": seed}
+    (config,) = take_sets("probe", sets or (), ProbeConfig, usual=usual)
     probed_on(checkpoint, describe_checkpoint(checkpoint), folder, config.data)
     try:
         from tactile_rt.models.training.probing import probe as fit
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     console = Console(stderr=True)
-    with console.status("probing"):
-        shown: list[Progress] = []
-        best = fit(checkpoint, folder, config, shown.append)
+    shown: list[Progress] = []
+    with progress_bar(console, "probing") as update:
+
+        def show(at: "Progress") -> None:
+            shown.append(at)
+            update(total=at.updates, completed=at.update)
+
+        best = fit(checkpoint, folder, config, show)
     m = shown[-1].metrics
+    told_as_json({"best": best, **m}, json)
     console.print(
         f"{best}: validation top-1 {100 * m['validation_top1']:.1f} % clean, "
         f"{100 * m['validation_top1_noisy']:.1f} % at rated noise"
@@ -224,13 +206,17 @@ def export(
             "several, all."
         ),
     ] = None,
+    license: Annotated[
+        str, typer.Option(help="Under which the file may be used, as Apache-2.0; to be stored.")
+    ] = "",
+    json: Json = None,
 ) -> None:
     """Export a trained network as a streaming ONNX step, with everything needed to run it."""
     from tactile_rt.models.checkpoint_files import describe_checkpoint
     from tactile_rt.models.data_checks import trained_on
 
-    if model.is_dir():
-        raise ConfigError(f"{model} is a folder: name a file to write")
+    for file in (model, json):
+        check_output(file)
     trained_on(checkpoint, describe_checkpoint(checkpoint), data or ())
     try:
         from tactile_rt.export.precision import PRECISIONS
@@ -245,7 +231,7 @@ def export(
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     console = Console(stderr=True)
-    with console.status("calibrating, exporting and checking parity"):
+    with working(console, "calibrating, exporting and checking parity"):
         card = release(
             checkpoint,
             model,
@@ -253,9 +239,15 @@ def export(
             precision,
             "window" if kind == "window" else "step",
             data or (),
+            license,
         )
+    megabytes = model.stat().st_size / 1e6
+    told_as_json(
+        {"model": model, "megabytes": megabytes, "temperature": card.temperature, **card.figures},
+        json,
+    )
     console.print(
-        f"{model}: {model.stat().st_size / 1e6:.1f} MB, parity {card.figures['parity']:.1e}, "
+        f"{model}: {megabytes:.1f} MB, parity {card.figures['parity']:.1e}, "
         f"temperature {card.temperature:.2f}"
     )
     if precision != "fp32":

@@ -1,6 +1,5 @@
 """`tactile-rt view`: a sweep as a picture, as a video, or in a window."""
 
-import math
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,7 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, progress_bar, starting
+from tactile_rt.cli.app import app, check_output, needs, set_option, starting
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.settings import take_sets
 from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
@@ -42,32 +43,13 @@ def view(
         int | None, typer.Option(min=320, max=3840, help="Width. Default: 1280, of a GIF 800.")
     ] = None,
     array: Annotated[str, typer.Option(help="mouse, rat, rat-left, ..., or a file.")] = "mouse",
-    size: Annotated[float, typer.Option(min=1, max=1e3, help="Largest extent, mm.")] = 40.0,
-    speed: Annotated[float, typer.Option(min=1, max=1e3, help="Of the object, mm/s.")] = 34.0,
-    yaw: Annotated[float, typer.Option(help="Turn of the object about z, degrees.")] = 0.0,
-    height: Annotated[float, typer.Option(help="Of the object's centre, mm.")] = -2.0,
-    distance: Annotated[
-        float | None,
-        typer.Option(
-            help="From the whiskers' bases to the object, mm. Default: 6.5 for a mouse, for "
-            "others as much more as their whiskers reach further."
-        ),
-    ] = None,
-    roll: Annotated[float, typer.Option(help="Turn about the object's own x, degrees.")] = 0.0,
-    pitch: Annotated[float, typer.Option(help="Turn about its own y, degrees.")] = 0.0,
-    heading: Annotated[
-        float, typer.Option(help="Turn of its way about z, -60 to 60 degrees.")
-    ] = 0.0,
-    climb: Annotated[float, typer.Option(help="Rise of its way, -60 to 60 degrees.")] = 0.0,
-    up: Annotated[str, typer.Option(help="Of a mesh file: y or z. Default: z, in glTF y.")] = "",
-    hull: Annotated[bool, typer.Option("--hull", help="Of a mesh: its convex hull only.")] = False,
-    surface_error: Annotated[
-        float, typer.Option(help="How far its pieces may be from a mesh of 40 mm, mm.")
-    ] = 0.1,
-    max_pieces: Annotated[int, typer.Option(help="Of a mesh: into how many at most.")] = 1024,
     profile: Annotated[
         str, typer.Option(help="How finely: realtime, dataset (finer), accurate, mujoco.")
     ] = "dataset",
+    sets: Annotated[
+        list[str] | None,
+        set_option("Of the sweep or a mesh: size_mm=30, yaw_deg=45, distance_mm=8, hull=true"),
+    ] = None,
 ) -> None:
     """Show a sweep: the scene with force arrows, the map of forces, their traces.
 
@@ -109,38 +91,18 @@ def view(
         raise ConfigError(f"no camera {camera!r}: there are {', '.join(VIEWS)}")
     if profile not in PROFILES:
         raise ConfigError(f"no profile {profile!r}: there are {', '.join(PROFILES)}")
-    for option, value in (
-        ("yaw", yaw),
-        ("height", height),
-        ("distance", distance or 0.0),
-        ("roll", roll),
-        ("pitch", pitch),
-        ("heading", heading),
-        ("climb", climb),
-    ):
-        if not math.isfinite(value):
-            raise ConfigError(f"--{option} must be a finite number, not {value}")
 
-    mesh = MeshDetail(surface_error_mm=surface_error, max_pieces=max_pieces, hull=hull, up=up)
-    animals, thing = load_animals(array), load_object(target, mesh)
+    animals = load_animals(array)
+    usual = {"distance_mm": usual_distance(animals)}
+    sweep, mesh = take_sets("view", sets or (), Sweep, MeshDetail, usual=usual)
+    thing = load_object(target, mesh)
     spec = world_spec(animals)
-    sweep = Sweep(
-        size_mm=size,
-        speed_mm_s=speed,
-        yaw_deg=yaw,
-        height_mm=height,
-        distance_mm=usual_distance(animals) if distance is None else distance,
-        roll_deg=roll,
-        pitch_deg=pitch,
-        heading_deg=heading,
-        climb_deg=climb,
-    )
     simulation = SweepSimulation(animals, thing, sweep, PROFILES[profile], whole=True)
     if at is not None and not 0 <= at <= simulation.duration_ms:
         raise ConfigError(f"--at {at:g}: the sweep lasts {simulation.duration_ms:.0f} ms")
     console = Console(stderr=True)
     if not simulation.touches:
-        console.print(f"{thing.name} passes without touching: change --height or --distance")
+        console.print(f"{thing.name} passes without touching: --set height_mm or distance_mm")
     fps = FPS.get(suffix, 25)
     period = PICTURE_MS if suffix in IMAGES else max(1, round(1000 / (fps * slow)))
     with progress_bar(console, "simulating", total=1.0) as update:
@@ -155,8 +117,8 @@ def view(
     if suffix in FPS:
         detail += f" · {fps * period / 1000:.2g} x real speed"
     title = (
-        f"{thing.name[:40]}, {size:g} mm large, sweeps past the {len(spec.elements)} whiskers "
-        f"of {spec.name[:40]} at {speed:g} mm/s"
+        f"{thing.name[:40]}, {sweep.size_mm:g} mm large, sweeps past the {len(spec.elements)} "
+        f"whiskers of {spec.name[:40]} at {sweep.speed_mm_s:g} mm/s"
     )
     width = pixels or WIDTH.get(suffix, 1280)
     with Film(footage, camera, orthographic, title, detail, width) as film:

@@ -2,15 +2,47 @@
 
 import hashlib
 import math
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, progress_bar, starting
+from tactile_rt.cli.app import app, check_output, needs, set_option, starting
+from tactile_rt.cli.progress import progress_bar
+from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.settings import take_sets
 from tactile_rt.stream import ConfigError
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Where what the array whisks against stands.
+
+    Attributes:
+        position_mm: The centre of an object: ``x,y,z``, x lateral (away from the head), y rostral,
+            z up, mm.
+        size_mm: The largest extent of an object, mm.
+        yaw_deg: The turn of an object about z, degrees.
+        radius_mm: The radius of the stimuli's arc, mm.
+        step_mm: From a stimulus to the next further one: ``x,y,z``, mm.
+
+    Raises:
+        ConfigError: a value that cannot be.
+    """
+
+    position_mm: str = "25,5,0"
+    size_mm: float = 20.0
+    yaw_deg: float = 0.0
+    radius_mm: float = 63.6
+    step_mm: str = "1,1,0"
+
+    def __post_init__(self) -> None:
+        if not 0 < self.size_mm < 1e3:
+            raise ConfigError(f"size_mm must be above 0 and below 1000, not {self.size_mm:g}")
+        if not math.isfinite(self.yaw_deg):
+            raise ConfigError(f"yaw_deg must be a number of degrees, not {self.yaw_deg}")
 
 
 @app.command()
@@ -23,45 +55,29 @@ def whisk(
     target: Annotated[
         str | None, typer.Option("--object", help="Instead of a stimulus: mug-3, or a mesh file.")
     ] = None,
-    position: Annotated[
-        str,
-        typer.Option(
-            help="Of the object's centre: x lateral (away from the head), y rostral, z up, mm."
-        ),
-    ] = "25,5,0",
-    size: Annotated[float, typer.Option(help="Of the object: its largest extent, mm.")] = 20.0,
-    yaw: Annotated[float, typer.Option(help="Of the object, degrees.")] = 0.0,
-    radius: Annotated[float, typer.Option(help="Of the stimuli's arc, mm.")] = 63.6,
-    step: Annotated[
-        str, typer.Option(help="From a stimulus to the next further one: x,y,z, mm.")
-    ] = "1,1,0",
     array: Annotated[str, typer.Option(help="mouse, rat, mouse-left, ..., or a file.")] = "mouse",
     trajectory: Annotated[
         Path | None,
         typer.Option(help="A .csv of time_s and theta_deg, instead of regular whisking."),
     ] = None,
-    frequency: Annotated[float, typer.Option(help="Cycles per second.")] = 8.0,
-    protraction: Annotated[float, typer.Option(help="Furthest forward of rest, degrees.")] = 35.0,
-    retraction: Annotated[float, typer.Option(help="Furthest backward of rest, degrees.")] = 10.0,
-    asymmetry: Annotated[float, typer.Option(help="Fraction of a cycle spent protracting.")] = 0.5,
-    phase: Annotated[float, typer.Option(help="At the start, degrees; 0: fully retracted.")] = 0.0,
-    duration: Annotated[float, typer.Option(help="Seconds.")] = 1.5,
-    up: Annotated[str, typer.Option(help="Of a mesh file: y or z. Default: z, in glTF y.")] = "",
-    hull: Annotated[bool, typer.Option("--hull", help="Of a mesh: its convex hull only.")] = False,
-    surface_error: Annotated[
-        float, typer.Option(help="How far its pieces may be from a mesh of 40 mm, mm.")
-    ] = 0.1,
-    max_pieces: Annotated[int, typer.Option(help="Of a mesh: into how many at most.")] = 1024,
     profile: Annotated[
         str, typer.Option(help="How finely: realtime, dataset (finer), accurate.")
     ] = "dataset",
+    sets: Annotated[
+        list[str] | None,
+        set_option(
+            "Of the whisking, the stimuli or the object: frequency_hz=10, duration_s=2, "
+            "radius_mm=60, position_mm=22,8,0, size_mm=30, hull=true"
+        ),
+    ] = None,
+    json: Json = None,
 ) -> None:
     """Whisk against surfaces and write what the array feels from first contact on."""
     if out.suffix != ".npz":
         raise ConfigError(f"{out}: name a file that ends in .npz")
     if target is not None and stimulus is not None:
         raise ConfigError("--object and --stimulus exclude each other: name one of them")
-    for file in (out, out.with_suffix(".json")):
+    for file in (out, out.with_suffix(".json"), json):
         check_output(file)
     try:
         with starting():
@@ -80,37 +96,27 @@ def whisk(
     if profile not in PROFILES:
         raise ConfigError(f"no profile {profile!r}: there are {', '.join(PROFILES)}")
     animal = load_array(array)
-    moves = (
-        read_trajectory(trajectory, animal.whiskers)
-        if trajectory
-        else Whisk(
-            frequency_hz=frequency,
-            protraction_deg=protraction,
-            retraction_deg=retraction,
-            asymmetry=asymmetry,
-            phase_deg=phase,
-            duration_s=duration,
-        )
-    )
+    regular, place, mesh = take_sets("whisk", sets or (), Whisk, Placing, MeshDetail)
+    moves = read_trajectory(trajectory, animal.whiskers) if trajectory else regular
     pieces, described = {}, {}
     # The stimuli stand on the right of the head, those of an array of the left on its left.
     left = all(w.base[0] < 0 for w in animal.whiskers)
     head, mirror = (HEAD.mirrored(), (-1.0, 1.0, 1.0)) if left else (HEAD, (1.0, 1.0, 1.0))
     if target is not None:
-        if not 0 < size < 1e3:
-            raise ConfigError(f"--size must be above 0 and below 1000 mm, not {size:g}")
-        if not math.isfinite(yaw):
-            raise ConfigError(f"--yaw must be a number of degrees, not {yaw}")
-        mesh = MeshDetail(surface_error_mm=surface_error, max_pieces=max_pieces, hull=hull, up=up)
         thing = load_object(target, mesh)
-        at = np.array(_three(position, "--position")) * mirror
-        turn = rotation("z", np.radians(yaw))
-        pieces[thing.name] = tuple(p.vertices * size @ turn.T + at for p in thing.pieces)
-        described[thing.name] = {"position_mm": at.tolist(), "size_mm": size, "yaw_deg": yaw}
+        at = np.array(_three(place.position_mm, "position_mm")) * mirror
+        turn = rotation("z", np.radians(place.yaw_deg))
+        pieces[thing.name] = tuple(p.vertices * place.size_mm @ turn.T + at for p in thing.pieces)
+        described[thing.name] = {
+            "position_mm": at.tolist(),
+            "size_mm": place.size_mm,
+            "yaw_deg": place.yaw_deg,
+        }
     else:
+        step = _three(place.step_mm, "step_mm")
         names = STIMULI if stimulus in (None, "all") else stimulus.split(",")
         for name in dict.fromkeys(n.strip() for n in names):
-            surface = Surface.named(name, _three(step, "--step"), radius)
+            surface = Surface.named(name, step, place.radius_mm)
             pieces[name] = tuple(corners * mirror for corners in surface.pieces())
             described[name] = {
                 **asdict(surface),
@@ -145,22 +151,29 @@ def whisk(
         base_angles(moves, times, animal.whiskers),
         parameters,
     )
-    for name, what in felt.items():
-        touched = int(what.touch.any(axis=0).sum())
+    told = [
+        {
+            "stimulus": name, "first_ms": what.first_ms,
+            "whiskers": int(what.touch.any(axis=0).sum()),
+        }
+        for name, what in felt.items()
+    ]  # fmt: skip
+    told_as_json(told, json)
+    for one in told:
         console.print(
-            f"{name}: first contact at {what.first_ms} ms, {touched} of "
+            f"{one['stimulus']}: first contact at {one['first_ms']} ms, {one['whiskers']} of "
             f"{len(animal.whiskers)} whiskers touch it"
         )
     console.print(f"{out} and {out.with_suffix('.json')}: {len(felt)} stimuli")
 
 
-def _three(text: str, option: str) -> tuple[float, float, float]:
+def _three(text: str, key: str) -> tuple[float, float, float]:
     try:
         x, y, z = (float(part) for part in text.split(","))
         if not all(map(math.isfinite, (x, y, z))):
             raise ValueError
     except ValueError:
-        raise ConfigError(f"{option} is three numbers, x,y,z, in mm; not {text!r}") from None
+        raise ConfigError(f"{key} is three numbers, x,y,z, in mm; not {text!r}") from None
     return x, y, z
 
 

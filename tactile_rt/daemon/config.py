@@ -89,6 +89,8 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
         behind_ms: Greatest age of a decision's newest sample with `catch_up` ``newest``, ms; 0 for
             three steps, at least 150 ms.
         providers: Execution providers of onnxruntime, best first: ``cpu``, ``cuda``, ``tensorrt``.
+        engine: What runs the model: ``onnxruntime``, ``openvino`` or ``openvino-bf16``; empty for
+            what `tactile-rt model bench --engines` kept for this machine, else ``onnxruntime``.
     """
 
     file: str = ""
@@ -104,6 +106,7 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
     catch_up: Literal["newest", "all"] = "newest"
     behind_ms: Annotated[float, msgspec.Meta(ge=0, le=60_000)] = 0.0
     providers: Annotated[tuple[Text, ...], msgspec.Meta(min_length=1)] = ("cpu",)
+    engine: Literal["", "onnxruntime", "openvino", "openvino-bf16"] = ""
 
 
 class PublisherConfig(_Table, frozen=True, kw_only=True):

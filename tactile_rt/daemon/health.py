@@ -172,6 +172,7 @@ class ModelState:
         refused: The reason for which the model that was to take the place of this one does not;
             empty if none was refused since this one was admitted.
         bad_samples: The number of samples that held what is no number, and were left out.
+        engine: The name of the engine that runs it; empty if that is not known yet.
     """
 
     part: PartState
@@ -195,6 +196,7 @@ class ModelState:
     skips: Losses = field(default_factory=Losses)
     lost: Losses = field(default_factory=Losses)
     refused: str = ""
+    engine: str = ""
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ here=$(CDPATH= cd -- "$(dirname -- "$0")" && pwd)
 # into, and the unit still the one that was read.
 again=$(mktemp -d)
 trap 'rm -rf -- "$again"' EXIT
-PYTHONDONTWRITEBYTECODE=1 {again} --to "$again/service" >/dev/null ||
+PYTHONDONTWRITEBYTECODE=1 {again} --out "$again/service" >/dev/null ||
     refuse "the configuration cannot be installed"
 cmp -s -- "$again/service/{unit}" "$here/{unit}" ||
     refuse "the configuration now gives another {unit}: write it anew"
@@ -157,7 +157,7 @@ def install_script(unit: str, again: Sequence[str], config: Config, user: str) -
 
     Args:
         unit: name of its file.
-        again: command that writes the unit once more, into the folder that is added as ``--to``.
+        again: command that writes the unit once more, into the folder that is added as ``--out``.
         config: folders that it writes into, and that are not there, are made.
         user: whose name it runs under; made if there is none.
     """

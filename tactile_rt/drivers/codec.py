@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt import extensions
+from tactile_rt.extras import lacking
 from tactile_rt.stream import ArraySpec, Chunk, ConfigError
 
 __all__ = [
@@ -351,11 +352,8 @@ def codec_class(wire: str, name: str) -> type[Codec[Any]]:
                 return described
             found: type[Codec[Any]] = getattr(there, attribute)
         except ModuleNotFoundError as error:
-            if (error.name or "").startswith("tactile_rt"):
-                raise
-            raise ConfigError(
-                f"codec {name} needs {error.name}, which is not installed: pip install {error.name}"
-            ) from None
+            # Of ours only those of DBC files need an extra.
+            raise lacking(f"codec {name} needs", "dbc", error) from None
         return found
     theirs: type[Codec[Any]] | None = extensions.added(extensions.CODECS, f"{wire}.{name}")
     if theirs is not None:

@@ -4,12 +4,13 @@ import json
 import operator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-__all__ = ["Record", "as_table", "show", "write"]
+__all__ = ["Record", "as_dicts", "as_table", "show", "write"]
 
 COMPARISONS = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
 
@@ -57,6 +58,11 @@ def as_table(records: list[Record]) -> Table:
     return table
 
 
+def as_dicts(records: list[Record]) -> list[dict[str, Any]]:
+    """Records as JSON has them, each with whether it meets its bar."""
+    return [{**asdict(r), "met": r.met} for r in records]
+
+
 def show(records: list[Record], console: Console) -> None:
     """Print records as a table."""
     console.print(as_table(records))
@@ -64,4 +70,4 @@ def show(records: list[Record], console: Console) -> None:
 
 def write(records: list[Record], path: Path) -> None:
     """Write records as JSON."""
-    path.write_text(json.dumps([{**asdict(r), "met": r.met} for r in records], indent=1) + "\n")
+    path.write_text(json.dumps(as_dicts(records), indent=1) + "\n")

@@ -90,6 +90,7 @@ def export_checkpoint(
     precision: Precision = "fp32",
     kind: Kind = "step",
     data: Sequence[Path] = (),
+    licence: str = "",
 ) -> ModelCard:
     """Export what `training.train` saved.
 
@@ -105,6 +106,7 @@ def export_checkpoint(
         precision: of the weights, and of products with them.
         kind: "step" or "window".
         data: where the sweep sets that it was trained on lie now; default: where they lay.
+        licence: `ModelCard.license`.
 
     Raises:
         ModelError: the checkpoint cannot be read, or the exported graph misses the parity bar.
@@ -148,6 +150,7 @@ def export_checkpoint(
             "python": platform.python_version(),
         },
         figures=dict(figures or {}),
+        license=licence,
     )
     return export_step(model, card, path, precision, kind)
 

@@ -43,6 +43,7 @@ def release(
     precision: Precision = "fp32",
     kind: Kind = "step",
     data: Sequence[Path] = (),
+    licence: str = "",
 ) -> ModelCard:
     """Fit the temperature on the validation split, then export.
 
@@ -50,6 +51,7 @@ def release(
 
     Args:
         data: where the sweep sets that it was trained on lie now; default: where they lay.
+        licence: `ModelCard.license`.
 
     Raises:
         ModelError, RecordingError: the checkpoint or its sweep set cannot be read.
@@ -92,6 +94,7 @@ def release(
         precision=precision,
         kind=kind,
         data=folders,
+        licence=licence,
     )
     if precision == "fp32":
         return card
@@ -187,9 +190,11 @@ def _training_options(config: dict[str, Any]) -> str:
     told = {f.name: config[f.name] for f in fields(TrainingConfig) if f.name in config}
     asked = TrainingConfig(**{**told, "also": also})
     recipe = [name for name in shipped_recipes() if read_recipe(name, **here) == asked]
-    network = ("encoder", "attender", "decoder", "width", "epochs", "batch", "learning_rate")
+    network = ("encoder", "attender", "decoder", "epochs", "batch")
     told = {"recipe": recipe[0]} if recipe else {name: config[name] for name in network}
-    options = [f"--{key.replace('_', '-')} {value}" for key, value in told.items()]
+    options = [f"--{key} {value}" for key, value in told.items()]
+    if not recipe:
+        options += [f"--set {key}={config[key]}" for key in ("width", "learning_rate")]
     options += [f"--also {folder}" for folder in also]
     options += [f"--from {begin}"] if begin else []
     return " ".join([*options, f"--seed {config['seed']}"])
@@ -197,20 +202,20 @@ def _training_options(config: dict[str, Any]) -> str:
 
 def _making(folder: Path, manifest: SweepManifest) -> str:
     """The command that makes a set again."""
-    options = recipe = manifest.recipe
+    recipe = manifest.recipe
     if manifest.recorded:
         return f"tactile-rt label {' '.join(recipe[RECORDINGS])} {folder} {recipe['options']}"
+    options = [f"--{key} {recipe[key]}" for key in ("profile", "seed") if key in recipe]
     if isinstance(recipe.get("objects"), dict):  # since version 2 of the manifest
-        objects = recipe["objects"]
-        options = {
-            "recipe": recipe["name"],
-            "objects": objects["per_category"],
-            **{side: f"{objects[side]:g}" for side in ("validation", "test")},
-            "sweeps": recipe["sweeps"]["draws"],
-            **{key: recipe[key] for key in ("profile", "seed")},
-        }
-    said = " ".join(f"--{key} {value}" for key, value in options.items())
-    return f"tactile-rt sweep {folder} {said}"
+        objects, draws = recipe["objects"], recipe["sweeps"]["draws"]
+        options.insert(0, f"--recipe {recipe['name']}")
+    else:
+        objects, draws = {**recipe, "per_category": recipe.get("objects")}, recipe.get("sweeps")
+    counts = {f"objects.{key}": objects.get(key) for key in ("per_category", "validation", "test")}
+    for key, value in {**counts, "sweeps.draws": draws}.items():
+        if value is not None:
+            options.append(f"--set {key}={value:g}")
+    return f"tactile-rt sweep {folder} {' '.join(options)}"
 
 
 def fit_temperature(posteriors: NDArray[np.float32], labels: NDArray[np.int64]) -> float:

@@ -242,10 +242,15 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
         "declared": DECLARED if array in ROBOTS else UNDECLARED,
     }
     folder.mkdir(parents=True, exist_ok=True)
-    for name in FILES:
-        text = Template((templates / f"{name}.txt").read_text("utf-8")).substitute(words)
-        _write(folder / name, text)
-    _write(folder / "array.toml", described)
+    texts = {name: (templates / f"{name}.txt").read_text("utf-8") for name in FILES}
+    try:
+        for name, text in texts.items():
+            _write(folder / name, Template(text).substitute(words))
+        _write(folder / "array.toml", described)
+    except OSError:  # the disk is full: the folder may be named again
+        for name in texts:
+            (folder / name).unlink(missing_ok=True)
+        raise
     return Project(folder)
 
 

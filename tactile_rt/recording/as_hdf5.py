@@ -10,6 +10,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from tactile_rt.extras import lacking
 from tactile_rt.recording.as_arrays import (
     ABOUT,
     BLOCK,
@@ -22,7 +23,7 @@ from tactile_rt.recording.as_arrays import (
 )
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.layout import Raw
-from tactile_rt.stream import Chunk, ConfigError, RecordingError, TactileError, concatenate
+from tactile_rt.stream import Chunk, RecordingError, TactileError, concatenate
 
 __all__ = ["need_h5py", "read_hdf5", "write_hdf5"]
 
@@ -38,9 +39,7 @@ def need_h5py() -> Any:
     try:
         import h5py
     except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"HDF5 needs {error.name}, which is not installed: pip install 'tactile-rt[hdf5]'"
-        ) from None
+        raise lacking("HDF5 needs", "hdf5", error) from None
     return h5py
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from tactile_rt.classifier.engines import DEFAULT
 from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.recording.description import Description
 from tactile_rt.settings import parse_toml
@@ -45,12 +46,14 @@ class RecordedModel:
         file: The path that the model's file had.
         sha256: The SHA-256 of the file, in hexadecimal; empty: the recording does not tell.
         table: The model's table ``[[model]]`` in the configuration.
+        engine: The name of the engine that ran it.
     """
 
     name: str
     file: Path
     sha256: str
     table: Fields = field(default_factory=dict)
+    engine: str = DEFAULT
 
 
 def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
@@ -69,7 +72,8 @@ def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
         table = tables.get(name, {})
         if table.get("source", session.get("daemon_source")) == session.get("daemon_source"):
             file, _, sha256 = value.rpartition(" sha256:")
-            found.append(RecordedModel(name, Path(file), sha256, table))
+            engine = session.get(f"engine.{name}", DEFAULT)
+            found.append(RecordedModel(name, Path(file), sha256, table, engine))
     return tuple(found)
 
 

@@ -285,7 +285,7 @@ def check_shares(shares: Sequence[float]) -> None:
     """
     if len(shares) != len(SPLITS) or not all(0 <= s < inf for s in shares) or not shares[0]:
         raise ConfigError(
-            "--split is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15: 0 or more each, and some to train"
+            "--shares is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15: 0 or more each, and some to train"
         )
 
 

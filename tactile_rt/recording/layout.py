@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.extras import lacking
+from tactile_rt.stream import Chunk
 
 __all__ = [
     "DECISIONS",
@@ -65,10 +66,7 @@ def need_mcap() -> None:
     try:
         import mcap.writer  # noqa: F401
     except ModuleNotFoundError as error:
-        missing = (error.name or "mcap").partition(".")[0]
-        raise ConfigError(
-            f"recordings need {missing}, which is not installed: pip install 'tactile-rt[record]'"
-        ) from None
+        raise lacking("recordings need", "record", error) from None
 
 
 def encode_samples(chunk: Chunk) -> bytes:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.extras import lacking
 from tactile_rt.stream import ConfigError
 
 __all__ = ["VIDEO", "CameraFilm", "film_of", "write_film"]
@@ -145,7 +146,5 @@ def _need_av() -> Any:
     try:
         import av
     except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"films need {error.name}, which is not installed: pip install 'tactile-rt[view]'"
-        ) from None
+        raise lacking("films need", "view", error) from None
     return av

@@ -12,8 +12,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.extras import lacking
 from tactile_rt.recording.lerobot_film import VIDEO, CameraFilm
-from tactile_rt.stream import ConfigError
 
 __all__ = ["DATA", "FRAME", "INFO", "Episode", "Statistics", "need_pyarrow", "write_meta"]
 
@@ -43,10 +43,7 @@ def need_pyarrow() -> tuple[Any, Any]:
         import pyarrow
         import pyarrow.parquet
     except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"LeRobot datasets need {error.name}, which is not installed: "
-            "pip install 'tactile-rt[lerobot]'"
-        ) from None
+        raise lacking("LeRobot datasets need", "lerobot", error) from None
     return pyarrow, pyarrow.parquet
 
 

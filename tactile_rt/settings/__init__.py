@@ -31,8 +31,10 @@ from tactile_rt.settings.written import (
     parse_options,
     read_csv,
     set_key,
+    set_keys,
     split_url,
     take_options,
+    take_sets,
 )
 
 __all__ = [
@@ -54,6 +56,8 @@ __all__ = [
     "read_toml",
     "refusal",
     "set_key",
+    "set_keys",
     "split_url",
     "take_options",
+    "take_sets",
 ]

@@ -211,7 +211,8 @@ def _build(
         made = [_build(v, (*path, i), lines, file, folder, line) for i, v in enumerate(value)]
     node = SettingNode(made, file, line, folder)
     if isinstance(value, float) and (value != value or value in (float("inf"), -float("inf"))):
-        raise ConfigError(f"{node.where}: {named(path)}: {value} is no quantity")
+        where = f"{node.where}: {named(path)}" if path else node.where
+        raise ConfigError(f"{where}: {value} is no quantity")
     if isinstance(value, int) and not -INT64 <= value < INT64:
         raise ConfigError(f"{node.where}: {named(path)}: more than 64 bits")
     return node

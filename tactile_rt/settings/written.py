@@ -18,8 +18,10 @@ __all__ = [
     "parse_options",
     "read_csv",
     "set_key",
+    "set_keys",
     "split_url",
     "take_options",
+    "take_sets",
 ]
 
 T = TypeVar("T")
@@ -47,7 +49,7 @@ def set_key(nodes: SettingNode, text: str, kind: Any) -> SettingNode:
     origin = f"--set {text}"
     steps = key.split(".")
     if not equals or not all(steps):
-        raise ConfigError(f"{origin}: a setting is KEY=VALUE, e.g. page.port=9000")
+        raise ConfigError(f"{origin}: a setting is KEY=VALUE")
     at: Any = nodes
     path: list[str | int] = []
     for i, step in enumerate(steps):
@@ -71,6 +73,56 @@ def set_key(nodes: SettingNode, text: str, kind: Any) -> SettingNode:
                 at.value[step] = make_node([] if listed else {}, origin, 0, Path.cwd())
             at = at.value[step]
     return nodes
+
+
+def set_keys(
+    nodes: SettingNode, sets: Sequence[str], kind: Any, known: Sequence[str] | None = None
+) -> SettingNode:
+    """A tree in which some keys are otherwise, each as `set_key` has it.
+
+    Args:
+        nodes: the tree; it is changed.
+        sets: ``a.b=value`` each; of the same key twice the last holds.
+        kind: the struct or dataclass that the tree is to be.
+        known: its keys that may be set; None: all.
+
+    Raises:
+        ConfigError: not of that form, or no such key.
+    """
+    known = list(types_of(kind)) if known is None else known
+    for text in sets:
+        key, equals, _ = text.partition("=")
+        key = key.partition(".")[0]
+        if not equals:
+            raise ConfigError(f"--set {text}: a setting is KEY=VALUE; {nearest('', known)}")
+        if key not in known:
+            raise ConfigError(f"--set {text}: no key {key!r}; {hint(key, known)}")
+        set_key(nodes, text, kind)
+    return nodes
+
+
+def take_sets(
+    what: str, sets: Sequence[str], *kinds: type[Any], usual: Mapping[str, Any] | None = None
+) -> tuple[Any, ...]:
+    """Settings of a command shared out among dataclasses: each takes those that it knows.
+
+    Args:
+        what: whose they are, for the message of values that do not go together.
+        sets: ``key=value`` each.
+        kinds: dataclasses of the settings.
+        usual: values where nothing is set, beside the dataclasses' own.
+
+    Raises:
+        ConfigError: not of that form, a key that none knows, or a value that cannot be.
+    """
+    known = {name: kind for kind in kinds for name in types_of(kind)}
+    made = []
+    for kind in kinds:
+        values = {k: v for k, v in (usual or {}).items() if k in types_of(kind)}
+        nodes = make_node(values, what, 0, Path.cwd())
+        mine = [s for s in sets if known.get(re.split("[=.]", s)[0], kinds[0]) is kind]
+        made.append(convert(set_keys(nodes, mine, kind, list(known)), kind))
+    return tuple(made)
 
 
 def _item(node: SettingNode, step: str, origin: str, where: str) -> int:

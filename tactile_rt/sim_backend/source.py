@@ -260,6 +260,8 @@ class SimSource(PacedSource):
         self._simulation: SweepSimulation | None = None
         self._left = 0  # samples of the sweep still to deliver
         self._order: list[int] = []
+        if self.live:
+            self._warm_up()
 
     @staticmethod
     def check(array: str, options: SimOptions) -> ArraySpec:
@@ -331,6 +333,13 @@ class SimSource(PacedSource):
         return Chunk(
             seq, start_ns + seq * period, values, np.ones(values.shape[:2], dtype=np.bool_)
         )
+
+    def _warm_up(self) -> None:
+        """Have compiled what steps a sweep: the stream would stand still for half a minute."""
+        target, rng = promised_object(next(iter(CATEGORIES)))(), np.random.default_rng(0)
+        profile = PROFILES[self._options.profile]
+        _, sweep = draw_simulation(rng, self._animals, target, profile, self._draw)
+        sweep.advance(1)
 
     def _begin_sweep(self, start_ns: int) -> None:
         done = len(self.passes)

@@ -18,6 +18,7 @@ from tactile_rt import extensions
 from tactile_rt.calibration import load_calibration
 from tactile_rt.classifier.array_file import read_array
 from tactile_rt.drivers.opening import Prepared
+from tactile_rt.extras import lacking
 from tactile_rt.settings import nearest, parse_options, split_url
 from tactile_rt.stream import ArraySpec, ConfigError, Source, SpecMismatch
 
@@ -107,12 +108,7 @@ def _of_scheme(
         try:
             made: Any = getattr(import_module(module), attribute)
         except ModuleNotFoundError as error:
-            if (error.name or "").startswith("tactile_rt"):
-                raise
-            raise ConfigError(
-                f"source {scheme}: needs {error.name}, which is not installed: "
-                f"pip install 'tactile-rt[{extra}]'"
-            ) from None
+            raise lacking(f"source {scheme}: needs", extra, error) from None
         if not hasattr(made, "Options"):
             further = {"array": told} if scheme in ASKED else {}
             prepared: Prepared = made(target, fields, **further)

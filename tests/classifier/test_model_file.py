@@ -260,6 +260,7 @@ def test_outputs_that_the_card_promises_must_be_there(
         ({"labels": ("a", "b", "c", "d", "")}, "labels must be 1 to 200 printable characters"),
         ({"labels": ("a", "b", "c", "d", "e" * 201)}, "labels must be 1 to 200 printable"),
         ({"name": "x" * 3_000_000}, "a name of 3000000 characters"),
+        ({"license": "\x1b[2J"}, "a licence must be at most 200 printable characters"),
         ({"steps": 1_000_000}, "an episode of 18000000 values"),
         ({"provenance": {"commands": 5}}, "commands of the provenance must be a list"),
         ({"provenance": {"unseen_objects": "mug"}}, "unseen_objects of the provenance"),

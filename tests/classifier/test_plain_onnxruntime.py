@@ -5,14 +5,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from tactile_rt.classifier.model_card import decided
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.stepper import Stepper
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "plain_onnxruntime.py"
-pytestmark = pytest.mark.skipif(not EXAMPLE.exists(), reason="a source archive, without docs")
 
 # Anything else is as if it were not installed.
 ALONE = """
@@ -60,3 +58,12 @@ def test_it_runs_alone_and_decides_as_we_do() -> None:
 
 def test_it_is_short() -> None:
     assert len(EXAMPLE.read_text(encoding="utf-8").splitlines()) <= 40
+
+
+def test_without_a_file_it_says_what_it_is_and_how_to_get_one() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE, EXAMPLE], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "python plain_onnxruntime.py FILE" in done.stderr
+    assert "shipped_model" in done.stderr and "Traceback" not in done.stderr

@@ -130,7 +130,7 @@ import tactile_rt.classifier.model_file as model_file
 import tactile_rt.classifier.trial as trial
 from tactile_rt.stream import ModelError
 
-def load_model(path):
+def load_model(path, *others):
     kinds = resource.RLIMIT_CPU, resource.RLIMIT_CORE, resource.RLIMIT_DATA
     raise ModelError(f"{[resource.getrlimit(k) for k in kinds]}, {os.nice(0)}")
 

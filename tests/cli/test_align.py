@@ -32,7 +32,7 @@ def test_score_report_and_a_baseline(call, frozen, tmp_path):
     scores, page = tmp_path / "scores.json", tmp_path / "page.html"
     code, out, _ = call(
         "align", "score", MODEL, "--benchmark", frozen / "6.json", "--json", scores,
-        "--page", page, "--performance", "0.91",
+        "--html", page, "--performance", "0.91",
     )  # fmt: skip
     assert code == 0 and "mouse44" in out and "raw sensor" in out
     model = json.loads(scores.read_text())["models"][0]
@@ -143,7 +143,7 @@ def test_mistakes_are_one_line(call, frozen, tmp_path):
         (("score", tmp_path / "none.pt", *benchmark), "no checkpoint"),
         (("score", MODEL, *benchmark, "--performance", "0.4,0.5"), "--performance is 1 numbers"),
         (("score", MODEL, *benchmark, "--performance", "90"), "from 0 to 1"),
-        (("score", MODEL, *benchmark, "--page", tmp_path / "x" / "p.html"), "no folder"),
+        (("score", MODEL, *benchmark, "--html", tmp_path / "x" / "p.html"), "no folder"),
         (("report", frozen / "6.json", "--out", tmp_path / "p.html"), "has no scores"),
         (("build", tmp_path / "none", "--out", tmp_path / "b.json"), "none"),
         (("decode", MODEL, "--stimuli", tmp_path / "none.npz"), "no file"),
@@ -157,7 +157,7 @@ def test_mistakes_are_one_line(call, frozen, tmp_path):
 def test_an_example_is_built_from_and_scored(call, tmp_path):
     pytest.importorskip("h5py")
     brain, out = tmp_path / "brain", tmp_path / "scores.json"
-    code, _, err = call("align", "example", brain, "--mice", 3, "--trials", 12)
+    code, _, err = call("align", "example", brain, "--set", "mice=3", "--set", "trials=12")
     assert code == 0 and "another-mouse.npz" in err and "align build" in err
     code, _, err = call(
         "align", "build", brain / "recordings", "--out", brain / "b.json", "--bootstraps", 5

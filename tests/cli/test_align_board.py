@@ -29,7 +29,7 @@ def test_a_board_of_a_model_its_untrained_network_and_responses(call, brain, tmp
     code, out, err = call(
         "align", "board", MODEL, brain / "models" / "another-mouse.npz",
         "--data", f"example={brain / 'recordings'}", "--metric", "rsa", "--metric", "crossnobis",
-        "--part", "all", "--part", "L5", "--json", board, "--page", page,
+        "--part", "all", "--part", "L5", "--json", board, "--html", page,
     )  # fmt: skip
     assert code == 0, err
     made = json.loads(board.read_text())

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tactile_rt.classifier.model_file import read_model
 from tactile_rt.sweep_set import SweepManifest
 from tests.helpers.tiny_sweeps import plate, write_tiny_set
 
@@ -13,8 +14,8 @@ for module in ("torch", "lightning", "onnx", "matplotlib"):
     pytest.importorskip(module)
 
 ROBOT = plate(2, 4)
-TINY = ("--encoder", "gru", "--attender", "none", "--width", "0.0625", "--epochs", 1, "--batch", 4,
-        "--precision", "fp32")  # fmt: skip
+TINY = ("--encoder", "gru", "--attender", "none", "--epochs", 1, "--batch", 4,
+        "--set", "width=0.0625", "--set", "precision=fp32")  # fmt: skip
 
 
 @pytest.fixture
@@ -88,7 +89,8 @@ def test_a_network_is_not_used_at_another_sample_period(refused, trained, tmp_pa
 def test_align_takes_any_array_with_its_own_stimuli(call, refused, trained, tmp_path):
     _, best = trained()
     model = tmp_path / "robot.onnx"
-    assert call("export", best, model)[0] == 0
+    assert call("export", best, model, "--license", "MIT")[0] == 0
+    assert read_model(model)[0].license == "MIT"
     stimuli = felt(tmp_path / "robot.npz", ROBOT)
     for file in (best, model):
         said = refused("align", "decode", file)

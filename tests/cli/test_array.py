@@ -20,7 +20,6 @@ from tests.helpers.recordings import write
 from tests.helpers.source_tree import ROOT
 
 PAGE = ROOT / "docs" / "how-to" / "your-array.md"
-pytestmark = pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
 
 
 @pytest.fixture(scope="module")

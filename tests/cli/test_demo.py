@@ -15,6 +15,7 @@ from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.cli import demo as demo_module
 from tactile_rt.cli.demo import draw, watch
 from tactile_rt.cli.demonstration import RECORDING, Demonstration
+from tactile_rt.extras import install_extra
 from tactile_rt.stream import Chunk
 
 simulated = pytest.mark.skipif(not find_spec("mujoco"), reason="MuJoCo is not installed")
@@ -114,7 +115,7 @@ def test_without_mujoco_a_recording_is_played_over_a_serial_port(call, monkeypat
     assert first.endswith("right") and second.endswith("right")
     assert "2 of 2 right (100 %)" in summary
     code, out, err = call("demo", "--fast")
-    assert code == 2 and "are for a simulation: install tactile-rt[sim]" in err
+    assert code == 2 and f"are for a simulation: {install_extra('sim')}" in err
 
 
 def test_the_view_of_a_recording_says_that_it_is_one() -> None:

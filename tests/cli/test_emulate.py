@@ -35,7 +35,7 @@ def test_another_process_meets_the_device(tmp_path):
     link = tmp_path / "whisker0"
     process, url = started(
         "native", "--source", "synthetic:3x6?pace=fast", "--link", link, "--fast",
-        "--seconds", 2, "--faults", faults, "--option", "format=int16",
+        "--seconds", 2, "--faults", faults, "--set", "format=int16",
     )  # fmt: skip
     assert url == f"serial://{link}?codec=native&format=int16"
     fd = os.open(link, os.O_RDWR | os.O_NOCTTY)
@@ -73,9 +73,9 @@ def test_ctrl_c_leaves(tmp_path):
         (["native", "--wire", "usb"], "--wire must be serial, slcan or can, not 'usb'"),
         (["native", "--wire", "can"], "--wire can needs --bus INTERFACE:CHANNEL"),
         (["native", "--bus", "virtual:x", "--link", "y"], "--link names a port; a --bus has none"),
-        (["native", "--option", "format"], "--option is NAME=VALUE, not 'format'"),
-        (["native", "--option", "form=int16"], "no option 'form'; did you mean format?"),
-        (["native", "--option", "format=int8"], "format must be one of float32, int16, not 'int8'"),
+        (["native", "--set", "format"], "--set format: an option is KEY=VALUE"),
+        (["native", "--set", "form=int16"], "no option 'form'; did you mean format?"),
+        (["native", "--set", "format=int8"], "format must be one of float32, int16, not 'int8'"),
         (["native", "--faults", "none.toml"], "none.toml: no such file"),
         (["native", "--source", "sintetic:"], "did you mean synthetic:?"),
         (["native", "--link", "/none/x"], "/none/x: No such file or directory"),

@@ -20,7 +20,17 @@ from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sweep_set import write_object
 
-TINY_SET = ("--recipe", "mouse12", "--objects", 3, "--validation", 1, "--test", 1, "--sweeps", 1)
+COUNTS = [
+    part
+    for text in (
+        "objects.per_category=3",
+        "objects.validation=1",
+        "objects.test=1",
+        "sweeps.draws=1",
+    )
+    for part in ("--set", text)
+]
+TINY_SET = ("--recipe", "mouse12", *COUNTS)
 
 
 def tiny_recipe():
@@ -141,11 +151,14 @@ def torch():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--width", 0.1), "width is 0.1, must be a positive multiple of 1/32"),
-        (("--width", 1e6), "width is 1000000.0, must be a positive multiple of 1/32, at most 4"),
+        (("--set", "width=0.1"), "width is 0.1, must be a positive multiple of 1/32"),
+        (
+            ("--set", "width=1e6"),
+            "width is 1000000.0, must be a positive multiple of 1/32, at most 4",
+        ),
         (("--attender", "lstm"), "attender is 'lstm', not one of gpt, mamba, none"),
         (("--seed", -1), "seed must be 0 to 4294967295"),
-        (("--learning-rate", "nan"), "learning_rate: nan is no quantity"),
+        (("--set", "learning_rate=nan"), "--set learning_rate=nan: nan is no quantity"),
     ],
 )
 def test_options_that_cannot_be_trained_with_leave_no_run(
@@ -158,7 +171,7 @@ def test_options_that_cannot_be_trained_with_leave_no_run(
 def test_a_run_that_cannot_begin_can_be_begun_again_with_other_options(
     torch, refused, call, sweep_set, tmp_path
 ):
-    command = ("train", sweep_set, tmp_path / "run", "--width", 1 / 32, "--epochs", 1)
+    command = ("train", sweep_set, tmp_path / "run", "--set", f"width={1 / 32}", "--epochs", 1)
     assert "a batch of 99 is more than the 12 sweeps" in refused(*command, "--batch", 99)
     assert call(*command, "--batch", 12)[0] == 0
     assert "another configuration" in refused(*command, "--batch", 6)
@@ -196,7 +209,7 @@ def test_a_run_cannot_be_made_in_a_file(torch, refused, sweep_set, a_file):
 @pytest.mark.parametrize("content", [b"", b"junk\n", b"PK\x03\x04 cut short"])
 def test_a_damaged_checkpoint_is_one_line(torch, refused, sweep_set, tmp_path, content):
     folder = tmp_path / "run"
-    command = ("train", sweep_set, folder, "--width", 1 / 32, "--epochs", 1, "--batch", 12)
+    command = ("train", sweep_set, folder, "--set", f"width={1 / 32}", "--epochs", 1, "--batch", 12)
     folder.mkdir()
     for name in ("best.pt", "last.pt"):
         (folder / name).write_bytes(content)

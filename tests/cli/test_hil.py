@@ -54,7 +54,7 @@ def test_unless_told_otherwise_objects_pass_that_the_model_has_never_met(
     ("arguments", "said"),
     [
         (["--wire", "usb"], "wire must be one of serial, slcan, virtual"),
-        (["--option", "form=int16"], "no option 'form'; did you mean format?"),
+        (["--set", "form=int16"], "no option 'form'; did you mean format?"),
         (["--source", "synthetic:", "--sweeps", 3], "--sweeps is of a sim: source"),
         (["--source", "synthetic:3x6?seconds=1"], "was made for another array"),
         (["--faults", "none.toml"], "none.toml: no such file"),
@@ -81,7 +81,7 @@ def test_a_difference_is_exit_code_1(call, tmp_path: Path, monkeypatch: pytest.M
 @needs_sim
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "arguments", [(), ("--option", "format=int16"), ("--wire", "slcan")], ids=" ".join
+    "arguments", [(), ("--set", "format=int16"), ("--wire", "slcan")], ids=" ".join
 )
 def test_24_sweeps(call, arguments: tuple[str, ...]) -> None:
     """Bit-equal in float32; else 99 % of all decisions have the same label."""

@@ -28,7 +28,16 @@ from tests.helpers.tiny_sweeps import LEAD, SAMPLES, plate, write_tiny_set
 
 PAGE = ROOT / "docs" / "how-to" / "labelling.md"
 SOUND = {"noise": 1.0, "gain": 0.0, "dead": 0.0}
-SMALL = ("--encoder", "gru", "--attender", "none", "--decoder", "linear", "--width", 1 / 32)
+SMALL = (
+    "--encoder",
+    "gru",
+    "--attender",
+    "none",
+    "--decoder",
+    "linear",
+    "--set",
+    f"width={1 / 32}",
+)
 
 
 def blocks(language):
@@ -64,14 +73,18 @@ def lines_of(call, *words):
     return out, err
 
 
-@pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
 def test_the_tutorial_does_what_it_says(here, call, monkeypatch):
     monkeypatch.chdir(here)
     said = {}
     for block in blocks("sh"):
         words = shlex.split(block)[1:]
         if words[0] == "train":  # all that is not as on the page: minutes are seconds here
-            words += ["--updates", "8" if words[2] == "runs/night" else "2", "--width", "0.03125"]
+            words += [
+                "--set",
+                f"updates={8 if words[2] == 'runs/night' else 2}",
+                "--set",
+                "width=0.03125",
+            ]
             words = [w for k, w in enumerate(words) if "--from" not in words or k < len(words) - 2]
         said[" ".join(words[:3])] = lines_of(call, *words)
     (promised,) = re.findall(r"^    (night: .*)$", PAGE.read_text("utf-8"), re.M)
@@ -84,7 +97,7 @@ def test_the_tutorial_does_what_it_says(here, call, monkeypatch):
     manifest = SweepManifest.read(here / "both")
     assert manifest.period_ns == SweepManifest.read(here / "data" / "robot").period_ns
     (making, *_) = load_model(here / "night.onnx")[1].provenance["commands"]
-    assert making == "tactile-rt label night.mcap night --split 0.7,0.15,0.15 --seed 0"
+    assert making == "tactile-rt label night.mcap night --shares 0.7,0.15,0.15 --seed 0"
 
 
 def fed(model, path):
@@ -114,7 +127,7 @@ def fed(model, path):
 
 def test_training_gets_what_a_classifier_feeds_its_network(here, night, call, monkeypatch):
     run = here / "parity"
-    lines_of(call, "train", night, run, *SMALL, "--batch", 8, "--updates", 1)
+    lines_of(call, "train", night, run, *SMALL, "--batch", 8, "--set", "updates=1")
     lines_of(call, "export", run / "best.pt", here / "parity.onnx")
     samples, offset, sigma = fed(here / "parity.onnx", here / "night.mcap")
     assert samples.shape == (24, 22, 5, *ARRAY.shape)
@@ -213,7 +226,7 @@ def test_a_set_is_replaced_on_demand_and_nothing_else_is(here, night, tmp_path, 
     shutil.copytree(night, out)
     err = refused("label", recording, out)
     assert f"{out} is there already: name another folder, or give --force" in err
-    _, err = lines_of(call, "label", recording, out, "--force", "--split", "0.5,0.25,0.25")
+    _, err = lines_of(call, "label", recording, out, "--force", "--shares", "0.5,0.25,0.25")
     assert "24 of 24 touches" in err
     assert "is made of recordings, by `tactile-rt label`" in refused("sweep", out)
     assert [p.name for p in tmp_path.iterdir()] == ["set"]
@@ -239,8 +252,8 @@ def test_what_is_wrong_is_one_line(here, tmp_path, refused):
         ((recording, out, "--labels", tmp_path / "no.csv"), "no.csv"),
         ((recording, out, "--by-name", "--unlabelled"), "exclude one another: give one"),
         ((recording, recording, out), "is named twice: name it once"),
-        ((recording, out, "--split", "much"), "--split is TRAIN,VALIDATION,TEST"),
-        ((recording, out, "--split", "0,1,1"), "--split is TRAIN,VALIDATION,TEST"),
+        ((recording, out, "--shares", "much"), "--shares is TRAIN,VALIDATION,TEST"),
+        ((recording, out, "--shares", "0,1,1"), "--shares is TRAIN,VALIDATION,TEST"),
         ((tmp_path / "no.mcap", out, "--by-name"), "no recording"),
         ((recording, out, "--like", tmp_path), "is not a sweep set"),
     ):

@@ -25,9 +25,9 @@ gap_mm = 0.5
 def test_from_sweeps_to_figures(call, tmp_path):
     recipe, folder, checkpoint = (tmp_path / n for n in ("mine.toml", "set", "locate.pt"))
     recipe.write_text(RECIPE)
-    options = ("--recipe", recipe, "--processes", 1, "--contacts")
+    options = ("--recipe", recipe, "--processes", 1, "--set", "contacts=true")
     assert call("sweep", folder, *options)[0] == 0
-    code, _, err = call("locate", "train", folder, checkpoint, "--epochs", 2, "--hidden", 8)
+    code, _, err = call("locate", "train", folder, checkpoint, "--epochs", 2, "--set", "hidden=8")
     assert (code, "epoch 2/2" in err) == (0, True)
     figures = tmp_path / "figures.json"
     code, out, _ = call("locate", "eval", checkpoint, folder, "--json", figures)
@@ -51,7 +51,7 @@ def test_a_set_without_contacts_is_told_how_to_get_them(call, tmp_path):
     recipe.write_text(RECIPE.replace("540", "180"))
     assert call("sweep", folder, "--recipe", recipe, "--processes", 1)[0] == 0
     code, _, err = call("locate", "train", folder, tmp_path / "x.pt")
-    assert code == 2 and "`tactile-rt sweep --contacts`" in err
+    assert code == 2 and "`tactile-rt sweep --set contacts=true`" in err
     assert err.count("\n") == 1 and not (tmp_path / "x.pt").exists()
     code, _, err = call("locate", "train", folder, tmp_path / "none" / "x.pt")
     assert code == 2 and "no folder" in err

@@ -126,7 +126,7 @@ def test_verify_a_sealed_file(call, sealed):
     path = sealed()
     code, out, err = call("model", "verify", path)
     assert (code, err) == (0, "")
-    assert out.splitlines()[0] == f"sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}"
+    assert out.splitlines()[0] == f"sha256: {hashlib.sha256(path.read_bytes()).hexdigest()}"
     assert "graph: as it was exported" in out
     assert "embedding: 2 units, finite" in out
     assert "bad samples: NaN and infinity are no load" in out

@@ -47,7 +47,7 @@ def made(folder):
 
 def test_a_set_is_made_gone_on_with_described_and_checked(call, recipe, tmp_path):
     folder = tmp_path / "set"
-    options = ("--seed", 3, "--sweeps", 1, "--processes", 1)
+    options = ("--seed", 3, "--set", "sweeps.draws=1", "--processes", 1)
     code, out, err = call("sweep", folder, "--recipe", recipe, *options, "--split", "test")
     assert (code, out) == (0, "")
     assert "1 sweeps at profile realtime" in err
@@ -76,14 +76,18 @@ def test_a_set_is_made_gone_on_with_described_and_checked(call, recipe, tmp_path
     [
         (("--recipe", "tiny"), "no recipe 'tiny'; there are default24,"),
         (("--recipe", "none.toml"), "none.toml: no such file"),
-        (("--objects", 2), "2 objects cannot be split with 4 for validation and 12 for test"),
-        (("--sweeps", 0), "sweeps.draws must be at least 1, not 0"),
-        (("--validation", 0), "objects.validation must be a whole number"),
-        (("--engine", "spark"), "no engine 'spark'; there are processes, ray"),
+        (
+            ("--set", "objects.per_category=2"),
+            "2 objects cannot be split with 4 for validation and 12 for test",
+        ),
+        (("--set", "sweeps.draws=0"), "sweeps.draws must be at least 1, not 0"),
+        (("--set", "objects.validation=0"), "objects.validation must be a whole number"),
+        (("--set", "objects=2"), "objects is a table of keys, not 2"),
+        (("--set", "contacs=true"), "--set contacs=true: no key 'contacs'; did you mean contacts?"),
+        (("--set", "objects.tset=1"), "objects has no key 'tset'; did you mean test?"),
         (("--verify",), "has no SHA256SUMS"),
-        (("--validation", "nan"), "objects.validation must be at most 100000, not nan"),
-        (("--test", "inf"), "objects.test must be at most 100000, not inf"),
-        (("--address", "head:6379"), "--address is that of a Ray cluster: give --engine ray, too"),
+        (("--set", "objects.validation=nan"), "--set objects.validation=nan: nan is no quantity"),
+        (("--set", "objects.test=inf"), "--set objects.test=inf: inf is no quantity"),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_nothing(call, tmp_path, monkeypatch, options, said):
@@ -115,7 +119,7 @@ def test_sweeps_that_miss_are_told(call, recipe, tmp_path):
 
 def test_a_ray_cluster_is_named_by_host_and_port(call, recipe, tmp_path):
     pytest.importorskip("ray")
-    options = ("--recipe", recipe, "--engine", "ray", "--address", "head")
+    options = ("--recipe", recipe, "--ray", "head")
     code, _, err = call("sweep", tmp_path / "set", *options)
     assert code == 2
     assert "no Ray cluster at head: give its HOST:PORT" in err

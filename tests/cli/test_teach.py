@@ -47,7 +47,7 @@ def lesson(tmp_path_factory):
     folder = tmp_path_factory.mktemp("teach") / "gestures"
     with device([kind for kind in KINDS for _ in range(EACH)], 1) as line:
         done = subprocess.run(
-            [*COMMAND, url(line), folder, "--labels", ",".join(KINDS), "--touches", str(EACH)],
+            [*COMMAND, url(line), folder, "--classes", ",".join(KINDS), "--touches", str(EACH)],
             stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -83,7 +83,7 @@ def test_a_lesson_goes_on_and_lines_are_orders(lesson):
     folder, _ = lesson
     with device(["twist"] * 3, 5) as line:
         done = subprocess.run(
-            [*COMMAND, url(line), folder, "--labels", "twist", "--touches", "2"],
+            [*COMMAND, url(line), folder, "--classes", "twist", "--touches", "2"],
             input="press\ntwist\n", capture_output=True, text=True, timeout=60, check=False,
         )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -104,7 +104,7 @@ def test_killed_at_any_moment_it_loses_the_touch_under_way_at_most(tmp_path):
     for k in range(6):
         with device(["press", "slide"] * 20, seed + k) as line:
             process = subprocess.Popen(
-                [*COMMAND, url(line), folder, "--labels", "press", "--touches", "999"],
+                [*COMMAND, url(line), folder, "--classes", "press", "--touches", "999"],
                 stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True,
             )  # fmt: skip
             said = []
@@ -127,19 +127,19 @@ def test_killed_at_any_moment_it_loses_the_touch_under_way_at_most(tmp_path):
 def test_mistakes_are_one_line(call, lesson, tmp_path):
     folder, _ = lesson
     for arguments, said in (
-        (("synthetic:3x2", tmp_path / "a", "--labels", "a/b"), "cannot be part of a file's name"),
-        (("synthetic:3x2", tmp_path / "a", "--labels", "a,a"), "names 'a' twice"),
-        (("synthetic:3x2", tmp_path / "a", "--labels", "unknown"), "has a meaning of its own"),
+        (("synthetic:3x2", tmp_path / "a", "--classes", "a/b"), "cannot be part of a file's name"),
+        (("synthetic:3x2", tmp_path / "a", "--classes", "a,a"), "names 'a' twice"),
+        (("synthetic:3x2", tmp_path / "a", "--classes", "unknown"), "has a meaning of its own"),
         (("synthetic:3x2", tmp_path / "a", "--page", "here"), "--page is HOST:PORT"),
-        (("synthetic:3x2", folder, "--labels", "a"), "or teach in another folder"),
-        (("synthetic:3x2", folder / LABELS, "--labels", "a"), "is not a folder"),
-        (("serial:/dev/none?codec=bota", tmp_path / "a", "--labels", "a"), "no such port"),
+        (("synthetic:3x2", folder, "--classes", "a"), "or teach in another folder"),
+        (("synthetic:3x2", folder / LABELS, "--classes", "a"), "is not a folder"),
+        (("serial:/dev/none?codec=bota", tmp_path / "a", "--classes", "a"), "no such port"),
         (
-            ("synthetic:3x2?pace=fast&seconds=3", tmp_path / "b", "--labels", ""),
+            ("synthetic:3x2?pace=fast&seconds=3", tmp_path / "b", "--classes", ""),
             "touches kept: 0, too few",
         ),
         (("synthetic:3x2", tmp_path / "a", "--model", tmp_path / "no"), "no model file"),
-        (("synthetic:mouse", tmp_path / "a", "--model", "shipped", "--labels", "mug"), "knows"),
+        (("synthetic:mouse", tmp_path / "a", "--model", "shipped", "--classes", "mug"), "knows"),
     ):
         code, _, err = call("teach", *arguments, "--seconds", "2")
         assert code == 2 and said in err and err.count("\n") == 1, (arguments, err)
@@ -156,7 +156,7 @@ def test_an_address_that_is_taken_is_told_before_anything_is_begun(call, tmp_pat
 
 def test_ctrl_c_learns_from_what_is_there(tmp_path):
     with device(["press"] * 9, 3, pace="realtime") as line:
-        command = [*COMMAND, line.url, tmp_path / "a", "--labels", "press,slide"]
+        command = [*COMMAND, line.url, tmp_path / "a", "--classes", "press,slide"]
         process = subprocess.Popen(
             command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             text=True,
@@ -187,7 +187,7 @@ def test_a_mouse_is_taught_what_the_shipped_model_does_not_know(call, tmp_path):
     pytest.importorskip("numba")
     objects = ",".join(f"teapot-{i}" for i in range(3))
     source = f"sim:mouse?objects={objects}&sweeps=3&pace=fast"
-    more = ("--labels", "teapot", "--touches", "3", "--model", "shipped")
+    more = ("--classes", "teapot", "--touches", "3", "--model", "shipped")
     code, out, err = call("teach", source, tmp_path / "a", *more)
     assert (code, err) == (0, "")
     assert "knows teapot beside 44 others, and what it does not know" in out
@@ -236,7 +236,7 @@ def test_keys_are_orders(tmp_path):
     ours, theirs = pty.openpty()
     with device(["press"] * 2, 1, pace="realtime") as line:
         process = subprocess.Popen(
-            [*COMMAND, url(line), tmp_path / "a", "--labels", "press,slide", "--touches", "9"],
+            [*COMMAND, url(line), tmp_path / "a", "--classes", "press,slide", "--touches", "9"],
             stdin=theirs, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
         said: list[str] = []
@@ -269,7 +269,6 @@ PAGE = ROOT / "docs" / "how-to" / "teaching.md"
 FIVE = ("press", "slide", "double", "push", "twist")
 
 
-@pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
 def test_the_tutorial_does_what_it_says(call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     page = PAGE.read_text("utf-8")

@@ -11,7 +11,7 @@ import av
 import numpy as np
 from PIL import Image
 
-QUICK = ("--speed", 300, "--size", 20, "--profile", "realtime", "--pixels", 320)
+QUICK = ("--set", "speed_mm_s=300", "--set", "size_mm=20", "--profile", "realtime", "--pixels", 320)
 
 
 @pytest.fixture
@@ -78,8 +78,11 @@ def test_a_gif(view):
         (("--out", "a.png", "--camera", "above"), "no camera 'above': there are front, side, top"),
         (("--out", "a.png", "--profile", "fast"), "no profile 'fast'"),
         (("--out", "a.png", "--at", 1e6), "the sweep lasts"),
-        (("--out", "a.png", "--height", "nan"), "--height must be a finite number, not nan"),
-        (("--out", "a.png", "--distance", "inf"), "--distance must be a finite number, not inf"),
+        (("--out", "a.png", "--set", "height_mm=nan"), "--set height_mm=nan: nan is no quantity"),
+        (
+            ("--out", "a.png", "--set", "distance_mm=inf"),
+            "--set distance_mm=inf: inf is no quantity",
+        ),
         (("--out", "a.mp4", "--at", 5), "--at is the moment of a picture"),
         (("--out", "a.png", "--array", "mosue"), "did you mean mouse?"),
         ((), "no display to open a window on: write a picture or video with --out"),
@@ -99,7 +102,7 @@ def test_mistakes_are_one_line_and_leave_nothing(call, tmp_path, monkeypatch, op
 
 def test_an_object_that_misses_is_said(call, tmp_path):
     path = tmp_path / "a.png"
-    code, _, err = call("view", "mug-1", "--out", path, *QUICK, "--height", 300)
+    code, _, err = call("view", "mug-1", "--out", path, *QUICK, "--set", "height_mm=300")
     if "no OpenGL" in err:
         pytest.skip(err)
     assert code == 0

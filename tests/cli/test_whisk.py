@@ -27,7 +27,16 @@ def test_a_stimulus_is_written_with_its_parameters(call, tmp_path, robot):
     out = tmp_path / "out.npz"
     code, _, err = call(
         *("whisk", out, "--array", robot, "--stimulus", "concave-close,convex-close"),
-        *("--profile", "realtime", "--protraction", 45, "--duration", 1.3, "--radius", 70),
+        *(
+            "--profile",
+            "realtime",
+            "--set",
+            "protraction_deg=45",
+            "--set",
+            "duration_s=1.3",
+            "--set",
+            "radius_mm=70",
+        ),
     )
     assert code == 0, err
     assert "first contact at" in err
@@ -55,8 +64,8 @@ def test_an_object_and_a_recorded_trajectory(call, tmp_path, robot):
     path.write_text("\n".join(["time_s,theta_deg", *lines]))
     out = tmp_path / "mug.npz"
     code, _, err = call(
-        *("whisk", out, "--array", robot, "--object", "mug-3", "--position", "22,8,0"),
-        *("--size", 14, "--trajectory", path, "--profile", "realtime"),
+        *("whisk", out, "--array", robot, "--object", "mug-3", "--set", "position_mm=22,8,0"),
+        *("--set", "size_mm=14", "--trajectory", path, "--profile", "realtime"),
     )
     assert code == 0, err
     described = json.loads(out.with_suffix(".json").read_text())
@@ -78,19 +87,21 @@ def test_an_object_and_a_recorded_trajectory(call, tmp_path, robot):
         (("out.npz", "--stimulus", "convex"), "no stimulus 'convex': there are convex-close"),
         (("out.npz", "--stimulus", "all", "--object", "mug"), "exclude each other"),
         (("out.npz", "--object", "mugg"), "no object called 'mugg'"),
-        (("out.npz", "--object", "mug", "--size", "-3"), "--size must be above 0"),
-        (("out.npz", "--object", "mug", "--position", "1,2"), "--position is three numbers"),
-        (("out.npz", "--step", "a"), "--step is three numbers"),
-        (("out.npz", "--step", "1,nan,0"), "--step is three numbers"),
-        (("out.npz", "--object", "mug", "--yaw", "nan"), "--yaw must be a number of degrees"),
+        (("out.npz", "--object", "mug", "--set", "size_mm=-3"), "size_mm must be above 0"),
+        (("out.npz", "--object", "mug", "--set", "position_mm=1,2"), "position_mm is three"),
+        (("out.npz", "--set", "positon_mm=1,2,3"), "; did you mean position_mm?"),
+        (("out.npz", "--set", "frequency_hz"), "a setting is KEY=VALUE; there are frequency_hz,"),
+        (("out.npz", "--set", "step_mm=a"), "step_mm is three numbers"),
+        (("out.npz", "--set", "step_mm=1,nan,0"), "step_mm is three numbers"),
+        (("out.npz", "--object", "mug", "--set", "yaw_deg=nan"), "yaw_deg=nan: nan is no quantity"),
         (("out.npz", "--profile", "best"), "no profile 'best'"),
         (("out.npz", "--array", "cat"), "'cat'"),
-        (("out.npz", "--frequency", "-1"), "frequency_hz must be"),
+        (("out.npz", "--set", "frequency_hz=-1"), "frequency_hz must be"),
         (("out.npz", "--trajectory", "none.csv"), "none.csv: no such file"),
-        (("out.npz", "--array", "robot.csv", "--duration", "0.4"), "the trajectory must last"),
-        (("out.npz", "--array", "robot.csv", "--object", "mug", "--position", "99,0,0",
-          "--duration", "0.1"), "mug-0: no whisker touches it"),
-        (("out.npz", "--array", "robot.csv", "--object", "mug", "--position", "12,0,0"),
+        (("out.npz", "--array", "robot.csv", "--set", "duration_s=0.4"), "trajectory must last"),
+        (("out.npz", "--array", "robot.csv", "--object", "mug", "--set", "position_mm=99,0,0",
+          "--set", "duration_s=0.1"), "mug-0: no whisker touches it"),
+        (("out.npz", "--array", "robot.csv", "--object", "mug", "--set", "position_mm=12,0,0"),
          "begin inside the object"),
     ],
 )  # fmt: skip
@@ -114,8 +125,15 @@ def test_the_left_side_meets_the_mirror_image(call, tmp_path, robot):
     felt = []
     for array in (robot, mirrored):
         out = tmp_path / f"{array.stem}.npz"
-        options = ("--stimulus", "convex-close", "--profile", "realtime", "--protraction", 45)
-        code, _, err = call("whisk", out, "--array", array, *options, "--duration", 1.3)
+        options = (
+            "--stimulus",
+            "convex-close",
+            "--profile",
+            "realtime",
+            "--set",
+            "protraction_deg=45",
+        )
+        code, _, err = call("whisk", out, "--array", array, *options, "--set", "duration_s=1.3")
         assert code == 0, err
         with np.load(out) as arrays:
             felt.append(arrays["values"])

@@ -14,6 +14,7 @@ from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.drivers.codec import CODECS, codec_class
 from tactile_rt.drivers.opening import CanOptions, SerialOptions
+from tactile_rt.extras import install_extra
 from tactile_rt.recording.replay import ReplayOptions, SweepOptions
 from tactile_rt.sources.opening import open_source
 from tactile_rt.sources.synthetic import SyntheticOptions
@@ -202,7 +203,7 @@ def test_a_simulation_without_its_extra_is_told_alike(alike, monkeypatch):
 
     monkeypatch.setattr(opening, "import_module", without_mujoco)
     for url in ("sim:mouse", "whisking:mouse?object=mug"):
-        assert alike(url, command=True).endswith("not installed: pip install 'tactile-rt[sim]'")
+        assert alike(url, command=True).endswith(f"not installed: {install_extra('sim')}")
 
 
 def test_so_is_what_is_wrong_with_a_file_that_it_names(alike, tmp_path):

@@ -30,7 +30,7 @@ class Trials:
         self._during = during
         monkeypatch.setattr(module, "try_model", self)
 
-    def __call__(self, path, limits, every, given_up):
+    def __call__(self, path, limits, every, given_up, engine):
         self.asked.append((path, limits, every))
         self._during()
         return self.found

@@ -31,9 +31,6 @@ from tests.helpers.published import (
 )
 
 DOCS = Path(__file__).parents[2] / "docs"
-pytestmark = pytest.mark.skipif(
-    not (DOCS / "reference" / "messages.md").exists(), reason="a source archive, without docs"
-)
 
 
 def blocks(page, language):

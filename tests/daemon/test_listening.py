@@ -11,8 +11,8 @@ import pytest
 
 from tests.helpers.waiting import until
 
-pytest.importorskip("zmq", reason="needs pyzmq: pip install 'tactile-rt[publish]'")
-pytest.importorskip("zenoh", reason="needs zenoh: pip install 'tactile-rt[publish]'")
+pytest.importorskip("zmq", reason="needs pyzmq: pip install '.[publish]'")
+pytest.importorskip("zenoh", reason="needs zenoh: pip install '.[publish]'")
 
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon

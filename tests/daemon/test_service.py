@@ -103,19 +103,19 @@ def test_install_service_writes_all_three_and_touches_nothing_else(tmp_path, mon
             main()
         return left.value.code or 0, *capsys.readouterr()
 
-    code, out, err = call(file, "--to", tmp_path / "to")
+    code, out, err = call(file, "--out", tmp_path / "to")
     assert code == 0, err
     assert "sudo sh" in out
     written = {p.name for p in (tmp_path / "to").iterdir()}
     assert written == {"tactile-rt.service", "99-tactile.rules", "install.sh"}
     assert f"{file}" in (tmp_path / "to" / "tactile-rt.service").read_text()
     assert "latency_timer" in (tmp_path / "to" / "99-tactile.rules").read_text()
-    code, _, err = call(file, "--to", tmp_path / "to")
+    code, _, err = call(file, "--out", tmp_path / "to")
     assert code == 2 and "is there already" in err
-    code, _, err = call(file, "--to", tmp_path / "new", "--user", "a; rm -rf /")
+    code, _, err = call(file, "--out", tmp_path / "new", "--user", "a; rm -rf /")
     assert code == 2 and "--user" in err and not (tmp_path / "new").exists()
     file.write_text("version = 2\n")
-    code, _, err = call(file, "--to", tmp_path / "new")
+    code, _, err = call(file, "--out", tmp_path / "new")
     assert code == 2 and "robot.toml:1" in err and not (tmp_path / "new").exists()
 
 
@@ -123,7 +123,7 @@ def test_install_service_writes_all_three_and_touches_nothing_else(tmp_path, mon
 
 CONFIG = "/etc/tactile/robot.toml"
 TOOL = [sys.executable, "-B", "-c", "from tactile_rt.cli import main; main()"]
-WRITE = shlex.join([*TOOL, "install-service", CONFIG, "--to"])
+WRITE = shlex.join([*TOOL, "install-service", CONFIG, "--out"])
 STUBS = "/opt/stubs"  # of what needs a running systemd; users and groups are real
 RUN = f"PATH={STUBS}:$PATH sh /root/service/install.sh"
 PREPARE = f"""

@@ -375,6 +375,7 @@ def test_what_the_card_says_of_sensor_and_rules_is_in_the_file(
         "unknown": UnknownRule("entropy", "embedding", (0.5,) * STEPS),
         "candidates": (CandidateRule("rank", 0.95, (2.5,) * STEPS, 200),),
         "loads": {"rms": ((1e-4,) * 6,) * 30},
+        "license": "Apache-2.0 OR MIT",
     }
     for version in (2, 3):  # a card taken from an older file is of an older version
         card = msgspec.structs.replace(exported.card, version=version, **given)

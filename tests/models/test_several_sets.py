@@ -15,8 +15,17 @@ from tactile_rt.stream import ConfigError
 from tactile_rt.sweep_set import SweepManifest, join_manifests
 from tests.helpers.tiny_sweeps import plate, write_tiny_set
 
-SMALL = ("--encoder", "gru", "--attender", "none", "--decoder", "linear", "--width", 1 / 32)
-QUICK = ("--batch", 6, "--updates", 3)
+SMALL = (
+    "--encoder",
+    "gru",
+    "--attender",
+    "none",
+    "--decoder",
+    "linear",
+    "--set",
+    f"width={1 / 32}",
+)
+QUICK = ("--batch", 6, "--set", "updates=3")
 FAULTS = {"implausible": 0.2}
 
 
@@ -84,7 +93,16 @@ def test_sets_of_two_arrays_are_refused(sets, tmp_path, call):
 def test_a_network_begins_with_what_another_knew_by_the_same_name(sets, run, tmp_path, call):
     knew, before = load_checkpoint(run / "best.pt")
     # no rate to speak of: the weights stay what they began as
-    begun = ("--from", run / "best.pt", "--batch", 6, "--updates", 1, "--learning-rate", 1e-12)
+    begun = (
+        "--from",
+        run / "best.pt",
+        "--batch",
+        6,
+        "--set",
+        "updates=1",
+        "--set",
+        "learning_rate=1e-12",
+    )
     code, _, said = call("train", sets / "other", tmp_path / "next", *begun)
     assert not code, said
     model, after = load_checkpoint(tmp_path / "next" / "best.pt")
@@ -108,8 +126,8 @@ def test_what_cannot_be_begun_with_is_said(sets, run, tmp_path, call):
         tmp_path / "b",
         "--from",
         run / "best.pt",
-        "--width",
-        1 / 16,
+        "--set",
+        "width=0.0625",
         *QUICK,
     )
     assert code == 2 and "cannot be begun with: it is of another width" in said
@@ -121,7 +139,7 @@ def test_what_cannot_be_begun_with_is_said(sets, run, tmp_path, call):
 def test_things_of_no_category_are_what_unknown_is_learnt_from(sets, tmp_path, call):
     """After some updates things of none are less likely to be taken for known ones."""
     code, _, said = call("train", sets / "one", tmp_path / "r", *SMALL, "--batch", 6,
-                         "--updates", 150, "--learning-rate", 0.01)  # fmt: skip
+                         "--set", "updates=150", "--set", "learning_rate=0.01")  # fmt: skip
     assert not code, said
     model, saved = load_checkpoint(tmp_path / "r" / "best.pt")
     at = [*saved["categories"], *saved["refusals"]].index(UNKNOWN)
@@ -143,7 +161,7 @@ def test_rows_go_by_name_where_as_many_labels_are_known_in_another_order(tmp_pat
         write_tiny_set(tmp_path / f"set-{k}", categories=categories)
     code, _, said = call("train", tmp_path / "set-0", tmp_path / "first", *SMALL, *QUICK)
     assert not code, said
-    begun = ("--from", tmp_path / "first" / "best.pt", *QUICK, "--learning-rate", 1e-12)
+    begun = ("--from", tmp_path / "first" / "best.pt", *QUICK, "--set", "learning_rate=1e-12")
     assert not call("train", tmp_path / "set-1", tmp_path / "next", *begun)[0]
     old, new = (
         load_checkpoint(tmp_path / run / "best.pt")[0].state_dict() for run in ("first", "next")

@@ -31,7 +31,7 @@ from tests.helpers.holding import held_elsewhere  # noqa: E402
 from tests.helpers.tiny_sweeps import write_tiny_set  # noqa: E402
 
 SMALL = {"encoder": "gru", "decoder": "linear", "width": 1 / 32, "batch": 6}
-OPTIONS = ("--encoder", "gru", "--decoder", "linear", "--width", 1 / 32, "--batch", 6)
+OPTIONS = ("--encoder", "gru", "--decoder", "linear", "--set", f"width={1 / 32}", "--batch", 6)
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +56,7 @@ def trained(tiny, tmp_path_factory):
 def test_a_second_training_in_a_folder_is_refused(tiny, refused, tmp_path):
     folder = tmp_path / "run"
     with held_elsewhere(folder) as pid:
-        said = refused("train", tiny, folder, *OPTIONS, "--updates", 1)
+        said = refused("train", tiny, folder, *OPTIONS, "--set", "updates=1")
         assert f"folder {folder} is in use by process {pid}: wait" in said
         assert not folder.exists()
 
@@ -97,11 +97,11 @@ def test_a_probe_never_takes_the_place_of_what_it_probes(trained, refused, tmp_p
 
 def test_the_probe_s_steps_are_chosen_by_the_command(trained, call, refused, tmp_path):
     assert "readout is 'all', not one of last, mean" in refused(
-        "probe", trained / "best.pt", tmp_path / "p", "--readout", "all"
+        "probe", trained / "best.pt", tmp_path / "p", "--set", "readout=all"
     )
     found = {}
     for readout in ("last", "mean"):
-        options = ("--epochs", 3, "--readout", readout)
+        options = ("--epochs", 3, "--set", f"readout={readout}")
         assert call("probe", trained / "best.pt", tmp_path / readout, *options)[0] == 0
         config = ProbeConfig(epochs=3, readout=readout)
         again = probe(trained / "best.pt", tmp_path / "again", config)
@@ -187,7 +187,9 @@ def test_a_full_disk_is_one_line_of_tensorboard_s_too(tiny, disk, refused, no_th
     place, full = disk
     train(TrainingConfig(tiny, **SMALL, updates=1), place / "run")
     with full(0):
-        said = refused("train", tiny, place / "run", *OPTIONS, "--updates", 1, "--tensorboard")
+        said = refused(
+            "train", tiny, place / "run", *OPTIONS, "--set", "updates=1", "--tensorboard"
+        )
     assert f"cannot use {place / 'run' / 'tensorboard'}/events.out.tfevents" in said
 
 

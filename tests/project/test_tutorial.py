@@ -27,7 +27,6 @@ from tactile_rt.sweep_set import SweepManifest, read_skipped
 from tests.helpers.source_tree import ROOT
 
 PAGE = ROOT / "docs" / "how-to" / "your-array.md"
-pytestmark = pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
 CLI = [
     sys.executable,
     "-c",

@@ -205,9 +205,6 @@ def test_text_is_as_documented(path, tmp_path):
     assert outputs_of(tmp_path / "x.csv") == [tmp_path / "x.csv", tmp_path / "x.csv.json"]
 
 
-@pytest.mark.skipif(
-    not (DOCS / "reference" / "recording.md").exists(), reason="a source archive, without docs"
-)
 def test_the_example_reads_hdf5(path, tmp_path, monkeypatch):
     convert(path, tmp_path / "run.h5")
     monkeypatch.chdir(tmp_path)

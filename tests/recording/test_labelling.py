@@ -151,7 +151,7 @@ def test_shares_are_of_each_category_and_some_of_each_are_trained(night, tmp_pat
     none = write_set(tmp_path / "none", found, (1, 0, 0))
     assert not none.split["validation"] and not none.split["test"]
     for bad in ((0.5, 0.5), (0, 1, 0), (1, -1, 0)):
-        with pytest.raises(ConfigError, match="--split is TRAIN,VALIDATION,TEST"):
+        with pytest.raises(ConfigError, match="--shares is TRAIN,VALIDATION,TEST"):
             write_set(tmp_path / "bad", found, bad)
 
 

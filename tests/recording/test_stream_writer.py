@@ -2,6 +2,7 @@
 
 import errno
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -10,6 +11,7 @@ import time
 import numpy as np
 import pytest
 
+from tactile_rt.extras import install_extra
 from tactile_rt.recording import Recording, StreamWriter, recover, writer
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError, RecordingError
@@ -265,5 +267,7 @@ def test_without_the_extra_it_says_what_to_install(path, monkeypatch):
         lambda: recover(path),
         lambda: open_source(f"replay:{path}"),
     ):
-        with pytest.raises(ConfigError, match=r"need mcap, .* pip install 'tactile-rt\[record\]'"):
+        with pytest.raises(
+            ConfigError, match=f"need mcap, .*: {re.escape(install_extra('record'))}"
+        ):
             use()

@@ -4,6 +4,7 @@ from importlib.util import find_spec
 
 import pytest
 
+from tactile_rt.extras import install_extra
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import ConfigError
 from tactile_rt.testing import ArraySource, small_spec
@@ -122,7 +123,7 @@ def test_an_extra_that_is_not_installed_is_named(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(sources, "import_module", without_mujoco)
     said = refusal(open_source, "sim:mouse")
-    assert said == "source sim: needs mujoco, which is not installed: pip install 'tactile-rt[sim]'"
+    assert said == f"source sim: needs mujoco, which is not installed: {install_extra('sim')}"
 
     def broken(name: str) -> None:
         raise ModuleNotFoundError("no such module", name="tactile_rt.sim_backend.sauce")

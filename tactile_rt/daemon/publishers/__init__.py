@@ -4,6 +4,7 @@ from importlib import import_module
 from typing import Any
 
 from tactile_rt import extensions
+from tactile_rt.extras import lacking
 from tactile_rt.settings import no_such
 from tactile_rt.stream import ConfigError
 
@@ -52,8 +53,4 @@ def load_class(where: str, what: str, extra: str) -> Any:
     except ModuleNotFoundError as error:
         if error.name == module:
             raise ConfigError(f"{what} is not in this release") from None
-        if (error.name or "").startswith("tactile_rt"):
-            raise
-        raise ConfigError(
-            f"{what} needs {error.name}, which is not installed: pip install 'tactile-rt[{extra}]'"
-        ) from None
+        raise lacking(f"{what} needs", extra, error) from None

@@ -198,23 +198,28 @@ def with_cells(
 
     Raises:
         ConfigError: no such part or metric.
+        ModuleNotFoundError: threadpoolctl is not installed.
     """
-    columns, cells = [], []
-    steps = len(parts) * len(metrics)
-    for done, (part, metric) in enumerate((p, m) for p in parts for m in metrics):
-        targets = part_of(animals, part)
-        measures = [find_metric(metric)(target) for target in targets]
-        usable = [k for k, measure in enumerate(measures) if measure.usable]
-        ceilings = np.array([measures[k].ceiling for k in usable])
-        columns.append(
-            BoardColumn(dataset.name, part, metric, len(targets), len(usable),
-                        _number(ceilings.mean()) if usable else None)
-        )  # fmt: skip
-        for row, (_, traces) in enumerate(rows):
-            cells.append(_cell(row, done, traces, [measures[k] for k in usable]))
-        others = [(targets[k], measures[k]) for k in usable]
-        cells.append(_another(len(rows), done, others))
-        progress((done + 1) / steps)
+    from threadpoolctl import threadpool_limits
+
+    columns: list[BoardColumn] = []
+    cells: list[BoardCell] = []
+    # Matrices are small: more threads wait for each other, on a busy machine for minutes.
+    with threadpool_limits(1):
+        for done, (part, metric) in enumerate((p, m) for p in parts for m in metrics):
+            targets = part_of(animals, part)
+            measures = [find_metric(metric)(target) for target in targets]
+            usable = [k for k, measure in enumerate(measures) if measure.usable]
+            ceilings = np.array([measures[k].ceiling for k in usable])
+            columns.append(
+                BoardColumn(dataset.name, part, metric, len(targets), len(usable),
+                            _number(ceilings.mean()) if usable else None)
+            )  # fmt: skip
+            for row, (_, traces) in enumerate(rows):
+                cells.append(_cell(row, done, traces, [measures[k] for k in usable]))
+            others = [(targets[k], measures[k]) for k in usable]
+            cells.append(_another(len(rows), done, others))
+            progress((done + 1) / (len(parts) * len(metrics)))
     card = BoardDataset(
         name=dataset.name,
         title=dataset.title,

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tactile_rt.files import whole_folder
 from tactile_rt.models.alignment.example import MODELS, Brain, example_models, gains
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.stream import ConfigError
@@ -73,24 +74,26 @@ def write_example(
         raise ConfigError(f"{folder} is there already: name a new folder")
     truth, models, mice = (np.random.default_rng([seed, part]) for part in range(3))
     shared = brain.geometry(truth)
-    recordings, others = folder / "recordings", folder / "models"
-    for part in (recordings, others):
-        part.mkdir(parents=True)
-    for name, layers in example_models(brain, models, shared).items():
-        np.savez(others / f"{name}.npz", **layers)  # type: ignore[arg-type]
-    for k in range(brain.mice):
-        name = f"mouse-{k + 1:02d}"
-        features = brain.features(mice, shared)
-        home = recordings / f"sub-{name}"
-        home.mkdir()
-        for j in range(brain.sessions):
-            path = home / f"sub-{name}_ses-{j + 1}_behavior+ecephys.nwb"
-            with h5py.File(path, "w") as file:
-                _session(file, mice, name, brain.rates(mice, features, brain.units), brain.trials)
-            progress((k * brain.sessions + j + 1) / (brain.mice * brain.sessions))
-    told = {"brain": asdict(brain), "seed": seed, "lost": MODELS, "shared": shared.tolist()}
-    (folder / "truth.json").write_text(json.dumps(told, indent=1) + "\n")
-    return recordings, others
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with whole_folder(folder) as made:
+        for part in ("recordings", "models"):
+            (made / part).mkdir()
+        for name, layers in example_models(brain, models, shared).items():
+            np.savez(made / "models" / f"{name}.npz", **layers)  # type: ignore[arg-type]
+        for k in range(brain.mice):
+            name = f"mouse-{k + 1:02d}"
+            features = brain.features(mice, shared)
+            home = made / "recordings" / f"sub-{name}"
+            home.mkdir()
+            for j in range(brain.sessions):
+                path = home / f"sub-{name}_ses-{j + 1}_behavior+ecephys.nwb"
+                rates = brain.rates(mice, features, brain.units)
+                with h5py.File(path, "w") as file:
+                    _session(file, mice, name, rates, brain.trials)
+                progress((k * brain.sessions + j + 1) / (brain.mice * brain.sessions))
+        told = {"brain": asdict(brain), "seed": seed, "lost": MODELS, "shared": shared.tolist()}
+        (made / "truth.json").write_text(json.dumps(told, indent=1) + "\n")
+    return folder / "recordings", folder / "models"
 
 
 def _session(

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from tactile_rt.models.alignment.another_mouse import MARGIN, Mice, Power
+from tactile_rt.models.alignment.another_mouse import MARGIN, SURE, Mice, Power
 from tactile_rt.models.alignment.benchmark import Benchmark
 from tactile_rt.models.alignment.scoring import Score
 from tactile_rt.models.alignment.statistics import student
@@ -117,7 +117,7 @@ def turing(score: Score, mice: Mice, power: Power | None = None) -> Check:
     found = mice.compare(score.rdms[None])
     fit, floor, least = float(found.fit[0]), float(found.floor[0]), (1 - MARGIN) * found.ceiling
     why = (
-        f"fit {fit:.3f}, of another mouse {found.ceiling:.3f} and in 7 of 8 cases at least "
+        f"fit {fit:.3f}, of another mouse {found.ceiling:.3f} and in 9 of 10 cases at least "
         f"{found.bound:.3f}; confidently above {floor:.3f} ({least:.3f} is needed); "
         f"p {score.p:.4f} (below {LARGEST_P})"
     )
@@ -148,7 +148,7 @@ def regression(score: Score, mice: Mice, baseline: ArrayLike) -> Check:
     before = mice.compare(np.asarray(baseline, dtype=np.float64)[None]).fits[0]
     drops = (before - mice.compare(score.rdms[None]).fits[0]) / mice.ceiling
     mean = float(drops.mean())
-    half = student(drops.size - 1) * float(drops.std(ddof=1)) / math.sqrt(drops.size)
+    half = student(drops.size - 1, SURE) * float(drops.std(ddof=1)) / math.sqrt(drops.size)
     why = (
         f"the fit dropped by {mean:+.3f} [{mean - half:+.3f}, {mean + half:+.3f}] of the noise "
         f"ceiling over {drops.size} animals (at most {LARGEST_DROP})"

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.extras import lacking
 from tactile_rt.models.alignment.clock import CLOCKS, ContactResponse, contact_response
 from tactile_rt.models.alignment.neural import NeuralSession
 from tactile_rt.models.alignment.nwb_parts import (
@@ -176,10 +177,8 @@ def read_session(
 def _h5py() -> Any:
     try:
         import h5py
-    except ModuleNotFoundError:
-        raise ConfigError(
-            "reading NWB needs h5py, which is not installed: pip install 'tactile-rt[align]'"
-        ) from None
+    except ModuleNotFoundError as error:
+        raise lacking("reading NWB needs", "align", error) from None
     return h5py
 
 

@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 __all__ = [
     "COLUMNS",
     "CONTACTS",
+    "EXPERIMENT",
+    "LARGEST",
     "RECORDING",
+    "SUBJECT",
     "TRIALS",
     "WHISKER",
     "animal_name",
@@ -43,6 +46,7 @@ TRIALS = "intervals/trials"
 RECORDING = "extracellular array recording"  # of the published files; else the only one there is
 CONTACTS = "contacts_by_whisker_"
 WHISKER = "processed_position_whisker_"
+SUBJECT = "general/subject/subject_id"
 EXPERIMENT = "general/experiment_description"  # says which task it was
 LARGEST = 1 << 30  # bytes of a column; the longest ones, of spike times, have some millions
 
@@ -168,8 +172,8 @@ def starting_time(file: "h5py.File") -> float | None:
 
 def animal_name(file: "h5py.File", stem: str) -> str:
     """The subject; without one, the first part of the file's name, as published."""
-    if "general/subject/subject_id" in file:
-        return str(text(np.atleast_1d(file["general/subject/subject_id"][()]))[0])
+    if SUBJECT in file:
+        return str(text(np.atleast_1d(file[SUBJECT][()]))[0])
     return stem.partition("_")[0].removeprefix("sub-")
 
 

@@ -79,6 +79,11 @@ HATCH = (
     'height="6" patternUnits="userSpaceOnUse" patternTransform="rotate(45)"><line x1="0" y1="0" '
     'x2="0" y2="6" stroke="var(--soft)" stroke-width="1.5"/></pattern></defs></svg>'
 )
+VERDICTS = {
+    "pass": '<span class="good">passes</span>',
+    "fail": '<span class="bad">fails</span>',
+    "inconclusive": "cannot tell",
+}
 STRICT = (
     "The score is the mean over animals of the fit of one layer, which is chosen on the other "
     "animals: it is not the highest bar."
@@ -145,7 +150,8 @@ def _summary(results: Results) -> str:
             f"<tr><td>{escape(model.name)}</td><td><b>{_said(model.score)}</b> ± {_said(model.sem)}"
             f"</td><td>{_p(model.p)}</td><td>{_said(model.null_95)}</td>"
             f"<td>{_said(untrained.score) if untrained else ''}</td>"
-            f"<td>{model.parameters:,}</td><td>{_verdict(results, model)}</td></tr>"
+            f"<td>{f'{model.parameters:,}' if model.parameters else ''}</td>"
+            f"<td>{_verdict(model)}</td></tr>"
         )
     return (
         '<div class="scroll"><table><tr><th>model</th><th>score ± s.e.m.</th><th>p</th>'
@@ -158,23 +164,27 @@ def _summary(results: Results) -> str:
         f"<br><small>highest {_said(b.a2a_highest)}</small></td>"
         "<td></td><td></td><td></td><td></td><td></td></tr></table></div>"
         '<p class="soft">p: share of the 720 relabellings of the stimuli that score as high, the '
-        "layer chosen anew each time. A model passes with a score of at least animal to animal "
-        "less its standard error, and p below 0.05. Where the raw "
-        "input or the untrained network scores as high, it is not training that made it fit.</p>"
+        "layer chosen anew each time. Where the raw input or the untrained network scores as high, "
+        "it is not training that made it fit. The Turing test asks whether a model fits single "
+        "animals as another animal would: it fails what is worse, and passes what is shown to be "
+        "near. Its fits weigh dissimilarities by how they vary together: they are not the scores "
+        "above. <em>Power</em>: what it finds among these animals themselves.</p>"
+        f"{_reasons(results)}"
     )
 
 
-def _verdict(results: Results, model: ModelResult) -> str:
-    b = results.benchmark
-    values = (model.score, model.p, b.a2a_mean, b.a2a_sem)
-    if any(v is None for v in values) or sum(b.reliable[: len(b.a2a)]) < 5:
-        return "cannot tell"
-    score, p, mean, sem = (float(v) for v in values if v is not None)
-    if score >= mean - sem and p < 0.05:
-        return '<span class="good">passes</span>'
-    missed = [why for why, is_so in (("below the animals", score < mean - sem),
-                                     ("chance is not excluded", p >= 0.05)) if is_so]  # fmt: skip
-    return f'<span class="bad">fails</span>: {" and ".join(missed)}'
+def _verdict(model: ModelResult) -> str:
+    return VERDICTS.get(model.turing, "")
+
+
+def _reasons(results: Results) -> str:
+    """The figures behind each verdict, a line for every model that has one."""
+    lines = [
+        f"<li>{escape(model.name)}: {escape(model.turing_why)}</li>"
+        for model in results.models
+        if model.turing_why
+    ]
+    return f'<ul class="soft">{"".join(lines)}</ul>' if lines else ""
 
 
 def _layer_key(results: Results) -> str:

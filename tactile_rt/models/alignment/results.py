@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from tactile_rt.files import write_whole
 from tactile_rt.models.alignment.benchmark import Benchmark
 from tactile_rt.models.alignment.benchmark_file import benchmark_sha256
+from tactile_rt.models.alignment.gate import neural_checks
 from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, rdm
 from tactile_rt.models.alignment.scoring import Score, score
@@ -63,6 +64,9 @@ class ModelResult(msgspec.Struct, frozen=True):
         untrained: The network before its training as a control, where there is one.
         groups: The groups that the model belongs to, by what they divide models by: encoder,
             attender, objective, augmentation, masking; without those that are not known.
+        turing: The verdict of the gate's NeuroAI Turing test: pass, fail or inconclusive; empty in
+            files that were written without it.
+        turing_why: The reason for that verdict, and what the test would find in this benchmark.
     """
 
     name: str
@@ -86,6 +90,8 @@ class ModelResult(msgspec.Struct, frozen=True):
     untrained: AlignmentControl | None = None
     notes: tuple[str, ...] = ()
     groups: dict[str, str] = {}
+    turing: str = ""
+    turing_why: str = ""
 
 
 class BenchmarkResult(msgspec.Struct, frozen=True):
@@ -162,6 +168,7 @@ def model_result(
     """Score a model."""
     patterns = layers.patterns
     made = score(benchmark, patterns)
+    test = next(c for c in neural_checks(made, benchmark) if c.name == "turing")
     return ModelResult(
         name=layers.name,
         sha256=layers.sha256,
@@ -186,6 +193,8 @@ def model_result(
         ),
         notes=layers.notes,
         groups=_groups(layers),
+        turing=test.verdict,
+        turing_why=test.why,
     ), made
 
 

@@ -24,12 +24,16 @@ __all__ = [
 
 Floats = NDArray[np.float64]
 
-# Points of Student's t that it exceeds in one of eight cases, for 1, 2, ... degrees of freedom; the
-# normal's beyond.
-STUDENT = (2.414, 1.604, 1.423, 1.344, 1.301, 1.273, 1.254, 1.240, 1.230, 1.221, 1.214, 1.209,
-           1.204, 1.200, 1.197, 1.194, 1.191, 1.189, 1.187, 1.185, 1.183, 1.182, 1.180, 1.179,
-           1.178, 1.177, 1.176, 1.175, 1.174, 1.173)  # fmt: skip
-NORMAL = 1.150
+# Points of Student's t that it exceeds in one of so many cases, for 1, 2, ... degrees of freedom;
+# and the normal's beyond.
+STUDENT = {
+    8: (2.414, 1.604, 1.423, 1.344, 1.301, 1.273, 1.254, 1.240, 1.230, 1.221, 1.214, 1.209, 1.204,
+        1.200, 1.197, 1.194, 1.191, 1.189, 1.187, 1.185, 1.183, 1.182, 1.180, 1.179, 1.178, 1.177,
+        1.176, 1.175, 1.174, 1.173, 1.150),
+    10: (3.078, 1.886, 1.638, 1.533, 1.476, 1.440, 1.415, 1.397, 1.383, 1.372, 1.363, 1.356, 1.350,
+         1.345, 1.341, 1.337, 1.333, 1.330, 1.328, 1.325, 1.323, 1.321, 1.319, 1.318, 1.316, 1.315,
+         1.314, 1.313, 1.311, 1.310, 1.282),
+}  # fmt: skip
 Statistic = Callable[[Floats], Floats]
 
 # Relabellings that leave an RDM as it is give its statistic again, but for rounding.
@@ -126,6 +130,7 @@ def standard_error(values: ArrayLike) -> float:
     return float(there.std(ddof=1) / np.sqrt(there.size))
 
 
-def student(degrees: int) -> float:
-    """What Student's t of one or more degrees of freedom exceeds in one of eight cases."""
-    return STUDENT[degrees - 1] if degrees <= len(STUDENT) else NORMAL
+def student(degrees: int, cases: int) -> float:
+    """What Student's t of one or more degrees of freedom exceeds in one of 8 or of 10 cases."""
+    points = STUDENT[cases]
+    return points[min(degrees, len(points)) - 1]

@@ -1,7 +1,7 @@
 """Train EAD networks: what to train (`config`, `recipes`), how (`loop`), and what comes of it.
 
     tactile-rt train data/default24 runs/mine
-    tactile-rt train data/default24 runs/simclr --recipe paper-simclr --width 0.125
+    tactile-rt train data/default24 runs/simclr --recipe paper-simclr --set width=0.125
     tactile-rt probe runs/simclr/best.pt runs/simclr-probe
 
 A run folder holds `config.json`, `history.csv` (a line per epoch), `last.pt` (everything needed to

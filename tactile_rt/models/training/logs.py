@@ -9,6 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from tactile_rt.extras import install_line
 from tactile_rt.files import replaced
 from tactile_rt.stream import ConfigError
 
@@ -61,7 +62,7 @@ class Board:
             except ImportError:
                 raise ConfigError(
                     "--tensorboard needs tensorboard, which is not installed: "
-                    "pip install tensorboard"
+                    + install_line("tensorboard")
                 ) from None
 
     def begin(self, done: int) -> None:

@@ -10,7 +10,7 @@ objective = "simclr"
 learning_rate = [0.1, 0.01, 0.001, 0.0001]
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import fields as fields_of
 from dataclasses import replace
 from importlib import resources
@@ -21,7 +21,7 @@ from typing import Any
 import msgspec
 
 from tactile_rt.models.training.config import TrainingConfig
-from tactile_rt.settings import convert, hint, make_node, no_such, parse_toml, read_toml
+from tactile_rt.settings import convert, hint, make_node, no_such, parse_toml, read_toml, set_keys
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Recipe", "load_recipe", "read_recipe", "shipped_recipes"]
@@ -42,14 +42,20 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     train: dict[str, Any] = {}
     search: dict[str, list[Any]] = {}
 
-    def config(self, data: str, **overrides: Any) -> TrainingConfig:
+    def config(self, data: str, sets: Sequence[str] = (), **overrides: Any) -> TrainingConfig:
         """The configuration, with what is asked for otherwise.
 
+        Args:
+            data: the sweep set's folder.
+            sets: ``key=value`` each, as on a command line.
+            overrides: fields of `TrainingConfig`.
+
         Raises:
-            ConfigError: a value that cannot be.
+            ConfigError: a key that there is not, or a value that cannot be.
         """
-        asked = {**self.train, **overrides, "data": data}
-        made: TrainingConfig = convert(make_node(asked, "training", 0, Path()), TrainingConfig)
+        nodes = make_node({**self.train, **overrides, "data": data}, "training", 0, Path())
+        set_keys(nodes, sets, TrainingConfig, KEYS)
+        made: TrainingConfig = convert(nodes, TrainingConfig)
         return made
 
     def searched(self) -> Iterator[dict[str, Any]]:
@@ -96,15 +102,16 @@ def load_recipe(name: str) -> Recipe:
     return recipe
 
 
-def read_recipe(name: str, data: str, **overrides: Any) -> TrainingConfig:
+def read_recipe(name: str, data: str, sets: Sequence[str] = (), **overrides: Any) -> TrainingConfig:
     """The training configuration of a recipe.
 
     Args:
         name: of one that ships, or of a TOML file.
         data: the sweep set's folder.
+        sets: ``key=value`` each, which are to be otherwise.
         overrides: fields that are to be otherwise.
 
     Raises:
         ConfigError: there is none, it is damaged, or a value cannot be.
     """
-    return load_recipe(name).config(data, **overrides)
+    return load_recipe(name).config(data, sets, **overrides)

@@ -14,9 +14,10 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final
 
+from tactile_rt.extras import lacking
 from tactile_rt.files import open_regular
 from tactile_rt.recording.records import MAGIC
-from tactile_rt.stream import NS_PER_S, ConfigError, RecordingError
+from tactile_rt.stream import NS_PER_S, RecordingError
 
 __all__ = ["ROS1", "OpenBag", "open_bag"]
 
@@ -88,10 +89,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError as error:
-        missing = (error.name or "rosbags").partition(".")[0]
-        raise ConfigError(
-            f"bags need {missing}, which is not installed: pip install 'tactile-rt[import]'"
-        ) from None
+        raise lacking("bags need", "import", error) from None
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
         reader.open()

@@ -16,6 +16,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
+from tactile_rt.extras import lacking
 from tactile_rt.stream import ConfigError, TactileError
 
 __all__ = ["ENGINES", "Outcome", "Work", "run_processes", "run_ray"]
@@ -147,9 +148,7 @@ def run_ray(
     try:
         import ray
     except ModuleNotFoundError as error:
-        raise ConfigError(
-            f"this needs {error.name}, which is not installed: pip install 'tactile-rt[cluster]'"
-        ) from None
+        raise lacking("this needs", "cluster", error) from None
     started = not ray.is_initialized()
     if started:
         _join_cluster(ray, address, processes)

@@ -18,6 +18,7 @@ from tactile_rt.settings import (
     parse_toml,
     read_toml,
     refusal,
+    set_keys,
 )
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.datasets.recipes import (
@@ -121,27 +122,31 @@ def shipped_recipes() -> tuple[str, ...]:
     return tuple(sorted(p.name[:-5] for p in folder.iterdir() if p.name.endswith(".toml")))
 
 
-def read_recipe(name: str, folder: Path | None = None) -> SweepRecipe:
+def read_recipe(name: str, folder: Path | None = None, sets: Sequence[str] = ()) -> SweepRecipe:
     """The recipe of this name that ships with the package, or the one in a TOML file.
 
     Args:
         name: of the recipe, or its file.
         folder: where folders and files in it are found from; None: the working directory, as they
             are on a command line.
+        sets: ``key=value`` each, of which ``objects.test=3`` is one of a table.
 
     Raises:
         ConfigError: no such recipe, or something in it is wrong.
     """
     if Path(name).suffix == ".toml":
-        return _recipe(read_toml(Path(name)), folder)
+        return _recipe(set_keys(read_toml(Path(name)), sets, _File), folder)
     if name not in shipped_recipes():
         known = no_such("recipe", name, shipped_recipes())
         raise ConfigError(f"{known} (or give a file that ends in .toml)")
     shipped = resources.files(__package__) / "recipes" / f"{name}.toml"
-    return _recipe(parse_toml(shipped.read_text(encoding="utf-8"), name))
+    nodes = parse_toml(shipped.read_text(encoding="utf-8"), name)
+    return _recipe(set_keys(nodes, sets, _File))
 
 
-def recipe_of_set(recipe: dict[str, Any], categories: Sequence[str]) -> SweepRecipe:
+def recipe_of_set(
+    recipe: dict[str, Any], categories: Sequence[str], sets: Sequence[str] = ()
+) -> SweepRecipe:
     """The recipe that a set's manifest or a model's card holds.
 
     One of version 1, which knew fewer settings, comes to the same objects, split and ranges; its
@@ -150,6 +155,7 @@ def recipe_of_set(recipe: dict[str, Any], categories: Sequence[str]) -> SweepRec
     Args:
         recipe: as stored.
         categories: class names of the set.
+        sets: ``key=value`` each, as `read_recipe` takes them.
 
     Raises:
         ConfigError: it is not one that this release knows.
@@ -167,7 +173,7 @@ def recipe_of_set(recipe: dict[str, Any], categories: Sequence[str]) -> SweepRec
             "objects": {**old["objects"], **counts},
             "sweeps": {**old["sweeps"], "draws": recipe.get("sweeps", 8)},
         }
-    return recipe_from_dict(recipe, "the set's recipe")
+    return _recipe(set_keys(make_node(recipe, "the set's recipe", 0, Path()), sets, _File))
 
 
 def recipe_from_dict(raw: dict[str, Any], where: str = "recipe") -> SweepRecipe:
@@ -267,7 +273,10 @@ def _usual_lengths(period_ms: float) -> tuple[float, float]:
 
 def _absolute(path: str, folder: Path | None) -> str:
     """Whoever makes a part of the set may do so from another folder."""
-    return str(((folder or Path()) / Path(path).expanduser()).absolute())
+    try:
+        return str(((folder or Path()) / Path(path).expanduser()).absolute())
+    except RuntimeError:  # no such user, or one without a home
+        raise ConfigError(f"{path} is no path of a user here") from None
 
 
 def _choice(nodes: SettingNode, name: str, sweeps: _Sweeps, usual: Choice) -> Choice:

@@ -191,7 +191,7 @@ def _fetched(file: ListedFile) -> bytes:
             content: bytes = answer.read()
     except (OSError, urllib.error.URLError) as error:
         raise ConfigError(
-            f"{url}: cannot be got ({error}); clone {file.repository} and say --from"
+            f"{url}: cannot be got ({error}); clone {file.repository} and say --clones"
         ) from None
     return content
 

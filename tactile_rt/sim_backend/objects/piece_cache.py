@@ -41,8 +41,11 @@ def cache_key(content: bytes, *settings: object) -> str:
 
 def read_pieces(key: str) -> Pieces | None:
     """What was written under this key; None if nothing was, or it cannot be read any more."""
+    path = _path(key)
+    if path is None:
+        return None
     try:
-        with open(_path(key), "rb") as raw, np.load(raw, allow_pickle=False) as file:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
             corners = np.split(file["vertices"], np.cumsum(file["corners"])[:-1])
             faces = np.split(file["faces"].astype(np.int64), np.cumsum(file["sides"])[:-1])
             error, made_by = float(file["surface_error"]), str(file["made_by"])
@@ -57,6 +60,8 @@ def read_pieces(key: str) -> Pieces | None:
 def write_pieces(key: str, pieces: Pieces) -> None:
     """Keep the pieces under this key, if there is a place to keep them."""
     path = _path(key)
+    if path is None:
+        return
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
@@ -77,9 +82,12 @@ def write_pieces(key: str, pieces: Pieces) -> None:
             raise
 
 
-def _path(key: str) -> Path:
+def _path(key: str) -> Path | None:
+    """Where it is kept; None where a user has no home."""
     own = os.environ.get("TACTILE_RT_CACHE")
     if own:
         return Path(own) / f"{key}.npz"
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    return Path(base) / "tactile_rt" / "pieces" / f"{key}.npz"
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(base):  # the specification has relative paths ignored
+        base = os.path.expanduser("~/.cache")
+    return Path(base) / "tactile_rt" / "pieces" / f"{key}.npz" if os.path.isabs(base) else None

@@ -1,31 +1,58 @@
-"""Compilation of the inner loops to machine code."""
+"""Compilation of the inner loops to machine code, which is kept for the next process.
+
+Where nothing can be kept (a folder that belongs to another, no home, a full disk), or what is kept
+is damaged, a process compiles for itself: that takes it half a minute, and no more.
+"""
 
 import contextlib
+import logging
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 __all__ = ["compiled"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 
+# Numba looks only at the file of a function, not at those of the functions that it calls: what was
+# compiled before one of these files changed is old.
+STAMP = tuple(
+    (file.name, status.st_mtime_ns, status.st_size)
+    for file in sorted(Path(__file__).parent.glob("*.py"))
+    for status in [file.stat()]
+)
 
-def _forget_what_is_old() -> None:
-    """Drop what was compiled before one of these files changed.
 
-    Numba looks only at the file of a function, not at those of the functions that it calls.
-    """
-    folder = Path(__file__).parent
-    newest = max(file.stat().st_mtime for file in folder.glob("*.py"))
-    for kept in (folder / "__pycache__").glob("*.nbi"):
+class _Kept(FunctionCache):  # type: ignore[misc]
+    """What numba keeps of a function, and lives without."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file = IndexDataCacheFile(self.cache_path, self._impl.filename_base, STAMP)
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # damage shows itself in a dozen ways
+            with contextlib.suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
         with contextlib.suppress(OSError):
-            if kept.stat().st_mtime < newest:
-                kept.unlink()
+            super().save_overload(sig, data)
 
 
-_forget_what_is_old()
+@cache
+def _tell_once() -> None:
+    logging.getLogger(__name__).warning(
+        "the simulator is compiled anew, which takes half a minute: there is no folder to keep it "
+        "in; NUMBA_CACHE_DIR can name one"
+    )
 
 
 def compiled(function: Function) -> Function:
@@ -34,4 +61,9 @@ def compiled(function: Function) -> Function:
     It lets other threads run, and its sums are in the order in which they are written: the same
     numbers on every machine.
     """
-    return cast(Function, numba.njit(cache=True, nogil=True, error_model="numpy")(function))
+    made = numba.njit(nogil=True, error_model="numpy")(function)
+    try:
+        made._cache = _Kept(function)
+    except RuntimeError:  # no folder to keep it in
+        _tell_once()
+    return cast(Function, made)

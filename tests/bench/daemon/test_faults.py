@@ -1,4 +1,4 @@
-"""Every fault of the daemon's world once; `bench daemon --faults` causes each 40 times."""
+"""Every fault of the daemon's world once; `bench faults` causes each 40 times."""
 
 import pytest
 

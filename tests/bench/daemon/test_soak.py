@@ -6,9 +6,9 @@ import resource
 import numpy as np
 import pytest
 
-pytest.importorskip("onnx", reason="needs onnx: pip install 'tactile-rt[train]'")
-pytest.importorskip("mcap", reason="needs mcap: pip install 'tactile-rt[record]'")
-pytest.importorskip("zenoh", reason="needs zenoh: pip install 'tactile-rt[publish]'")
+pytest.importorskip("onnx", reason="needs onnx: pip install '.[train]'")
+pytest.importorskip("mcap", reason="needs mcap: pip install '.[record]'")
+pytest.importorskip("zenoh", reason="needs zenoh: pip install '.[publish]'")
 
 from bench.daemon import chaos
 from bench.daemon.accounts import RecordedSamples, account

@@ -5,6 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
+from tactile_rt.extras import install_extra
+
 pytest.importorskip("torch")
 pytest.importorskip("onnx")
 
@@ -54,7 +56,7 @@ def test_without_torch_it_says_what_is_missing(monkeypatch):
 
     monkeypatch.setattr(speed.importlib, "import_module", missing)
     (record,) = speed.window_speed(quick=True)
-    assert record.how == "needs torch (pip install 'tactile-rt[train]')"
+    assert record.how == f"needs torch ({install_extra('train')})"
 
 
 @pytest.mark.slow

@@ -13,8 +13,6 @@ from bench.pages.benchmarks import PAGE, Measurement, read, row, section, writte
 from tactile_rt.cli.bench import AREAS
 from tactile_rt.evidence.records import Record
 
-pytestmark = pytest.mark.skipif(not PAGE.exists(), reason="a source archive, without docs")
-
 
 def test_the_page_is_made_of_what_is_kept() -> None:
     assert PAGE.read_text("utf-8") == written(), "python -m bench.pages.benchmarks writes it anew"

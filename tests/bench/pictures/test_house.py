@@ -6,8 +6,6 @@ pytest.importorskip("grimp")
 
 from bench.pictures.house import FILE, draw, floors, imports, reduced
 
-pytestmark = pytest.mark.skipif(not FILE.exists(), reason="a source archive, without docs")
-
 
 def test_the_picture_is_of_this_tree() -> None:
     assert FILE.read_text("utf-8") == draw(), "python -m bench.pictures.house redraws it"

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
-pytest.importorskip("cyclonedds", reason="needs cyclonedds: pip install 'tactile-rt[ros2]'")
+pytest.importorskip("cyclonedds", reason="needs cyclonedds: pip install '.[ros2]'")
 
 from bench.daemon import ros2_node
 from bench.daemon.ros2 import BAR_MS, free_domain, measure

@@ -10,7 +10,7 @@ from tactile_rt.models.alignment import another_mouse
 from tactile_rt.models.alignment.another_mouse import MARGIN, Mice
 from tactile_rt.models.alignment.example import Brain
 from tactile_rt.models.alignment.rdm import rdm
-from tactile_rt.models.alignment.statistics import STUDENT, student
+from tactile_rt.models.alignment.statistics import student
 
 PAIRS = list(combinations(range(6), 2))
 
@@ -118,7 +118,7 @@ def test_errors_are_jackknives_and_bounds_are_of_student():
     t = stats.t.ppf(0.875, 5)
     assert found.floor[0] == pytest.approx(found.fit[0] - t * expected, abs=1e-3)
     fits = [np.mean([unit(rdms[i]) @ unit(rdms[j]) for j in range(7) if j != i]) for i in range(7)]
-    t = stats.t.ppf(0.875, 6)
+    t = stats.t.ppf(0.9, 6)
     bound = np.mean(fits) - t * np.sqrt(1 + 1 / 7) * np.std(fits, ddof=1)
     assert found.bound == pytest.approx(bound, abs=1e-3)
     # Without a stimulus, none of its entries counts.
@@ -164,6 +164,9 @@ def test_verdicts_and_power_on_a_brain_of_known_truth():
     assert 0 < MARGIN < 1
 
 
-def test_students_points():
-    np.testing.assert_allclose(STUDENT, stats.t.ppf(0.875, np.arange(1, 31)), atol=5e-4)
-    assert student(1000) == pytest.approx(stats.norm.ppf(0.875), abs=5e-4)
+@pytest.mark.parametrize("cases", [8, 10])
+def test_students_points(cases):
+    for degrees in range(1, 31):
+        expected = stats.t.ppf(1 - 1 / cases, degrees)
+        assert student(degrees, cases) == pytest.approx(expected, abs=5e-4)
+    assert student(1000, cases) == pytest.approx(stats.norm.ppf(1 - 1 / cases), abs=5e-4)

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from tactile_rt.models.alignment import board as boards
 from tactile_rt.models.alignment.board import (
     ANOTHER,
     BoardRow,
@@ -22,6 +23,7 @@ from tactile_rt.models.alignment.board_page import board_page
 from tactile_rt.models.alignment.datasets import DATASETS, dataset_names, find_dataset
 from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.metrics import find_metric
+from tactile_rt.models.alignment.metrics.geometry import NOTHING
 from tactile_rt.models.alignment.stimuli_input import read_stimuli
 from tactile_rt.stream import ConfigError
 from tests.helpers import brains
@@ -60,6 +62,20 @@ def test_a_cell_is_the_mean_of_the_layer_chosen_on_other_animals(made):
     assert cell.sem == pytest.approx(np.std(wanted, ddof=1) / 2, abs=1e-12)
     assert cell.value == pytest.approx(np.mean([m.fit(layers["encoder.good"]) for m in measures]))
     assert board.columns[0].ceiling == pytest.approx(np.mean([m.ceiling for m in measures]))
+
+
+def test_one_thread_measures_whatever_others_use(made, monkeypatch):
+    threadpoolctl = pytest.importorskip("threadpoolctl")
+    seen = []
+
+    def metric(animal):
+        seen.extend(pool["num_threads"] for pool in threadpoolctl.threadpool_info())
+        return NOTHING
+
+    monkeypatch.setattr(boards, "find_metric", lambda name: metric)
+    with threadpoolctl.threadpool_limits(2):
+        with_cells([], find_dataset("example"), made[1], ("all",), ("mine",))
+    assert seen and set(seen) == {1}
 
 
 def test_another_animal_stands_below(made):

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_rt.extras import install_extra
 from tactile_rt.models.alignment import build
 from tactile_rt.models.alignment.published import read_published, write_published
 from tactile_rt.stream import ConfigError
@@ -133,7 +134,7 @@ def test_requests_that_cannot_be_met(tmp_path):
 def test_without_h5py_it_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     (tmp_path / "a.nwb").touch()
-    with pytest.raises(ConfigError, match=r"pip install 'tactile-rt\[align\]'"):
+    with pytest.raises(ConfigError, match=re.escape(install_extra("align"))):
         build([tmp_path / "a.nwb"])
 
 

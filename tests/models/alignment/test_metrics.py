@@ -1,10 +1,9 @@
 """Metrics against rsatoolbox, scikit-learn and plain loops, and on animals whose truth is known."""
 
-import warnings
-
 import numpy as np
 import pytest
 
+from bench.align import oracles
 from tactile_rt.models.alignment.metrics import (
     METRICS,
     MINIMUM_CEILING,
@@ -14,7 +13,7 @@ from tactile_rt.models.alignment.metrics import (
 from tactile_rt.models.alignment.metrics.crossnobis import crossnobis, distances, shrunk_covariance
 from tactile_rt.models.alignment.metrics.geometry import cka, cosine, rsa, time_course, u_centred
 from tactile_rt.models.alignment.metrics.halves import bins_of, divisions, half_means, means_of
-from tactile_rt.models.alignment.metrics.linear import PENALTIES, predicted
+from tactile_rt.models.alignment.metrics.linear import predicted
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
 from tactile_rt.models.alignment.selection import LAYERS_UM
 from tactile_rt.models.alignment.targets import part_of
@@ -126,38 +125,22 @@ def test_halves_are_means_of_half_of_the_trials_of_every_stimulus(scene):
 
 
 def test_crossnobis_is_that_of_rsatoolbox():
-    rsatoolbox = pytest.importorskip("rsatoolbox")
-    from rsatoolbox.data.noise import cov_from_residuals, prec_from_residuals
+    pytest.importorskip("rsatoolbox")
+    from rsatoolbox.data.noise import cov_from_residuals
 
     rng = np.random.default_rng(5)
     session = brains.session(rng, "a", "s", brains.geometry(rng), trials=9, units=20)
-    order = np.argsort(session.stimulus, kind="stable")  # theirs is by first appearance
-    session = NeuralSession("a", "s", session.rates[order], session.stimulus[order])
-    data = rsatoolbox.data.Dataset(
-        session.rates,
-        obs_descriptors={"stimulus": session.stimulus, "trial": np.arange(len(session.stimulus))},
-    )
     means = np.stack([session.rates[session.stimulus == k].mean(axis=0) for k in range(6)])
     residuals = session.rates - means[session.stimulus]
     np.testing.assert_allclose(
         shrunk_covariance(residuals, 48), cov_from_residuals(residuals, 48), rtol=1e-10
     )
-    noise = prec_from_residuals(residuals, 48)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        theirs = rsatoolbox.rdm.calc_rdm_unbalanced(
-            data, method="crossnobis", descriptor="stimulus", cv_descriptor="trial", noise=noise
-        ).get_vectors()[0]
-    every = np.ones((1, len(session.rates)), dtype=bool)
-    white = session.rates @ np.linalg.cholesky(noise)
-    found = distances(white, session.stimulus, every)[0] / session.rates.shape[1]
-    np.testing.assert_allclose(found, theirs, rtol=1e-9)
-    # A layer is compared by r, so the whole metric is known from theirs.
-    layer = rng.normal(size=(6, 1, 12))
-    data = rsatoolbox.data.Dataset(layer[:, 0])
-    euclidean = rsatoolbox.rdm.calc_rdm(data, method="euclidean").get_vectors()[0]
-    wanted = np.corrcoef(euclidean, theirs)[0, 1]
-    assert crossnobis(Animal("a", (session,))).fit(layer) == pytest.approx(wanted, abs=1e-9)
+    # A layer is compared by r, so distances are theirs but for their scale.
+    measure = crossnobis(Animal("a", (session,)))
+    for _ in range(16):  # more layers than distances: no distance can be wrong unseen
+        layer = rng.normal(size=(6, 1, 12))
+        wanted = oracles.by_crossnobis(session, layer)
+        assert measure.fit(layer) == pytest.approx(wanted, abs=1e-9)
 
 
 def test_noise_lengthens_no_crossnobis_distance():
@@ -170,19 +153,9 @@ def test_noise_lengthens_no_crossnobis_distance():
 
 
 def test_cka_is_the_ratio_of_unbiased_hsics():
-    def hsic(k, m):  # Song et al. 2012, equation 5, as it is printed
-        k, m, n = k - np.diag(np.diag(k)), m - np.diag(np.diag(m)), len(k)
-        one = np.ones(n)
-        return (
-            np.trace(k @ m)
-            + one @ k @ one * (one @ m @ one) / ((n - 1) * (n - 2))
-            - 2 / (n - 2) * (one @ k @ m @ one)
-        ) / (n * (n - 3))
-
     rng = np.random.default_rng(8)
     x, y = rng.normal(size=(6, 9)), rng.normal(size=(6, 40))
-    k, m = x @ x.T, y @ y.T
-    wanted = hsic(k, m) / np.sqrt(hsic(k, k) * hsic(m, m))
+    wanted = oracles.by_hsic(x @ x.T, y @ y.T)
     assert cosine(u_centred(x), u_centred(y)) == pytest.approx(wanted, abs=1e-12)
 
 
@@ -195,26 +168,11 @@ def test_cka_of_noise_is_nought_on_average():
 
 
 def test_linear_is_that_of_scikit_learn():
-    linear_model = pytest.importorskip("sklearn.linear_model")
+    pytest.importorskip("sklearn.linear_model")
     rng = np.random.default_rng(10)
     layer, goal = rng.normal(size=(6, 4, 7)), rng.normal(size=(6, 4, 5))
     layer[..., 0] += goal[..., 0]
-
-    def regress(known, held, penalty):
-        x = (layer[known] - layer[known].mean(axis=0)).reshape(-1, 7)
-        y = (goal[known] - goal[known].mean(axis=0)).reshape(-1, 5)
-        alpha = penalty * np.trace(x @ x.T) / len(x)
-        machine = linear_model.Ridge(alpha=alpha, fit_intercept=False, solver="svd").fit(x, y)
-        return goal[known].mean(axis=0) + machine.predict(layer[held] - layer[known].mean(axis=0))
-
-    wanted = np.empty_like(goal)
-    for i in range(6):
-        rest = [k for k in range(6) if k != i]
-        errors = [
-            sum(((regress([k for k in rest if k != j], j, p) - goal[j]) ** 2).sum() for j in rest)
-            for p in PENALTIES
-        ]
-        wanted[i] = regress(rest, i, PENALTIES[int(np.argmin(errors))])
+    wanted = oracles.predicted_by_ridge(layer, goal)
     np.testing.assert_allclose(predicted(layer, goal), wanted, atol=1e-9)
 
 

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from tactile_rt.models.alignment.gate import neural_checks
 from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.pictures import (
     Bar,
@@ -112,16 +113,34 @@ def test_everything_is_on_the_page(results):
     assert len(dots) == 3 * sum(results.benchmark.reliable)
 
 
+def test_the_verdict_is_the_gates_and_its_power_stands_beside_it(results, benchmark, tmp_path):
+    rng = np.random.default_rng(0)
+    model, made = model_result(benchmark, network(rng, "model"))
+    (test,) = (c for c in neural_checks(made, benchmark) if c.name == "turing")
+    assert (model.turing, model.turing_why) == (test.verdict, test.why) and "Power: " in test.why
+    said = {"pass": ">passes<", "fail": ">fails<", "inconclusive": ">cannot tell<"}
+    for verdict, word in said.items():
+        one = msgspec.structs.replace(model, turing=verdict)
+        text = page(msgspec.structs.replace(results, models=(one,)))
+        assert [w for w in said.values() if w in text] == [word]
+        assert f"model: {test.why}".replace("<", "&lt;") in text
+    old = msgspec.structs.replace(model, turing="", turing_why="")  # written without one
+    assert not any(
+        word in page(msgspec.structs.replace(results, models=(old,))) for word in said.values()
+    )
+
+
 def test_one_model_is_not_compared(results):
     text = page(msgspec.structs.replace(results, models=results.models[:1]))
     assert "side by side" not in text and "task performance" not in text
 
 
-def test_a_benchmark_without_reliable_animals_says_so(results):
-    b = results.benchmark
-    bad = msgspec.structs.replace(b, reliable=(False,) * 5, a2a_mean=None, a2a_sem=None)
-    text = page(msgspec.structs.replace(results, benchmark=bad))
-    assert "cannot tell" in text
+def test_a_benchmark_without_reliable_animals_says_so(benchmark):
+    targets = tuple(replace(t, reliable=False) for t in benchmark.targets)
+    bad = replace(benchmark, targets=targets)
+    model, _ = model_result(bad, network(np.random.default_rng(0), "model"))
+    text = page(results_of(bad, read_stimuli(), [model]))
+    assert "cannot tell" in text and "the benchmark is not valid" in text
     parsed(text)
 
 

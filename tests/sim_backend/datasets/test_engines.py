@@ -1,4 +1,5 @@
 import os
+import re
 import subprocess
 import sys
 import textwrap
@@ -6,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from tactile_rt.extras import install_extra
 from tactile_rt.sim_backend.datasets import engines
 from tactile_rt.sim_backend.datasets.engines import DIED, run_processes, run_ray
 from tactile_rt.stream import ConfigError
@@ -103,7 +105,7 @@ def test_processes_use_one_thread_each_and_leave_our_environment_alone(
 
 def test_without_ray_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(ConfigError, match=r"needs ray, .*pip install 'tactile-rt\[cluster\]'"):
+    with pytest.raises(ConfigError, match=f"needs ray, .*: {re.escape(install_extra('cluster'))}"):
         list(run_ray(len, ["a"]))
 
 

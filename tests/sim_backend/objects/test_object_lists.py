@@ -80,7 +80,7 @@ def upright(folder: Path) -> None:
 
 def test_objects_come_out_of_a_folder_of_clones(shapes, tmp_path: Path, call) -> None:
     wanted, clones = shapes
-    code, out, err = call("objects", "get", wanted, tmp_path / "got", "--from", clones)
+    code, out, err = call("objects", "get", wanted, tmp_path / "got", "--clones", clones)
     assert (code, err) == (0, "")
     assert out.startswith("2 of 2 objects of 2 kinds are in ")
     upright(tmp_path / "got")
@@ -143,7 +143,7 @@ def test_a_file_that_is_not_what_the_list_means_is_not_used(shapes, tmp_path, ca
     back = clones / "shapes" / "meshes" / "the back.stl"
     kept = back.read_bytes()
     back.write_bytes(kept + b" ")
-    code, out, err = call("objects", "get", wanted, tmp_path / "got", "--from", clones)
+    code, out, err = call("objects", "get", wanted, tmp_path / "got", "--clones", clones)
     assert code == 1 and out.startswith("1 of 2 objects")
     assert "some/shapes/meshes/the back.stl: is not what the list means (sha256 " in err
     assert not (tmp_path / "got" / "chair").exists()

@@ -1,9 +1,10 @@
 """Recordings that models are compared with, by name, each imported when it is asked for.
 
 A dataset says where its recordings come from (title, citation, license, size), and reads what its
-user downloaded: animals, and the input of the models if it is not the six stimuli that ship. Its
-six conditions stand on the axis of `STIMULI`, under names of their own. Recordings are never
-bundled. Datasets of other packages are found by the entry points ``tactile_rt.alignment_datasets``.
+user downloaded or fetched: animals, and the input of the models if it is not the six stimuli that
+ship. Its six conditions stand on the axis of `STIMULI`, under names of their own. Recordings are
+never bundled. Datasets of other packages are found by the entry points
+``tactile_rt.alignment_datasets``.
 """
 
 from collections.abc import Callable, Sequence
@@ -57,6 +58,10 @@ class NeuralDataset:
         read: The function that reads downloaded files or folders. It takes them, the input of the
             six stimuli, and a function to call with the share done, 0 to 1, and raises
             `ConfigError` where they cannot be used.
+        listing: The file beside `fetching` that lists the files of one version, of which
+            `align fetch` gets what is needed; empty if they must be downloaded.
+        counts: The mice and the units that the published analysis is of, which what is fetched is
+            held against; None where that is not known.
     """
 
     name: str
@@ -68,6 +73,8 @@ class NeuralDataset:
     about: str
     read: Reader
     conditions: tuple[str, ...] = STIMULI
+    listing: str = ""
+    counts: tuple[int, int] | None = None
 
 
 # name: where the dataset is

@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.extras import lacking
 from tactile_rt.models.alignment.datasets import DatasetContents, NeuralDataset
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
 from tactile_rt.models.alignment.stimuli_input import PERIOD_MS, StimuliInput
@@ -61,10 +62,8 @@ def _read(
 ) -> DatasetContents:
     try:
         import h5py
-    except ModuleNotFoundError:
-        raise ConfigError(
-            "reading NWB needs h5py, which is not installed: pip install 'tactile-rt[align]'"
-        ) from None
+    except ModuleNotFoundError as error:
+        raise lacking("reading NWB needs", "align", error) from None
     files = [f for p in paths for f in (sorted(p.rglob("*.nwb")) if p.is_dir() else [p])]
     if not files:
         raise ConfigError(f"no .nwb file in {', '.join(map(str, paths))}")

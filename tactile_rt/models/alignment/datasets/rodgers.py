@@ -19,22 +19,27 @@ def _read(
     return DatasetContents(by_animal(sessions), None, tuple(notes))
 
 
-# Title, citation, license, size: dandiset.yaml of the draft, github.com/dandisets/000231.
+# Title, citation, license, size: dandiset.yaml of the draft, github.com/dandisets/000231. The list:
+# its tag 0.220904.1554, which names every file by size and SHA-256, and its addresses. The counts:
+# Chung et al. (2025), of the units with valid trials.
 DANDI_000231 = NeuralDataset(
     name="000231",
     title="A detailed behavioral, videographic, and neural dataset on object recognition in mice",
     citation=(
         "Rodgers, Chris (2022). A detailed behavioral, videographic, and neural dataset on object "
-        "recognition in mice. DANDI archive. https://dandiarchive.org/dandiset/000231"
+        "recognition in mice (version 0.220904.1554). DANDI archive. "
+        "https://dandiarchive.org/dandiset/000231/0.220904.1554"
     ),
     license="CC0-1.0",
     url="https://dandiarchive.org/dandiset/000231",
-    size="2.0 TB in 4,228 files of 15 mice, most of it video, which is not needed",
+    size="2.0 TB in 4,228 files of 15 mice, most of it video; `align fetch` gets the MB needed",
     about=(
         "Mice whisk a convex or a concave surface, close, at a medium distance or far. Rates of "
         "correct trials count from first contact to choice."
     ),
     read=_read,
+    listing="dandi_000231.csv",
+    counts=(11, 999),
 )
 EXAMPLE = NeuralDataset(
     name="example",

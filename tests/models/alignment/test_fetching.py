@@ -1,0 +1,247 @@
+"""What is needed of published sessions, read by ranges from a server on this machine."""
+
+import hashlib
+import re
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import numpy as np
+import pytest
+
+from tactile_rt.models.alignment.datasets import fetching, ranges
+from tactile_rt.models.alignment.datasets.fetching import PublishedFile, fetch, published_files
+from tactile_rt.models.alignment.example import Brain
+from tactile_rt.models.alignment.example_files import write_example
+from tactile_rt.models.alignment.nwb import CLOCKS, WINDOWS, read_session
+from tactile_rt.stream import ConfigError
+
+h5py = pytest.importorskip("h5py", reason="h5py reads the files")
+pytest.importorskip("urllib3")
+
+VOLTAGES = 4 << 20  # bytes that nothing needs
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Sessions of the published structure, voltages and whiskers' angles included."""
+    folder = tmp_path_factory.mktemp("whole") / "brain"
+    write_example(folder, Brain(mice=2, sessions=1, units=12, trials=6))
+    files = sorted((folder / "recordings").rglob("*.nwb"))
+    for path in files:
+        with h5py.File(path, "r+") as file:
+            (series,) = file["acquisition"].values()
+            if "data" in series:
+                del series["data"]
+            noise = np.random.default_rng(0).integers(-99, 99, VOLTAGES // 2, dtype=np.int16)
+            series["data"] = noise
+    return files
+
+
+class Archive(BaseHTTPRequestHandler):
+    """Serves files by ranges, as an object store does; `fault` makes it misbehave."""
+
+    protocol_version = "HTTP/1.1"
+    fault = ""
+
+    def do_GET(self):
+        data = self.files.get(self.path)
+        asked = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
+        type(self).requests.append((self.path, self.headers.get("Range")))
+        if data is None or self.fault == "gone":
+            return self.answer(404, b"no such key")
+        if self.fault == "no ranges" or not asked:
+            return self.answer(200, data[:1000])
+        if self.fault == "once busy":
+            type(self).fault = ""
+            return self.answer(503, b"slow down")
+        begin, end = int(asked[1]), int(asked[2])
+        size = len(data) + (self.fault == "another size")
+        part = data[begin : end + 1]
+        self.answer(206, part, f"bytes {begin}-{end}/{size}", cut=self.fault == "cut")
+
+    def answer(self, status, body, content_range="", cut=False):
+        self.send_response(status)
+        if content_range:
+            self.send_header("Content-Range", content_range)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body[: len(body) // 2] if cut else body)
+        self.close_connection = cut
+
+    def log_message(self, *_):
+        pass
+
+
+@pytest.fixture
+def archive(whole, monkeypatch):
+    """A list of the sessions on a server, and the server's handler."""
+    monkeypatch.setattr(ranges, "AGAIN", 1)
+    for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"):
+        monkeypatch.delenv(name, raising=False)
+    handler = type("Here", (Archive,), {"files": {}, "requests": []})
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    server.handle_error = lambda *_: None  # who is refused hangs up
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+    thread.start()
+    listing = []
+    for k, path in enumerate(whole):
+        data = path.read_bytes()
+        handler.files[f"/blob{k}"] = data
+        url = f"http://127.0.0.1:{server.server_port}/blob{k}"
+        listing.append(
+            PublishedFile(f"sub/{path.name}", len(data), hashlib.sha256(data).hexdigest(), url)
+        )
+    yield listing, handler
+    server.shutdown()
+    thread.join()
+    server.server_close()
+
+
+@pytest.mark.parametrize("window", WINDOWS)
+@pytest.mark.parametrize("clock", CLOCKS)
+def test_what_is_fetched_reads_as_the_whole_file_does(whole, archive, tmp_path, window, clock):
+    listing, _ = archive
+    fetch(listing, tmp_path / "small")
+    for path in whole:
+        expected = read_session(path, window, clock=clock)
+        found = read_session(tmp_path / "small" / path.name, window, clock=clock)
+        for name in ("animal", "name"):
+            assert getattr(found.session, name) == getattr(expected.session, name)
+        for name in ("rates", "stimulus", "course", "depth", "inhibitory", "begin"):
+            np.testing.assert_array_equal(
+                getattr(found.session, name), getattr(expected.session, name)
+            )
+        assert (found.notes, found.task) == (expected.notes, expected.task)
+        np.testing.assert_array_equal(found.response.histogram, expected.response.histogram)
+
+
+def test_voltages_stay_where_they_are(whole, archive, tmp_path):
+    listing, handler = archive
+    done = fetch(listing, tmp_path)
+    assert (done.files, done.new) == (2, 2)
+    size = sum(file.size for file in listing)
+    assert done.transferred < size - 1.8 * VOLTAGES
+    assert sum(p.stat().st_size for p in tmp_path.iterdir()) < done.transferred
+    with h5py.File(tmp_path / whole[0].name) as file:
+        assert file.attrs["source_sha256"] == listing[0].sha256
+    # None is asked for twice.
+    assert len(set(handler.requests)) == len(handler.requests)
+
+
+def test_a_fetch_goes_on_where_it_broke_off(archive, tmp_path):
+    listing, handler = archive
+    handler.files.pop("/blob1"), handler.requests.clear()
+    with pytest.raises(ConfigError, match=r"sub/.* cannot be fetched: the server says 404"):
+        fetch(listing, tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == [listing[0].name]
+    handler.files["/blob1"] = handler.files["/blob0"]
+    handler.requests.clear()
+    done = fetch([listing[0]], tmp_path)
+    assert (done.files, done.new, done.transferred, handler.requests) == (1, 0, 0, [])
+
+
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("gone", "the server says 404"),
+        ("no ranges", "the server sends whole files, no ranges"),
+        ("another size", r"it has \d+ bytes, and not \d+"),
+        ("cut", "IncompleteRead"),
+    ],
+)
+def test_what_a_server_does_wrong_is_one_line(archive, tmp_path, fault, said):
+    listing, handler = archive
+    handler.fault = fault
+    with pytest.raises(ConfigError, match=said) as error:
+        fetch(listing, tmp_path)
+    assert "\n" not in str(error.value) and listing[0].path in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_server_that_is_busy_is_asked_again(archive, tmp_path):
+    listing, handler = archive
+    handler.fault = "once busy"
+    assert fetch(listing, tmp_path).new == 2
+
+
+def test_no_server(tmp_path, monkeypatch):
+    monkeypatch.setattr(ranges, "AGAIN", 0)
+    file = PublishedFile("sub/a.nwb", 10, "", "http://127.0.0.1:9/a")
+    with pytest.raises(ConfigError, match=r"sub/a.nwb cannot be fetched: .*refused"):
+        fetch([file], tmp_path)
+
+
+def test_what_is_no_session_is_one_line(archive, tmp_path):
+    listing, handler = archive
+    handler.files["/blob0"] = bytes(listing[0].size)
+    with pytest.raises(ConfigError, match="cannot be fetched") as error:
+        fetch(listing, tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_is_read_as_from_a_disk(archive):
+    listing, handler = archive
+    data = handler.files["/blob0"]
+    remote = ranges.RangeFile(ranges.connections(), listing[0].url, len(data))
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        begin, number = int(rng.integers(len(data))), int(rng.integers(3 * ranges.BLOCK))
+        remote.seek(begin)
+        assert remote.read(number) == data[begin : begin + number]
+        assert remote.tell() == min(begin + number, len(data))
+    assert remote.seek(-5, 2) == len(data) - 5 and remote.read() == data[-5:]
+    assert remote.read(1) == b""
+
+
+def test_few_blocks_are_kept(archive, monkeypatch):
+    listing, handler = archive
+    monkeypatch.setattr(ranges, "KEPT", 3)
+    remote = ranges.RangeFile(ranges.connections(), listing[0].url, listing[0].size)
+    data = handler.files["/blob0"]
+    for k in (0, 5, 2, 9, 0, 1):
+        remote.seek(k * ranges.BLOCK)
+        assert remote.read(7) == data[k * ranges.BLOCK :][:7]
+        assert len(remote._blocks) <= 3
+    assert len(handler.requests) == 6  # the first block had gone by then
+
+
+def test_the_command(archive, tmp_path, monkeypatch, call):
+    listing, handler = archive
+    monkeypatch.setattr(fetching, "published_files", lambda name: tuple(listing))
+    small = tmp_path / "small"
+    code, out, _ = call("align", "fetch", "000231", "--list")
+    assert code == 0 and [line.split()[1] for line in out.splitlines()] == [
+        f.sha256 for f in listing
+    ]
+    code, _, err = call("align", "fetch", "000231", small, "--session", "mouse-01")
+    assert code == 0 and "1 sessions (1 new), 1 mice, 12 units" in err and "WARNING" not in err
+    code, _, err = call("align", "fetch", "000231", small)
+    assert code == 0 and "2 sessions (1 new), 2 mice, 24 units" in err
+    assert "WARNING: the published analysis is of 11 mice and 999 units" in err
+    code, _, err = call("align", "build", small, "--out", tmp_path / "b.json", "--bootstraps", 5)
+    assert (code, err.count("WARNING")) == (0, 0) and "spikes on the session's clock" in err, err
+    handler.fault = "gone"
+    for arguments, said in (
+        (("000231", tmp_path / "other"), "the server says 404"),
+        (("000231",), "name a folder"),
+        (("000231", small, "--session", "none"), "no session of 2 is of none"),
+        (("000013", small), "000013 cannot be fetched"),
+        (("00231", small), "did you mean 000231"),
+    ):
+        code, _, err = call("align", "fetch", *arguments)
+        assert code == 2 and said in err and err.startswith("tactile-rt: "), err
+        assert err.count("\n") == 1
+
+
+def test_the_list_of_the_published_sessions():
+    files = published_files("dandi_000231.csv")
+    assert len(files) == len({f.name for f in files}) == 44
+    assert len({f.path.partition("/")[0] for f in files}) == 11
+    assert {f.path.partition("_")[0] for f in files if "231CR" in f.path} == {"sub-231CR/sub-231CR"}
+    for file in files:
+        assert re.fullmatch(
+            r"sub-\w+/sub-\w+_ses-\d{8}T\d{6}_behavior\+ecephys\+image\.nwb", file.path
+        )
+        assert re.fullmatch(r"[0-9a-f]{64}", file.sha256) and file.size > 5e9
+        assert file.url.startswith("https://dandiarchive.s3.amazonaws.com/blobs/")
+        assert "?versionId=" in file.url

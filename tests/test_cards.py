@@ -1,0 +1,87 @@
+"""What a release says of itself to machines: addresses, version and licence are the same wherever
+they stand, and the cards of model and data say what their pages say."""
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import tactile_rt
+from tactile_rt.classifier.model_file import read_model, shipped_model
+from tests.helpers.source_tree import ROOT
+
+yaml = pytest.importorskip("yaml")
+
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+SOURCE = PROJECT["urls"]["Source"]
+REFERENCE = ROOT / "docs" / "reference"
+MODEL, DATA = REFERENCE / "mouse44.md", REFERENCE / "realtouch.md"
+
+
+def parts(page: Path) -> tuple[dict, str]:
+    """The card of a page, and the page below it."""
+    _, card, text = page.read_text("utf-8").split("---\n", 2)
+    return yaml.safe_load(card), text
+
+
+def test_the_citation_is_of_this_release() -> None:
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert {"cff-version", "message", "title", "authors"} <= set(cited)  # what the format demands
+    assert cited["version"] == tactile_rt.__version__
+    assert cited["license"] == PROJECT["license"]
+    assert cited["repository-code"] == SOURCE
+    assert cited["keywords"] == PROJECT["keywords"]
+
+
+def test_every_address_of_the_project_is_the_same() -> None:
+    owner = SOURCE.removeprefix("https://github.com/")
+    template = ROOT / ".github" / "ISSUE_TEMPLATE" / "config.yml"
+    for file in (ROOT / "pyproject.toml", ROOT / "CITATION.cff", template):
+        text = file.read_text("utf-8")
+        named = re.findall(r"(?:github|githubusercontent)\.com/(tactile[\w-]*/\w+)", text)
+        assert set(named) == {owner}, file
+
+
+def test_the_model_says_its_licence() -> None:
+    card, text = parts(MODEL)
+    assert read_model(shipped_model())[0].license == PROJECT["license"]
+    assert card["license"] == PROJECT["license"].lower()
+    assert f"| licence | {PROJECT['license']}," in text
+
+
+def test_the_model_s_card_has_the_figures_of_its_page() -> None:
+    card, text = parts(MODEL)
+    (model,) = card["model-index"]
+    assert model["name"] == read_model(shipped_model())[0].name
+    found = [float(m["value"]) for r in model["results"] for m in r["metrics"]]
+    row = re.search(
+        r"^\| top-1, one sweep \|[^|]*\| \*\*([\d.]+)\*\*[^|]*\| \*\*([\d.]+)", text, re.M
+    )
+    upright = re.search(r"^\| upright; .*?\|.*?\| ([\d.]+)", text, re.M)
+    assert row and upright
+    assert found == [float(row[1]), float(row[2]), float(upright[1])]
+
+
+def test_the_data_s_card_says_how_many_sweeps_there_are() -> None:
+    card, text = parts(DATA)
+    rows = re.findall(r"^\| `\w+` \|[^|]*\| \d+ \| \d+ \| (\d+) \| (\d+|-) \|$", text, re.M)
+    sweeps = sum(int(n) for row in rows for n in row if n != "-")
+    assert len(rows) == 6
+    assert card["size_categories"] == ["1K<n<10K"]
+    assert 1_000 < sweeps < 10_000
+    assert card["license"] == PROJECT["license"].lower()
+
+
+@pytest.mark.parametrize(("page", "kind"), [(MODEL, "ModelCard"), (DATA, "DatasetCard")])
+def test_the_hub_reads_them(page: Path, kind: str) -> None:
+    hub = pytest.importorskip("huggingface_hub")
+    data = getattr(hub, kind)(page.read_text("utf-8")).data.to_dict()
+    card, _ = parts(page)
+    assert {name: data[name] for name in card if name != "model-index"} == {
+        name: value for name, value in card.items() if name != "model-index"
+    }
+    if "model-index" in card:
+        assert [r["dataset"]["name"] for r in data["model-index"][0]["results"]] == [
+            r["dataset"]["name"] for r in card["model-index"][0]["results"]
+        ]

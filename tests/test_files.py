@@ -1,0 +1,71 @@
+"""Files and folders that are there whole or not at all."""
+
+import errno
+import os
+import stat
+
+import pytest
+
+from tactile_rt.files import whole_folder, write_whole
+
+
+@pytest.fixture
+def umask():
+    """Set it, and set it back."""
+    before = os.umask(0o022)
+    yield os.umask
+    os.umask(before)
+
+
+@pytest.mark.parametrize(("mask", "file", "folder"), [(0o022, 0o644, 0o755), (0o077, 0o600, 0o700)])
+def test_what_is_written_is_as_private_as_its_user_wants(umask, tmp_path, mask, file, folder):
+    umask(mask)
+    write_whole(tmp_path / "a.json", lambda out: out.write(b"{}"))
+    with whole_folder(tmp_path / "bag") as made:
+        (made / "b").write_bytes(b"")
+    assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == file
+    assert stat.S_IMODE((tmp_path / "bag").stat().st_mode) == folder
+    assert stat.S_IMODE((tmp_path / "bag" / "b").stat().st_mode) == file
+
+
+def test_a_failure_names_the_file_that_was_to_be_and_leaves_the_old_one(tmp_path):
+    path = tmp_path / "a.json"
+    path.write_bytes(b"before")
+
+    def full(out):
+        out.write(b"half")
+        raise OSError(errno.ENOSPC, "of a system call, which names nothing")
+
+    with pytest.raises(OSError, match="No space left on device") as failed:
+        write_whole(path, full)
+    assert failed.value.filename == str(path)
+    assert path.read_bytes() == b"before" and os.listdir(tmp_path) == ["a.json"]
+
+
+def test_a_failure_of_another_file_names_that_one(tmp_path):
+    with pytest.raises(FileNotFoundError) as failed:
+        write_whole(tmp_path / "a", lambda out: out.write((tmp_path / "b").read_bytes()))
+    assert failed.value.filename == str(tmp_path / "b")
+
+
+def test_where_nothing_can_be_made_the_name_is_the_one_that_was_given(tmp_path):
+    path = tmp_path / "none" / "a"
+    with pytest.raises(FileNotFoundError) as failed:
+        write_whole(path, lambda out: None)
+    assert failed.value.filename == str(path)
+    with pytest.raises(FileNotFoundError) as failed, whole_folder(path):
+        pass
+    assert failed.value.filename == str(path)
+
+
+def test_a_folder_is_replaced_whole_or_stays(tmp_path):
+    path = tmp_path / "bag"
+    path.mkdir()
+    (path / "old").write_bytes(b"")
+    with pytest.raises(ZeroDivisionError), whole_folder(path) as made:
+        (made / "new").write_bytes(b"")
+        raise ZeroDivisionError
+    assert os.listdir(path) == ["old"]
+    with whole_folder(path) as made:
+        (made / "new").write_bytes(b"")
+    assert os.listdir(path) == ["new"] and os.listdir(tmp_path) == ["bag"]
