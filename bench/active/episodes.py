@@ -58,7 +58,8 @@ class Episodes:
 
     def steps_at(self, budget: int) -> NDArray[np.int64]:
         """(episode,) the last step with no more touches than this, of at most `STEPS`."""
-        return np.maximum((self.touches <= budget).sum(axis=1) - 1, 0)
+        steps: NDArray[np.int64] = np.maximum((self.touches <= budget).sum(axis=1) - 1, 0)
+        return steps
 
 
 def joined(parts: Sequence[Episodes]) -> Episodes:

@@ -152,15 +152,13 @@ def _sniff_port(
     if not found and ask:
         typer.echo("asking for samples as each codec does", err=True)
 
-        def connect(codec: Any) -> SerialLink:
-            return SerialLink(port, codec.baud, codec.parity, dtr)
+        for speed in bauds or [0]:  # 0: each codec's own
 
-        for fit in (
-            fit
-            for _, data in ask_devices("serial", connect, seconds)
-            for fit in sniff_bytes(data, further)
-        ):
-            found.append((fit, _usual_baud(fit)))
+            def connect(codec: Any, speed: int = speed) -> SerialLink:
+                return SerialLink(port, speed or codec.baud, codec.parity, dtr)
+
+            for _, data in ask_devices("serial", connect, seconds):
+                found += [(fit, speed or _usual_baud(fit)) for fit in sniff_bytes(data, further)]
     found.sort(
         key=lambda one: (
             one[0].explained * (1 + one[0].proof), one[1] == _usual_baud(one[0]), one[0].intact
@@ -270,13 +268,16 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
     if fits:
         _show(fits, told)
         _import(path, fits[0], told)
-    elif log.form != "raw" or not _sniff_text(path, bytes(data), told):
+    elif log.form not in ("raw", "terminal") or not _sniff_text(path, bytes(data), log.form, told):
         told.nothing(f"nothing fits {path}", _hint(bytes(data)))
 
 
 def _form(form: str) -> str:
-    return {"raw": "bytes as they are", "hex": "bytes in hexadecimal", "dump": "a dump of a line"
-            }.get(form, f"a CAN log ({form})")  # fmt: skip
+    told = {
+        "raw": "bytes as they are", "hex": "bytes in hexadecimal", "dump": "a dump of a line",
+        "terminal": "lines of text and when each came",
+    }  # fmt: skip
+    return told.get(form, f"a CAN log ({form})")
 
 
 def _import(path: Path, fit: "CodecFit", told: _Told) -> None:
@@ -291,11 +292,11 @@ def _import(path: Path, fit: "CodecFit", told: _Told) -> None:
     told.go_on(f"tactile-rt import {shlex.quote(str(path))} --as {quoted}")
 
 
-def _sniff_text(path: Path, data: bytes, told: _Told) -> bool:
+def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:
     """Propose the columns of a table, or of what a board prints; whether there are any."""
-    from tactile_rt.recording.importing.proposing import propose_columns
+    from tactile_rt.recording.importing.proposing import propose_columns, propose_line_columns
 
-    proposed = propose_columns(path, data)
+    proposed = propose_columns(path, data) if form == "raw" else propose_line_columns(data)
     if proposed is None:
         return False
     told.say(f"{proposed.said}: names and units are for you to say")
@@ -316,7 +317,7 @@ def _sniff_bag(path: Path, told: _Told) -> None:
     from rich.table import Table
 
     from tactile_rt.recording import Recording
-    from tactile_rt.recording.importing.bag import bag_topics
+    from tactile_rt.recording.importing.bag import bag_topics, proposed_columns
     from tactile_rt.ros2 import messages
 
     try:
@@ -336,9 +337,16 @@ def _sniff_bag(path: Path, told: _Told) -> None:
         print_table(table)
     known = [t for t in topics if t.columns or t.type == messages.SAMPLES]
     if not known:
-        told.nothing(
-            f"{path}: of no topic is known what is what", "`import` takes it with --columns"
+        proposed = [(columns, t.name) for t in topics if (columns := proposed_columns(path, t))]
+        if not proposed:
+            told.nothing(f"{path}: no message holds a number")
+        columns, name = max(proposed, key=lambda one: len(one[0]))
+        told.say(f"of no topic is known what is what; {name}: names and units are for you to say")
+        told.go_on(
+            f"tactile-rt import {shlex.quote(str(path))} --topic {shlex.quote(name)} --columns "
+            f"{shlex.quote(columns)}"
         )
+        return
     best = max(known, key=lambda t: t.messages)
     only = "" if len(known) == 1 else f" --topic {shlex.quote(best.name)}"
     told.go_on(f"tactile-rt import {shlex.quote(str(path))}{only}")

@@ -9,7 +9,7 @@ from tactile_rt.drivers.codecs.ascii_text import in_seconds
 from tactile_rt.drivers.slcan import SlcanDecoder
 from tactile_rt.stream import NS_PER_S
 
-__all__ = ["of_candump", "of_dump", "of_dump_can", "of_gvret", "of_hex", "of_slcan"]
+__all__ = ["of_candump", "of_dump", "of_dump_can", "of_gvret", "of_heard", "of_hex", "of_slcan"]
 
 _CANDUMP: Final = re.compile(
     r"\s*(?:\((?P<t>[^)]*)\)\s*)?(?P<bus>[A-Za-z]\w*)\s+(?:[TR]X\s+\S+\s+\S+\s+)?"
@@ -31,6 +31,10 @@ _DUMP: Final = re.compile(
 _DUMP_CAN: Final = re.compile(
     r" *(?P<t>\d+\.\d{3}) ms  (?P<id>[0-9A-F]{3}|[0-9A-F]{8}) (?P<kind>[RF ]) \[(?P<n>\d+)\]"
     r" ?(?P<hex>(?:[0-9a-f]{2} ?)*)"
+)
+_HEARD: Final = re.compile(  # the Arduino IDE; CoolTerm, Tera Term and the like
+    r"(?P<arduino>\d\d:\d\d:\d\d\.\d+) -> (?P<a>.*)"
+    r"|\[(?P<t>(?:\d{4}-\d\d-\d\d[ T])?\d\d:\d\d:\d\d[.,]\d+)\]:? ?(?P<b>.*)"
 )
 # xxd, hexdump -C, and bytes in hex with or without a time before them
 _XXD: Final = re.compile(
@@ -112,6 +116,16 @@ def of_dump_can(line: str) -> Found:
     kind, data = found["kind"], bytes.fromhex(found["hex"])
     frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, kind == "F", kind == "R")
     return "", [frame], _time(found["t"], NS_PER_S // 1000)
+
+
+def of_heard(line: str) -> Found:
+    """A line of text with the time at which a terminal got it."""
+    found = _HEARD.fullmatch(line)
+    if found is None:
+        return None
+    t_ns = _time((found["arduino"] or found["t"]).replace(",", "."))
+    text = found["a"] if found["b"] is None else found["b"]
+    return None if t_ns is None else ("", f"{text}\n".encode(), t_ns)
 
 
 def of_hex(line: str) -> Found:

@@ -22,6 +22,7 @@ from tactile_rt.drivers.log_lines import (
     of_dump,
     of_dump_can,
     of_gvret,
+    of_heard,
     of_hex,
     of_slcan,
 )
@@ -30,7 +31,7 @@ from tactile_rt.stream import NS_PER_S, ConfigError
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 
-SERIAL_FORMS: Final = ("raw", "dump", "hex")
+SERIAL_FORMS: Final = ("raw", "dump", "hex", "terminal")
 CAN_FORMS: Final = ("candump", "dump-can", "slcan", "gvret", "asc", "blf", "trc", "csv")
 FORMS: Final = (*SERIAL_FORMS, *CAN_FORMS)
 PIECE: Final = 256
@@ -106,7 +107,7 @@ class LineLog:
     def _text(self, file: LogFile) -> Iterator[Timed]:
         parse = {
             "candump": of_candump, "dump-can": of_dump_can, "dump": of_dump, "hex": of_hex,
-            "gvret": of_gvret, "slcan": of_slcan,
+            "gvret": of_gvret, "slcan": of_slcan, "terminal": of_heard,
         }[self.form]  # fmt: skip
         others, errors, buses = -(self.form == "gvret"), 0, Counter[str]()  # its first line: names
         apart, now = self.form == "candump" and _times_are_apart(self.path), 0
@@ -313,6 +314,7 @@ def _form(path: Path) -> str:
         return "asc"
     for form, parse in (
         ("dump", of_dump), ("dump-can", of_dump_can), ("candump", of_candump), ("slcan", of_slcan),
+        ("terminal", of_heard),
     ):  # fmt: skip
         if sum(parse(x) is not None for x in lines) >= MOSTLY * len(lines):
             return form

@@ -220,8 +220,8 @@ def _fed(
 
 def _borne(found: Samples, limit: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(sample, element) the valid loads that are within the limit of each channel."""
-    within: NDArray[np.bool_] = (np.abs(found.values) <= limit).all(axis=2)
-    return found.valid & within
+    borne: NDArray[np.bool_] = found.valid & np.all(np.abs(found.values) <= limit, axis=2)
+    return borne
 
 
 def _damaged(data: bytes) -> bytes:

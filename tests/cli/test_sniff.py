@@ -58,6 +58,28 @@ FILES = {
         lambda: b"".join(b"%d %d %d.5\r\n" % (10 * k, k * k % 7, k % 5) for k in range(40)),
         "--columns time:ms,T{0..1}.value",
     ),
+    "names in a plotter's lines": (
+        lambda: b"".join(b"Fx:%d,Fy:%d\n" % (k * k % 7, k % 5) for k in range(40)),
+        "--as codec=ascii_line&columns=Fx%3DS.fx:N,Fy%3DS.fy:N",
+    ),
+    "lines and when a terminal had them": (
+        lambda: b"".join(
+            b"12:00:%02d.%03d -> X: %d Y: %d\n" % (k // 50, k % 50 * 20, k * k % 7, k % 5)
+            for k in range(90)
+        ),
+        "--as codec=ascii_line&columns=X%3DS.x:1,Y%3DS.y:1",
+    ),
+    "units below": (
+        lambda: b"Zeit,Fx\n[s],[mN]\n" + b"".join(b"%d,%d\n" % (k, k * k % 7) for k in range(40)),
+        "--columns Zeit=time:s,Fx=S.fx:mN",
+    ),
+    "seconds and the rest": (
+        lambda: b"".join(
+            b"%d,%d,ft,%d\n" % (1_700_000_000 + k // 4, k % 4 * 250_000_000, k * k % 7)
+            for k in range(40)
+        ),
+        "--columns time:s,time:ns,-,T0.value",
+    ),
     "names": (
         lambda: b"".join(b"Fx: %d N\r\nFy: %d N\r\n" % (k * k % 7, k % 5) for k in range(40)),
         "--as codec=ascii_line&columns=Fy%3DS.fy:N,Fx%3DS.fx:N",
@@ -143,6 +165,17 @@ def test_a_device_that_must_be_asked_is_asked_only_if_it_is_allowed(call, monkey
         assert not device.codec.streaming
         code, said, _ = call("sniff", url, "--seconds", "0.2", "--ask")
     assert code == 0 and next_command(said) == ["run", "--source", f"{url}?codec=xela"]
+
+
+def test_it_is_asked_at_the_speed_that_is_named(call, monkeypatch):
+    monkeypatch.setattr(listening, "FIRST_S", 0.2)
+    monkeypatch.setattr(device_source, "ATTEMPTS", 1)
+    with open_source("synthetic:5x6") as signal, EmulatedSerial(
+        signal, "ft300", options={"baud": "57600"}, log=False
+    ) as device:  # fmt: skip
+        code, said, _ = call("sniff", device.port, "--baud", "57600", "--ask", "--seconds", "0.2")
+    url = f"serial://{device.port}?codec=ft300&baud=57600"
+    assert code == 0 and next_command(said) == ["run", "--source", url]
 
 
 def test_what_is_nothing_at_all_is_one_line(refused, here):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.calibration import Calibration
+from tactile_rt.cli.demonstration import RECORDING
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.as_ros2 import write_bag
 from tactile_rt.recording.layout import encode_samples
@@ -99,6 +100,13 @@ def test_each_channel_of_a_daemon_s_recording_is_read_by_both(path):
         assert found["/tactile/finger_1/decisions"][2].step == 2
         assert found["/tactile/finger_1/events"][0].touching
         assert found["/tactile/finger_1/health"][0].state == "closed"
+
+
+def test_the_recording_that_is_shipped_is_read_by_both():
+    one, other = by_rosbags(RECORDING), by_mcap_ros2(RECORDING)
+    assert {t: len(m) for t, m in one.items() if m} == {t: len(m) for t, m in other.items()}
+    values = np.concatenate([m.values for m in one["/tactile/mouse_right/samples"]])
+    assert len(values) == 30 * 6 * sum(map(len, Recording(RECORDING)))
 
 
 @pytest.mark.parametrize("name", ["device", "daemon"])

@@ -26,7 +26,7 @@ Rows = Sequence[Sequence[float | None]]
 
 _TIME: Final = re.compile(
     r"(?:%|.*[._ ])?"
-    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed)"
+    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed|x_value)"
     r"(?:[_ ]?(?:s|sec|ms|us|µs|ns|nsec))?", re.IGNORECASE,
 )  # fmt: skip
 _COUNT: Final = re.compile(
@@ -37,6 +37,7 @@ _COUNT: Final = re.compile(
 _TIME_UNIT: Final = re.compile(
     r"(?:^|[_ ([/.]|millis|micros)(s|sec|secs|ms|us|µs|ns|nsec|nsecs)\W*$"
 )
+_IN_SECONDS: Final = re.compile(r"[\[(](?:s|sec|ms|us|\u00b5s|ns)[\])]")
 _BRACKET: Final = re.compile(r"[\[(]([^\])]*)[\])]")
 _TAIL_UNIT: Final = re.compile(r"_(mN|uN|N|Nm|mNm|kPa|Pa|uT|mT|T|degC|mV|V|mm|um|pF)$")
 _QUANTITY: Final = tuple(  # (name, channel, unit if the name says it)
@@ -62,6 +63,7 @@ _ALIASES: Final = {
     "kg": "kgf", "volt": "V", "volts": "V", "m/s^2": "m/s2", "m/s²": "m/s2", "n": "N",
 }  # fmt: skip
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9_-]+")
+_NAMED: Final = re.compile(r"=|:\s|[A-Za-z_)\]]:")
 _LABELLED: Final = re.compile(r"([A-Za-z_][\w ()\[\]/°%]*?)\s*[:=\[]\s*([^\s,;|\]]+)")
 
 
@@ -81,6 +83,8 @@ def guess_columns(
     time = _place_time(names, series, dated)
     if time is not None:
         kinds[time[0]] = time[1]
+        if _is_part_of_a_second(series, time[0] + 1):
+            kinds[time[0] + 1] = "time:ns"
     count = _place_count(names, series, kinds)
     if count is not None:
         kinds[count] = "count"
@@ -177,7 +181,7 @@ def _of_places(lines: list[str]) -> tuple[list[str], int, int] | None:
     numeric = [k for k in range(width) if share[k] >= MOSTLY]
     if 2 * len(numeric) < width or (2 * len(numeric) == width and width > 2):
         return None
-    if sum("=" in line or ": " in line for line, _ in same) > len(same) / 2 and width > 1:
+    if sum(_NAMED.search(line) is not None for line, _ in same) > len(same) / 2 and width > 1:
         labelled = _of_labels(lines)  # names tell more than places
         if labelled is not None and len(labelled[0]) >= len(numeric) - 1:
             return labelled
@@ -235,7 +239,14 @@ def _place_time(
 ) -> tuple[int, str] | None:
     for k in sorted(dated):
         return k, "time:iso"
-    known = [k for k, name in enumerate(names) if _TIME.fullmatch(_bare(name))]
+    for k in range(len(series)):
+        if _is_part_of_a_second(series, k + 1):
+            return k, "time:s"
+    known = [k for k, name in enumerate(names) if _TIME.fullmatch(_bare(name))] or [
+        k
+        for k, name in enumerate(names)
+        if _IN_SECONDS.search(name)  # of any language
+    ]
     for k in [*known, *(() if known else range(len(series)))]:
         v = series[k]
         if v is None or len(v) < 2 or not np.isfinite(v).all():
@@ -255,6 +266,14 @@ def _place_time(
 def _is_utc(v: NDArray[np.float64]) -> bool:
     """Whether these are times from 1970 on, of 2001 to 2065, in s, ms, us or ns."""
     return any(1e9 * unit <= v[0] <= v[-1] <= 3e9 * unit for unit in (1, 1e3, 1e6, 1e9))
+
+
+def _is_part_of_a_second(series: Sequence[NDArray[np.float64] | None], k: int) -> bool:
+    """Whether these are the nanoseconds of the seconds in the column before, as ROS has it."""
+    if k >= len(series) or (v := series[k]) is None or (seconds := series[k - 1]) is None:
+        return False
+    whole = np.isfinite(v).all() and (v % 1 == 0).all() and (seconds % 1 == 0).all()
+    return bool(whole and _is_utc(seconds) and 0 <= v.min() and 1e6 < v.max() < 1e9)
 
 
 def _time_unit(name: str, v: NDArray[np.float64]) -> str:

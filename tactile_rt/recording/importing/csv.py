@@ -8,9 +8,10 @@ and passed over. Cells between spaces may stand in brackets and have units, as b
 
 import csv
 import re
+from codecs import getincrementaldecoder
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
@@ -27,9 +28,19 @@ LOOKED_AT: Final = 200  # lines
 ENOUGH: Final = 0.5  # of the lines that are looked at are rows
 DELIMITERS: Final = (";", "\t", ",", "|", " ")
 NAMES: Final = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";"}
+REMARKED: Final = (
+    "comment",
+    "comments",
+    "remark",
+    "note",
+)  # a last column that is hardly ever there
 REMARKS: Final = ("#", "%", "//")
 LONGEST: Final = 1 << 20  # characters of a line
 _COMMA: Final = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*")
+_UNIT: Final = re.compile(
+    r"[\[(].*[\])]||-|s|sec|ms|us|\u00b5s|ns|Hz|\u00b0C?|[munk\u00b5]?(?:N|g|V|A|T|m|rad|Pa|Ohm|F)"
+    r"|[mu]?N[ .*\u00b7-]?m{1,2}|deg|degC|kgf?|%|bar|counts?"
+)
 _NUMBER_COMMA: Final = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 
 
@@ -41,6 +52,7 @@ class CsvForm:
         delimiter: What stands between cells; a space stands for any of spaces and tabs.
         comma: Whether numbers have a decimal comma.
         names: Names of the columns; empty for a table without.
+        units: What stands below the names, a unit each; empty for a table without.
         first: Number of lines before the first row.
         width: Number of cells of a row.
         lines: Number of lines of text that are one row.
@@ -52,6 +64,7 @@ class CsvForm:
     first: int
     width: int
     lines: int = 1
+    units: tuple[str, ...] = ()
 
 
 def csv_form(
@@ -93,9 +106,7 @@ def csv_form(
             "numbers (--delimiter, --skip and --lines tell how it is written)"
         )
     form = best[1]
-    return CsvForm(
-        form.delimiter, form.comma, form.names, skip + form.first * lines, form.width, lines
-    )
+    return replace(form, first=skip + form.first * lines, lines=lines)
 
 
 def read_table(path: Path, form: CsvForm) -> Table:
@@ -115,6 +126,8 @@ def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
             if line.startswith(REMARKS) or not line.strip(" \t,;"):
                 continue
             cells = _cells(line, form.delimiter, form.comma)
+            if len(cells) == form.width - 1 and line.endswith(form.delimiter):
+                cells.append("")
             if form.names and all(number(c.strip()) is None for c in cells):
                 continue  # units below the names, or names once more
             yield cells
@@ -123,8 +136,12 @@ def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
 
 
 def _text(file: Any) -> TextIOWrapper:
-    begins = file.peek(2)[:2]
-    encoding = "utf-16" if begins in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    begins = file.peek(2)
+    encoding = "utf-16" if begins[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    try:
+        getincrementaldecoder(encoding)().decode(begins)
+    except UnicodeDecodeError:
+        encoding = "cp1252"  # of Windows in Europe
     return TextIOWrapper(file, encoding, "replace", newline="")
 
 
@@ -157,6 +174,11 @@ def _points(line: str) -> str:
     return re.sub(r"(?<=\d),(?=\d)", ".", line)
 
 
+def _is_there(cell: str) -> bool:
+    """Whether this may stand where numbers do."""
+    return not cell.strip() or number(cell.strip()) is not None or _is_number(cell)
+
+
 def _is_number(cell: str) -> bool:
     plain = cell.strip()
     found = number(plain)
@@ -177,25 +199,37 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
         for k, x in enumerate(head)
         if x.strip(" \t,;") and not x.startswith(REMARKS)
     ]
-    numeric = [(k, c) for k, c in rows if 2 * sum(map(_is_number, c)) >= len(c) > 0]
+    numeric = [(k, c) for k, c in rows if 2 * sum(map(_is_there, c)) >= len(c) > 0]
     widths = Counter(len(c) for _, c in numeric)
     if not widths:
         return None
     width, often = max(widths.items(), key=lambda w: (w[1], w[0]))
-    first = next(k for k, c in numeric if len(c) == width)
+    if widths[width + 1] and all(
+        head[k].endswith(delimiter) for k, c in numeric if len(c) == width
+    ):
+        width, often = width + 1, often + widths[width + 1]  # its last column is seldom there
+        numeric = [(k, [*c, ""] if len(c) == width - 1 else c) for k, c in numeric]
+    whole = [c for _, c in numeric if len(c) == width]
+    usual = [j for j in range(width) if 2 * sum(_is_number(c[j]) for c in whole) > len(whole)]
+    first = next(
+        (k for k, c in numeric if len(c) == width and all(_is_there(c[j]) for j in usual)),
+        numeric[0][0],
+    )
     below = sum(k >= first for k, _ in rows)
     if often < ENOUGH * below:
         return None
     share = sum(
         sum(map(_is_number, c)) / width for _, c in numeric if len(c) == width
     ) / often  # fmt: skip
-    names = _names(head[:first], delimiter, width)
+    names, units = _names(head[:first], delimiter, width)
     # one cell a line is a table, too, but only if nothing else is
     score = often / below * share + (0.5 if width > 1 else 0.0) + (0.2 if names else 0.0)
-    return score, CsvForm(delimiter, comma, names, first, width)
+    return score, CsvForm(delimiter, comma, names, first, width, units=units)
 
 
-def _names(above: list[str], delimiter: str, width: int) -> tuple[str, ...]:
+def _names(above: list[str], delimiter: str, width: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The names of the columns, and the units below them; empty: there are none."""
+    units: tuple[str, ...] = ()
     for line in reversed(above):
         text = line
         for mark in ("#", "//"):
@@ -209,12 +243,16 @@ def _names(above: list[str], delimiter: str, width: int) -> tuple[str, ...]:
             cells = cells[1:] if cells[:1] == ["%"] else cells
         if len(cells) == width - 1 and delimiter != " " and text.rstrip().endswith(delimiter):
             cells.append("")
+        if len(cells) == width + 1 and cells[-1].lower() in REMARKED:
+            del cells[-1]
         words = [c for c in cells if c and not _is_number(c)]
-        if len(cells) == width and 2 * len(words) >= width:
-            units = all(re.fullmatch(r"[\[(].*[\])]|", c) for c in cells)
-            if not units:
-                return tuple(_distinct(cells))
-    return ()
+        if len(cells) != width or 2 * len(words) < width:
+            continue
+        if all(_UNIT.fullmatch(c) for c in cells):
+            units = units or tuple(c.strip("[]() ") for c in cells)
+        else:
+            return tuple(_distinct(cells)), units
+    return (), ()
 
 
 def _distinct(names: list[str]) -> list[str]:

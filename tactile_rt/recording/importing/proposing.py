@@ -1,6 +1,6 @@
 """Columns for a table, or for what a board printed, for a user to look at and change."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 
@@ -11,7 +11,7 @@ from tactile_rt.drivers.opening import make_codec
 from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
 from tactile_rt.stream import ConfigError, RecordingError
 
-__all__ = ["ProposedColumns", "line_columns", "propose_columns"]
+__all__ = ["ProposedColumns", "line_columns", "propose_columns", "propose_line_columns"]
 
 LEAST = 3  # rows
 DATED = 20  # rows that are looked at for dates
@@ -68,12 +68,23 @@ def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
         proposed = _of_table(path, form)
         if proposed is not None:
             return proposed
+    told = propose_line_columns(data)
+    if form is None or (told is not None and "=" in told.columns):
+        return told
+    return _of_table(path, form) if told is None else replace(told, table=True)
+
+
+def propose_line_columns(data: bytes) -> ProposedColumns | None:
+    """The columns of what a board printed; None where it printed no samples.
+
+    Args:
+        data: how that begins.
+    """
     told = line_columns(data)
     if told is None:
         return None
     columns, n = told
-    by_places = form is not None and "=" not in columns
-    return ProposedColumns(columns, by_places, "time" in columns, f"{n} lines are samples")
+    return ProposedColumns(columns, False, "time" in columns, f"{n} lines are samples")
 
 
 def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
@@ -87,7 +98,10 @@ def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
         for k in range(form.width)
         if all(":" in row[k] and in_seconds(row[k]) != row[k] for row in rows[:DATED])
     }
-    words, timed = guess_columns(form.names, cells, dated)
+    names = form.names
+    if form.units:  # said as names say them
+        names = tuple(f"{n} [{u}]" if u else n for n, u in zip(names, form.units, strict=True))
+    words, timed = guess_columns(names, cells, dated)
     if not any("." in word for word in words if not word.startswith("time")):
         return None
     if form.names:

@@ -2,8 +2,9 @@
 
     time=time:s,(x{0..3}=T{0..3}.fx:mN,y{0..3}=T{0..3}.fy:mN)
 
-What a column may be is told in `ascii_mapping`; here a time may have decimals in every unit, and
-does not wrap. Columns are found by their names or, without names, by their places.
+What a column may be is told in `ascii_mapping`; here a time may have decimals in every unit, does
+not wrap, and may be of two columns, seconds and the rest in us or ns. Columns are found by their
+names or, without names, by their places.
 
 Times. Rows that share one time (a clock that is too coarse) are spread evenly up to the next. Where
 a time goes back, another stretch begins, one period after the row before.
@@ -33,7 +34,7 @@ from tactile_rt.recording.importing.account import Import, clock_of, write_chunk
 from tactile_rt.settings import nearest
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError
 
-__all__ = ["Table", "import_table", "place_columns", "shown_names"]
+__all__ = ["BESIDE", "Table", "import_table", "place_columns", "shown_names"]
 
 NS: Final = {"s": NS_PER_S, "iso": NS_PER_S, "ms": 10**6, "us": 1000, "ns": 1}
 GAP: Final = 10  # typical steps: what is longer is no period
@@ -132,7 +133,8 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     places, notes = place_columns(parsed, table.names, where)
     if rate_hz:
         mapping = msgspec.structs.replace(mapping, rate_hz=rate_hz)
-    spec = array_of(mapping, parsed, where)
+    parts = _parts_of_seconds(parsed)
+    spec = array_of(mapping, tuple(c for k, c in enumerate(parsed) if k not in parts), where)
     if not rate_hz and table.times_ns is None and not any(c.kind in NS for c in parsed):
         raise ConfigError(f"{table.path}: no column is a time: give --rate, in Hz")
     read = _read(table, parsed, places, spec)
@@ -176,7 +178,7 @@ def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: 
     scale = np.array([columns[k].scale for k in order])
     offset = np.array([columns[k].offset for k in order])
     measured = [places[k] for k in order]
-    clock = next(((places[k], c) for k, c in enumerate(columns) if c.kind in NS), None)
+    clocks = [(places[k], c) for k, c in enumerate(columns) if c.kind in NS]
     counter = next((places[k] for k, c in enumerate(columns) if c.kind == "count"), None)
     need = max(places) + 1
     width = len(table.names) or need
@@ -197,10 +199,8 @@ def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: 
             if len(cells) < need or (table.names and len(cells) > width):
                 raise ValueError(f"{len(cells)} columns, not {width}")
             row = [_number(cells[k]) for k in measured]
-            t_ns = 0
-            if clock is not None:
-                t_ns = _time(cells[clock[0]], clock[1])
-            elif table.times_ns is not None:
+            t_ns = sum(_time(cells[place], column) for place, column in clocks)
+            if not clocks and table.times_ns is not None:
                 t_ns = table.times_ns[-1]
             if counter is not None:
                 counts.append(_whole(cells[counter]))
@@ -213,11 +213,17 @@ def _read(table: Table, columns: Sequence[Column], places: Sequence[int], spec: 
         if len(rows) == BLOCK:
             close()
     close()
-    timed = clock is not None or table.times_ns is not None
+    timed = bool(clocks) or table.times_ns is not None
     return _Read(
         np.concatenate(blocks), np.array(times, np.int64) if timed else None,
         np.array(counts, np.int64) if counter is not None else None, corrupt, complaint,
     )  # fmt: skip
+
+
+def _parts_of_seconds(columns: Sequence[Column]) -> list[int]:
+    """Which columns are the rest of a time whose seconds have a column of their own."""
+    seconds = any(c.kind == "s" for c in columns)
+    return [k for k, c in enumerate(columns) if seconds and c.kind in ("us", "ns")]
 
 
 def _number(cell: Any) -> float:

@@ -28,6 +28,7 @@ from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, RecordingError, Sour
 __all__ = ["import_wire"]
 
 PROBED, SHORTEST = 16_384, 8  # bytes
+FEW, UNUSUAL = 10, 1.2  # samples; how far their rate may be from the codec's
 AHEAD = 4096  # packets in which a device may describe itself before samples must come
 
 
@@ -83,6 +84,11 @@ def import_wire(
         account.notes.append(f"{codec.stats.incomplete} samples lack a part")
     if stats.duplicates:
         account.notes.append(f"{stats.duplicates} samples came twice")
+    came_hz = (account.samples + account.missing - 1) / (account.seconds or 1.0)
+    if account.samples >= FEW and not UNUSUAL > came_hz / account.rate_hz > 1 / UNUSUAL:
+        account.notes.append(
+            f"they came at {came_hz:.4g} Hz: --rate says what the device was set to"
+        )
     return account
 
 

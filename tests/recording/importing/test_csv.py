@@ -32,6 +32,13 @@ WRITTEN = {
     "yarpdatadumper": ("", "{k} {s:.6f} {a} {b} \n", "count,time:s,S.fx:mN,S.fy:mN"),
     "quoted": ('"t","x, N","y"\n', '"{s:.2f}","{a}","{b}"\n', 't=time:s,"x, N"=S.fx:mN,y=S.fy:mN'),
     "units below": ("t,x,y\n[s],[mN],[mN]\n", "{s:.2f},{a},{b}\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
+    "units without brackets": (
+        "t;x;y\ns;mN;mN\n", "{s:.2f};{a};{b}\n", "t=time:s,x=S.fx:mN,y=S.fy:mN",
+    ),
+    "LabVIEW": (
+        "Samples\t60\t60\t\nX0\t0.0\t0.0\n***End_of_Header***\t\nX_Value\tFx\tFy\tComment\n",
+        "{s:.2f}\t{a}\t{b}\n", "X_Value=time:s,Fx=S.fx:mN,Fy=S.fy:mN",
+    ),
     "above it": (
         "Sensor: ATI mini40\nRate, 100\n\nt,x,y\n", "{s:.2f},{a},{b}\n",
         "t=time:s,x=S.fx:mN,y=S.fy:mN",
@@ -56,6 +63,29 @@ def test_a_table_is_read_as_it_is_written(tmp_path, name):
     assert chunk.values[:, 0] == pytest.approx(np.array(expected))
     assert np.diff(chunk.t_ns).tolist() == [10_000_000] * (N - 1)
     assert about.spec.rate_hz == 100 and about.spec.units == ("N", "N")
+
+
+def test_a_column_that_is_seldom_there_is_a_column(tmp_path):
+    lines = (f"{k / 100},nan,{20 + k if k % 10 == 0 else ''}\n" for k in range(N))
+    (tmp_path / "t.csv").write_text("t,fx,temp\n" + "".join(lines))
+    columns = "t=time:s,fx=A0.value:1,temp=T0.value:1"
+    made, chunk, _ = imported(tmp_path / "t.csv", columns)
+    assert (made.samples, made.corrupt) == (N, 0)
+    assert chunk.valid[:, 1].tolist() == [k % 10 == 0 for k in range(N)]
+
+
+def test_a_time_of_seconds_and_the_rest(tmp_path):
+    (tmp_path / "t.csv").write_text(
+        "".join(f"{1_700_000_000 + k // 2},{k % 2 * 500_000_001},ft,{k}\n" for k in range(9))
+    )
+    _, chunk, about = imported(tmp_path / "t.csv", "time:s,time:ns,-,S.fx")
+    assert about.utc_offset_ns == 1_700_000_000 * 10**9 and about.spec.rate_hz == 2
+    assert chunk.t_ns[:4].tolist() == [0, 500_000_001, 10**9, 1_500_000_001]
+
+
+def test_names_from_windows(tmp_path):
+    (tmp_path / "t.csv").write_bytes(("t;T (\u00b0C)\n" + rows("{k};{b}\n")).encode("cp1252"))
+    assert csv_form(tmp_path / "t.csv").names == ("t", "T (\u00b0C)")
 
 
 @pytest.mark.parametrize("delimiter", [";", "\t", " "])

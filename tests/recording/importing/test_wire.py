@@ -146,3 +146,15 @@ def test_what_cannot_be_is_one_line(tmp_path, fields, why):
     with pytest.raises(ConfigError, match=why):
         imported(tmp_path / "raw.bin", tmp_path / "o.mcap", **fields)
     assert not (tmp_path / "o.mcap").exists()
+
+
+def test_lines_have_the_time_at_which_a_terminal_had_them(tmp_path):
+    path = tmp_path / "monitor.txt"
+    path.write_text("".join(f"[12:00:{k / 50:06.3f}] {k},{k + 1}\n" for k in range(100)))
+    fields = {"codec": "ascii_line", "columns": "A0.fx,A0.fy"}
+    made = import_wire(read_log(path), tmp_path / "out.mcap", fields)
+    assert made.samples == 99  # the first line may be half a line
+    assert made.seconds == pytest.approx(1.96)
+    assert made.notes == ["they came at 50 Hz: --rate says what the device was set to"]
+    chunk = concatenate(list(Recording(tmp_path / "out.mcap")))
+    assert chunk.values[7, 0].tolist() == [8, 9]
