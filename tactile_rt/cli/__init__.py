@@ -105,7 +105,7 @@ def _run() -> None:
 class _Told(io.FileIO):
     """The error output: where it can take no more, as the disk of a log is full, work goes on."""
 
-    def write(self, data: "ReadableBuffer") -> int:  # type: ignore[override]
+    def write(self, data: "ReadableBuffer") -> int:
         with suppress(OSError):
             super().write(data)
         return memoryview(data).nbytes
