@@ -81,7 +81,10 @@ def _hidden(path: Path) -> Path:
 
 def _name(error: BaseException, hidden: Path, path: Path) -> None:
     """Let a failure of what is hidden, or of no file that is named, be one of `path`."""
-    if isinstance(error, OSError) and error.errno and error.filename in (None, str(hidden)):
+    if not isinstance(error, OSError) or not error.errno:
+        return
+    named = error.filename  # a number, where the file was opened by one
+    if named is None or (isinstance(named, str) and Path(named).is_relative_to(hidden)):
         raise OSError(error.errno, os.strerror(error.errno), str(path)) from None
 
 

@@ -58,6 +58,13 @@ def test_where_nothing_can_be_made_the_name_is_the_one_that_was_given(tmp_path):
     assert failed.value.filename == str(path)
 
 
+def test_a_failure_in_a_hidden_folder_names_what_it_was_to_be(tmp_path):
+    with pytest.raises(FileNotFoundError) as failed, whole_folder(tmp_path / "bag") as made:
+        (made / "none" / "a").write_bytes(b"")
+    assert failed.value.filename == str(tmp_path / "bag")
+    assert os.listdir(tmp_path) == []
+
+
 def test_a_folder_is_replaced_whole_or_stays(tmp_path):
     path = tmp_path / "bag"
     path.mkdir()

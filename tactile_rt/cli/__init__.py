@@ -7,6 +7,7 @@ import io
 import os
 import signal
 import sys
+from contextlib import suppress
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -104,11 +105,10 @@ def _run() -> None:
 class _Told(io.FileIO):
     """The error output: where it can take no more, as the disk of a log is full, work goes on."""
 
-    def write(self, data: "ReadableBuffer") -> int | None:
-        try:
-            return super().write(data)
-        except OSError:
-            return memoryview(data).nbytes
+    def write(self, data: "ReadableBuffer") -> int:
+        with suppress(OSError):
+            super().write(data)
+        return memoryview(data).nbytes
 
 
 def _open_streams() -> None:

@@ -27,6 +27,7 @@ __all__ = ["WIDTH", "draw", "watch"]
 
 WIDTH = 80
 HEIGHT = 15  # of the upper panels
+DROPPED = 0.02  # share of the samples from which on the score says little of the model
 REFRESH_S = 1 / 15  # seldom enough that drawing costs the stream nothing
 
 # Lower limit of |F| (uN) and (background, text): matplotlib's inferno, whose lightness rises
@@ -95,6 +96,10 @@ def demo(
     }  # fmt: skip
     if not told_as_json(told, json):
         typer.echo(demonstration.summary())
+    if demonstration.share_dropped > DROPPED:
+        wait = "" if recorded else "; --fast waits for it"
+        late = f"{100 * demonstration.share_dropped:.0f} % of the samples came too late"
+        typer.echo(f"the machine is busy: {late} for the model to be right{wait}", err=True)
 
 
 def watch(demo: Demonstration, console: Console) -> None:

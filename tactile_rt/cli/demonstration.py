@@ -196,6 +196,11 @@ class Demonstration:
         """Samples for which the classifier was too late."""
         return self._session.dropped + self._source.stats.dropped
 
+    @property
+    def share_dropped(self) -> float:
+        """Those samples over all that there were, 0 to 1."""
+        return self.dropped / max(1.0, self.simulated_s * self._source.spec.rate_hz)
+
     def latency_ms(self, percentile: float) -> float:
         """A percentile of the time that a model step takes, ms; NaN before the first step."""
         if not self._latencies:

@@ -1,5 +1,6 @@
 """`tactile-rt list`, `doctor`, `codecs`, `describe`, `echo`, `hz`, `dump`: looking at devices."""
 
+import math
 import time
 from pathlib import Path
 from typing import Annotated, Any
@@ -174,20 +175,21 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
     with starting():
         opened = open_source(source)
     looks: list[dict[str, Any]] = []
-    with opened, leaving(seconds):
+    with opened, leaving(None):
         spec = opened.spec
         shape = f"{spec.shape[0]} elements x {spec.shape[1]} channels"
         typer.echo(f"{spec.name}: {shape}, nominally {spec.rate_hz:g} Hz", err=json == STDOUT)
-        while True:
-            began, n, late = time.monotonic(), 0, []
+        ends, ended = time.monotonic() + (seconds or math.inf), False
+        while not ended and (began := time.monotonic()) < ends:
+            until, n, late = min(began + WINDOW_S, ends), 0, []
             try:
-                while (left := began + WINDOW_S - time.monotonic()) > 0:
+                while (left := until - time.monotonic()) > 0:
                     chunk = opened.read(left)
                     if chunk is not None:
                         n += len(chunk)
                         late.append((time.monotonic_ns() - int(chunk.t_ns[-1])) / 1e6)
             except EndOfStream:
-                break
+                ended = True
             rate = n / (time.monotonic() - began)
             spread = np.quantile(late, (0.5, 0.99)) - min(late) if late else (0.0, 0.0)
             stats = opened.stats

@@ -59,6 +59,7 @@ def teach(
     stdin is no terminal, a line is an order: a class's name, next, undo or done.
     """
     from tactile_rt.classifier.model_file import shipped_model
+    from tactile_rt.locks import alone_in
     from tactile_rt.recording.layout import need_mcap
     from tactile_rt.sources.opening import open_source
     from tactile_rt.teaching.lesson import MODEL, Lesson
@@ -75,7 +76,7 @@ def teach(
     lesson = _begun_before(folder, base)
     with starting():
         opened = open_source(source)
-    with opened, _Buttons(at) as buttons, leaving(seconds):
+    with opened, alone_in(folder), _Buttons(at) as buttons, leaving(seconds):
         lesson = lesson or (_begun(folder, opened) if base is None else Lesson.on(folder, base))
         buttons.teacher = Teacher(lesson, wanted, touches)
         _teach(buttons.teacher, opened, source, buttons.orders)

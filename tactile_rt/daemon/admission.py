@@ -15,6 +15,7 @@ from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.classifier.trial import Trial, TrialLimits, try_model
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.items import Opened
+from tactile_rt.daemon.process import ADMISSION
 from tactile_rt.stream import ModelError, TactileError
 
 __all__ = ["Admission", "file_stamp", "model_path"]
@@ -58,7 +59,7 @@ class Admission:
         self.classifier: Classifier | None = None
         self._limits, self._opened, self._age = limits, opened, age
         self._given_up = threading.Event()
-        threading.Thread(target=self._run, name="tactile-rt admission", daemon=True).start()
+        threading.Thread(target=self._run, name=ADMISSION, daemon=True).start()
 
     def give_up(self) -> None:
         """Nobody wants it any more."""

@@ -22,11 +22,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from tactile_rt.daemon.daemon import Daemon
 
-__all__ = ["ExitCode", "leave", "note_signals", "run_daemon"]
+__all__ = ["ADMISSION", "ExitCode", "leave", "note_signals", "run_daemon"]
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 OVER = 0  # no signal has this number
 TURN_S = 0.25  # how often the main loop tells that it goes on
+ADMISSION = "tactile-rt admission"  # the name of a thread that loads a model
+LOADED_S = 5.0  # for it to end by itself
 SWITCH_S = 0.001  # how long a thread that computes may keep those waiting that acquire
 
 Calls = SimpleQueue[int]  # what a signal handler may put into
@@ -161,8 +163,13 @@ def _reload(daemon: "Daemon", path: Path, sets: Sequence[str]) -> None:
 
 
 def leave(code: ExitCode) -> None:
-    """End the process; past threads that hang, which would otherwise keep it."""
-    if code == ExitCode.ABANDONED:
+    """End the process; past threads that hang, which would otherwise keep it, or, being torn out
+    of the loading of a model, abort it."""
+    loading = [t for t in threading.enumerate() if t.name == ADMISSION]
+    until = time.monotonic() + LOADED_S
+    for thread in loading:
+        thread.join(max(0.0, until - time.monotonic()))
+    if code == ExitCode.ABANDONED or any(thread.is_alive() for thread in loading):
         sys.stderr.flush()
         os._exit(code)
     sys.exit(code)

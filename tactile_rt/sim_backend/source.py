@@ -17,7 +17,7 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
@@ -260,8 +260,7 @@ class SimSource(PacedSource):
         self._simulation: SweepSimulation | None = None
         self._left = 0  # samples of the sweep still to deliver
         self._order: list[int] = []
-        if self.live:
-            self._warm_up()
+        _warm_up()
 
     @staticmethod
     def check(array: str, options: SimOptions) -> ArraySpec:
@@ -334,13 +333,6 @@ class SimSource(PacedSource):
             seq, start_ns + seq * period, values, np.ones(values.shape[:2], dtype=np.bool_)
         )
 
-    def _warm_up(self) -> None:
-        """Have compiled what steps a sweep: the stream would stand still for half a minute."""
-        target, rng = promised_object(next(iter(CATEGORIES)))(), np.random.default_rng(0)
-        profile = PROFILES[self._options.profile]
-        _, sweep = draw_simulation(rng, self._animals, target, profile, self._draw)
-        sweep.advance(1)
-
     def _begin_sweep(self, start_ns: int) -> None:
         done = len(self.passes)
         if self._options.sweeps and done == self._options.sweeps * self._options.repeat:
@@ -360,6 +352,16 @@ class SimSource(PacedSource):
         self._left = round(self._simulation.duration_ms / SAMPLE_MS)
         now = start_ns + round(self._sent * SAMPLE_MS * 1e6)
         self.passes.append(Pass(now, target.name, target.category, sweep))
+
+
+@cache
+def _warm_up() -> None:
+    """Have compiled what steps a sweep: a stream would stand still for half a minute, and whoever
+    wants to leave would wait for it."""
+    target, rng = promised_object(next(iter(CATEGORIES)))(), np.random.default_rng(0)
+    mouse = load_animals("mouse")
+    _, sweep = draw_simulation(rng, mouse, target, PROFILES["realtime"], draw_sweep)
+    sweep.advance(1)
 
 
 def _drawing(

@@ -509,6 +509,17 @@ def test_without_a_configured_folder_it_is_the_home_s(monkeypatch, tmp_path) -> 
         assert calibration_path("d") == expected
 
 
+def test_a_user_without_a_home_is_told_so(monkeypatch) -> None:
+    def homeless() -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
+    monkeypatch.setattr(Path, "home", homeless)
+    for use in (calibration_path, load_calibration):
+        with pytest.raises(ConfigError, match="no home to keep calibrations in: set XDG_CONFIG"):
+            use("d")
+
+
 def test_a_write_that_fails_leaves_the_old_file(home, monkeypatch) -> None:
     old = Calibration.of("d", small_spec())
     path = save_calibration(old)

@@ -20,6 +20,7 @@ pytest.importorskip("mcap")
 
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, shipped_model
+from tactile_rt.locks import alone_in
 from tactile_rt.recording.labels import LABELS
 from tactile_rt.sources.opening import open_source
 from tactile_rt.teaching.lesson import Lesson
@@ -122,6 +123,13 @@ def test_killed_at_any_moment_it_loses_the_touch_under_way_at_most(tmp_path):
         assert not again.lost, (seed, k)
         kept = len(again.touches)
     assert kept > 6 and again.learn().classes == ("press",)
+
+
+def test_one_teaches_at_a_time(refused, tmp_path):
+    with alone_in(tmp_path / "gestures"):
+        said = refused("teach", "synthetic:2x1", tmp_path / "gestures", "--labels", "press,slide")
+    assert "is in use by process" in said
+    assert not (tmp_path / "gestures").exists()
 
 
 def test_mistakes_are_one_line(call, lesson, tmp_path):

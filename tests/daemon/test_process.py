@@ -375,3 +375,24 @@ def test_the_daemon_reaches_nothing_that_a_robot_does_not_have():
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
     assert done.stdout == "set()\n"
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_model_that_is_being_loaded_does_not_abort_the_end(monkeypatch, ends):
+    """A thread in native code is torn out of it when the interpreter ends, and C++ aborts."""
+    import threading
+
+    from tactile_rt.daemon import process
+
+    loaded, left = threading.Event(), []
+    thread = threading.Thread(target=loaded.wait, name=process.ADMISSION, daemon=True)
+    thread.start()
+    monkeypatch.setattr(process, "LOADED_S", PATIENCE_S if ends else 0.0)
+    monkeypatch.setattr(process.os, "_exit", left.append)
+    if ends:
+        loaded.set()
+    with pytest.raises(SystemExit):
+        process.leave(process.ExitCode.STOPPED)
+    assert left == ([] if ends else [process.ExitCode.STOPPED])
+    loaded.set()
+    thread.join()

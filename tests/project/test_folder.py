@@ -1,5 +1,6 @@
 """A new project: what is in it, and what it refuses."""
 
+import errno
 import re
 from pathlib import Path
 from urllib.parse import urlencode
@@ -15,6 +16,7 @@ pytest.importorskip("matplotlib")
 import trimesh
 
 from tactile_rt.daemon.loading import load_config
+from tactile_rt.project import folder as folder_module
 from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized, write_budget
 from tactile_rt.project.folder import KINDS, Project, new_project
 from tactile_rt.project.making import make
@@ -177,3 +179,17 @@ def test_what_is_taken_for_what_worst_first() -> None:
     assert confused(table, ("a", "b", "c")) == [("b", "a", 0.25), ("a", "b", 0.1)]
     assert confused(table, ("a", "b", "c"), 0.2) == [("b", "a", 0.25)]
     assert confused(np.eye(3, dtype=np.int64), ("a", "b", "c")) == []
+
+
+def test_a_full_disk_leaves_a_folder_that_can_be_named_again(tmp_path, monkeypatch) -> None:
+    write = folder_module.write_whole
+
+    def full(path, fill):
+        if path.name == "robot.toml":
+            raise OSError(errno.ENOSPC, "No space left on device", str(path))
+        write(path, fill)
+
+    with monkeypatch.context() as patch, pytest.raises(OSError, match="No space"):
+        patch.setattr(folder_module, "write_whole", full)
+        new_project(tmp_path / "arm")
+    assert new_project(tmp_path / "arm").array.is_file()

@@ -368,3 +368,19 @@ def test_turns_of_bases_that_give_are_channels(springs: str) -> None:
 def test_a_mount_that_does_not_give_has_no_turns_to_show() -> None:
     with pytest.raises(ConfigError, match=r"base_turns: no mount of mouse-right gives; a \.toml"):
         open_source("sim:mouse?base_turns=true")
+
+
+def test_what_is_compiled_is_so_before_the_clock_begins(monkeypatch) -> None:
+    asked: list[int] = []
+    simulation = source_module.draw_simulation
+
+    def told(*arguments):
+        sweep, made = simulation(*arguments)
+        made.advance = asked.append
+        return sweep, made
+
+    monkeypatch.setattr(source_module, "draw_simulation", told)
+    source_module._warm_up.cache_clear()
+    SimSource("mouse", SimOptions(objects="mug")).close()
+    fast(objects="mug").close()
+    assert asked == [1]

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core import caching
 
 __all__ = ["compiled"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+_caching: Any = caching  # which has no types
 
 # Numba looks only at the file of a function, not at those of the functions that it calls: what was
 # compiled before one of these files changed is old.
@@ -27,12 +29,14 @@ STAMP = tuple(
 )
 
 
-class _Kept(FunctionCache):  # type: ignore[misc]
+class _Kept(_caching.FunctionCache):  # type: ignore[misc]
     """What numba keeps of a function, and lives without."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        self._cache_file = IndexDataCacheFile(self.cache_path, self._impl.filename_base, STAMP)
+        self._cache_file = _caching.IndexDataCacheFile(
+            self.cache_path, self._impl.filename_base, STAMP
+        )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
@@ -61,7 +65,7 @@ def compiled(function: Function) -> Function:
     It lets other threads run, and its sums are in the order in which they are written: the same
     numbers on every machine.
     """
-    made = numba.njit(nogil=True, error_model="numpy")(function)
+    made: Any = numba.njit(nogil=True, error_model="numpy")(function)
     try:
         made._cache = _Kept(function)
     except RuntimeError:  # no folder to keep it in

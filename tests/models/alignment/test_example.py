@@ -15,6 +15,15 @@ h5py = pytest.importorskip("h5py")
 SMALL = Brain(mice=2, sessions=1, units=6, trials=5)
 
 
+def test_what_is_interrupted_leaves_nothing(tmp_path):
+    def interrupted(share):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_example(tmp_path / "brain", SMALL, progress=interrupted)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_features_share_what_they_say():
     rng = np.random.default_rng(0)
     for private, lost in ((0.15, 0.0), (0.15, 0.5), (0.4, 0.25), (0.2, 1.0)):

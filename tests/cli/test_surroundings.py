@@ -1,0 +1,118 @@
+"""What a command makes of the place it is run in: closed streams, full disks, who ends it."""
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tactile_rt.cli import app as cli_app
+from tactile_rt.cli.devices import _about
+from tactile_rt.drivers.codec import SerialCodec
+from tactile_rt.recording import Recording, StreamWriter
+
+CLI = "import sys; sys.argv[0] = 'tactile-rt'; from tactile_rt.cli import main; main()"
+SOURCE = "synthetic:2x1?pace=fast&seconds=1"
+
+
+def shell(words: str, streams: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["sh", "-c", f'"$0" -c "$1" {words} {streams}', sys.executable, CLI],
+        capture_output=True,
+        text=True,
+    )
+
+
+def test_without_any_stream_it_does_its_work(tmp_path):
+    pytest.importorskip("mcap")
+    path = tmp_path / "a.mcap"
+    # Nothing that is opened meanwhile is taken for the output.
+    assert shell(f"record '{SOURCE}' {path}", "<&- >&- 2>&-").returncode == 0
+    assert sum(map(len, Recording(path))) == 1000
+    assert shell("no-such-command", "<&- >&- 2>&-").returncode == 2
+
+
+def test_the_disk_of_its_log_may_be_full():
+    full = shell("run --source 'synthetic:mouse?pace=fast&seconds=1'", "2>/dev/full")
+    assert (full.returncode, full.stderr) == (0, "")
+    assert shell("replay none.mcap", "2>/dev/full").returncode == 2
+
+
+def test_a_full_disk_under_its_output_is_one_line():
+    full = shell(f"describe '{SOURCE}'", ">/dev/full")
+    assert (full.returncode, full.stderr) == (2, "tactile-rt: No space left on device\n")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_who_is_told_to_leave_leaves_nothing_half_written(call, tmp_path, monkeypatch, number):
+    pytest.importorskip("mcap")
+    from tactile_rt.recording import conversion
+
+    call("record", SOURCE, tmp_path / "a.mcap")
+
+    def write(*arguments):
+        arguments[3].write(b"half")
+        os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(conversion, "_write", write)
+    before = signal.getsignal(number)
+    assert call("convert", tmp_path / "a.mcap", tmp_path / "a.csv") == (128 + number, "", "")
+    assert os.listdir(tmp_path) == ["a.mcap"]
+    assert signal.getsignal(number) == before
+
+
+def test_a_recording_is_whole_when_the_terminal_closes(call, tmp_path, monkeypatch):
+    pytest.importorskip("mcap")
+    push = StreamWriter.push
+
+    def push_and_close(writer, chunk):
+        push(writer, chunk)
+        os.kill(os.getpid(), signal.SIGHUP)
+
+    monkeypatch.setattr(StreamWriter, "push", push_and_close)
+    code, _, err = call("record", "synthetic:2x1?pace=fast", tmp_path / "a.mcap")
+    assert (code, err) == (0, "")
+    assert sum(map(len, Recording(tmp_path / "a.mcap"))) > 0
+
+
+def test_what_ignores_hangups_goes_on_ignoring_them():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with cli_app.leaving(None):
+            os.kill(os.getpid(), signal.SIGHUP)
+            went_on = True
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert went_on
+
+
+def test_a_folder_of_others_is_refused_before_the_work(refused, tmp_path, monkeypatch):
+    pytest.importorskip("mcap")
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
+    said = refused("record", "serial:///dev/none?codec=native", tmp_path / "a.mcap")
+    assert f"{tmp_path} may not be written into" in said
+
+
+def test_a_configuration_is_written_whole_or_not(refused, tmp_path, monkeypatch):
+    from tactile_rt import files
+
+    def full(source, target):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(files.os, "replace", full)
+    path = tmp_path / "robot.toml"
+    assert refused("config", "example", path) == (
+        f"tactile-rt: cannot use {path}: No space left on device\n"
+    )
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_codec_without_docstrings_has_not_those_of_its_base():
+    """As all have under `python -OO`, where the bases of the standard library keep theirs."""
+    assert _about(type("Bare", (SerialCodec,), {})) == ""
+    assert _about(type("Told", (SerialCodec,), {"__doc__": "\n    Reads ``x``.\n\n    More."})) == (
+        "Reads x."
+    )
