@@ -117,8 +117,17 @@ def verify(file: File) -> None:
 def bench(
     file: File,
     steps: Annotated[int, typer.Option(min=10, max=1_000_000, help="Steps to time.")] = 2000,
+    engines: Annotated[
+        bool, typer.Option("--engines", help="Compare the installed engines, and keep the best.")
+    ] = False,
 ) -> None:
-    """How fast it is here: size, loading, memory, CPU time of a step, and the machine's limit."""
+    """How fast it is here: size, loading, memory, CPU time of a step, and the machine's limit.
+
+    --engines: CPU time of a step by every engine that is installed (onnxruntime,
+    openvino, openvino-bf16), and how many of its decisions are onnxruntime's. The
+    fastest of which 99.9 % are is kept for this file and machine: whatever runs
+    the model here takes it, unless told otherwise.
+    """
     from tactile_rt.classifier.model_file import read_model
     from tactile_rt.evidence.model_steps import Subject, measure_model
     from tactile_rt.evidence.records import as_table
@@ -126,9 +135,34 @@ def bench(
     card, _, _ = read_model(file)
     if card.kind != "step":
         raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
+    if engines:
+        _engines(file, steps)
+        return
     with Console(stderr=True).status("measuring"):
         records = measure_model(Subject("model", file), steps)
     print_table(as_table(records))
+
+
+def _engines(file: Path, steps: int) -> None:
+    from tactile_rt.classifier.engine_choice import keep_engine
+    from tactile_rt.classifier.engines import ENGINES
+    from tactile_rt.evidence.engines import best_engine, engine_records, measure_engines
+    from tactile_rt.evidence.records import as_table
+    from tactile_rt.stream import ConfigError
+
+    with Console(stderr=True).status("measuring"):
+        found = measure_engines(file, steps)
+    print_table(as_table(engine_records(found, "engines")))
+    missing = {e.package: e.extra for e in ENGINES.values() if not e.version}
+    for package, extra in missing.items():
+        typer.echo(f"{package} is not installed (extra tactile-rt[{extra}]): not compared")
+    best = best_engine(found)
+    try:
+        where = keep_engine(file, best.engine, best.p50)
+    except ConfigError as error:
+        typer.echo(f"{best.engine} is best here, and not kept: {error}", err=True)
+        return
+    typer.echo(f"{best.engine} is kept for this file on this machine, in {where}")
 
 
 def _channels(spec: Any, values: tuple[float, ...]) -> str:
