@@ -12,7 +12,7 @@ from rich.table import Table
 
 from tactile_rt.cli.app import app
 from tactile_rt.cli.tables import STDOUT, Json, print_table, write_json
-from tactile_rt.stream import ModelError
+from tactile_rt.stream import ConfigError, ModelError
 
 model = typer.Typer(help="Look into a model file, check it, time it.", no_args_is_help=True)
 app.add_typer(model, name="model")
@@ -120,13 +120,18 @@ def bench(
     engines: Annotated[
         bool, typer.Option("--engines", help="Compare the installed engines, and keep the best.")
     ] = False,
+    on: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="Compare decisions on this, e.g. replay:FILE.mcap."),
+    ] = None,
 ) -> None:
     """How fast it is here: size, loading, memory, CPU time of a step, and the machine's limit.
 
     --engines: CPU time of a step by every engine that is installed (onnxruntime,
     openvino, openvino-bf16), and how many of its decisions are onnxruntime's. The
     fastest of which 99.9 % are is kept for this file and machine: whatever runs
-    the model here takes it, unless told otherwise.
+    the model here takes it, unless told otherwise. They are compared on touches
+    that are made up, harder than real ones; --on takes a recording of yours.
     """
     from tactile_rt.classifier.model_file import read_model
     from tactile_rt.evidence.model_steps import Subject, measure_model
@@ -136,22 +141,30 @@ def bench(
     if card.kind != "step":
         raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
     if engines:
-        _engines(file, steps)
+        _engines(file, steps, on)
         return
+    if on is not None:
+        raise ConfigError("--on is what engines are compared on: give --engines")
     with Console(stderr=True).status("measuring"):
         records = measure_model(Subject("model", file), steps)
     print_table(as_table(records))
 
 
-def _engines(file: Path, steps: int) -> None:
+def _engines(file: Path, steps: int, on: str | None) -> None:
     from tactile_rt.classifier.engine_choice import keep_engine
     from tactile_rt.classifier.engines import ENGINES
-    from tactile_rt.evidence.engines import best_engine, engine_records, measure_engines
+    from tactile_rt.evidence.engines import (
+        best_engine,
+        decide_stream,
+        engine_records,
+        measure_engines,
+    )
     from tactile_rt.evidence.records import as_table
-    from tactile_rt.stream import ConfigError
 
     with Console(stderr=True).status("measuring"):
         found = measure_engines(file, steps)
+        if on is not None:
+            decide_stream(file, found, on)
     print_table(as_table(engine_records(found, "engines")))
     missing = {e.package: e.extra for e in ENGINES.values() if not e.version}
     for package, extra in missing.items():

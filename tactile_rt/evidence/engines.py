@@ -8,13 +8,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.engines import DEFAULT, ENGINES, open_network
 from tactile_rt.classifier.model_card import ModelCard, decided
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.evidence.records import Record
+from tactile_rt.sources.opening import check_model, open_source
 from tactile_rt.stream import ConfigError, ModelError
 
-__all__ = ["AGREEMENT", "STREAM", "EngineSteps", "best_engine", "engine_records", "measure_engines"]
+__all__ = [
+    "AGREEMENT",
+    "STREAM",
+    "EngineSteps",
+    "best_engine",
+    "decide_stream",
+    "engine_records",
+    "measure_engines",
+]
 
 AGREEMENT = 99.9  # % of decisions, at least, that are onnxruntime's
 WORTH = 0.95  # of onnxruntime's time: what gains less is within what a busy machine does
@@ -31,7 +41,8 @@ class EngineSteps:
         version: The release of its package.
         refused: Why it cannot run the file; empty: it can.
         ms: (turn, step) CPU time of the process for each step, ms.
-        labels: (step of all turns) The decisions, as indices of the card's labels.
+        labels: (decision) The decisions, as indices of the card's labels.
+        stream: What they are about.
         gap: The largest difference of a logit from onnxruntime's, over the spread of those.
     """
 
@@ -41,6 +52,7 @@ class EngineSteps:
     ms: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0)))
     labels: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     gap: float = 0.0
+    stream: str = STREAM
 
     @property
     def p50(self) -> float:
@@ -57,7 +69,9 @@ class EngineSteps:
         return float(np.median(np.median(self.ms, axis=1) / np.median(other.ms, axis=1)))
 
     def agreement(self, other: "EngineSteps") -> float:
-        """Share of decisions that are another's, %."""
+        """Share of decisions that are another's, %; 0 if there is none."""
+        if not len(self.labels):
+            return 0.0
         return float(100 * np.mean(self.labels == other.labels))
 
 
@@ -109,6 +123,34 @@ def measure_engines(path: Path, steps: int) -> list[EngineSteps]:
     return found
 
 
+def decide_stream(path: Path, found: list[EngineSteps], url: str) -> None:
+    """Let the decisions that are compared be those about a stream, of every step.
+
+    Args:
+        path: the ``.onnx`` file.
+        found: the engines, as `measure_engines` gives them; their decisions are replaced.
+        url: of a source that ends, as `tactile-rt run --source` takes it.
+
+    Raises:
+        SpecMismatch: the stream is of another array.
+        ConfigError: there is no such source, it never ends, or nothing is touched in it.
+    """
+    check_model(path, url)
+    with open_source(url) as source:
+        if source.live:
+            raise ConfigError(f"{url} is live: give what ends, such as a recording")
+        chunks = list(source)
+        spec = source.spec
+    for measured in found:
+        if not measured.refused:
+            classifier = Classifier(path, spec, engine=measured.engine)
+            labels = [d.label for chunk in chunks for d in classifier.push(chunk)]
+            known = classifier.card.labels
+            measured.labels, measured.stream = np.array([known.index(x) for x in labels]), url
+    if not len(found[0].labels):
+        raise ConfigError(f"{url}: nothing is touched in it, so nothing is decided")
+
+
 def best_engine(found: list[EngineSteps]) -> EngineSteps:
     """The fastest whose decisions are onnxruntime's; onnxruntime where none is worth it."""
     default = found[0]
@@ -139,7 +181,7 @@ def engine_records(found: list[EngineSteps], prefix: str) -> list[Record]:
             ),
             Record(
                 f"{name}.agreement", e.agreement(default), "%", f">= {AGREEMENT}",
-                f"decisions of onnxruntime, {len(e.labels)} on {STREAM}",
+                f"decisions of onnxruntime, {len(e.labels)} on {e.stream}",
                 f"logits within {e.gap:.1e} of their spread",
             ),
         ]  # fmt: skip

@@ -108,7 +108,7 @@ def test_a_damaged_file_is_one_line_and_stops_nobody(machine, model, how):
     assert classifier.remark.startswith(f"{choices_file()} cannot be read (")
     assert "\n" not in classifier.remark
     if how == "folder":
-        with pytest.raises(ConfigError, match="engines.json cannot be written: "):
+        with pytest.raises(ConfigError, match=r"engines\.json cannot be written: "):
             keep_engine(model, "openvino", 0.25)
     else:
         keep_engine(model, "openvino", 0.25)

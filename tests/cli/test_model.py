@@ -275,6 +275,29 @@ def test_bench_compares_engines_and_keeps_the_best(call, tmp_path, monkeypatch):
     assert "engines.openvino.agreement" in out
 
 
+def test_decisions_are_compared_on_a_recording(call, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    about = shipped_model().with_name("demo.mcap")
+    asked = ("--engines", "--steps", 22, "--on", f"replay:{about}")
+    code, out, err = call("model", "bench", shipped_model(), *asked)
+    assert (code, err) == (0, "")
+    if ENGINES["openvino"].version:
+        assert f"on replay:{about}"[:40] in out.replace("\n", "")
+
+
+@pytest.mark.parametrize(
+    "asked, said",
+    [
+        (("--on", "replay:x.mcap"), "--on is what engines are compared on: give --engines"),
+        (("--engines", "--on", "synthetic:", "--steps", 22), "synthetic: is live: give what ends"),
+        (("--engines", "--on", "nothing:", "--steps", 22), "nothing"),
+    ],
+)
+def test_what_is_no_stream_to_compare_on_is_refused(refused, monkeypatch, asked, said):
+    monkeypatch.setattr("tactile_rt.evidence.engines.check_model", lambda model, url: None)
+    assert said in refused("model", "bench", shipped_model(), *asked)
+
+
 def test_an_engine_that_cannot_be_kept_is_told_and_one_that_is_not_there_too(
     call, tmp_path, monkeypatch
 ):

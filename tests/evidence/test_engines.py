@@ -58,7 +58,7 @@ def test_the_same_stream_is_decided_as_the_file_says(monkeypatch):
             posterior = np.exp(logits / card.temperature)
             expected.append(decided(card, posterior / posterior.sum(), step))
     assert found.labels.tolist() == expected
-    assert len(set(expected)) > 3  # it tells something apart
+    assert len(set(expected)) > 2  # it tells something apart
 
 
 def test_figures_name_the_stream_and_mark_what_disagrees():
