@@ -37,7 +37,7 @@ class Admission:
         finished: Set when the model is there, or refused.
         error: The reason for which the model is refused; None: it is not.
         trial: What the trial found; None before.
-        remark: One line where another engine was kept for it than is to run it; else empty.
+        remark: The reason, a line, for which not the engine runs it that was kept; else empty.
         classifier: The model, warm; None before, and without a stream.
     """
 

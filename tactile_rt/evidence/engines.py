@@ -39,11 +39,11 @@ class EngineSteps:
     Attributes:
         engine: The name of the engine.
         version: The release of its package.
-        refused: Why it cannot run the file; empty: it can.
+        refused: The reason for which the engine cannot run the file; empty if it can.
         ms: (turn, step) CPU time of the process for each step, ms.
         labels: (decision) The decisions, as indices of the card's labels.
-        stream: What they are about.
-        gap: The largest difference of a logit from onnxruntime's, over the spread of those.
+        stream: The name of the stream that the decisions are about.
+        gap: The largest difference of a logit from that of onnxruntime, over the spread of those.
     """
 
     engine: str
