@@ -1,5 +1,6 @@
 import os
 import sys
+import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +11,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 # Dozens of children import the package: they need not compile it, whatever the shell says.
 os.environ["PYTHONDONTWRITEBYTECODE"] = ""
+
+# What this machine's user has measured and kept decides nothing here.
+os.environ["XDG_STATE_HOME"] = os.path.join(tempfile.gettempdir(), "tactile_rt-tests-keep-nothing")
 
 import pytest
 from hypothesis import settings

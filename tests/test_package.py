@@ -16,7 +16,17 @@ ROOT = Path(__file__).parent.parent
 PACKAGE = Path(tactile_rt.__file__).parent
 LINKS = ("drivers", "export", "models", "sim_backend")
 # What a robot has none of.
-HEAVY = ("torch", "mujoco", "trimesh", "scipy", "onnx", "onnxscript", "sklearn", "matplotlib")
+HEAVY = (
+    "torch",
+    "mujoco",
+    "trimesh",
+    "scipy",
+    "onnx",
+    "onnxscript",
+    "sklearn",
+    "matplotlib",
+    "openvino",
+)
 ONBOARD = (
     "calibration", "classifier.classifier", "classifier.contact_point", "classifier.session",
     "cli", "daemon.daemon", "drivers.opening", "recording", "settings", "sources.combined",

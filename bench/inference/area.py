@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.inference.engine_speed import engine_speed
 from bench.inference.window_speed import window_speed
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, shipped_model
@@ -97,12 +98,13 @@ def run(quick: bool) -> list[Record]:
     ]
     shipped = Subject("shipped", shipped_model(), step_ms="<= 2")
     records += measure_model(shipped, 300 if quick else 3000, 5 if quick else 10)
+    records += engine_speed("shipped", shipped.path, 44 if quick else 2000)
     return [*records, *_full_size(quick), *window_speed(quick)]
 
 
 def _full_size(quick: bool) -> list[Record]:
     """Steps of the published networks, and how many of them could be measured."""
-    records, why = [], "random weights"
+    records, measured, why = [], 0, "random weights"
     if quick:
         why = "full size: left out of a quick look"
     else:
@@ -114,8 +116,11 @@ def _full_size(quick: bool) -> list[Record]:
             with tempfile.TemporaryDirectory() as folder:
                 for subject in full_size(Path(folder)):
                     records.append(measure_model(subject, 500))
+                    measured += 1
+                    if subject.name.endswith("fp32"):
+                        records.append(engine_speed(subject.name, subject.path, 264))
                     subject.path.unlink()
-    count = Record("inference.full_size", len(records), f"of {NETWORKS}", how=why)
+    count = Record("inference.full_size", measured, f"of {NETWORKS}", how=why)
     return [*itertools.chain(*records), count]
 
 

@@ -164,7 +164,7 @@ class Classifier:
         engine: The name of the engine in use.
         providers: Names of the execution providers in use, as onnxruntime has them; of other
             engines none.
-        remark: One line where another engine was kept for this model than can run it; else empty.
+        remark: The reason, a line, for which not the engine runs it that was kept; else empty.
 
     Raises:
         ModelError: the file cannot be used, or has no embedding and is asked for one.

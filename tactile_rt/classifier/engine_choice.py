@@ -51,8 +51,8 @@ class EngineChoice(msgspec.Struct, frozen=True):
 
     Attributes:
         engine: The name of the engine.
-        kept: Whether it was measured and kept, rather than asked for, or onnxruntime by default.
-        remark: One line where what was kept is of no use; else empty.
+        kept: Whether the engine was measured and kept, rather than asked for or the default.
+        remark: The reason, a line, for which what was kept is of no use; else empty.
     """
 
     engine: str

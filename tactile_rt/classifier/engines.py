@@ -2,40 +2,23 @@
 
     open_network(path, "openvino") -> Network, card;  Network.bind(inputs, outputs) -> step()
 
-An engine opens a file that was checked and binds it to memory that its user owns: samples, tare
-and state are explicit, nothing is kept between steps but what the buffers hold. What is not
-``onnxruntime`` is imported when it is chosen, never before.
+What is not ``onnxruntime`` is imported when it is chosen, never before.
 """
 
-import importlib
 import importlib.util
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
-import onnxruntime as ort
-from numpy.typing import DTypeLike, NDArray
 
 from tactile_rt.classifier import model_file
 from tactile_rt.classifier.model_card import ModelCard
-from tactile_rt.classifier.runtime import PROVIDERS, device_of
+from tactile_rt.classifier.network import Network, OnnxruntimeNetwork
+from tactile_rt.classifier.runtime import PROVIDERS
 from tactile_rt.extras import install_extra
 from tactile_rt.stream import ConfigError
 
-__all__ = [
-    "DEFAULT",
-    "ENGINES",
-    "Engine",
-    "Network",
-    "OnnxruntimeNetwork",
-    "Tensor",
-    "check_engine",
-    "import_engine",
-    "open_network",
-]
+__all__ = ["DEFAULT", "ENGINES", "Engine", "check_engine", "import_engine", "open_network"]
 
 DEFAULT = "onnxruntime"
 
@@ -45,9 +28,9 @@ class Engine:
     """A runtime in one of its ways to compute.
 
     Attributes:
-        package: What it is imported as, and installed by.
-        extra: The extra of this package that installs it; empty: it is always there.
-        exact: Whether it computes in the precision of the file.
+        package: The name of the package, to import and to install.
+        extra: The extra of this package that installs the engine; empty if it is always there.
+        exact: Whether the engine computes in the precision of the file.
     """
 
     package: str
@@ -72,77 +55,6 @@ ENGINES = {
 }
 
 
-class Tensor:
-    """An array, and what onnxruntime sees: the same memory on the CPU, else a copy on a device."""
-
-    def __init__(self, shape: tuple[int, ...], dtype: DTypeLike, device: str) -> None:
-        self.array: NDArray[Any] = np.zeros(shape, dtype=dtype)
-        self.value = ort.OrtValue.ortvalue_from_numpy(self.array, device, 0)
-        self._apart = device != "cpu"
-
-    def send(self) -> None:
-        """Let the device have what was written to the array."""
-        if self._apart:
-            self.value.update_inplace(self.array)
-
-    def zero(self, lane: int | None = None) -> None:
-        """Zero one lane, or all."""
-        if lane is None:
-            self.array.fill(0)
-        else:
-            if self._apart:
-                self.array[:] = self.value.numpy()
-            self.array[lane] = 0
-        self.send()
-
-
-class Network(Protocol):
-    """A graph that an engine has opened.
-
-    Attributes:
-        batch: The number of lanes that the graph is fixed to; None if it takes any.
-        device: Where its tensors are to be: ``cpu`` or ``cuda``.
-        in_place: Whether a cache may be input and output in one memory.
-        providers: Names of onnxruntime's execution providers in use; of other engines none.
-    """
-
-    batch: int | None
-    device: str
-    in_place: bool
-    providers: tuple[str, ...]
-
-    def bind(
-        self, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]
-    ) -> Callable[[], object]:
-        """A call that takes a step from these inputs to these outputs, again and again. All
-        bindings of a network have tensors of the same shapes."""
-        ...
-
-
-class OnnxruntimeNetwork:
-    """A session of onnxruntime as a `Network`."""
-
-    def __init__(self, session: ort.InferenceSession) -> None:
-        self._session = session
-        batch = session.get_inputs()[0].shape[0]
-        self.batch = batch if isinstance(batch, int) else None
-        self.device = device_of(session)
-        self.providers = tuple(session.get_providers())
-        # How other providers than onnxruntime's own write rows is not known.
-        self.in_place = self.providers == (PROVIDERS["cpu"],)
-
-    def bind(
-        self, inputs: Mapping[str, Tensor], outputs: Mapping[str, Tensor]
-    ) -> Callable[[], object]:
-        binding = self._session.io_binding()
-        for name, tensor in inputs.items():
-            binding.bind_ortvalue_input(name, tensor.value)
-        for name, tensor in outputs.items():
-            binding.bind_ortvalue_output(name, tensor.value)
-        run = self._session.run_with_iobinding
-        return lambda: run(binding)
-
-
 def check_engine(name: str) -> str:
     """The name of an engine, if it can be used here.
 
@@ -161,8 +73,13 @@ def check_engine(name: str) -> str:
 
 
 def import_engine(name: str) -> None:
-    """Import the package of an engine, which may take a second."""
-    importlib.import_module(ENGINES[name].package)
+    """Import what an engine needs, which may take a second.
+
+    Raises:
+        ConfigError: the package cannot be imported.
+    """
+    if name != DEFAULT:
+        from tactile_rt.classifier import openvino_engine  # noqa: F401
 
 
 def open_network(

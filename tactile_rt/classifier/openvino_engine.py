@@ -9,9 +9,9 @@ from typing import Any
 
 import openvino
 
-from tactile_rt.classifier.engines import Network, Tensor
 from tactile_rt.classifier.model_card import ModelCard, one_line
 from tactile_rt.classifier.model_file import check_graph, read_model
+from tactile_rt.classifier.network import Network, Tensor
 from tactile_rt.classifier.runtime import FlushDenormals
 from tactile_rt.stream import ModelError
 

@@ -11,8 +11,8 @@ import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.engines import Network, OnnxruntimeNetwork, Tensor
 from tactile_rt.classifier.model_card import ModelCard
+from tactile_rt.classifier.network import Network, OnnxruntimeNetwork, Tensor
 from tactile_rt.classifier.runtime import FlushDenormals
 from tactile_rt.stream import ConfigError
 

@@ -26,7 +26,7 @@ class Placing:
         size_mm: The largest extent of an object, mm.
         yaw_deg: The turn of an object about z, degrees.
         radius_mm: The radius of the stimuli's arc, mm.
-        step_mm: From a stimulus to the next further one: ``x,y,z``, mm.
+        step_mm: The vector from a stimulus to the next further one: ``x,y,z``, mm.
 
     Raises:
         ConfigError: a value that cannot be.

@@ -15,7 +15,7 @@ from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.classifier.trial import Trial, TrialLimits, try_model
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
 from tactile_rt.daemon.items import Opened
-from tactile_rt.daemon.process import ADMISSION
+from tactile_rt.daemon.threads import ADMISSION
 from tactile_rt.stream import ModelError, TactileError
 
 __all__ = ["Admission", "file_stamp", "model_path"]
@@ -38,7 +38,7 @@ class Admission:
         finished: Set when the model is there, or refused.
         error: The reason for which the model is refused; None: it is not.
         trial: What the trial found; None before.
-        remark: One line where another engine was kept for it than is to run it; else empty.
+        remark: The reason, a line, for which not the engine runs it that was kept; else empty.
         classifier: The model, warm; None before, and without a stream.
     """
 

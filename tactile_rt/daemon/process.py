@@ -19,15 +19,16 @@ from queue import Empty, SimpleQueue
 from types import FrameType
 from typing import TYPE_CHECKING
 
+from tactile_rt.daemon.threads import ADMISSION
+
 if TYPE_CHECKING:
     from tactile_rt.daemon.daemon import Daemon
 
-__all__ = ["ADMISSION", "ExitCode", "leave", "note_signals", "run_daemon"]
+__all__ = ["ExitCode", "leave", "note_signals", "run_daemon"]
 
 SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 OVER = 0  # no signal has this number
 TURN_S = 0.25  # how often the main loop tells that it goes on
-ADMISSION = "tactile-rt admission"  # the name of a thread that loads a model
 LOADED_S = 5.0  # for it to end by itself
 SWITCH_S = 0.001  # how long a thread that computes may keep those waiting that acquire
 

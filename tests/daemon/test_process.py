@@ -16,6 +16,7 @@ import pytest
 from tactile_rt.cli import main
 from tactile_rt.daemon.config import EXAMPLE
 from tactile_rt.daemon.process import SIGNALS
+from tactile_rt.daemon.threads import ADMISSION
 from tests.helpers.waiting import PATIENCE_S, until
 
 RUN = [sys.executable, "-c", "from tactile_rt.cli import main; main()"]
@@ -385,7 +386,7 @@ def test_a_model_that_is_being_loaded_does_not_abort_the_end(monkeypatch, ends):
     from tactile_rt.daemon import process
 
     loaded, left = threading.Event(), []
-    thread = threading.Thread(target=loaded.wait, name=process.ADMISSION, daemon=True)
+    thread = threading.Thread(target=loaded.wait, name=ADMISSION, daemon=True)
     thread.start()
     monkeypatch.setattr(process, "LOADED_S", PATIENCE_S if ends else 0.0)
     monkeypatch.setattr(process.os, "_exit", left.append)
