@@ -398,6 +398,6 @@ def test_the_temporary_file_is_hidden_and_in_the_same_folder(tmp_path: Path) -> 
     """The same file system, or the final rename could not be atomic; hidden from `*.npz`."""
     seen = []
     write_whole(tmp_path / "a.npz", lambda file: seen.append(file.name))
-    (handle,) = seen
-    assert isinstance(handle, int)
+    (path,) = map(Path, seen)
+    assert path.parent == tmp_path and path.name.startswith(".") and path.suffix != ".npz"
     assert listing(tmp_path) == ["a.npz"]

@@ -80,6 +80,8 @@ def choose_engine(model: Path, asked: str = "", providers: Sequence[str] = PLAIN
         return EngineChoice(asked)
     if tuple(providers) != PLAIN:
         return EngineChoice(DEFAULT)
+    if not model.is_file():  # nothing is kept for it, and whoever opens it tells
+        return EngineChoice(DEFAULT)
     try:
         found = _read().get(_key(model))
     except (OSError, msgspec.MsgspecError, ValueError) as error:

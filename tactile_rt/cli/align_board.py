@@ -58,6 +58,7 @@ def fetch_recordings(
     listed: Annotated[
         bool, typer.Option("--list", help="List sizes in bytes, SHA-256 and names; fetch nothing.")
     ] = False,
+    json: Json = None,
 ) -> None:
     """Get what is needed of published recordings, some MB of hundreds of GB, from their archive."""
     from tactile_rt.models.alignment.datasets import find_dataset
@@ -73,9 +74,11 @@ def fetch_recordings(
     if not files:
         raise ConfigError(f"no session of {len(every)} is of {wanted}: --list names them")
     console = Console(stderr=True)
+    check_output(json)
     if listed:
-        for file in files:
-            typer.echo(f"{file.size:11} {file.sha256} {file.path}")
+        if not told_as_json(files, json):
+            for file in files:
+                typer.echo(f"{file.size:11} {file.sha256} {file.path}")
         return
     if folder is None:
         raise ConfigError("name a folder to write to, or give --list")
@@ -93,6 +96,9 @@ def fetch_recordings(
         f"trials; {done.transferred / 1e6:.0f} MB of {size / 1e9:.0f} GB were read",
         highlight=False, soft_wrap=True,
     )  # fmt: skip
+    told_as_json(
+        {"mice": mice, "units": units, "transferred": done.transferred, "files": files}, json
+    )
     if len(files) == len(every) and dataset.counts not in (None, (mice, units)):
         console.print(
             "WARNING: the published analysis is of {} mice and {} units".format(*dataset.counts),

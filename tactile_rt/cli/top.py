@@ -191,7 +191,7 @@ def _sources(now: "Snapshot", before: "Snapshot | None") -> Table:
     )  # fmt: skip
     old = {s.part.name: s.samples for s in before.sources} if before is not None else {}
     for s in now.sources:
-        rate = ""
+        rate = "-"  # of one look it is not known
         if before is not None and s.part.name in old:
             rate = f"{(s.samples - old[s.part.name]) / ((now.t_ns - before.t_ns) / 1e9):.0f}"
         state = _state(s.part)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("onnx")
 
-from tactile_rt.classifier import runtime, stepper
+from tactile_rt.classifier import network, runtime
 from tactile_rt.classifier.classifier import Classification, Classifier, without_bad_samples
 from tactile_rt.classifier.exits import Deadline
 from tactile_rt.classifier.model_file import load_model, shipped_model
@@ -107,8 +107,8 @@ def test_a_device_apart_from_the_cpu_gets_and_gives_the_same(
     options = {"mode": "sliding", "every": 1}
     chunks = stream(signal([(QUIET, 260, 0.1), (300, 360, 0.2)], 360))
     expected = push_all(Classifier(model, SAME_RATE, **options), chunks)
-    made = stepper.ort.OrtValue.ortvalue_from_numpy
-    init = stepper._Tensor.__init__
+    made = network.ort.OrtValue.ortvalue_from_numpy
+    init = network.Tensor.__init__
 
     def apart(self, shape, dtype, device) -> None:
         init(self, shape, dtype, device)
@@ -117,7 +117,7 @@ def test_a_device_apart_from_the_cpu_gets_and_gives_the_same(
             self.value = made(self.copy, "cpu", 0)
             self._apart = True
 
-    monkeypatch.setattr(stepper._Tensor, "__init__", apart)
+    monkeypatch.setattr(network.Tensor, "__init__", apart)
     assert same(push_all(Classifier(model, SAME_RATE, **options), chunks), expected)
 
 

@@ -28,8 +28,8 @@ def unseen(monkeypatch):
     some = load(shipped_model())[1].provenance["unseen_objects"][::120]
     assert len(some) == 3
 
-    def with_some(path):
-        session, card = load(path)
+    def with_some(path, *more):
+        session, card = load(path, *more)
         provenance = {**card.provenance, "unseen_objects": some}
         return session, msgspec.structs.replace(card, provenance=provenance)
 

@@ -127,7 +127,7 @@ def test_killed_at_any_moment_it_loses_the_touch_under_way_at_most(tmp_path):
 
 def test_one_teaches_at_a_time(refused, tmp_path):
     with alone_in(tmp_path / "gestures"):
-        said = refused("teach", "synthetic:2x1", tmp_path / "gestures", "--labels", "press,slide")
+        said = refused("teach", "synthetic:2x1", tmp_path / "gestures", "--classes", "press,slide")
     assert "is in use by process" in said
     assert not (tmp_path / "gestures").exists()
 

@@ -66,7 +66,7 @@ def test_all_that_matters_is_on_one_screen():
 
 def test_rates_are_not_made_up():
     first = text(picture(busy_snapshot(), None))
-    assert "whiskers  streaming      1000     5000" in first
+    assert "whiskers  streaming   -  1000     5000" in first
     # Another process under the same address, or no time between: nothing to divide by.
     assert text(picture(busy_snapshot(), busy_snapshot())) == first
     other = dataclasses.replace(busy_snapshot(), pid=78)

@@ -21,7 +21,9 @@ def ours():
 def test_it_is_what_the_published_code_computes(name, ours):
     found = [digest(part.detach().numpy()) for part in ours[name]]
     exact = name.startswith(("cell", "lars", "rates"))  # in double precision
-    np.testing.assert_allclose(found, STORED[name], rtol=0, atol=1e-12 if exact else 1e-6)
+    # What is in single precision is rounded to 6e-8 of its size, on each processor otherwise.
+    rtol, atol = (0, 1e-12) if exact else (1e-6, 1e-6)
+    np.testing.assert_allclose(found, STORED[name], rtol=rtol, atol=atol)
 
 
 def test_nothing_of_it_is_left_out(ours):

@@ -28,7 +28,7 @@ def lines(form: str) -> bytes:
         ("magX[{a}] magY[{b}]\r\n", "magX=S.bx:1,magY=S.by:1"),
         ("X: {a} uT\r\nY: {b} uT\r\n", "Y=S.y:1,X=S.x:1"),
         ('{{"t": {t}, "f": {{"x": {a}, "y": {b}}}}}\n', "t=time:ms,f.x=S.fx:N,f.y=S.fy:N"),
-        ("left:{a}\tright:{b}\r\n", "T{0..1}.value"),
+        ("left:{a}\tright:{b}\r\n", "left=left.value:1,right=right.value:1"),
         ("{t},{a},kg,\n", "time:ms,T0.value,-"),
     ],
 )

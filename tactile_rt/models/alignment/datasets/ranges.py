@@ -113,8 +113,10 @@ class RangeFile(io.RawIOBase):
                 if answer.status != 206:
                     raise ConfigError(f"the server says {answer.status} {answer.reason or ''}")
                 data = answer.read()
-            finally:
-                answer.close() if answer.status != 206 else answer.release_conn()
+            except ConfigError:
+                answer.close()  # what it still sends would be taken for the next answer
+                raise
+            answer.release_conn()
             if len(data) != end - begin:
                 raise ConfigError(f"{len(data)} bytes came where {end - begin} were asked for")
         except (ConfigError, urllib3.exceptions.HTTPError) as error:
