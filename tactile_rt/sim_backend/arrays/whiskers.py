@@ -250,13 +250,14 @@ class Whisker:
         )
 
 
-def rotation(axis: str, angle: float) -> NDArray[np.float64]:
-    """(3, 3) right-handed rotation by angle (rad) about the x, y or z axis."""
+def rotation(axis: str, angle: float | NDArray[np.float64]) -> NDArray[np.float64]:
+    """(..., 3, 3) right-handed rotations by angles (rad) about the x, y or z axis."""
     i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
-    matrix = np.eye(3)
-    matrix[i, i] = matrix[j, j] = np.cos(angle)
-    matrix[j, i] = np.sin(angle)
-    matrix[i, j] = -matrix[j, i]
+    matrix = np.zeros((*np.shape(angle), 3, 3))
+    matrix[..., 3 - i - j, 3 - i - j] = 1.0
+    matrix[..., i, i] = matrix[..., j, j] = np.cos(angle)
+    matrix[..., j, i] = np.sin(angle)
+    matrix[..., i, j] = -matrix[..., j, i]
     return matrix
 
 

@@ -16,7 +16,6 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.linalg import expm
-from scipy.spatial.transform import Rotation
 
 from tactile_rt.sim_backend.approach import centrelines, faces_right, way_to_contact
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
@@ -187,10 +186,8 @@ class WhiskingHead:
         times = samples.astype(np.float64) * (SAMPLE_MS * 1e-3)
         angles = base_angles(self._drive, times, self.array.whiskers)
         signs, offsets = np.array([1.0, -1.0, 1.0]), np.array([-np.pi / 2, 0.0, np.pi / 2])
-        euler = (angles * signs + offsets).reshape(-1, 3)
-        turned = Rotation.from_euler("ZYX", euler).as_matrix()
-        found: Floats = self._turn @ turned.reshape(*angles.shape[:2], 3, 3)
-        return found
+        z, y, x = np.moveaxis(angles * signs + offsets, -1, 0)
+        return self._turn @ rotation("z", z) @ rotation("y", y) @ rotation("x", x)
 
     def advance(self, samples: int, velocity_mm_s: Sequence[float] | Floats = (0, 0, 0)) -> Stretch:
         """Go and whisk for some samples of 1 ms.

@@ -24,6 +24,7 @@ __all__ = [
     "place",
     "solve_back",
     "solve_forth",
+    "solve_many_forth",
 ]
 
 A = Any  # a contiguous array of float64: what is compiled knows its arguments' types by itself
@@ -268,6 +269,17 @@ def solve_forth(lower: A, n: int, x: A) -> None:
         for k in range(i):
             s -= lower[i, k] * x[k]
         x[i] = s / lower[i, i]
+
+
+@compiled
+def solve_many_forth(lower: A, n: int, count: int, x: A) -> None:
+    """Solve L y = x for as many columns of x, in place."""
+    for i in range(n):
+        for k in range(i):
+            for c in range(count):
+                x[i, c] -= lower[i, k] * x[k, c]
+        for c in range(count):
+            x[i, c] /= lower[i, i]
 
 
 @compiled

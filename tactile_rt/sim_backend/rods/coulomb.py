@@ -17,7 +17,10 @@ __all__ = ["impulses"]
 
 A = Any
 CREEP = 2e-5  # mm/ms: slower slips are held with less than all friction
-MOST_SWEEPS, MOST_ROUNDS = 20, 10
+MOST_SWEEPS = 20
+# For a contact's drag, in the first sweep and in later ones: there the other contacts have yet to
+# settle, and what more rounds would find is lost.
+MOST_ROUNDS, LATER_ROUNDS = 10, 2
 TOLERANCE = 1e-4  # of the largest impulse
 
 
@@ -58,7 +61,7 @@ def impulses(count: int, response: A, free: A, friction: float, drag: A, found: 
                     response[i + 2, i + 2],
                 )
                 d = drag[c]
-                for _ in range(MOST_ROUNDS):
+                for _ in range(LATER_ROUNDS if sweep else MOST_ROUNDS):
                     # Slip under the drag: (1 + d R) slip = w + r n, r what n does to the slip.
                     m11, m12, m22 = 1.0 + d * r11, d * r12, 1.0 + d * r22
                     det = m11 * m22 - m12 * m12

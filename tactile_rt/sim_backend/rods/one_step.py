@@ -13,6 +13,7 @@ from tactile_rt.sim_backend.rods.chains import (
     mass_matrix,
     solve_back,
     solve_forth,
+    solve_many_forth,
 )
 from tactile_rt.sim_backend.rods.compiled import compiled
 from tactile_rt.sim_backend.rods.coulomb import impulses
@@ -83,7 +84,7 @@ def scratch(links: int, n: int) -> Scratch:
         np.zeros((links, 6)),
         np.zeros(MOST_CONTACTS),
         np.empty((wide, 3)),
-        np.empty((wide, n)),
+        np.empty((n, wide)),
         np.empty((wide, wide)),
         np.empty(max(wide, n)),
         np.empty(wide),
@@ -161,7 +162,7 @@ def step(
         for c in range(count):
             link = link_of[segments[c]]
             _directions(normals[c], frames[link], rows[3 * c : 3 * c + 3])
-            reply[3 * c : 3 * c + 3, :n] = 0.0
+            reply[:, 3 * c : 3 * c + 3] = 0.0
             for k in range(2 * (link + 1 - clamped)):
                 b = clamped + k // 2
                 r0, r1, r2 = (
@@ -173,7 +174,9 @@ def step(
                 j1 = axes[k, 2] * r0 - axes[k, 0] * r2
                 j2 = axes[k, 0] * r1 - axes[k, 1] * r0
                 for i in range(3 * c, 3 * c + 3):
-                    reply[i, k] = j0 * rows[i, 0] + j1 * rows[i, 1] + j2 * rows[i, 2]
+                    reply[k, i] = j0 * rows[i, 0] + j1 * rows[i, 1] + j2 * rows[i, 2]
+        solve_many_forth(lower, n, 3 * count, reply)
+        for c in range(count):
             # what the base's own motion gives the point, less the object's
             r0, r1, r2 = (
                 points[c, 0] - nodes[0, 0],
@@ -184,18 +187,17 @@ def step(
             u1 = base[0, 1] + base[1, 2] * r0 - base[1, 0] * r2 - surface[1]
             u2 = base[0, 2] + base[1, 0] * r1 - base[1, 1] * r0 - surface[2]
             for i in range(3 * c, 3 * c + 3):
-                solve_forth(lower, n, reply[i])
                 s = rows[i, 0] * u0 + rows[i, 1] * u1 + rows[i, 2] * u2
                 for k in range(n):
-                    s += reply[i, k] * move[k]
+                    s += reply[k, i] * move[k]
                 free[i] = s
             free[3 * c] += max(gaps[c], 0.0) / h
         for i in range(3 * count):
-            for j in range(i + 1):
-                s = 0.0
-                for k in range(n):
-                    s += reply[i, k] * reply[j, k]
-                response[i, j], response[j, i] = s, s
+            for j in range(3 * count):
+                response[i, j] = 0.0
+            for k in range(n):
+                for j in range(3 * count):
+                    response[i, j] += reply[k, i] * reply[k, j]
         for c in range(count):
             # begin from the last step's, of the contact on the same link
             link = link_of[segments[c]]
@@ -221,7 +223,7 @@ def step(
                     f1 += rows[i, 1] * found[i] / h
                     f2 += rows[i, 2] * found[i] / h
                     for k in range(n):
-                        move[k] += reply[i, k] * found[i]
+                        move[k] += reply[k, i] * found[i]
             pushed[link, 0] += f0
             pushed[link, 1] += f1
             pushed[link, 2] += f2
@@ -258,7 +260,11 @@ def _out(
     n = len(q)
     gaps, points, nodes = near.gaps, near.points, pose.nodes
     lower, rows, reply, response = room.lower, room.rows, room.reply, room.response
-    free, found = room.free, room.found
+    free, found, turned = room.free, room.found, room.move
+    for k in range(n):  # J v = (L^-1 J')' L' v
+        turned[k] = 0.0
+        for j in range(k, n):
+            turned[k] += lower[j, k] * v[j]
     # free: how far each contact will still be inside after the step, mm
     for c in range(count):
         i = 3 * c
@@ -269,12 +275,8 @@ def _out(
         u1 = base[0, 1] + base[1, 2] * r0 - base[1, 0] * r2 - surface[1]
         u2 = base[0, 2] + base[1, 0] * r1 - base[1, 1] * r0 - surface[2]
         s = rows[i, 0] * u0 + rows[i, 1] * u1 + rows[i, 2] * u2
-        # J v = (L^-1 J')' L' v
         for k in range(n):
-            x = 0.0
-            for j in range(k, n):
-                x += lower[j, k] * v[j]
-            s += reply[i, k] * x
+            s += reply[k, i] * turned[k]
         free[c] = gaps[c] + h * s
         found[c] = 0.0
     for _ in range(OUT_SWEEPS):
@@ -292,7 +294,7 @@ def _out(
         free[k] = 0.0
     for c in range(count):
         for k in range(n):
-            free[k] += reply[3 * c, k] * found[c]
+            free[k] += reply[k, 3 * c] * found[c]
     solve_back(lower, n, free)
     for k in range(n):
         q[k] += free[k]
