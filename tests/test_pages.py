@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import tactile_rt
+from tests.helpers.commands import commands, options_of
 from tests.helpers.followed_page import Block, blocks, check_printed, follow
 from tests.helpers.source_tree import ROOT
 
@@ -95,6 +96,40 @@ def test_no_link_leads_nowhere(page: Path) -> None:
         elif anchor and there.suffix == ".md" and anchor not in anchors(there):
             dead.append(target)
     assert dead == []
+
+
+# commands
+
+CALL = re.compile(r"(?<![\w./-])tactile-rt((?: +[^\s|;&>`#)]+)*)")
+DECIDED = ROOT / "docs" / "decisions"  # what was said then
+
+
+@pytest.mark.parametrize(
+    "page",
+    [p for p in PAGES if DECIDED not in p.parents and p.name != "CHANGELOG.md"],
+    ids=lambda p: p.relative_to(ROOT).as_posix(),
+)
+def test_every_command_of_a_page_is_there_with_its_options(page: Path) -> None:
+    every = commands()
+    groups = {name.partition(" ")[0] for name in every if " " in name}
+    wrong = []
+    for call in CALL.findall(page.read_text("utf-8").replace("\\\n", " ")):
+        words = call.split()
+        names = [w for w in words if re.fullmatch(r"[a-z][a-z0-9-]*", w)][:2]
+        name = " ".join(names) if names and names[0] in groups else "".join(names[:1])
+        asked = [w.partition("=")[0] for w in words if w.startswith("--")]
+        if (words and words[0].startswith("-")) or not names or words[0] != names[0]:
+            continue  # of the program itself, or prose
+        if name in groups:
+            continue  # all of its commands
+        if name not in every:
+            wrong.append(f"{call.strip()}: no command {name!r}")
+            continue
+        known = {*options_of(every[name]), "--help"} | {
+            o for p in every[name].params for o in p.secondary_opts
+        }
+        wrong += [f"{call.strip()}: no option {one}" for one in asked if one not in known]
+    assert wrong == []
 
 
 # the site
