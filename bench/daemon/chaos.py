@@ -138,9 +138,11 @@ KINDS: dict[str, tuple[Callable[[DisturbedDaemon, int], float], Expected, float,
         1.0, "read again to the publisher running",
     ),
     "peer_gone": (_lose_peer, {}, 1.0, "the next subscriber to its first message"),
-    "clock": (_step_clock, {("daemon", "clock"): ONCE}, 0.5, "stepped by an hour, to told"),
+    "clock": (
+        _step_clock, DAEMON | {("daemon", "clock"): ONCE}, 0.5, "stepped by an hour, to told",
+    ),
     "page_flooded": (
-        _flood, {}, 1.0, f"{FLOOD} connections closed to the page served again",
+        _flood, DAEMON, 1.0, f"{FLOOD} connections closed to the page served again",
     ),
 }  # fmt: skip
 
@@ -203,10 +205,18 @@ def _starved(scene: DisturbedDaemon, since: int, expected: Expected) -> bool:
 
 
 def _unexpected(scene: DisturbedDaemon, since: int, expected: Expected) -> list[str]:
-    """What was told too often, not at all, or though nothing of it was to be told."""
+    """What was told too often, not at all, or though nothing of it was to be told.
+
+    That the daemon is degraded is told for each reason: lost, then late, then behind.
+    """
     counts: dict[tuple[str, str], int] = {}
+    reasons: set[str] = set()
     for told in scene.all_told(since):
         key = (told.part, told.state)
+        if key == ("daemon", "degraded"):
+            if told.reason not in reasons and key in counts:
+                counts[key] -= 1
+            reasons.add(told.reason)
         counts[key] = counts.get(key, 0) + 1
     wrong = []
     for key in {*counts, *expected}:

@@ -39,6 +39,19 @@ HEAD: Final = 16_384  # bytes that tell the form
 MOSTLY: Final = 0.8  # of the lines at the beginning are of the form
 BLF: Final = b"LOGG"
 GZIP: Final = b"\x1f\x8b"
+# What is neither a log nor a text, by its first bytes, and how it becomes one.
+OTHERS: Final = {
+    b"\x93NUMPY": "an array of NumPy: write it as a table, as numpy.savetxt does",
+    b"PK\x03\x04": "a zip archive, as .npz and .xlsx are: write a table of it as text; "
+    "`tactile-rt convert` reads an .npz of ours",
+    b"\x89HDF\r\n": "an HDF5 file: write a table of it as text; `tactile-rt convert` reads ours",
+    b"MATLAB 5.0": "a file of MATLAB: write a table of it, as writematrix does",
+    b"PAR1": "a Parquet file: write a table of it, as DataFrame.to_csv does",
+    b"MDF     ": "a measurement file (MDF): asammdf writes its groups as CSV",
+    b"UnFinMF ": "a measurement file (MDF) that was not finished: asammdf writes it as CSV",
+    b"\xd4\xc3\xb2\xa1": "a capture of packets (pcap): tshark writes a bus's frames as text",
+    b"\n\r\r\n": "a capture of packets (pcapng): tshark writes a bus's frames as text",
+}
 OF_PYTHON_CAN: Final = "timestamp,arbitration_id,extended,remote,error,dlc,data"
 OF_SAVVYCAN: Final = "time stamp,id,extended,"
 FALLING: Final = 0.2  # of the times of candump -td are less than the one before
@@ -208,10 +221,16 @@ def open_log_file(path: Path) -> BufferedReader:
     """A file to read, unpacked if it is of gzip; what is cut short or damaged ends where it does.
 
     Raises:
+        ConfigError: it is known to be no log and no table.
         OSError: it cannot be read, or is a pipe or device.
     """
     file = open_regular(path)
-    packed = file.read(len(GZIP)) == GZIP
+    begins = file.read(max(map(len, OTHERS)))
+    for magic, what in OTHERS.items():
+        if begins.startswith(magic):
+            file.close()
+            raise ConfigError(f"{path} is {what}")
+    packed = begins.startswith(GZIP)
     file.seek(0)
     return BufferedReader(_Unpacked(file)) if packed else cast(BufferedReader, file)
 

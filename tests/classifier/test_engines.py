@@ -104,7 +104,10 @@ def test_an_engine_that_is_not_there_is_told_with_what_installs_it(monkeypatch) 
     with pytest.raises(ConfigError, match="no engine 'tpu'; there are onnxruntime, openvino"):
         check_engine("tpu")
     monkeypatch.setattr(Engine, "version", property(lambda engine: ""))
-    with pytest.raises(ConfigError, match=r"^engine 'openvino' needs .*, which is not installed: .*pip install .*openvino"):
+    with pytest.raises(
+        ConfigError,
+        match=r"^engine 'openvino' needs .*, which is not installed: .*pip install .*openvino",
+    ):
         Classifier(shipped_model(), CARD.array, engine="openvino")
 
 

@@ -186,3 +186,20 @@ def test_what_is_no_file_or_form_is_refused(tmp_path):
         read_log(tmp_path / "none")
     with pytest.raises(ConfigError, match="no form 'pcap' of a log"):
         read_log(written(tmp_path / "a.log"), "pcap")
+
+
+@pytest.mark.parametrize(
+    ("begins", "said"),
+    [
+        (b"\x93NUMPY\x01\x00", "is an array of NumPy: write it as a table"),
+        (b"PK\x03\x04", "is a zip archive"),
+        (b"\x89HDF\r\n\x1a\n", "is an HDF5 file"),
+        (b"MDF     4.10", "is a measurement file"),
+        (b"\n\r\r\n", "is a capture of packets"),
+    ],
+)
+def test_what_is_known_to_be_no_log_says_what_it_is(tmp_path, begins, said):
+    path = tmp_path / "x.bin"
+    path.write_bytes(begins + bytes(64))
+    with pytest.raises(ConfigError, match=f"x.bin {said}"):
+        read_log(path)

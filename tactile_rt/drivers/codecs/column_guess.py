@@ -26,7 +26,8 @@ Rows = Sequence[Sequence[float | None]]
 
 _TIME: Final = re.compile(
     r"(?:%|.*[._ ])?"
-    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed|x_value)"
+    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed|x_value"
+    r"|zeit|zeitstempel|temps|tiempo|tempo|tijd|tid)"
     r"(?:[_ ]?(?:s|sec|ms|us|µs|ns|nsec))?", re.IGNORECASE,
 )  # fmt: skip
 _COUNT: Final = re.compile(
