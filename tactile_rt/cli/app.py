@@ -23,6 +23,7 @@ __all__ = [
     "Pace",
     "Seconds",
     "app",
+    "check_new",
     "check_output",
     "leaving",
     "needs",
@@ -136,6 +137,27 @@ def check_output(file: Path | None) -> None:
         raise ConfigError(f"{file} is a folder: name a file to write")
     if not os.access(file.parent, os.W_OK | os.X_OK):
         raise ConfigError(f"{file} cannot be written: {file.parent} may not be written into")
+
+
+def check_new(file: Path, force: bool) -> None:
+    """Refuse to write a recording over a file that is there, or that is just being recorded.
+
+    Args:
+        file: the recording to write.
+        force: whether one that is there is to be replaced.
+
+    Raises:
+        ConfigError: as `check_output`; it is there, and not to be replaced; or some process is
+            recording into it.
+    """
+    check_output(file)
+    if not file.exists():
+        return
+    if not force:
+        raise ConfigError(f"{file} is there already: name another file, or give --force")
+    from tactile_rt.recording.writer import check_not_recorded
+
+    check_not_recorded(file)
 
 
 def needs(extra: str, error: ModuleNotFoundError) -> TactileError:

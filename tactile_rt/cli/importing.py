@@ -7,7 +7,7 @@ from urllib.parse import parse_qsl
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, starting
+from tactile_rt.cli.app import app, check_new, check_output, starting
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import ConfigError
@@ -60,10 +60,8 @@ def import_file(
     output = output or Path(f"{log.name.partition('.')[0] or 'import'}.mcap")
     if output.suffix != ".mcap":
         raise ConfigError(f"{output}: a recording is a .mcap; `tactile-rt convert` makes others")
-    for file in (output, json):
-        check_output(file)
-    if output.exists() and not force:
-        raise ConfigError(f"{output} is there already: name another file, or give --force")
+    check_output(json)
+    check_new(output, force)
     if decimal not in ("", ",", "."):
         raise ConfigError(f"--decimal is , or ., not {decimal!r}")
     with starting(), working(Console(stderr=True), f"reading {log}"):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
+from tactile_rt.cli.app import Seconds, app, check_new, check_output, leaving, starting
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.settings import no_such
@@ -57,8 +57,8 @@ def record(
     for file in (output, json):
         check_output(file)
     rotated = rotate_mb or rotate_s  # which writes over nothing
-    if output.exists() and not force and not rotated:  # before a device is opened and started
-        raise ConfigError(f"{output} is there already: name another file, or give --force")
+    if not rotated:  # before a device is opened and started
+        check_new(output, force)
     session = _notes(note or [])
     with starting():
         opened = open_source(source)
@@ -206,9 +206,7 @@ def convert(
         raise ConfigError("name a recording and what to write, or say what --to")
     recording, output = files
     for file in outputs_of(output):
-        check_output(file)
-        if file.exists() and not force:
-            raise ConfigError(f"{file} is there already: name another file, or give --force")
+        check_new(file, force)
     with working(console, f"converting {recording}"):
         samples = converted(recording, output, episode)
     _tell({"output": output, "samples": samples}, json)

@@ -12,7 +12,7 @@ from tactile_rt.recording.layout import is_message, need_mcap
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC, read_whole_records
 from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, is_in_file_form, name_of, plain
-from tactile_rt.recording.writer import McapFile
+from tactile_rt.recording.writer import McapFile, check_not_recorded
 from tactile_rt.stream import ConfigError, RecordingError
 
 if TYPE_CHECKING:
@@ -37,8 +37,8 @@ def recover(path: str | Path, output: str | Path | None = None, force: bool = Fa
         The new file; `path` itself if it is whole.
 
     Raises:
-        ConfigError: there is no such file, the output is there already, or the extra is not
-            installed.
+        ConfigError: there is no such file, the output is there already or is being recorded right
+            now, or the extra is not installed.
         RecordingError: it is no recording, or nothing in it is whole.
     """
     need_mcap()
@@ -51,6 +51,7 @@ def recover(path: str | Path, output: str | Path | None = None, force: bool = Fa
         raise ConfigError(f"{output} is there already: name another file, or force it")
     if output.resolve() == path.resolve():
         raise ConfigError(f"{output} is the damaged file itself: name another")
+    check_not_recorded(output)
     with open_regular(path) as file:
         if file.read(len(MAGIC)) != MAGIC:
             raise RecordingError(f"{path} is not an MCAP file, or was cut before it began")

@@ -14,6 +14,7 @@ daemon's recorder.
 """
 
 import errno
+import fcntl
 import os
 import secrets
 import time
@@ -48,9 +49,9 @@ from tactile_rt.recording.layout import (
 from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, FileForm
 from tactile_rt.recording.syncing import Extent, Syncer
 from tactile_rt.ros2.definitions import schema_text
-from tactile_rt.stream import Source
+from tactile_rt.stream import ConfigError, Source
 
-__all__ = ["PART", "McapFile", "RecordingWriter", "WriterStats"]
+__all__ = ["PART", "McapFile", "RecordingWriter", "WriterStats", "check_not_recorded"]
 
 SEQUENCES = 1 << 32
 PART = ".mcap.part"  # ends the name of a file until it says what it is of
@@ -168,6 +169,7 @@ class RecordingWriter:
 
     Raises:
         FileExistsError: there is such a file.
+        ConfigError: it is to be replaced, and is being recorded right now.
         OSError: it cannot be written.
     """
 
@@ -193,8 +195,13 @@ class RecordingWriter:
         self._syncer, self._waiting, self._name_synced = syncer, False, False
         target = path.resolve() if force else path  # a link is followed, not replaced
         special = force and target.exists() and not target.is_file()  # a pipe, /dev/null
+        if force:
+            check_not_recorded(path)
         hidden = target if special else _hidden(target, force)
         self._raw = _create(hidden, special)
+        if not special:
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
         try:
             self._file = McapFile(self._raw, about)
             for packet, t_ns in prelude if about.wire else ():
@@ -302,6 +309,8 @@ class RecordingWriter:
             try:
                 self._sync_soon(last=True)
             finally:
+                with suppress(OSError):  # the syncer may hold a duplicate for some time yet
+                    fcntl.flock(self._raw, fcntl.LOCK_UN)
                 self._raw.close()
         if self._syncer is None and self.failed is not None:
             raise self.failed
@@ -349,6 +358,33 @@ def _changing(health: Health | None) -> tuple[Any, ...]:
         health.state, health.connections, health.clock_steps, health.counter_resets, health.status,
         health.can_errors,
     )  # fmt: skip
+
+
+def check_not_recorded(path: Path) -> None:
+    """Refuse to replace a file that a `RecordingWriter` of any process has open.
+
+    It is told by the lock that the writer has on the file itself, which ends with the writer,
+    however it ends, and goes where the file is moved to.
+
+    Raises:
+        ConfigError: it is being recorded.
+    """
+    if not path.is_file():
+        return
+    try:
+        handle = os.open(path, os.O_RDONLY)
+    except OSError:
+        return
+    try:
+        fcntl.flock(handle, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise ConfigError(
+            f"{path} is being recorded right now: name another file, or end that first"
+        ) from None
+    except OSError:  # a file system without locks
+        return
+    finally:
+        os.close(handle)
 
 
 def _hidden(path: Path, force: bool) -> Path:

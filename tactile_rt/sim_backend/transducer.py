@@ -10,7 +10,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from tactile_rt.sensor_spec import FIELD, MagnetSpec, SensorSpec
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
@@ -110,6 +109,8 @@ class Transducer:
         """
         readings = self._readings(chunk.values.astype(np.float64))
         if self._sensor.bandwidth_hz:
+            from scipy.signal import lfilter  # which takes longer to import than all else here
+
             keeps = self._keeps
             if self._passed is None:  # as it is now for ever before
                 self._passed = keeps * readings[:1]

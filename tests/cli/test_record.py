@@ -138,6 +138,39 @@ def test_a_file_that_is_there_is_not_written_over(call, path):
 
 
 @pytest.mark.parametrize(
+    "again",
+    [
+        ("record", SOURCE, "run.mcap"),
+        ("recover", "cut.mcap", "--out", "run.mcap"),
+        ("convert", "whole.npz", "run.mcap"),
+        ("import", "table.csv", "run.mcap", "--columns", "S.fx:N", "--rate", "10"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_what_another_process_is_recording_is_not_replaced(
+    again, call, refused, path, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "table.csv").write_text("1\n2\n3\n")
+    assert call("record", SOURCE, "whole.mcap")[0] == 0
+    assert call("convert", "whole.mcap", "whole.npz")[0] == 0
+    (tmp_path / "cut.mcap").write_bytes((tmp_path / "whole.mcap").read_bytes()[:-200])
+    there = sorted(tmp_path.iterdir())
+    other = start("record", "synthetic:2x3", path)
+    try:
+        assert "samples" in other.stderr.readline()  # it is at it
+        said = f"tactile-rt: {path.name} is being recorded right now: "
+        assert refused(*again, "--force").startswith(said)
+    finally:
+        other.send_signal(signal.SIGINT)
+        out, _ = other.communicate()
+    assert other.returncode == 0
+    assert f"{samples(path)} samples" in out  # and nothing of it is lost
+    assert sorted(tmp_path.iterdir()) == sorted([*there, path])
+    assert call(*again, "--force")[0] == 0  # now that it has ended
+
+
+@pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (("record", SOURCE, "none/x.mcap"), "no folder none to write x.mcap in"),
