@@ -106,7 +106,7 @@ def of_gvret(line: str) -> Found:
 
 
 def of_busmaster(line: str) -> Found:
-    """A line of a log of BUSMASTER, in its hexadecimal or decimal mode, with the time of the day."""
+    """A line of a log of BUSMASTER, hexadecimal or decimal, with the time of the day."""
     found = _BUSMASTER.fullmatch(line)
     if found is None:
         return None
