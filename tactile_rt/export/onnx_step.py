@@ -7,13 +7,11 @@ trained.
 
 import hashlib
 import logging
-import os
 import platform
-import tempfile
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import msgspec
 import numpy as np
@@ -30,6 +28,7 @@ from tactile_rt.classifier.onnx_check import graph_sha256
 from tactile_rt.export.precision import Precision, in_precision
 from tactile_rt.export.streaming import streaming
 from tactile_rt.export.windows import window_graph
+from tactile_rt.files import write_whole
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.training import TactileClassifier, load_checkpoint
 from tactile_rt.stream import ModelError
@@ -260,7 +259,11 @@ def write_model(
     precision: Precision = "fp32",
     kind: Kind = "step",
 ) -> ModelCard:
-    """Write what `step_graph` made, in a precision, as `export_step` says."""
+    """Write what `step_graph` made, in a precision, as `export_step` says.
+
+    Raises:
+        OSError: naming `path`: its folder cannot be written into, or the medium is full.
+    """
     (embedding,) = (o.type.tensor_type.shape for o in proto.graph.output if o.name == "embedding")
     card = msgspec.structs.replace(
         card,
@@ -272,10 +275,10 @@ def write_model(
         opset=OPSET,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, partial_name = tempfile.mkstemp(dir=path.parent, suffix=".partial")
-    os.close(handle)
-    partial = Path(partial_name)
-    try:
+
+    def fill(file: BinaryIO) -> None:
+        nonlocal card
+        partial = Path(file.name)  # written again and again, as what is found out goes into it
         if kind == "window":
             card = msgspec.structs.replace(card, state=(), kind="window")
         form = window_graph(proto, state) if kind == "window" else proto
@@ -300,10 +303,8 @@ def write_model(
         hashes = {**card.hashes, "graph": graph_sha256(partial.read_bytes())}
         card = msgspec.structs.replace(card, figures=figures, probe=probe, hashes=hashes)
         _write(form, card, partial)
-        os.chmod(partial, 0o644)
-        os.replace(partial, path)
-    finally:
-        partial.unlink(missing_ok=True)
+
+    write_whole(path, fill)
     return card
 
 

@@ -17,6 +17,7 @@ from tactile_rt.classifier.model_runs import file_outputs
 from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.export.precision import Precision
 from tactile_rt.export.promises import fitted_rules
+from tactile_rt.files import write_whole
 from tactile_rt.models.checkpoint_files import NETWORK
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
@@ -175,9 +176,7 @@ def _described(path: Path, card: ModelCard, figures: dict[str, float]) -> ModelC
     card = msgspec.structs.replace(card, figures={**card.figures, **figures})
     proto = onnx.load(path)
     onnx.helper.set_model_props(proto, {METADATA_KEY: msgspec.json.encode(card).decode()})
-    partial = path.with_suffix(".partial")
-    onnx.save(proto, partial)
-    partial.replace(path)
+    write_whole(path, lambda file: onnx.save(proto, file))
     return card
 
 

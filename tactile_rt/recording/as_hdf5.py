@@ -4,11 +4,12 @@ Beside the arrays it names the axes of `values`: ``elements``, ``channels`` and 
 attributes ``frame`` (of mounting), ``rate_hz`` and ``utc_offset_ns``. It needs the extra ``hdf5``.
 """
 
+import io
 import os
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from tactile_rt.extras import lacking
 from tactile_rt.recording.as_arrays import (
@@ -24,6 +25,9 @@ from tactile_rt.recording.as_arrays import (
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.layout import Raw
 from tactile_rt.stream import Chunk, RecordingError, TactileError, concatenate
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 __all__ = ["need_h5py", "read_hdf5", "write_hdf5"]
 
@@ -49,15 +53,16 @@ def write_hdf5(what: str, about: Description, raws: Iterable[Raw], file: BinaryI
     Raises:
         ConfigError: the extra is not installed.
         RecordingError: there is no sample.
+        OSError: the disk is full.
     """
     h5py = need_h5py()
     told, spec, n = Told(), about.spec, 0
-    # The library reads again what it has written.
-    with os.fdopen(os.dup(file.fileno()), "r+b") as both, h5py.File(both, "w") as made:
+    with _Patient(os.dup(file.fileno()), "r+b") as patient, h5py.File(patient, "w") as made:
         for block in _blocks(told.chunks(spec, raws)):
             for name in COLUMNS:
                 _append(made, name, getattr(block, name), n)
             n += len(block)
+            patient.check()
         if not n:
             raise RecordingError(f"{what} has no samples")
         text = h5py.string_dtype()
@@ -70,6 +75,40 @@ def write_hdf5(what: str, about: Description, raws: Iterable[Raw], file: BinaryI
         made.create_dataset(ABOUT, data=about_text(about), dtype=text)
         made.attrs.update(frame=spec.frame, rate_hz=spec.rate_hz, utc_offset_ns=about.utc_offset_ns)
     return n
+
+
+class _Patient(io.FileIO):
+    """A file that tells of a full disk when the library is done with it, not in its midst.
+
+    HDF5 would tell of every piece that it cannot write, in dozens of lines each.
+    """
+
+    def __init__(self, handle: int, mode: str) -> None:
+        super().__init__(handle, mode)
+        self._failed: OSError | None = None
+
+    def check(self) -> None:
+        """Tell what has failed.
+
+        Raises:
+            OSError: something could not be written.
+        """
+        if self._failed is not None:
+            raise self._failed
+
+    def write(self, data: "ReadableBuffer") -> int:
+        left = memoryview(data).cast("B")
+        size = len(left)
+        try:
+            while left and self._failed is None:
+                left = left[super().write(left) :]
+        except OSError as error:
+            self._failed = error
+        return size
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+        self.check()
 
 
 def _append(made: Any, name: str, data: Any, n: int) -> None:

@@ -46,6 +46,32 @@ def test_a_full_disk_under_its_output_is_one_line():
     assert (full.returncode, full.stderr) == (2, "tactile-rt: No space left on device\n")
 
 
+@pytest.mark.parametrize(
+    ("words", "made", "needs"),
+    [
+        ("convert a.mcap a.h5", "a.h5", "h5py"),
+        ("convert a.mcap a.npz", "a.npz", "mcap"),
+        ("convert a.mcap bag --to ros2", "bag", "mcap"),
+        ("align example brain", "brain", "h5py"),
+    ],
+)
+def test_what_finds_no_room_is_named_and_not_left(call, tmp_path, monkeypatch, words, made, needs):
+    pytest.importorskip("mcap")
+    pytest.importorskip(needs)
+    monkeypatch.chdir(tmp_path)
+    call("record", SOURCE, "a.mcap")
+    # No file may be larger than 4 KiB: to who writes it is as a disk that is full.
+    full = subprocess.run(
+        ["bash", "-c", f'ulimit -f 4; exec "$0" -c "$1" {words}', sys.executable, CLI],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},  # or halves of it would be kept
+    )
+    said = f"tactile-rt: cannot use {made}: File too large\n"
+    assert (full.returncode, full.stdout, full.stderr) == (2, "", said)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+
+
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_who_is_told_to_leave_leaves_nothing_half_written(call, tmp_path, monkeypatch, number):
     pytest.importorskip("mcap")

@@ -1,5 +1,7 @@
+import errno
 import hashlib
 import json
+import os
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -477,11 +479,13 @@ def test_a_disk_that_fills_up_leaves_nothing(
     replay(monkeypatch, exported.proto)
 
     def fail(*_: object) -> None:
-        raise OSError("no space left on device")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # which names no file
 
     monkeypatch.setattr(onnx, "save", fail)
-    with pytest.raises(OSError, match="no space"):
-        export_step(exported.model, exported.card, tmp_path / "m.onnx")
+    path = tmp_path / "m.onnx"
+    with pytest.raises(OSError, match="No space left on device") as full:
+        export_step(exported.model, exported.card, path)
+    assert full.value.filename == str(path)
     assert list(tmp_path.iterdir()) == []
 
 

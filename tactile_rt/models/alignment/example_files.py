@@ -11,6 +11,7 @@ import json
 import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,6 +66,7 @@ def write_example(
     Raises:
         ConfigError: the folder is there, or the seed is below 0.
         ModuleNotFoundError: h5py is not installed.
+        OSError: naming `folder`: the medium is full.
     """
     import h5py
 
@@ -88,8 +90,10 @@ def write_example(
             for j in range(brain.sessions):
                 path = home / f"sub-{name}_ses-{j + 1}_behavior+ecephys.nwb"
                 rates = brain.rates(mice, features, brain.units)
-                with h5py.File(path, "w") as file:
+                whole = BytesIO()  # of a full disk HDF5 tells in dozens of lines, and no OSError
+                with h5py.File(whole, "w") as file:
                     _session(file, mice, name, rates, brain.trials)
+                path.write_bytes(whole.getbuffer())
                 progress((k * brain.sessions + j + 1) / (brain.mice * brain.sessions))
         told = {"brain": asdict(brain), "seed": seed, "lost": MODELS, "shared": shared.tolist()}
         (made / "truth.json").write_text(json.dumps(told, indent=1) + "\n")
