@@ -99,7 +99,7 @@ def test_a_recording_is_whole_when_the_terminal_closes(call, tmp_path, monkeypat
         os.kill(os.getpid(), signal.SIGHUP)
 
     monkeypatch.setattr(StreamWriter, "push", push_and_close)
-    code, _, err = call("record", "synthetic:2x1?pace=fast", tmp_path / "a.mcap")
+    code, _, err = call("record", "synthetic:2x1?pace=fast&seconds=60", tmp_path / "a.mcap")
     assert (code, err) == (0, "")
     assert sum(map(len, Recording(tmp_path / "a.mcap"))) > 0
 
