@@ -7,7 +7,8 @@ import io
 import os
 import signal
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -25,24 +26,41 @@ def main() -> None:
         from tactile_rt.daemon.process import note_signals
 
         note_signals()
-    # Who is told to leave does so as by Ctrl-C: what is half-written is taken away.
-    ours = [s for s in (signal.SIGTERM, signal.SIGHUP) if signal.getsignal(s) == signal.SIG_DFL]
-    for number in ours:
-        signal.signal(number, _leave)
+    with _signals() as told:
+        _run(told)
+
+
+@contextmanager
+def _signals() -> Iterator[list[int]]:
+    """Let Ctrl-C, SIGTERM and SIGHUP alike end the block, so that what is half-written is taken
+    away; gives the signals that have come."""
+    told: list[int] = []
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        told.append(number)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        _leave(number)
+
+    untouched = signal.SIG_DFL, signal.default_int_handler
+    alike = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    before = {s: signal.getsignal(s) for s in alike if signal.getsignal(s) in untouched}
+    for number in before:
+        signal.signal(number, leave)
     try:
-        _run()
+        yield told
     except KeyboardInterrupt:
         _leave(signal.SIGINT)
     finally:
-        for number in ours:
-            signal.signal(number, signal.SIG_DFL)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-def _leave(number: int, frame: FrameType | None = None) -> NoReturn:
+def _leave(number: int) -> NoReturn:
     sys.exit(128 + number)
 
 
-def _run() -> None:
+def _run(told: list[int]) -> None:
     # Each module adds its commands; what a command needs is imported when it runs, so that
     # `--help` is instant and a robot never imports torch.
     import typer
@@ -86,6 +104,10 @@ def _run() -> None:
     try:
         try:
             sys.exit(app(prog_name="tactile-rt", standalone_mode=False))
+        except Exception:
+            if told:  # what a library makes of a signal is no mistake
+                _leave(told[-1])
+            raise
         finally:
             sys.stdout.flush()  # while what goes wrong can still be told
     except usage_error as error:

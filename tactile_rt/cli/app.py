@@ -91,7 +91,8 @@ def _options(
 
 @contextmanager
 def starting() -> Iterator[None]:
-    """Let Ctrl-C end the block even where it is swallowed, as trimesh does while it is imported."""
+    """Let Ctrl-C end the block even where a library swallows it, as trimesh does while it is
+    imported, or makes another error of it."""
     asked = False
 
     def note(number: int, frame: FrameType | None) -> None:
@@ -102,6 +103,10 @@ def starting() -> Iterator[None]:
     before = signal.signal(signal.SIGINT, note)
     try:
         yield
+    except Exception:
+        if asked:
+            raise KeyboardInterrupt from None
+        raise
     finally:
         signal.signal(signal.SIGINT, before)
     if asked:

@@ -3,6 +3,8 @@
 import csv
 import json
 import shutil
+import signal
+from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import msgspec
@@ -341,6 +343,23 @@ def test_a_table_goes_between_the_marks_of_a_page(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="to put the table between"):
         put_into(page, "new\n")
     assert page.read_text() == "no marks\n"
+
+
+def test_no_process_hears_an_interrupt_even_while_it_begins(
+    plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class StartedError(Exception):
+        pass
+
+    def start(process: SpawnProcess) -> None:
+        assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())  # as it inherits
+        raise StartedError
+
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    monkeypatch.setattr(SpawnProcess, "start", start)
+    with pytest.raises(StartedError):
+        run_grid(read_grid(plan), tmp_path / "two", 2)
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before
 
 
 @pytest.mark.slow

@@ -92,8 +92,13 @@ def _run(
         context.Process(target=_work, args=(grid, folder, todo, outcomes), daemon=True)
         for _ in range(min(processes, len(waiting)))
     ]
-    for worker in workers:
-        worker.start()
+    # Ctrl-C is this process's to handle: the others hear it not even while they begin.
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        for worker in workers:
+            worker.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
     idle, busy = len(workers), 0
     try:
         while True:
@@ -163,7 +168,6 @@ def _next(outcomes: Any, workers: list[Any]) -> Any:
 def _work(grid: Grid, folder: Path, todo: Any, outcomes: Any) -> None:
     import torch
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent says when to stop
     torch.set_num_threads(1)
     parent = os.getppid()
 

@@ -1,5 +1,6 @@
 import os
 import re
+import signal
 import subprocess
 import sys
 import textwrap
@@ -36,6 +37,23 @@ def test_every_name_is_done_once_and_processes_are_used_again(tmp_path: Path) ->
     assert all(len(w) == 1 for w in workers)
     assert len({w[0] for w in workers}) <= 2
     assert not any(alive(w[0]) for w in workers)
+
+
+class Heard(FrailWork):
+    """Notes which signals are held back when it arrives in another process."""
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__.update(state)
+        (self.folder / "held").write_text(
+            " ".join(s.name for s in signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+        )
+
+
+def test_no_process_hears_an_interrupt_even_while_it_begins(tmp_path: Path) -> None:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    assert sorted(run_processes(Heard(tmp_path), ["a", "b"], 2)) == [("a", None), ("b", None)]
+    assert (tmp_path / "held").read_text() == "SIGINT"
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before
 
 
 def test_one_process_works_in_order(tmp_path: Path) -> None:
