@@ -283,7 +283,7 @@ def test_the_tutorial_does_what_it_says(call, tmp_path, monkeypatch):
     taught, decided, check, _, emulated, again, mouse, met = re.findall(
         r"```sh\n(.*?)```", page, re.S
     )
-    (table,) = re.findall(r"```toml\n(.*?)```", page, re.S)
+    (table,) = re.findall(r"```toml[^\n]*\n(.*?)```", page, re.S)
     assert ",".join(FIVE) in taught
     with device([kind for kind in FIVE for _ in range(3)], 1) as line:
         command = taught.replace("serial:///dev/ttyUSB0?codec=bota", url(line))
