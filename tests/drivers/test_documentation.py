@@ -22,7 +22,7 @@ NUMBERS = {2: "two", 21: "twenty-one", 23: "twenty-three"}
 
 def block(language: str, word: str) -> str:
     """The one block of code with this word in it."""
-    found = re.findall(rf"```{language}\n(.*?)```", GUIDE, re.S)
+    found = re.findall(rf"```{language}[^\n]*\n(.*?)```", GUIDE, re.S)
     (text,) = [text for text in found if word in text]
     return text
 
