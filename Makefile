@@ -8,7 +8,7 @@ INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --co
 # As many processes as cores, each taking the next file: what a file's tests share is made once.
 # `pytest` alone runs the same tests in one process.
 PYTEST := $(BIN)/python -m pytest
-PARALLEL := -n logical --maxprocesses 8 --dist loadfile --no-loadscope-reorder
+PARALLEL := -n logical --maxprocesses 8 --max-worker-restart 0 --dist loadfile --no-loadscope-reorder
 
 # What `make quick` looks at: a package under tactile_rt, as P=drivers.
 P ?= stream

@@ -1,3 +1,4 @@
+import faulthandler
 import os
 import signal
 import sys
@@ -17,6 +18,7 @@ os.environ["PYTHONDONTWRITEBYTECODE"] = ""
 os.environ["XDG_STATE_HOME"] = os.path.join(tempfile.gettempdir(), "tactile_rt-tests-keep-nothing")
 
 import pytest
+from _pytest.faulthandler import fault_handler_stderr_fd_key
 from hypothesis import settings
 
 from tests.helpers.waiting import until
@@ -39,6 +41,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.nodeid.removeprefix("tests/").startswith(names):
             item.add_marker(pytest.mark.lengthy)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """Set the limit to hanging anew, which pytest takes away from a test that has failed."""
+    limit = float(item.config.getini("faulthandler_timeout"))
+    if limit:
+        file = item.config.stash[fault_handler_stderr_fd_key]
+        faulthandler.dump_traceback_later(limit, file=file, exit=True)
 
 
 @pytest.fixture

@@ -2,8 +2,6 @@
 
 import hashlib
 import re
-import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from tactile_rt.models.alignment.example import Brain
 from tactile_rt.models.alignment.example_files import write_example
 from tactile_rt.models.alignment.nwb import CLOCKS, WINDOWS, read_session
 from tactile_rt.stream import ConfigError
+from tests.helpers.archive import Archive
 
 h5py = pytest.importorskip("h5py", reason="h5py reads the files")
 pytest.importorskip("urllib3")
@@ -37,64 +36,22 @@ def whole(tmp_path_factory):
     return files
 
 
-class Archive(BaseHTTPRequestHandler):
-    """Serves files by ranges, as an object store does; `fault` makes it misbehave."""
-
-    protocol_version = "HTTP/1.1"
-    fault = ""
-
-    def do_GET(self):
-        data = self.files.get(self.path)
-        asked = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
-        type(self).requests.append((self.path, self.headers.get("Range")))
-        if data is None or self.fault == "gone":
-            return self.answer(404, b"no such key")
-        if self.fault == "no ranges" or not asked:
-            return self.answer(200, data[:1000])
-        if self.fault == "once busy":
-            type(self).fault = ""
-            return self.answer(503, b"slow down")
-        begin, end = int(asked[1]), int(asked[2])
-        size = len(data) + (self.fault == "another size")
-        part = data[begin : end + 1]
-        self.answer(206, part, f"bytes {begin}-{end}/{size}", cut=self.fault == "cut")
-
-    def answer(self, status, body, content_range="", cut=False):
-        self.send_response(status)
-        if content_range:
-            self.send_header("Content-Range", content_range)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body[: len(body) // 2] if cut else body)
-        self.close_connection = cut
-
-    def log_message(self, *_):
-        pass
-
-
 @pytest.fixture
-def archive(whole, monkeypatch):
-    """A list of the sessions on a server, and the server's handler."""
+def archive(whole, tmp_path_factory, monkeypatch):
+    """A list of the sessions on a server, and the server."""
     monkeypatch.setattr(ranges, "AGAIN", 1)
     for name in ("http_proxy", "https_proxy", "HTTP_PROXY", "HTTPS_PROXY"):
         monkeypatch.delenv(name, raising=False)
-    handler = type("Here", (Archive,), {"files": {}, "requests": []})
-    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    server.handle_error = lambda *_: None  # who is refused hangs up
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
-    thread.start()
-    listing = []
-    for k, path in enumerate(whole):
-        data = path.read_bytes()
-        handler.files[f"/blob{k}"] = data
-        url = f"http://127.0.0.1:{server.server_port}/blob{k}"
-        listing.append(
-            PublishedFile(f"sub/{path.name}", len(data), hashlib.sha256(data).hexdigest(), url)
-        )
-    yield listing, handler
-    server.shutdown()
-    thread.join()
-    server.server_close()
+    with Archive(tmp_path_factory.mktemp("archive")) as server:
+        listing = []
+        for k, path in enumerate(whole):
+            (server.folder / f"blob{k}").symlink_to(path)
+            data = path.read_bytes()
+            sha256 = hashlib.sha256(data).hexdigest()
+            listing.append(
+                PublishedFile(f"sub/{path.name}", len(data), sha256, server.url(f"blob{k}"))
+            )
+        yield listing, server
 
 
 @pytest.mark.parametrize("window", WINDOWS)
@@ -116,7 +73,7 @@ def test_what_is_fetched_reads_as_the_whole_file_does(whole, archive, tmp_path, 
 
 
 def test_voltages_stay_where_they_are(whole, archive, tmp_path):
-    listing, handler = archive
+    listing, server = archive
     done = fetch(listing, tmp_path)
     assert (done.files, done.new) == (2, 2)
     size = sum(file.size for file in listing)
@@ -125,19 +82,19 @@ def test_voltages_stay_where_they_are(whole, archive, tmp_path):
     with h5py.File(tmp_path / whole[0].name) as file:
         assert file.attrs["source_sha256"] == listing[0].sha256
     # None is asked for twice.
-    assert len(set(handler.requests)) == len(handler.requests)
+    requests = server.requests()
+    assert len(set(requests)) == len(requests)
 
 
 def test_a_fetch_goes_on_where_it_broke_off(archive, tmp_path):
-    listing, handler = archive
-    handler.files.pop("/blob1"), handler.requests.clear()
+    listing, server = archive
+    (server.folder / "blob1").unlink()
     with pytest.raises(ConfigError, match=r"sub/.* cannot be fetched: the server says 404"):
         fetch(listing, tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == [listing[0].name]
-    handler.files["/blob1"] = handler.files["/blob0"]
-    handler.requests.clear()
+    server.forget()
     done = fetch([listing[0]], tmp_path)
-    assert (done.files, done.new, done.transferred, handler.requests) == (1, 0, 0, [])
+    assert (done.files, done.new, done.transferred, server.requests()) == (1, 0, 0, [])
 
 
 @pytest.mark.parametrize(
@@ -150,8 +107,8 @@ def test_a_fetch_goes_on_where_it_broke_off(archive, tmp_path):
     ],
 )
 def test_what_a_server_does_wrong_is_one_line(archive, tmp_path, fault, said):
-    listing, handler = archive
-    handler.fault = fault
+    listing, server = archive
+    server.misbehave(fault)
     with pytest.raises(ConfigError, match=said) as error:
         fetch(listing, tmp_path)
     assert "\n" not in str(error.value) and listing[0].path in str(error.value)
@@ -159,8 +116,8 @@ def test_what_a_server_does_wrong_is_one_line(archive, tmp_path, fault, said):
 
 
 def test_a_server_that_is_busy_is_asked_again(archive, tmp_path):
-    listing, handler = archive
-    handler.fault = "once busy"
+    listing, server = archive
+    server.misbehave("once busy")
     assert fetch(listing, tmp_path).new == 2
 
 
@@ -172,16 +129,17 @@ def test_no_server(tmp_path, monkeypatch):
 
 
 def test_what_is_no_session_is_one_line(archive, tmp_path):
-    listing, handler = archive
-    handler.files["/blob0"] = bytes(listing[0].size)
+    listing, server = archive
+    (server.folder / "blob0").unlink()
+    (server.folder / "blob0").write_bytes(bytes(listing[0].size))
     with pytest.raises(ConfigError, match="cannot be fetched") as error:
         fetch(listing, tmp_path)
     assert "\n" not in str(error.value)
 
 
-def test_a_file_is_read_as_from_a_disk(archive):
-    listing, handler = archive
-    data = handler.files["/blob0"]
+def test_a_file_is_read_as_from_a_disk(whole, archive):
+    listing, _ = archive
+    data = whole[0].read_bytes()
     remote = ranges.RangeFile(ranges.connections(), listing[0].url, len(data))
     rng = np.random.default_rng(0)
     for _ in range(40):
@@ -193,20 +151,20 @@ def test_a_file_is_read_as_from_a_disk(archive):
     assert remote.read(1) == b""
 
 
-def test_few_blocks_are_kept(archive, monkeypatch):
-    listing, handler = archive
+def test_few_blocks_are_kept(whole, archive, monkeypatch):
+    listing, server = archive
     monkeypatch.setattr(ranges, "KEPT", 3)
     remote = ranges.RangeFile(ranges.connections(), listing[0].url, listing[0].size)
-    data = handler.files["/blob0"]
+    data = whole[0].read_bytes()
     for k in (0, 5, 2, 9, 0, 1):
         remote.seek(k * ranges.BLOCK)
         assert remote.read(7) == data[k * ranges.BLOCK :][:7]
         assert len(remote._blocks) <= 3
-    assert len(handler.requests) == 6  # the first block had gone by then
+    assert len(server.requests()) == 6  # the first block had gone by then
 
 
 def test_the_command(archive, tmp_path, monkeypatch, call):
-    listing, handler = archive
+    listing, server = archive
     monkeypatch.setattr(fetching, "published_files", lambda name: tuple(listing))
     small = tmp_path / "small"
     code, out, _ = call("align", "fetch", "000231", "--list")
@@ -220,7 +178,7 @@ def test_the_command(archive, tmp_path, monkeypatch, call):
     assert "WARNING: the published analysis is of 11 mice and 999 units" in err
     code, _, err = call("align", "build", small, "--out", tmp_path / "b.json", "--bootstraps", 5)
     assert (code, err.count("WARNING")) == (0, 0) and "spikes on the session's clock" in err, err
-    handler.fault = "gone"
+    server.misbehave("gone")
     for arguments, said in (
         (("000231", tmp_path / "other"), "the server says 404"),
         (("000231",), "name a folder"),
