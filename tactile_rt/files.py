@@ -59,11 +59,15 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
     """Let `write(file)` fill a file that appears under its name only when complete.
 
     Until then it is hidden: ``.NAME.XXXXXXXX`` in the same folder. If it fails, nothing has
-    changed.
+    changed. What is no file, as ``/dev/null`` or a pipe, is written into.
 
     Raises:
         OSError: naming `path`: its folder cannot be written into, or the medium is full.
     """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        with path.open("wb") as file:
+            write(file)
+        return
     hidden = _hidden(path)
     try:
         with hidden.open("x+b") as file:

@@ -1,4 +1,5 @@
 import os
+import signal
 import sys
 import tempfile
 import threading
@@ -68,7 +69,10 @@ def call(capsys, monkeypatch):
             main()
         return left.value.code or 0, *capsys.readouterr()
 
-    return run
+    handlers = {s: signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    yield run
+    for number, handler in handlers.items():  # a daemon takes them for good
+        signal.signal(number, handler)
 
 
 @pytest.fixture

@@ -76,3 +76,14 @@ def test_a_folder_is_replaced_whole_or_stays(tmp_path):
     with whole_folder(path) as made:
         (made / "new").write_bytes(b"")
     assert os.listdir(path) == ["new"] and os.listdir(tmp_path) == ["bag"]
+
+
+def test_what_is_no_file_is_written_into_and_stays_what_it_is(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    write_whole(pipe, lambda out: out.write(b"{}"))
+    assert os.read(reader, 10) == b"{}"
+    os.close(reader)
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+    assert [p.name for p in tmp_path.iterdir()] == ["pipe"]

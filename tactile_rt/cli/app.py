@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Iterator
@@ -57,12 +58,19 @@ def set_option(help: str) -> Any:
     return typer.Option("--set", metavar="KEY=VALUE", help=f"{help}; may be repeated.")
 
 
+COLUMNS, BOXED = shutil.get_terminal_size().columns, 100
+
 app = typer.Typer(
     name="tactile-rt",
     help="Tactile perception in real time: whisker arrays in, what they touch out.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    # Boxes cut long words where they have no room; plain text is as wide as the terminal.
+    rich_markup_mode="rich" if COLUMNS >= BOXED else None,
+    context_settings={
+        "help_option_names": ["-h", "--help"],
+        "terminal_width": min(COLUMNS, BOXED),
+    },
 )
 
 

@@ -1,5 +1,5 @@
-"""One line of a log of text: what `tactile-rt dump`, candump, SavvyCAN, slcan adapters and dumps in
-hexadecimal print."""
+"""One line of a log of text: what `tactile-rt dump`, candump, SavvyCAN, BUSMASTER, slcan adapters
+and dumps in hexadecimal print."""
 
 import re
 from typing import Any, Final
@@ -9,7 +9,16 @@ from tactile_rt.drivers.codecs.ascii_text import in_seconds
 from tactile_rt.drivers.slcan import SlcanDecoder
 from tactile_rt.stream import NS_PER_S
 
-__all__ = ["of_candump", "of_dump", "of_dump_can", "of_gvret", "of_heard", "of_hex", "of_slcan"]
+__all__ = [
+    "of_busmaster",
+    "of_candump",
+    "of_dump",
+    "of_dump_can",
+    "of_gvret",
+    "of_heard",
+    "of_hex",
+    "of_slcan",
+]
 
 _CANDUMP: Final = re.compile(
     r"\s*(?:\((?P<t>[^)]*)\)\s*)?(?P<bus>[A-Za-z]\w*)\s+(?:[TR]X\s+\S+\s+\S+\s+)?"
@@ -23,6 +32,10 @@ _COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
 _GVRET: Final = re.compile(  # what SavvyCAN saves
     r"(?P<us>\d+),(?P<id>[0-9A-Fa-f]{3,8}),(?P<extended>true|false),(?:[RT]x,)?(?P<bus>\d+),"
     r"(?P<n>\d+)(?P<hex>(?:,[0-9A-Fa-f]{2})*),*\s*"
+)
+_BUSMASTER: Final = re.compile(
+    r"(?P<t>\d+:\d\d:\d\d):(?P<part>\d{4}) [RT]x (?P<bus>\d+) (?P<id>(?P<hex>0x)?[0-9A-Fa-f]+) "
+    r"(?P<kind>[sx]r?) (?P<n>\d+)(?P<data>(?: +[0-9A-Fa-f]{1,3})*)\s*"
 )
 _SLCAN: Final = re.compile(r"(?:[tr][0-7][0-9A-Fa-f]{2}|[TR][01][0-9A-Fa-f]{7}|[dDbB])[0-9A-Fa-f]+")
 _DUMP: Final = re.compile(
@@ -90,6 +103,25 @@ def of_gvret(line: str) -> Found:
         return None
     frame = CanFrame(number, data, extended, len(data) > 8)
     return found["bus"], [frame], _time(found["us"], NS_PER_S // 1_000_000)
+
+
+def of_busmaster(line: str) -> Found:
+    """A line of a log of BUSMASTER, hexadecimal or decimal, with the time of the day."""
+    found = _BUSMASTER.fullmatch(line)
+    if found is None:
+        return None
+    base = 16 if found["hex"] else 10
+    extended, remote = found["kind"].startswith("x"), found["kind"].endswith("r")
+    try:
+        number, data = int(found["id"], base), bytes(int(b, base) for b in found["data"].split())
+    except ValueError:
+        return None
+    if number > (_EXTENDED if extended else 0x7FF) or len(data) > 64:
+        return None
+    if not remote and len(data) != int(found["n"]):
+        return None
+    frame = CanFrame(number, data, extended, len(data) > 8, remote)
+    return found["bus"], [frame], _time(f"{found['t']}.{found['part']}")
 
 
 def of_slcan(line: str) -> Found:

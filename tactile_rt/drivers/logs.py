@@ -18,6 +18,7 @@ from typing import Any, BinaryIO, Final, cast
 
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.log_lines import (
+    of_busmaster,
     of_candump,
     of_dump,
     of_dump_can,
@@ -32,12 +33,15 @@ from tactile_rt.stream import NS_PER_S, ConfigError
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 
 SERIAL_FORMS: Final = ("raw", "dump", "hex", "terminal")
-CAN_FORMS: Final = ("candump", "dump-can", "slcan", "gvret", "asc", "blf", "trc", "csv")
+CAN_FORMS: Final = (
+    "candump", "dump-can", "slcan", "gvret", "busmaster", "asc", "blf", "trc", "csv", "db",
+)  # fmt: skip
 FORMS: Final = (*SERIAL_FORMS, *CAN_FORMS)
 PIECE: Final = 256
 HEAD: Final = 16_384  # bytes that tell the form
 MOSTLY: Final = 0.8  # of the lines at the beginning are of the form
 BLF: Final = b"LOGG"
+SQLITE: Final = b"SQLite format 3\0"  # of python-can's logger, .db; bags of ROS 2 are .db3
 GZIP: Final = b"\x1f\x8b"
 # What is neither a log nor a text, by its first bytes, and how it becomes one.
 OTHERS: Final = {
@@ -53,6 +57,7 @@ OTHERS: Final = {
     b"\n\r\r\n": "a capture of packets (pcapng): tshark writes a bus's frames as text",
 }
 OF_PYTHON_CAN: Final = "timestamp,arbitration_id,extended,remote,error,dlc,data"
+OF_BUSMASTER: Final = "***busmaster"
 OF_SAVVYCAN: Final = "time stamp,id,extended,"
 FALLING: Final = 0.2  # of the times of candump -td are less than the one before
 
@@ -105,7 +110,7 @@ class LineLog:
     def _read(self, file: "LogFile") -> Iterator[Timed]:
         read: Callable[[LogFile], Iterator[Timed]] = {
             "raw": self._raw, "asc": self._logged, "blf": self._logged, "trc": self._logged,
-            "csv": self._logged,
+            "csv": self._logged, "db": self._logged,
         }.get(self.form, self._text)  # fmt: skip
         yield from read(file)
         if getattr(file.raw, "broken", False):
@@ -121,6 +126,7 @@ class LineLog:
         parse = {
             "candump": of_candump, "dump-can": of_dump_can, "dump": of_dump, "hex": of_hex,
             "gvret": of_gvret, "slcan": of_slcan, "terminal": of_heard,
+            "busmaster": of_busmaster,
         }[self.form]  # fmt: skip
         others, errors, buses = -(self.form == "gvret"), 0, Counter[str]()  # its first line: names
         apart, now = self.form == "candump" and _times_are_apart(self.path), 0
@@ -128,7 +134,8 @@ class LineLog:
             for line in lines:
                 found = parse(line.rstrip("\r\n"))
                 if found is None:
-                    others += bool(line.strip())
+                    # the head and the end of BUSMASTER's
+                    others += bool(line.strip()) and not line.startswith("***")
                     continue
                 bus, packet, t_ns = found
                 if packet is None:
@@ -144,7 +151,7 @@ class LineLog:
     # what python-can reads
 
     def _logged(self, file: LogFile) -> Iterator[Timed]:
-        from can.io import ASCReader, BLFReader, CSVReader, TRCReader
+        from can.io import ASCReader, BLFReader, CSVReader, SqliteReader, TRCReader
 
         logging.getLogger("can").addHandler(logging.NullHandler())  # it tells us, not the terminal
         made: Any
@@ -155,6 +162,8 @@ class LineLog:
                 made = BLFReader(file)
             elif self.form == "asc":
                 made = ASCReader(cast(Any, lines), relative_timestamp=False)
+            elif self.form == "db":
+                made = SqliteReader(self.path)
             elif self.form == "trc":
                 made = TRCReader(cast(Any, lines))
             else:
@@ -317,6 +326,8 @@ def _form(path: Path) -> str:
     head = _head(path)
     if head.startswith(BLF):
         return "blf"
+    if head.startswith(SQLITE):
+        return "db"
     if b"\0" in head:
         return "raw"
     lines = _lines(head)
@@ -326,6 +337,8 @@ def _form(path: Path) -> str:
         return "trc"
     if lines[0].startswith(OF_PYTHON_CAN):
         return "csv"
+    if lines[0].lower().startswith(OF_BUSMASTER):
+        return "busmaster"
     if lines[0].lower().startswith(OF_SAVVYCAN):
         return "gvret"
     begins = [x.strip().lower() for x in lines[:6]]

@@ -943,7 +943,7 @@ def test_a_table_that_cannot_be_read(tmp_path) -> None:
 
 def test_the_documented_file_is_one(tmp_path) -> None:
     page = Path(__file__).parents[2] / "docs" / "how-to" / "calibration.md"
-    (example,) = re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    (example,) = re.findall(r"```toml[^\n]*\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
     path = tmp_path / "left-pad.toml"
     path.write_text(example)
     calibration = load_calibration(path)

@@ -27,7 +27,7 @@ def device(tmp_path_factory) -> tuple[Path, Path]:
     """The page's array, read fast enough to hear it, and plucks of a noisier and stiffer one."""
     folder: Path = tmp_path_factory.mktemp("device")
     array = new_project(folder / "whiskers").array
-    (sensor,) = re.findall(r"```toml\n(.*?)```", PAGE.read_text("utf-8"), re.S)
+    (sensor,) = re.findall(r"```toml[^\n]*\n(.*?)```", PAGE.read_text("utf-8"), re.S)
     sensor = sensor.replace("rate_hz = 100", "rate_hz = 500")
     array.write_text(array.read_text().replace("[defaults]", f"{sensor}\n[defaults]", 1))
     real = folder / "real.toml"

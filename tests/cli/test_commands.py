@@ -2,7 +2,9 @@
 
 import io
 import json
+import os
 import re
+import subprocess
 import sys
 import typing
 from collections import defaultdict
@@ -16,6 +18,7 @@ from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.daemon.messages import StateMessage
 from tests.cli.test_top import busy_snapshot
 from tests.helpers.commands import commands, options_of
+from tests.helpers.source_tree import ROOT
 
 # Those that print neither a table nor figures, and what they do instead. Whoever adds a command
 # gives it --json, or a line here.
@@ -153,3 +156,27 @@ def test_json_to_stdout_is_alone_there(call, at_work, monkeypatch, words):
     code, out, err = call(*words, "--json", "-")
     assert code in (0, 1), err
     json.loads(out)
+
+
+@pytest.mark.parametrize("columns", ["40", "80", "100"])
+def test_no_word_of_a_help_is_cut(columns):
+    """In a process of its own: how wide a terminal is, is asked once."""
+    program = (
+        "import typer\n"
+        "from tactile_rt.cli.app import app\n"
+        "from tests.helpers.commands import commands\n"
+        "every, program = commands(), typer.main.get_command(app)\n"
+        "for name in every:\n"
+        "    try:\n"
+        "        program.main([*name.split(), '--help'], prog_name='tactile-rt')\n"
+        "    except SystemExit:\n"
+        "        pass\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], env={**os.environ, "COLUMNS": columns, "NO_COLOR": "1"},
+        capture_output=True, text=True, cwd=ROOT, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "…" not in done.stdout
+    if columns != "40":  # where a column of options leaves too little for some words
+        assert [x for x in done.stdout.splitlines() if len(x) > int(columns)] == []

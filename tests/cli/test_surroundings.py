@@ -72,10 +72,19 @@ def test_what_finds_no_room_is_named_and_not_left(call, tmp_path, monkeypatch, w
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
+@pytest.fixture
+def heard():
+    """Signals do what they do by themselves: under nohup the tests ignore hangups."""
+    before = {s: signal.signal(s, signal.SIG_DFL) for s in (signal.SIGTERM, signal.SIGHUP)}
+    yield
+    for s, handler in before.items():
+        signal.signal(s, handler)
+
+
 @pytest.mark.parametrize("made_of_it", [None, RuntimeError("unexpected pos 5760 vs 5672")])
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_who_is_told_to_leave_leaves_nothing_half_written(
-    call, tmp_path, monkeypatch, number, made_of_it
+    call, heard, tmp_path, monkeypatch, number, made_of_it
 ):
     pytest.importorskip("mcap")
     from tactile_rt.recording import conversion
@@ -97,7 +106,7 @@ def test_who_is_told_to_leave_leaves_nothing_half_written(
     assert signal.getsignal(number) == before
 
 
-def test_a_recording_is_whole_when_the_terminal_closes(call, tmp_path, monkeypatch):
+def test_a_recording_is_whole_when_the_terminal_closes(call, heard, tmp_path, monkeypatch):
     pytest.importorskip("mcap")
     push = StreamWriter.push
 
@@ -106,7 +115,7 @@ def test_a_recording_is_whole_when_the_terminal_closes(call, tmp_path, monkeypat
         os.kill(os.getpid(), signal.SIGHUP)
 
     monkeypatch.setattr(StreamWriter, "push", push_and_close)
-    code, _, err = call("record", "synthetic:2x1?pace=fast", tmp_path / "a.mcap")
+    code, _, err = call("record", "synthetic:2x1?pace=fast&seconds=60", tmp_path / "a.mcap")
     assert (code, err) == (0, "")
     assert sum(map(len, Recording(tmp_path / "a.mcap"))) > 0
 

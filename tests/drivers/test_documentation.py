@@ -23,7 +23,7 @@ NUMBERS = dict(enumerate(ONES, 1)) | {20 + k: f"twenty-{one}" for k, one in enum
 
 def block(language: str, word: str) -> str:
     """The one block of code with this word in it."""
-    found = re.findall(rf"```{language}(?: title=\"[^\"]+\")?\n(.*?)```", GUIDE, re.S)
+    found = re.findall(rf"```{language}[^\n]*\n(.*?)```", GUIDE, re.S)
     (text,) = [text for text in found if word in text]
     return text
 

@@ -3,6 +3,7 @@
 import gzip
 import itertools
 import random
+import sqlite3
 
 import can
 import pytest
@@ -133,6 +134,52 @@ def test_what_savvycan_saved_is_read(tmp_path):
         (b"\x0c", 0xABCDEF, True, 166_065_500_000),
     ]
     assert log.notes == ["frames of several buses: 0 (1), 1 (1); --bus takes those of one"]
+
+
+def test_a_table_of_python_can_s_is_read(tmp_path):
+    """As its SqliteWriter makes it."""
+    path = tmp_path / "run.db"
+    with sqlite3.connect(path) as table:
+        table.execute(
+            "CREATE TABLE messages(ts REAL, arbitration_id INTEGER, extended INTEGER, "
+            "remote INTEGER, error INTEGER, dlc INTEGER, data BLOB)"
+        )
+        for k, m in enumerate(messages()):
+            row = (T0 + k, m.arbitration_id, m.is_extended_id, 0, 0, m.dlc, bytes(m.data))
+            table.execute("INSERT INTO messages VALUES(?, ?, ?, ?, ?, ?, ?)", row)
+    table.close()
+    log = read_log(path)
+    packets = list(log.packets())
+    assert log.form == "db" and log.notes == []
+    assert [frame for packet, _ in packets for frame in packet] == [
+        CanFrame(m.arbitration_id, bytes(m.data), m.is_extended_id) for m in messages()
+    ]
+    path.write_bytes(path.read_bytes()[:100] + bytes(4000))
+    assert list(log.packets()) == [] and len(log.notes) == 1
+
+
+def test_what_busmaster_logged_is_read(tmp_path):
+    path = tmp_path / "bus.log"
+    path.write_text(
+        "***BUSMASTER Ver 3.2.2***\n***PROTOCOL CAN***\n***HEX***\n"
+        "10:00:00:0100 Rx 1 0x100 s 3 00 01 FF \n"
+        "10:00:00:0255 Tx 1 0x18FF0102 x 0 \n"
+        "10:00:00:0300 Rx 1 256 s 2 000 255 \n"
+        "10:00:00:0300 Rx 1 256 s 2 000 256 \n"
+        "10:00:00:0400 Rx 1 0x100 sr 8 \n"
+        "***[STOP LOGGING SESSION]***\n"
+    )
+    log = read_log(path)
+    found = [(frame, t_ns) for frames, t_ns in log.packets() for frame in frames]
+    day = 36_000_000_000_000
+    assert log.form == "busmaster"
+    assert found == [
+        (CanFrame(0x100, b"\x00\x01\xff"), day + 10_000_000),
+        (CanFrame(0x18FF0102, b"", True), day + 25_500_000),
+        (CanFrame(0x100, b"\x00\xff"), day + 30_000_000),
+        (CanFrame(0x100, b"", remote=True), day + 40_000_000),
+    ]
+    assert log.notes == ["passed over, no line of a busmaster log: 1"]
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from tactile_rt.models.evaluation import Interval
 from tactile_rt.models.grid.plan import SUPERVISED, SVM
@@ -47,8 +48,9 @@ def draw_grid(results: GridResults, path: Path) -> None:
         if svm is not None:
             axes.axvline(100 * svm.value, color="tab:red", linestyle="--")
     bottom = all_axes[-1, 0]
-    bottom.set_xlim(0, 106)
-    bottom.set_xticks(range(0, 101, 10))
+    best = max((row.top1.high for row in results.rows if row.top1 is not None), default=1.0)
+    bottom.set_xlim(0, 100 * best + 6)
+    bottom.xaxis.set_major_locator(MaxNLocator(steps=[1, 2, 5, 10]))
     bottom.set_xlabel("top-1 accuracy on objects never seen in training (%)")
     handles: list[object] = [
         Patch(color=colour, label=label)
@@ -117,8 +119,13 @@ def draw_curves(results: GridResults, path: Path) -> None:
         at.set_title(title, fontsize=10, loc="left")
         at.set_xlabel(label)
         at.grid(alpha=0.25)
+        for ticks in (at.xaxis.set_major_formatter, at.xaxis.set_minor_formatter):
+            ticks(FuncFormatter(_plainly))
+        if not at.has_data():
+            at.text(0.5, 0.5, "no shares were trained on", ha="center", transform=at.transAxes)
         above = at in axes[0]
         at.set_ylabel(f"top-1 (%), {'validation' if above else 'test'} objects")
+    axes[1, 0].margins(x=0.15)  # for the names
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
     figure.suptitle(
@@ -129,13 +136,20 @@ def draw_curves(results: GridResults, path: Path) -> None:
     figure.savefig(path, dpi=120)
 
 
+def _plainly(value: float, _: object) -> str:
+    """A tick of a logarithmic axis: 1, 2 or 4 times a power of ten, in full."""
+    digit = f"{value:.0e}"[0]
+    return f"{value:,.0f}" if digit in "124" and value >= 1 else ""
+
+
 def _line(row: Row) -> dict[str, Any]:
-    """How a network's line is drawn: an attender dashes it."""
+    """How a network's line is drawn: an attender dashes it, another width has open marks."""
     _, colour = _family(row)
     return {
         "color": colour,
         "marker": "o",
         "markersize": 4,
+        "markerfacecolor": "white" if "@" in row.network else colour,
         "linestyle": "--" if "+" in row.network else "-",
         "label": _label(row),
     }

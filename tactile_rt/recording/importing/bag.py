@@ -78,7 +78,9 @@ def is_bag(path: Path) -> bool:
         return (path / "metadata.yaml").is_file()
     with open_regular(path) as file:
         begins = file.read(len(SQLITE))
-    return begins.startswith((ROS1, SQLITE, MAGIC))
+    if begins == SQLITE:  # python-can's logger writes such files, too
+        return path.suffix == ".db3"
+    return begins.startswith((ROS1, MAGIC))
 
 
 def bag_topics(path: Path) -> list[BagTopic]:
