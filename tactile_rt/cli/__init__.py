@@ -174,5 +174,6 @@ def _give_up(why: str, code: int = 0) -> NoReturn:
 
     from tactile_rt.cli.app import USER_ERROR
 
-    typer.secho(f"tactile-rt: {why}", err=True, fg="red")
+    line = " ".join(why.splitlines())  # what a user wrote may have several
+    typer.secho(f"tactile-rt: {line}", err=True, fg="red")
     sys.exit(code or USER_ERROR)

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.table import Column, Table
 from typer.core import TyperCommand
 
-from tactile_rt.cli.app import app, check_output, needs, set_option
+from tactile_rt.cli.app import LARGEST_SEED, app, check_output, needs, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, print_table, told_as_json
 from tactile_rt.settings import take_sets
@@ -54,7 +54,7 @@ class GateCommand(TyperCommand):
 @align.command("example")
 def write_brain(
     folder: Annotated[Path, typer.Argument(help="The folder to make.")],
-    seed: Annotated[int, typer.Option(help="Of every random number.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of every random number.")] = 0,
     sets: Annotated[
         list[str] | None, set_option("Of the brain: mice=6, trials=60, private=0.3")
     ] = None,
@@ -104,7 +104,7 @@ def build_benchmark(
         typer.Option(help="Spike times are on the session's, or the recording's. See the docs."),
     ] = None,
     bootstraps: Annotated[int, typer.Option(help="Splits of the trials.")] = 1000,
-    seed: Annotated[int, typer.Option(help="Of the splits.")] = 1234,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the splits.")] = 1234,
     json: Json = None,
 ) -> None:
     """Freeze recordings into a small benchmark, so that nobody else needs them."""
@@ -154,7 +154,9 @@ def score_models(
     untrained: Annotated[
         bool, typer.Option(help="Score each checkpoint's network before training too.")
     ] = True,
-    seed: Annotated[int, typer.Option(help="Of the untrained networks.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the untrained networks.")
+    ] = 0,
     performance: Annotated[
         str | None,
         typer.Option(help="Accuracy of each model on its task, 0.46,0.52,...; else its own."),

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from tactile_rt.cli.align import align
-from tactile_rt.cli.app import check_output, needs
+from tactile_rt.cli.app import LARGEST_SEED, check_output, needs
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, print_table, told_as_json
 from tactile_rt.stream import ConfigError
@@ -132,7 +132,9 @@ def write_board(
     untrained: Annotated[
         bool, typer.Option(help="A row for each network before its training too.")
     ] = True,
-    seed: Annotated[int, typer.Option(help="Of the untrained networks.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the untrained networks.")
+    ] = 0,
 ) -> None:
     """Compare models with recordings by every metric, as shares of what noise permits."""
     for file in (json, html):

@@ -19,6 +19,8 @@ from tactile_rt.version import VERSION
 
 __all__ = [
     "INTERRUPTED",
+    "LARGEST_SEED",
+    "MOST_THREADS",
     "USER_ERROR",
     "Model",
     "Pace",
@@ -33,6 +35,8 @@ __all__ = [
 ]
 
 USER_ERROR, INTERRUPTED = 2, 130  # exit codes
+LARGEST_SEED = 2**32 - 1  # that every generator takes
+MOST_THREADS = 1024
 SLOW_WORK = "tactile_rt.sim_backend.objects"  # a logger
 
 Model = Annotated[

@@ -17,7 +17,17 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 
-from tactile_rt.cli.app import Model, Pace, Seconds, app, check_output, leaving, needs, starting
+from tactile_rt.cli.app import (
+    LARGEST_SEED,
+    Model,
+    Pace,
+    Seconds,
+    app,
+    check_output,
+    leaving,
+    needs,
+    starting,
+)
 from tactile_rt.cli.demonstration import Demonstration, SweepOutcome
 from tactile_rt.cli.tables import STDOUT, Json, told_as_json
 from tactile_rt.extras import install_extra
@@ -54,7 +64,9 @@ def demo(
     ] = 0,
     seconds: Seconds = None,
     model: Model = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the drawn objects and sweeps.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the drawn objects and sweeps.")
+    ] = 0,
     fast: Pace = False,
     recorded: Annotated[
         bool, typer.Option("--recorded", help="Play the recording, also if there is MuJoCo.")

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from tactile_rt.cli.app import (
     INTERRUPTED,
+    LARGEST_SEED,
     Pace,
     app,
     check_output,
@@ -50,7 +51,7 @@ def hil(
     seconds: Annotated[
         float | None, typer.Option(min=0.001, max=1e9, help="Leave after so much of the stream.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the default source.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the default source.")] = 0,
     fast: Pace = True,
     clock: Annotated[
         str, typer.Option(help="Time of the driver's samples: device; host (in real time).")

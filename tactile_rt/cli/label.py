@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output
+from tactile_rt.cli.app import LARGEST_SEED, app, check_output
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import ConfigError, RecordingError
@@ -33,7 +33,7 @@ def label(
     shares: Annotated[
         str, typer.Option(help="Shares of the objects: train,validation,test.")
     ] = "0.7,0.15,0.15",
-    seed: Annotated[int, typer.Option(min=0, help="Of the split.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the split.")] = 0,
     force: Annotated[bool, typer.Option("--force", help="Replace a set that is there.")] = False,
     json: Json = None,
 ) -> None:

@@ -84,12 +84,13 @@ def snapshot_at(url: str) -> "Snapshot":
 
     from tactile_rt.daemon.messages import StateMessage
 
-    parts = urlsplit(url if "//" in url else f"//{url}")
     try:
-        host, port = parts.hostname, parts.port or 9464
-    except ValueError:
-        host, port = None, 0
-    if parts.scheme not in ("", "http") or not host:
+        parts = urlsplit(url if "//" in url else f"//{url}")
+        scheme, host, port = parts.scheme, parts.hostname, parts.port or 9464
+        (host or "").encode("idna")
+    except ValueError:  # which a name that is none is, too
+        scheme, host, port = "", None, 0
+    if scheme not in ("", "http") or not host:
         raise ConfigError(f"{url} is not like http://127.0.0.1:9464")
     connection = http.client.HTTPConnection(host, port, timeout=3)
     try:

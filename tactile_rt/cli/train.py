@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, set_option
+from tactile_rt.cli.app import LARGEST_SEED, MOST_THREADS, app, check_output, needs, set_option
 from tactile_rt.cli.progress import progress_bar, working
 from tactile_rt.cli.tables import Json, show_table, told_as_json
 from tactile_rt.settings import take_sets
@@ -52,7 +52,7 @@ def train(
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Write logs for TensorBoard, too.")
     ] = False,
-    threads: Annotated[int, typer.Option(min=1, help="CPU threads.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, max=MOST_THREADS, help="CPU threads.")] = 1,
     json: Json = None,
 ) -> None:
     """Train an Encoder-Attender-Decoder network on a sweep set."""
@@ -151,7 +151,9 @@ def probe(
         Path | None, typer.Option(help="Sweep set; default: the one it was trained on.")
     ] = None,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the features.")] = 100,
-    seed: Annotated[int, typer.Option(help="Of the layer and the windows.")] = 0,
+    seed: Annotated[
+        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the layer and the windows.")
+    ] = 0,
     sets: Annotated[
         list[str] | None,
         set_option("How it is fitted: readout=mean, standardise=false, learning_rate=0.01"),

@@ -161,6 +161,9 @@ def torch():
         (("--attender", "lstm"), "attender is 'lstm', not one of gpt, mamba, none"),
         (("--seed", -1), "seed must be 0 to 4294967295"),
         (("--set", "learning_rate=nan"), "--set learning_rate=nan: nan is no quantity"),
+        (("--accelerator", "glove"), "accelerator is 'glove': "),
+        (("--threads", 10**30), "'--threads'"),
+        (("--set", f"width={1 / 32}", "--batch", 99), "a batch of 99 is more than the 12 sweeps"),
     ],
 )
 def test_options_that_cannot_be_trained_with_leave_no_run(

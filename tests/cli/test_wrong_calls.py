@@ -75,6 +75,11 @@ def wrong_calls():
             if kind in (int, float):
                 yield name, [*needed, option, "many"], "number"
                 yield name, [*needed, option, "1_0x"], "number"
+                bounds = parameter.type_descriptor.parameter_info
+                if bounds.min is not None:
+                    yield name, [*needed, option, str(bounds.min - 1)], "too small"
+                if bounds.max is not None:
+                    yield name, [*needed, option, str(2 * bounds.max + 1)], "too large"
                 if kind is int:
                     yield name, [*needed, option, "1.5"], "number"
                     yield name, [*needed, option, "nan"], "number"
@@ -84,6 +89,7 @@ def wrong_calls():
             if option == "--json":
                 yield name, [*needed, option, "file/below/x.json"], "place"
                 yield name, [*needed, option, "folder"], "place"
+                yield name, [*needed, option, "x" * 300], "place"
         if needed and name not in MAKES and name != "sniff":  # which looks at any file
             for file in FILES:
                 yield name, words_for(command, file), f"file {file}"
@@ -123,6 +129,29 @@ def test_a_wrong_call_is_one_line_and_leaves_nothing(call, place, name):
         assert not out, told
     after = {path.name for path in place.iterdir()} - {"cache", "config"}
     assert sorted(after) == before
+
+
+def test_every_seed_and_number_of_threads_has_bounds():
+    # A number that no generator takes is told by whoever is given it, each in words of its own.
+    checked = {"train", "sweep"}  # where a recipe may hold it, too
+    without = {
+        f"{name} {option}"
+        for name, command in EVERY.items()
+        for option, parameter in options_of(command).items()
+        if option in ("--seed", "--threads") and name not in checked
+        and parameter.type_descriptor.parameter_info.max is None
+    }  # fmt: skip
+    assert without == set()
+
+
+def test_what_was_written_in_several_lines_is_told_in_one(refused, place):
+    said = refused("model", "show", "no\nsuch\nmodel.onnx")
+    assert "no such model.onnx" in said
+
+
+@pytest.mark.parametrize("url", ["[x]", ".", "http://[::1", "a..b", "http://x:many"])
+def test_what_is_no_address_of_a_daemon_is_one_line(refused, url):
+    assert f"{url} is not like http://" in refused("top", url, "--once")
 
 
 def test_a_place_that_takes_no_file_is_told_before_the_work(refused, place, monkeypatch):

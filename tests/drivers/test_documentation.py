@@ -17,7 +17,8 @@ from tests.helpers.codec_contract import CodecCase, CodecContract
 
 ROOT = Path(__file__).parents[2]
 GUIDE = (ROOT / "docs" / "reference" / "drivers.md").read_text(encoding="utf-8")
-NUMBERS = {2: "two", 21: "twenty-one", 23: "twenty-three"}
+ONES = "one two three four five six seven eight nine".split()
+NUMBERS = dict(enumerate(ONES, 1)) | {20 + k: f"twenty-{one}" for k, one in enumerate(ONES, 1)}
 
 
 def block(language: str, word: str) -> str:

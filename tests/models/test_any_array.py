@@ -15,7 +15,7 @@ from tactile_rt.stream import ArraySpec, ConfigError
 from tactile_rt.timing import Timing
 from tests.helpers.small_networks import TOLERANCE, build, stream
 
-GRIDS = [(6, 1, 1), (30, 2, 4), (12, 1, 32), (15, 3, 3), (9, 10, 14), (4, 8, 1)]
+GRIDS = [(6, 1, 1), (30, 2, 2), (30, 2, 4), (12, 1, 32), (15, 3, 3), (9, 10, 14), (4, 8, 1)]
 
 
 @pytest.mark.parametrize("frame", GRIDS)

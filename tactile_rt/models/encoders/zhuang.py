@@ -36,8 +36,8 @@ def zhuang_graph(cell: str = "intersection-ln", frame: tuple[int, int, int] = MO
         reads = tuple(Edge(source) for source in sources)
         if name.startswith("fc"):
             nodes.append(Node(name, channels, reads, "dense", dense_cell))
-        else:  # the mouse's 5 x 7 grid becomes 4 x 6 maps in conv1; a single row stays one
-            less = name == "conv1" and min(frame[1:]) > 1
+        else:  # the mouse's 5 x 7 grid becomes 4 x 6 maps in conv1; one row, or 2 x 2, stays
+            less = name == "conv1" and min(frame[1:]) > 1 and max(frame[1:]) > 2
             nodes.append(Node(name, channels, reads, "valid" if less else "same", cell))
     return Graph(Input("frame", *frame), tuple(nodes), readout="fc8")
 

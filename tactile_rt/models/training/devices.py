@@ -32,7 +32,7 @@ def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
         device: "auto", "cpu", "cuda", ...
 
     Raises:
-        ConfigError: a batch is too small to be shared.
+        ConfigError: a batch is too small to be shared, or there is no such device here.
     """
     # Imported here: seconds that whoever only loads a checkpoint need not spend.
     with warnings.catch_warnings():
@@ -48,14 +48,17 @@ def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
         logging.getLogger(name).setLevel(logging.WARNING)
     # Of kernels of 1 x 1, whose numbers lie alike whichever strides they are told to have.
     warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
-    fabric = Fabric(
-        accelerator=device,
-        devices=local,
-        num_nodes=size // local,
-        # Static: some layers of some networks (a position never reached) have no part in a window,
-        # and always the same ones.
-        strategy=DDPStrategy(static_graph=True) if size > 1 else "auto",
-    )
+    try:
+        fabric = Fabric(
+            accelerator=device,
+            devices=local,
+            num_nodes=size // local,
+            # Static: some layers of some networks (a position never reached) have no part in a
+            # window, and always the same ones.
+            strategy=DDPStrategy(static_graph=True) if size > 1 else "auto",
+        )
+    except (ValueError, RuntimeError) as error:  # no such kind; none of it in this machine
+        raise ConfigError(f"accelerator is {device!r}: {error}") from None
     joined = torch.distributed.is_available() and torch.distributed.is_initialized()
     fabric.launch()
     try:

@@ -109,9 +109,6 @@ def _train(
     objective = build_objective(config, training)
     if config.begin:
         begin_from(objective.model, Path(config.begin), labels_of(training))
-    if fabric.is_global_zero:
-        _begin_run(config, folder)
-
     share = Share(fabric.global_rank, fabric.world_size)
     two_sweeps = config.pairs == "two-sweeps"
     batches = TrainingBatches(training, config.batch, config.seed, config.jitter, two_sweeps)
@@ -123,6 +120,8 @@ def _train(
     validate = Validation(config, validating, augmentation, share, fabric.device)
     optimizer = build_optimizer(objective, config)
     run = _Run(objective, optimizer, config, len(batches))
+    if fabric.is_global_zero:
+        _begin_run(config, folder)  # when all that may be refused has been
     fabric.barrier()
     run.resume(folder / "last.pt")
     board.begin(run.done)

@@ -125,7 +125,8 @@ def test_no_server(tmp_path, monkeypatch):
     monkeypatch.setattr(ranges, "AGAIN", 0)
     file = PublishedFile("sub/a.nwb", 10, "", "http://127.0.0.1:9/a")
     with pytest.raises(ConfigError, match=r"sub/a.nwb cannot be fetched: .*refused"):
-        fetch([file], tmp_path)
+        fetch([file], tmp_path / "new")
+    assert not (tmp_path / "new").exists()
 
 
 def test_what_is_no_session_is_one_line(archive, tmp_path):

@@ -106,12 +106,12 @@ def fetch(
         ModuleNotFoundError: h5py or urllib3 is not installed.
     """
     pool = connections()
-    folder.mkdir(parents=True, exist_ok=True)
     new = transferred = 0
     for done, file in enumerate(files, start=1):
         path = folder / file.name
         if not path.exists():
             small, came = _needed(RangeFile(pool, file.url, file.size), file)
+            folder.mkdir(parents=True, exist_ok=True)
             write_whole(path, lambda out, small=small: out.write(small))  # type: ignore[misc]
             new, transferred = new + 1, transferred + came
         progress(done / len(files))
