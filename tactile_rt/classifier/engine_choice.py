@@ -128,6 +128,8 @@ def keep_engine(model: Path, engine: str, step_ms: float) -> Path:
     written = msgspec.json.format(msgspec.json.encode(_File(1, choices))) + b"\n"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_fifo():  # which would be written into, as soon as somebody reads
+            path.unlink()
         write_whole(path, lambda file: file.write(written))
     except OSError as error:
         raise ConfigError(f"{path} cannot be written: {error.strerror}") from None
