@@ -14,6 +14,7 @@ __all__ = ["DEEPEST", "MOST_BYTES", "check_dbc"]
 
 MOST_BYTES: Final = 1 << 20  # of the file; 20,000 signals, a second
 MOST_FRAME: Final = 64  # bytes of a CAN FD frame
+MOST_MESSAGES: Final = 10_000
 MOST_SIGNALS: Final = 20_000
 MOST_MULTIPLEXED: Final = 1 << 16  # values of all multiplexers' ranges together
 DEEPEST: Final = 16  # multiplexers within each other
@@ -34,13 +35,14 @@ def check_dbc(file: str, text: str) -> None:
     Raises:
         ConfigError: one line with the file and the message or signal.
     """
+    messages = signals = 0
     for found in _MESSAGE.finditer(text):
+        messages += 1
         if _number(found[2]) > MOST_FRAME:
             raise ConfigError(
                 f"{file}: message {found[1][:50]} of {found[2][:20]} bytes; "
                 f"a CAN frame has {MOST_FRAME} at most"
             )
-    signals = 0
     for found in _SIGNAL.finditer(text):
         signals += 1
         start, length = _number(found[2]), _number(found[3])
@@ -49,10 +51,14 @@ def check_dbc(file: str, text: str) -> None:
                 f"{file}: signal {found[1][:50]} of {found[3][:20]} bits at bit {found[2][:20]}; "
                 f"a CAN frame has {8 * MOST_FRAME} bits at most"
             )
-    if signals > MOST_SIGNALS:
-        raise ConfigError(
-            f"{file}: {signals} signals, more than {MOST_SIGNALS}; keep the messages of the sensor"
-        )
+    for number, most, of in (
+        (messages, MOST_MESSAGES, "messages"),
+        (signals, MOST_SIGNALS, "signals"),
+    ):
+        if number > most:
+            raise ConfigError(
+                f"{file}: {number} {of}, more than {most}; keep the messages of the sensor"
+            )
     values = 0
     for ranges in _RANGES.finditer(text):
         for low, high in _RANGE.findall(ranges[1]):

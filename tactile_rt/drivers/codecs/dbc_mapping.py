@@ -302,7 +302,7 @@ class _Reader:
         message = self._message(where, of)
         known = {s.name: s for s in message.signals}
         if signal_name not in known:
-            hint = _near(signal_name, known) or f"; it has {', '.join(known)[:500]}"
+            hint = _near(signal_name, known) or f"; it has {', '.join(known)[:500] or 'none'}"
             raise ConfigError(
                 f"{where}: no signal {signal_name!r} in message {of} of {self.dbc}{hint}"
             )
