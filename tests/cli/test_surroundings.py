@@ -74,8 +74,13 @@ def test_what_finds_no_room_is_named_and_not_left(call, tmp_path, monkeypatch, w
 
 @pytest.fixture
 def heard():
-    """Signals do what they do by themselves: under nohup the tests ignore hangups."""
-    before = {s: signal.signal(s, signal.SIG_DFL) for s in (signal.SIGTERM, signal.SIGHUP)}
+    """Signals do what they do by themselves: nohup has hangups ignored, ``&`` Ctrl-C."""
+    own = {
+        signal.SIGINT: signal.default_int_handler,
+        signal.SIGTERM: signal.SIG_DFL,
+        signal.SIGHUP: signal.SIG_DFL,
+    }
+    before = {s: signal.signal(s, handler) for s, handler in own.items()}
     yield
     for s, handler in before.items():
         signal.signal(s, handler)
