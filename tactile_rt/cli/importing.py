@@ -30,7 +30,7 @@ def import_file(
     rate: Annotated[
         float, typer.Option(min=0, help="Samples a second, Hz, where nothing tells the time.")
     ] = 0,
-    bus: Annotated[str, typer.Option(help="Of a CAN log of several buses: which, e.g. can0.")] = "",
+    bus: Annotated[str, typer.Option(help="Of a log of several buses: which, e.g. can0.")] = "",
     form: Annotated[str, typer.Option(help="Of the log, if it is taken for another.")] = "",
     delimiter: Annotated[str, typer.Option(help="Of a table: a character, tab or space.")] = "",
     decimal: Annotated[str, typer.Option(help="Of a table: , or . in numbers.")] = "",
@@ -46,8 +46,9 @@ def import_file(
 ) -> None:
     """Make a recording of what is on the disk; `tactile-rt sniff` tells how.
 
-    Raw bytes, hexadecimal text, what a terminal logged, and logs of a CAN
-    bus (candump, asc, blf, trc, SavvyCAN, BUSMASTER) are decoded --as a codec. Tables (CSV, what
+    Raw bytes, hexadecimal text, what a terminal logged or a logic analyzer
+    exported, and logs of a CAN bus (candump, asc, blf, trc, SavvyCAN,
+    BUSMASTER) are decoded --as a codec. Tables (CSV, what
     a board or yarpdatadumper printed) need --columns. Of ROS 1 and ROS 2 bags (the
     extra "import") wrenches, arrays and our own messages need nothing
     more. gzip is unpacked.

@@ -1,6 +1,7 @@
-"""One line of a log of text: what `tactile-rt dump`, candump, SavvyCAN, BUSMASTER, slcan adapters
-and dumps in hexadecimal print."""
+"""One line of a log of text: what `tactile-rt dump`, candump, SavvyCAN, BUSMASTER, slcan adapters,
+Saleae's logic analyzers and dumps in hexadecimal print."""
 
+import csv
 import re
 from typing import Any, Final
 
@@ -10,6 +11,9 @@ from tactile_rt.drivers.slcan import SlcanDecoder
 from tactile_rt.stream import NS_PER_S
 
 __all__ = [
+    "OF_SALEAE",
+    "Found",
+    "SaleaeLines",
     "of_busmaster",
     "of_candump",
     "of_dump",
@@ -57,6 +61,14 @@ _HEX: Final = re.compile(
     r"\s*(?:\[?(?P<t>\d+\.\d+)\]?(?:\s*s)?[\s,:;]+)?"
     r"(?P<hex>(?:0x)?[0-9a-fA-F]{2}(?:[\s,]+(?:0x)?[0-9a-fA-F]{2})*|(?:[0-9a-fA-F]{2}){8,})\s*,?\s*"
 )
+# The first lines of what Logic 1 and Logic 2 export of an asynchronous serial line, without quotes.
+OF_SALEAE: Final = ("time [s],value,parity error,framing error", "name,type,start_time,duration,")
+_OF_BYTE: Final = re.compile(
+    r"(?:.* )?\(?0x(?P<hex>[0-9a-fA-F]{1,2})\)?|0b(?P<bits>[01]{1,8})"  # 0x41, A (0x41)
+    r"|'(?P<code>\d{1,3})'|(?P<escape>\\[rnt0])|(?P<comma>COMMA)|(?P<text>[\x20-\x7e]|' ')"
+)
+_ESCAPES: Final = {r"\r": 13, r"\n": 10, r"\t": 9, r"\0": 0}
+_LATEST_S: Final = 1e9
 _ERROR, _EXTENDED = 1 << 29, 0x1FFFFFFF
 
 Found = tuple[str, Any, int | None] | None  # bus, packet (None: an error frame), when, ns
@@ -170,6 +182,68 @@ def of_hex(line: str) -> Found:
         return "", bytes.fromhex(found["hex"].replace("0x", "").replace(",", " ")), t_ns
     except ValueError:
         return None
+
+
+class SaleaeLines:
+    """Lines that Logic exports of asynchronous serial analyzers, bytes as hexadecimal or ASCII.
+
+    The first line names the columns. Logic 2 names the analyzer of each byte, which is its bus:
+    that of what a device sends, and that of what it is told, say.
+    """
+
+    def __init__(self) -> None:
+        self._at: tuple[int, int, int | None, int | None] | None = None  # time, data, name, type
+        self._zero_ns: int | None = None  # times before a trigger are below 0
+
+    def __call__(self, line: str) -> Found:
+        """A byte, its analyzer and its time; None for what is none."""
+        try:
+            cells = next(csv.reader([line]), [])
+        except csv.Error:
+            return None
+        if self._at is None:
+            names = [cell.strip().lower() for cell in cells]
+            if {"start_time", "data", "name", "type"} <= set(names):
+                at = (names.index(x) for x in ("start_time", "data", "name", "type"))
+                self._at = next(at), next(at), next(at), next(at)
+            else:
+                self._at = 0, 1, None, None
+            return None
+        time, data, name, kind = self._at
+        if len(cells) <= max(time, data, name or 0, kind or 0):
+            return None
+        if kind is not None and cells[kind] != "data":
+            return None
+        byte, t_ns = _byte(cells[data]), _decimal_time(cells[time])
+        if byte is None or t_ns is None:
+            return None
+        if self._zero_ns is None:
+            self._zero_ns = min(t_ns, 0)
+        return "" if name is None else cells[name], bytes((byte,)), t_ns - self._zero_ns
+
+
+def _byte(cell: str) -> int | None:
+    found = _OF_BYTE.fullmatch(cell)
+    if found is None:
+        return None
+    if found["hex"] or found["bits"]:
+        return int(found["hex"] or found["bits"], 16 if found["hex"] else 2)
+    if found["code"]:
+        return int(found["code"]) if int(found["code"]) < 256 else None
+    if found["escape"]:
+        return _ESCAPES[found["escape"]]
+    return ord("," if found["comma"] else found["text"].strip("'") or "'")
+
+
+def _decimal_time(text: str) -> int | None:
+    """Seconds, before a trigger too and as 6.025e-05, or a date; in ns."""
+    if "T" in text:
+        return _time(text)
+    try:
+        seconds = float(text)
+    except ValueError:
+        return None
+    return round(seconds * NS_PER_S) if abs(seconds) < _LATEST_S else None
 
 
 def _time(text: str, unit_ns: int = NS_PER_S) -> int | None:

@@ -18,6 +18,9 @@ from typing import Any, BinaryIO, Final, cast
 
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.log_lines import (
+    OF_SALEAE,
+    Found,
+    SaleaeLines,
     of_busmaster,
     of_candump,
     of_dump,
@@ -32,7 +35,7 @@ from tactile_rt.stream import NS_PER_S, ConfigError
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 
-SERIAL_FORMS: Final = ("raw", "dump", "hex", "terminal")
+SERIAL_FORMS: Final = ("raw", "dump", "hex", "terminal", "saleae")
 CAN_FORMS: Final = (
     "candump", "dump-can", "slcan", "gvret", "busmaster", "asc", "blf", "trc", "csv", "db",
 )  # fmt: skip
@@ -81,6 +84,7 @@ class LineLog:
         wire: What was logged: ``serial`` or ``can``.
         piece: Bytes of a packet where the log says nothing of packets.
         notes: What could not be read, a sentence each; complete once all packets were read.
+        buses: How many packets each bus had, by its name; so too.
     """
 
     def __init__(self, path: Path, form: str, bus: str = "") -> None:
@@ -88,6 +92,7 @@ class LineLog:
         self.wire = "can" if form in CAN_FORMS else "serial"
         self.piece = PIECE
         self.notes: list[str] = []
+        self.buses: Counter[str] = Counter()
 
     def packets(self) -> Iterator[Timed]:
         """The packets, bytes or a CAN frame each, and when each came, ns; None where the log does
@@ -97,6 +102,7 @@ class LineLog:
             OSError: the file cannot be read.
         """
         self.notes.clear()
+        self.buses.clear()
         latest, back = -(1 << 62), 0
         with open_log_file(self.path) as file:
             for packet, t_ns in self._read(file):
@@ -123,12 +129,14 @@ class LineLog:
             yield piece, None
 
     def _text(self, file: LogFile) -> Iterator[Timed]:
-        parse = {
+        forms: dict[str, Callable[[str], Found]] = {
             "candump": of_candump, "dump-can": of_dump_can, "dump": of_dump, "hex": of_hex,
             "gvret": of_gvret, "slcan": of_slcan, "terminal": of_heard,
-            "busmaster": of_busmaster,
-        }[self.form]  # fmt: skip
-        others, errors, buses = -(self.form == "gvret"), 0, Counter[str]()  # its first line: names
+            "busmaster": of_busmaster, "saleae": SaleaeLines(),
+        }  # fmt: skip
+        parse = forms[self.form]
+        named = self.form in ("gvret", "saleae")  # the columns, by the first line
+        others, errors, buses = -named, 0, self.buses
         apart, now = self.form == "candump" and _times_are_apart(self.path), 0
         with TextIOWrapper(file, "utf-8", "replace") as lines:
             for line in lines:
@@ -146,7 +154,7 @@ class LineLog:
                 buses[bus] += 1
                 if not self._bus or bus == self._bus:
                     yield packet, t_ns
-        self._tell(others, "line", errors, buses)
+        self._tell(others, "line", errors)
 
     # what python-can reads
 
@@ -155,7 +163,7 @@ class LineLog:
 
         logging.getLogger("can").addHandler(logging.NullHandler())  # it tells us, not the terminal
         made: Any
-        n, errors, buses = 0, 0, Counter[str]()
+        n, errors, buses = 0, 0, self.buses
         lines = _Lines(file)
         try:
             if self.form == "blf":
@@ -191,20 +199,21 @@ class LineLog:
         except Exception as error:  # python-can raises anything on a file that is cut or damaged
             why = " ".join(str(error).split()) or type(error).__name__
             self.notes.append(f"it is cut short or damaged after {n} frames ({why:.80})")
-        self._tell(0, "frame", errors, buses)
+        self._tell(0, "frame", errors)
 
-    def _tell(self, others: int, what: str, errors: int, buses: Counter[str]) -> None:
+    def _tell(self, others: int, what: str, errors: int) -> None:
+        buses, frames = self.buses, "bytes" if self.wire == "serial" else "frames"
         if others:
             self.notes.append(f"passed over, no {what} of a {self.form} log: {others}")
         if errors:
             self.notes.append(f"{errors} error frames")
-        if len(buses) > 1:
+        if self._bus and self._bus not in buses:
+            known = ", ".join(sorted(buses)) or "none"
+            self.notes.append(f"no {frames} are of bus {self._bus}; there are those of {known}")
+        elif len(buses) > 1:
             named = ", ".join(f"{bus or 'none'} ({n})" for bus, n in sorted(buses.items()))
             taken = f"those of {self._bus} are taken" if self._bus else "--bus takes those of one"
-            self.notes.append(f"frames of several buses: {named}; {taken}")
-        elif self._bus and self._bus not in buses:
-            known = ", ".join(sorted(buses)) or "none"
-            self.notes.append(f"no frame is of bus {self._bus}; there are frames of {known}")
+            self.notes.append(f"{frames} of several buses: {named}; {taken}")
 
 
 def read_log(path: Path, form: str = "", bus: str = "") -> LineLog:
@@ -341,6 +350,8 @@ def _form(path: Path) -> str:
         return "busmaster"
     if lines[0].lower().startswith(OF_SAVVYCAN):
         return "gvret"
+    if lines[0].lower().replace('"', "").startswith(OF_SALEAE):
+        return "saleae"
     begins = [x.strip().lower() for x in lines[:6]]
     if any(x.startswith("date ") for x in begins) and any(x.startswith("base ") for x in begins):
         return "asc"

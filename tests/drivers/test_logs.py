@@ -182,6 +182,49 @@ def test_what_busmaster_logged_is_read(tmp_path):
     assert log.notes == ["passed over, no line of a busmaster log: 1"]
 
 
+LOGIC = [
+    (  # Logic 1, hexadecimal; the second byte with an error is kept: a codec will tell
+        "Time [s],Value,Parity Error,Framing Error\n0.000019680000000,0x5A,,\n"
+        "0.001061440000000,0x00,,Error\n",
+        [("", b"\x5a", 19_680), ("", b"\x00", 1_061_440)],
+    ),
+    (  # Logic 1, ASCII
+        "Time [s],Value,Parity Error,Framing Error\n"
+        "0,o,,\n1,',,\n2,' ',,\n3, ,,\n4,COMMA,,\n5,'13',,\n6,\\n,,\n7,7,,\n",
+        [("", bytes([byte]), k * 10**9) for k, byte in enumerate(b"o'  ,\r\n7")],
+    ),
+    (  # Logic 2 of old, before and after its trigger
+        '"name","type","start_time","duration","data"\n'
+        '"Async Serial","data",-6.025e-05,2.375e-05,0xC8\n'
+        '"Async Serial","data",0.000001,2.375e-05,0x09\n',
+        [("Async Serial", b"\xc8", 0), ("Async Serial", b"\x09", 61_250)],
+    ),
+    (  # Logic 2 of today, with an analyzer of another bus
+        "name,type,start_time,duration,ack,data,error\nRX,data,0.5,8e-06,,A (0x41),\n"
+        "I2C,address,0.6,8e-06,true,,\nTX,data,0.7,8e-06,,0b01000010,\nTX,data,x,8e-06,,0x41,\n"
+        'RX,data,0.8,8e-06,,"\"\"",\nRX,data,0.9,8e-06,,0x141,\n',
+        [("RX", b"A", 500_000_000), ("TX", b"B", 700_000_000), ("RX", b'"', 800_000_000)],
+    ),
+    (
+        "name,type,start_time,duration,data,error\nRX,data,2026-05-04T10:00:00.25Z,8e-06,0x41,\n",
+        [("RX", b"A", 1_777_888_800_250_000_000)],
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("text", "bytes_"), LOGIC)
+def test_what_a_logic_analyzer_exported_is_read(tmp_path, text, bytes_):
+    path = tmp_path / "uart.csv"
+    path.write_text(text)
+    log = read_log(path)
+    assert (log.wire, log.form) == ("serial", "saleae")
+    assert list(log.packets()) == [(byte, t_ns) for _, byte, t_ns in bytes_]
+    for name in {name for name, _, _ in bytes_}:
+        one = read_log(path, bus=name)
+        of_it = [(byte, t_ns) for bus, byte, t_ns in bytes_ if bus == name]
+        assert list(one.packets()) == of_it
+
+
 @pytest.mark.parametrize(
     ("apart", "times"),
     [("0 .5 .25 .75 .125 .5", "0 .5 .75 1.5 1.625 2.125"), ("0 .5 .5 .5", "0 .5 1 1.5"),

@@ -239,6 +239,8 @@ def _joined(parts: list[Samples]) -> Samples:
 
 def _why_none(log: LineLog, codec: Codec[Any], name: str) -> str:
     stats = codec.stats
+    if log.notes and not (stats.intact or stats.corrupt or stats.skipped):
+        return log.notes[-1]  # of another bus than asked for, say
     guess = codec.complaint or (
         f"{stats.intact} intact and {stats.corrupt} damaged frames, {stats.skipped} "
         f"{'bytes' if codec.wire == 'serial' else 'frames'} beside them"
