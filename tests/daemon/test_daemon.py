@@ -156,8 +156,10 @@ def test_two_arrays_and_three_models_on_ptys_lose_nothing(robot, tmp_path):
         assert left.wait(PATIENCE_S) and right.wait(PATIENCE_S)
         until(lambda: all(len(seqs(spy, n)) == 2000 for n in ("left", "right")))
         until(lambda: daemon.snapshot().state != "starting")
-        # Nothing more comes: on a slow machine that may be told already.
-        assert all("the device is stale" in line for line in daemon.snapshot().degraded)
+        # Nothing more comes, and a slow machine is late: that may be told already, but no loss.
+        late = ("late: ", "no samples: ", "late samples: ", "late decisions: ")
+        told = daemon.snapshot().degraded
+        assert all(line.startswith(late) for line in told), told
         until(lambda: all(m.queue.taken["samples"] == 2000 for m in daemon.snapshot().models))
         snapshot = daemon.snapshot()
     for name in ("left", "right"):
@@ -263,7 +265,8 @@ def test_a_device_that_goes_and_comes_is_told_and_the_other_goes_on(robot, tmp_p
         until(lambda: spy.told("source.goes", "device:lost"))
         until(lambda: spy.told("daemon", "degraded"))
         assert daemon.snapshot().state == "degraded"
-        assert "source.goes: the device is lost" in daemon.snapshot().degraded[0]
+        lost = "no samples: source.goes: the device is lost"
+        until(lambda: any(line.startswith(lost) for line in daemon.snapshot().degraded))
         before = len(seqs(spy, "stays"))
         until(lambda: len(seqs(spy, "stays")) > before + 100)
         goes.replug()
