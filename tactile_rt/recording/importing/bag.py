@@ -1,4 +1,4 @@
-"""Topics of ROS 1 and ROS 2 bags, by the library rosbags, without ROS.
+"""Topics of ROS 1 and ROS 2 bags, by the library rosbags, without ROS; of MCAP files in JSON, too.
 
 A message is a row, its fields are columns by their paths (``wrench.force.x``, ``data.3``). Messages
 of known types need no more: wrenches, arrays of numbers, magnetic fields and the like, and our own.
@@ -8,6 +8,7 @@ The time is that of the header, where there is one that is set, else that of the
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -35,6 +36,7 @@ __all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag", "proposed_columns"]
 SQLITE: Final = b"SQLite format 3\0"
 PROBED: Final = 50  # messages whose numbers are looked at
 MOST: Final = 4096  # fields of a message that are columns
+DEEPEST: Final = 16  # of fields in fields
 # What messages are of: columns by the end of the type's name, with {} for the frame's name.
 KNOWN: Final = {
     "geometry_msgs/msg/WrenchStamped": "wrench.force.x={0}.fx:N,wrench.force.y={0}.fy:N,"
@@ -51,6 +53,7 @@ KNOWN: Final = {
     "std_msgs/msg/Float64": "data={0}.value",
 }  # fmt: skip
 NUMBERS: Final = re.compile(r"std_msgs/msg/(?:U?Int(?:8|16|32|64)|Float(?:32|64))MultiArray")
+OTHERWISE: Final = (KeyError, AttributeError, TypeError)
 _NO_NAME: Final = re.compile(r"[^A-Za-z0-9_-]+")
 
 
@@ -223,15 +226,14 @@ def _whole(bag: OpenBag, topic: str) -> Iterator[Any]:
 
 def _leaves(value: Any, at: str) -> Iterator[str]:
     if is_dataclass(value):
-        for field in fields(value):
-            if field.name != "__msgtype__":
-                yield from _leaves(
-                    getattr(value, field.name), f"{at}.{field.name}" if at else field.name
-                )
-    elif isinstance(value, np.ndarray | list | tuple):
+        value = {f.name: getattr(value, f.name) for f in fields(value) if f.name != "__msgtype__"}
+    if isinstance(value, dict) and at.count(".") < DEEPEST:
+        for name, one in value.items():
+            yield from _leaves(one, f"{at}.{name}" if at else name)
+    elif isinstance(value, np.ndarray | list | tuple) and at.count(".") < DEEPEST:
         for k, one in enumerate(value):
-            yield from _leaves(one, f"{at}.{k}")
-    elif isinstance(value, int | float | np.number):
+            yield from _leaves(one, f"{at}.{k}" if at else f"{k}")
+    elif isinstance(value, int | float | np.number) and at:
         yield at
 
 
@@ -256,17 +258,30 @@ def _row(message: Any, steps: list[list[int | str]]) -> list[Any]:
         value = message
         try:
             for step in path:
-                value = value[step] if isinstance(step, int) else getattr(value, step)
-        except IndexError:
-            value = np.nan  # a list that is shorter than the first one
-        row.append(value)
+                if isinstance(value, dict):
+                    value = value[str(step)]
+                else:
+                    value = value[step] if isinstance(step, int) else getattr(value, step)
+        except (IndexError, *OTHERWISE):
+            value = np.nan  # a list that is shorter than the first one, JSON of another form
+        row.append(value if isinstance(value, int | float | np.number) else np.nan)
     return row
 
 
 def _stamp(message: Any) -> int:
-    """The time of the message's header, ns; 0: it has none, or it is not set."""
-    stamp = getattr(getattr(message, "header", None), "stamp", None)
-    return 0 if stamp is None else int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
+    """The time of the message's header, or its timestamp in JSON, ns; 0: it has none, or it is not
+    set."""
+    stamp = _of(_of(message, "header"), "stamp") or _of(message, "timestamp")
+    parts = _of(stamp, "sec"), _of(stamp, "nanosec", "nsec")
+    if not all(isinstance(part, int | np.integer) for part in parts):
+        return 0
+    return int(parts[0]) * NS_PER_S + int(parts[1])
+
+
+def _of(value: Any, *names: str) -> Any:
+    """A field by the first of its names that is there; None without."""
+    get = value.get if isinstance(value, dict) else partial(getattr, value)
+    return next((get(name, None) for name in names if get(name, None) is not None), None)
 
 
 def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str) -> Import:

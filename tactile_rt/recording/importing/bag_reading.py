@@ -1,18 +1,23 @@
 """Bags opened: by the library rosbags where they are whole, else from their beginning on.
 
 A bag that was cut short has no index, which every library reads first. Its records are still there
-one after the other: they are read until one is not whole.
+one after the other: they are read until one is not whole. So is an MCAP file that did not come from
+ROS 2: messages of ROS 1 and in JSON.
 """
 
 import bz2
+import os
 import struct
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final
+
+import msgspec
 
 from tactile_rt.extras import lacking
 from tactile_rt.files import open_regular
@@ -25,6 +30,10 @@ ROS1: Final = b"#ROSBAG V2.0\n"
 LARGEST: Final = 1 << 30  # bytes of a record
 MESSAGE, CHUNK, CONNECTION = b"\x02", b"\x05", b"\x07"
 NOT_WHOLE: Final = (TypeError, ValueError, KeyError, AssertionError, IndexError, struct.error)
+
+# How messages in an MCAP file are encoded, and what describes them; of JSON nothing needs to.
+CDR, OF_ROS1, JSON = "cdr", "ros1", "json"
+DESCRIBED: Final = {CDR: "ros2msg", OF_ROS1: "ros1msg"}
 
 Stored = tuple[str, int, bytes]  # topic, time in ns, message
 
@@ -46,15 +55,18 @@ class OpenBag:
     notes: list[str] = field(default_factory=list)
     _reader: Any = None
     _stored: list[Stored] = field(default_factory=list)
-    _store: Any = None
+    _decoders: dict[str, Callable[[bytes], Any]] = field(default_factory=dict)
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes, Any]]:
         """(time in the bag in ns, bytes, message) of each message of a topic; None for a message
         that is damaged."""
-        kind = self.types[topic]
+        if self._reader is None:
+            decode = self._decoders[topic]
+        else:
+            decode = partial(self._reader.deserialize, typ=self.types[topic])
         for t_ns, raw in self._raw(topic):
             try:
-                message = self._decoded(raw, kind)
+                message = decode(raw)
             except Exception:  # rosbags raises anything on bytes that are no such message
                 message = None
             yield t_ns, raw, message
@@ -69,12 +81,6 @@ class OpenBag:
                 yield t_ns, bytes(raw)
         except Exception as error:  # so it does where a chunk is damaged
             self.notes.append(f"it is damaged, and read up to there ({_words(error)})")
-
-    def _decoded(self, raw: bytes, kind: str) -> Any:
-        if self._reader is not None:
-            return self._reader.deserialize(raw, kind)
-        store, ros2 = self._store
-        return store.deserialize_cdr(raw, kind) if ros2 else store.deserialize_ros1(raw, kind)
 
 
 @contextmanager
@@ -114,8 +120,6 @@ def _from_its_beginning(path: Path, why: str) -> OpenBag:
     Raises:
         RecordingError: nothing is.
     """
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
     if path.is_dir():
         files = sorted(path.glob("*.mcap"))
         if len(files) != 1:
@@ -125,15 +129,39 @@ def _from_its_beginning(path: Path, why: str) -> OpenBag:
     with open_regular(path) as file:
         begins = file.read(len(ROS1))
         file.seek(0)
-        ros2 = begins.startswith(MAGIC)
-        if ros2:
-            _read_mcap(file, found)
+        mcap = begins.startswith(MAGIC)
+        if mcap:
+            whole = _read_mcap(file, found)
         elif begins == ROS1:
+            whole = False
             file.seek(len(ROS1))
             _read_ros1(file, found)
-    store = get_typestore(Stores.LATEST if ros2 else Stores.ROS1_NOETIC)
+    types, decoders = _decoders(found)
+    stored = [one for one in found.stored if one[0] in types]
+    if not stored:
+        others = sorted(found.others)
+        if mcap and others:
+            why = f"its messages are {' and '.join(others)}; those of ROS and in JSON are read"
+        raise RecordingError(f"{path} cannot be read as a bag: {why}")
+    counts = Counter(topic for topic, _, _ in stored)
+    notes = [] if whole else [
+        f"its end is missing or damaged ({why}): what is whole before it was read"
+    ]  # fmt: skip
+    return OpenBag(path, types, counts, notes, None, stored, decoders)
+
+
+def _decoders(found: "_Found") -> tuple[dict[str, str], dict[str, Callable[[bytes], Any]]]:
+    """The type of each topic that can be read, and what makes a message of its bytes."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    ros2, ros1 = get_typestore(Stores.LATEST), get_typestore(Stores.ROS1_NOETIC)
     types: dict[str, str] = {}
-    for topic, (kind, text) in found.topics.items():
+    decoders: dict[str, Callable[[bytes], Any]] = {}
+    for topic, (kind, text, encoding) in found.topics.items():
+        if encoding == JSON:
+            types[topic], decoders[topic] = kind or "JSON", msgspec.json.decode
+            continue
+        store = ros2 if encoding == CDR else ros1
         name = kind if kind.count("/") == 2 else kind.replace("/", "/msg/")
         try:
             known = get_types_from_msg(text, name)
@@ -141,22 +169,23 @@ def _from_its_beginning(path: Path, why: str) -> OpenBag:
         except Exception:  # a definition that is not of our kind: a topic that we cannot read
             continue
         types[topic] = name
-    stored = [one for one in found.stored if one[0] in types]
-    if not stored:
-        raise RecordingError(f"{path} cannot be read as a bag: {why}")
-    counts = Counter(topic for topic, _, _ in stored)
-    note = f"its end is missing or damaged ({why}): what is whole before it was read"
-    return OpenBag(path, types, counts, [note], None, stored, (store, ros2))
+        decode = store.deserialize_cdr if encoding == CDR else store.deserialize_ros1
+        decoders[topic] = partial(decode, typename=name)
+    return types, decoders
 
 
 @dataclass
 class _Found:
-    topics: dict[str, tuple[str, str]] = field(default_factory=dict)  # type, its definition
+    topics: dict[str, tuple[str, str, str]] = field(default_factory=dict)
+    """Type, its definition, and encoding: one of `CDR`, `OF_ROS1`, `JSON`."""
+    others: set[str] = field(default_factory=set)
+    """Encodings that are not read."""
     stored: list[Stored] = field(default_factory=list)
 
 
-def _read_mcap(file: BinaryIO, found: _Found) -> None:
-    """The records of ROS 2 messages in an MCAP file, also those of a chunk that is cut short."""
+def _read_mcap(file: BinaryIO, found: _Found) -> bool:
+    """The records of messages in an MCAP file, also those of a chunk that is cut short; whether the
+    file is whole."""
     from mcap.data_stream import ReadDataStream
     from mcap.records import Channel, Message, Schema
 
@@ -169,10 +198,17 @@ def _read_mcap(file: BinaryIO, found: _Found) -> None:
             schemas[schema.id] = schema
         elif opcode == 4:
             channel = Channel.read(ReadDataStream(BytesIO(data)))
-            told = schemas.get(channel.schema_id)
-            if told and channel.message_encoding == "cdr" and told.encoding == "ros2msg":
-                channels[channel.id] = channel.topic
-                found.topics[channel.topic] = told.name, told.data.decode("utf-8", "replace")
+            told, encoding = schemas.get(channel.schema_id), channel.message_encoding
+            name = told.name if told else ""
+            if encoding == JSON:
+                text = ""
+            elif told and DESCRIBED.get(encoding) == told.encoding:
+                text = told.data.decode("utf-8", "replace")
+            else:
+                found.others.add(encoding or "of no encoding")
+                return
+            channels[channel.id] = channel.topic
+            found.topics[channel.topic] = name, text, encoding
         elif opcode == 5:
             message = Message.read(ReadDataStream(BytesIO(data)), len(data))
             if message.channel_id in channels:
@@ -194,7 +230,9 @@ def _read_mcap(file: BinaryIO, found: _Found) -> None:
                 if complete:
                     take(inner, record)
     except (EOFError, OSError, RuntimeError, *NOT_WHOLE):
-        return
+        return False
+    file.seek(-len(MAGIC), os.SEEK_END)
+    return file.read() == MAGIC
 
 
 def _framed(file: BinaryIO) -> Iterator[tuple[int, bytes, bool]]:
@@ -227,6 +265,7 @@ def _take(header: dict[bytes, bytes], data: bytes, topics: dict[bytes, str], fou
         found.topics[topic] = (
             told[b"type"].decode("utf-8", "replace"),
             told[b"message_definition"].decode("utf-8", "replace"),
+            OF_ROS1,
         )
     elif header.get(b"op") == MESSAGE and header[b"conn"] in topics:
         seconds, ns = struct.unpack("<II", header[b"time"])
