@@ -7,6 +7,7 @@ import io
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from _typeshed import ReadableBuffer
 
 __all__ = ["main"]
+
+AGAIN_S = 0.01  # after which a signal that was dropped comes again
 
 
 def main() -> None:
@@ -42,16 +45,29 @@ def _signals() -> Iterator[list[int]]:
             raise KeyboardInterrupt
         _leave(number)
 
+    def again(unraisable: "sys.UnraisableHookArgs") -> None:
+        if told and isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
+            # It came while an object was taken away, where Python drops what is raised; and would
+            # do so at once again.
+            main = threading.main_thread().ident or 0
+            later = threading.Timer(AGAIN_S, signal.pthread_kill, (main, told[-1]))
+            later.daemon = True
+            later.start()
+        else:
+            dropped(unraisable)
+
     untouched = signal.SIG_DFL, signal.default_int_handler
     alike = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
     before = {s: signal.getsignal(s) for s in alike if signal.getsignal(s) in untouched}
     for number in before:
         signal.signal(number, leave)
+    dropped, sys.unraisablehook = sys.unraisablehook, again
     try:
         yield told
     except KeyboardInterrupt:
         _leave(signal.SIGINT)
     finally:
+        sys.unraisablehook = dropped
         for number, handler in before.items():
             signal.signal(number, handler)
 

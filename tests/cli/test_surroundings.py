@@ -5,6 +5,8 @@ import os
 import signal
 import subprocess
 import sys
+import time
+import weakref
 from pathlib import Path
 
 import pytest
@@ -109,6 +111,35 @@ def test_who_is_told_to_leave_leaves_nothing_half_written(
     assert call("convert", tmp_path / "a.mcap", tmp_path / "a.csv") == (128 + number, "", "")
     assert os.listdir(tmp_path) == ["a.mcap"]
     assert signal.getsignal(number) == before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_who_is_told_to_leave_where_python_drops_what_is_raised_leaves(
+    call, heard, tmp_path, monkeypatch, number
+):
+    """As while h5py takes an object away, in a callback of a weak reference."""
+    pytest.importorskip("mcap")
+    from tactile_rt.recording import conversion
+
+    call("record", SOURCE, tmp_path / "a.mcap")
+    taken = []
+
+    class Thing:
+        """What a weak reference may be of."""
+
+    def write(*arguments):
+        thing = Thing()
+        kept = weakref.ref(thing, lambda _: taken.append(os.kill(os.getpid(), number)))
+        del thing
+        assert kept() is None
+        for _ in range(3000):  # it comes again soon
+            time.sleep(0.01)
+
+    monkeypatch.setattr(conversion, "_write", write)
+    before = sys.unraisablehook
+    assert call("convert", tmp_path / "a.mcap", tmp_path / "a.csv") == (128 + number, "", "")
+    assert os.listdir(tmp_path) == ["a.mcap"] and taken == []
+    assert sys.unraisablehook is before
 
 
 def test_a_recording_is_whole_when_the_terminal_closes(call, heard, tmp_path, monkeypatch):

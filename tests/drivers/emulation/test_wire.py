@@ -143,11 +143,12 @@ def test_a_can_bus_carries_what_its_bit_rate_lets_it():
         EmulatedCan(opened, "native", options=plain) as emulated,
     ):
         chunks, stats = received(emulated.url)
-        t_ns = np.concatenate([chunk.t_ns for chunk in chunks])
-        whole = sum(chunk.valid.all(axis=1).sum() for chunk in chunks)
-    rate = whole / (1e-9 * (t_ns[-1] - t_ns[0]))
-    assert rate == pytest.approx(63.0, rel=0.15)
-    assert stats.missing > 5 * whole
+        whole_ns = np.concatenate([c.t_ns[c.valid.all(axis=1)] for c in chunks])
+    n = 16  # over so many a busy machine has let it alone at least once
+    at_best = n / (1e-9 * (whole_ns[n:] - whole_ns[:-n]).min())
+    on_average = (len(whole_ns) - 1) / (1e-9 * (whole_ns[-1] - whole_ns[0]))
+    assert on_average < 63.0 * 1.15 and at_best > 63.0 * 0.85
+    assert stats.missing > 5 * len(whole_ns)
 
 
 def test_a_host_at_another_baud_rate_hears_nonsense():
