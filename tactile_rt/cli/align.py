@@ -75,7 +75,7 @@ def write_brain(
     names = ", ".join(sorted(path.name for path in models.iterdir()))
     for line in (
         f"{recordings}: {brain.mice} mice; {models}: {names}",
-        f"next: tactile-rt align build {recordings} --out {folder / 'benchmark.json'}",
+        f"next: tactile-rt align build {recordings} --out benchmark.json",
     ):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
