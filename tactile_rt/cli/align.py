@@ -136,11 +136,12 @@ def build_benchmark(
     told_as_json(told, json)
     for note in made.notes:
         colour = "bold red" if note.startswith("WARNING") else None
-        console.print(note, highlight=False, markup=False, style=colour)
+        console.print(note, highlight=False, markup=False, style=colour, soft_wrap=True)
     console.print(
         f"{out}: {len(made.reliable)} of {len(made.targets)} animals are reliable; animal to "
         f"animal {made.a2a.mean:.3f} ± {made.a2a.sem:.3f}",
         highlight=False,
+        soft_wrap=True,
     )
 
 
@@ -192,6 +193,10 @@ def score_models(
     results = results_of(frozen, felt, done)
     if html:
         write_page(results, html)
+    for model in done:
+        if model.score is None:
+            why = "no score: in no layer do its responses tell the stimuli apart"
+            typer.echo(f"{model.name}: {why}", err=True)
     if not told_as_json(results, json):
         _show_scores(results)
 

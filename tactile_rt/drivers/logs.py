@@ -84,7 +84,7 @@ class LineLog:
         wire: What was logged: ``serial`` or ``can``.
         piece: Bytes of a packet where the log says nothing of packets.
         notes: What could not be read, a sentence each; complete once all packets were read.
-        buses: How many packets each bus had, by its name; so too.
+        buses: Number of packets of each bus, by its name; complete once all packets were read.
     """
 
     def __init__(self, path: Path, form: str, bus: str = "") -> None:

@@ -154,6 +154,19 @@ def test_mistakes_are_one_line(call, frozen, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_model_to_which_all_is_the_same_has_no_score_and_it_says_so(call, frozen, tmp_path):
+    np.savez(tmp_path / "same.npz", layer=np.ones((6, 20)))
+    code, out, err = call("align", "score", tmp_path / "same.npz", "--benchmark", frozen / "6.json")
+    assert code == 0 and "- ± -" in out
+    assert "same: no score: in no layer do its responses tell the stimuli apart\n" in err
+
+
+def test_an_array_without_a_layer_s_name_is_refused(refused, frozen, tmp_path):
+    np.save(tmp_path / "x.npy", np.ones((6, 20)))
+    said = refused("align", "score", tmp_path / "x.npy", "--benchmark", frozen / "6.json")
+    assert "in an .npz" in said
+
+
 def test_an_example_is_built_from_and_scored(call, tmp_path):
     pytest.importorskip("h5py")
     brain, out = tmp_path / "brain", tmp_path / "scores.json"

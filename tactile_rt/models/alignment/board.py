@@ -280,7 +280,9 @@ def read_board(path: Path) -> Alignments:
             )
         return msgspec.json.decode(raw, type=Alignments)
     except msgspec.MsgspecError as error:
-        raise ConfigError(f"{path} is damaged: {error}") from None
+        raise ConfigError(
+            f"{path} is damaged, or not what `tactile-rt align board --json` wrote: {error}"
+        ) from None
 
 
 def _cell(row: int, column: int, traces: Traces, measures: Sequence[Measure]) -> BoardCell:

@@ -9,7 +9,7 @@ from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.responses_file import RESPONSES, responses_layers
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.models.checkpoint_files import describe_checkpoint
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import ConfigError, ModelError
 
 __all__ = ["check_models", "load_layers", "load_untrained"]
 
@@ -28,6 +28,8 @@ def check_models(paths: Iterable[Path]) -> None:
             describe_checkpoint(path)
         elif path.suffix == RESPONSES:
             responses_layers(path)
+        elif path.suffix == ".npy":
+            raise ModelError(f"{path}: name responses by layer, in an .npz: numpy.savez")
         else:
             read_model(path, None)
 

@@ -224,7 +224,9 @@ def read_results(path: Path) -> Results:
             )
         results = msgspec.json.decode(raw, type=Results)
     except msgspec.MsgspecError as error:
-        raise ConfigError(f"{path} is damaged: {error}") from None
+        raise ConfigError(
+            f"{path} is damaged, or not what `tactile-rt align score --json` wrote: {error}"
+        ) from None
     targets = len(results.benchmark.targets)
     for model in results.models:
         shapes = {len(model.rdms), len(model.corrected), len(model.units), len(model.first)}
