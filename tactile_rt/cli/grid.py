@@ -16,6 +16,7 @@ def grid(
     plan: Annotated[str, typer.Argument(help="A TOML file, or the shipped `wide24`.")],
     folder: Annotated[Path, typer.Argument(help="Where it goes; what is done is kept.")],
     processes: Annotated[int, typer.Option(min=1, help="That train side by side.")] = 2,
+    accelerator: Annotated[str, typer.Option(help="auto, cpu, cuda ...")] = "cpu",
     report: Annotated[
         Path | None,
         typer.Option(help="Train nothing: write the table of what is done into this page."),
@@ -63,9 +64,9 @@ def grid(
         update(completed=done, total=total)
         right = found.right()
         said = found.failed or f"top-1 {100 * right.mean():.1f} %"
+        took = f", {found.seconds:.0f} CPU s" if found.seconds else ""
         console.print(
-            f"{done}/{total} {found.name}, seed {found.seed}: {said}, {found.seconds:.0f} CPU s",
-            highlight=False,
+            f"{done}/{total} {found.name}, seed {found.seed}: {said}{took}", highlight=False
         )
         if done % per_seed == 0:
             conclude()
@@ -74,6 +75,6 @@ def grid(
     if report is None:
         done = len(wanted.tasks()) - len(waiting_tasks(wanted, folder))
         with progress_bar(console, "tasks", len(wanted.tasks()), done, counted=True) as update:
-            run_grid(wanted, folder, processes, show)
+            run_grid(wanted, folder, processes, show, accelerator)
     told_as_json(conclude(), json)
     console.print(f"{folder}: its tables and pictures")

@@ -128,8 +128,9 @@ class Tactile:
         A reversed movement bends a whisker the other way: its loads change their sign.
         """
         samples, offset, sigma = loads
-        source, matrix = self._source[which], self._matrix[which]
-        each = torch.arange(len(which))[:, None]
+        device = samples.device
+        source, matrix = self._source[which].to(device), self._matrix[which].to(device)
+        each, reverse = torch.arange(len(which), device=device)[:, None], reverse.to(device)
         sign = 1.0 - 2.0 * reverse.float()
         flat = samples.flatten(1, 2).transpose(1, 2)[each, source]  # (batch, element, sample, c)
         moved = torch.einsum("besj,beij->besi", flat, matrix * sign[:, None, None, None])

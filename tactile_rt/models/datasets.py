@@ -201,6 +201,8 @@ def _lengthened(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
 
 def of_categories(data: SweepSet) -> SweepSet:
     """The sweeps of its categories alone, of which training then spoils none."""
+    if not data.refusals:
+        return data  # with the onsets that were found once
     known = np.flatnonzero(data.sweeps.labels >= 0)
     return with_faults(data[known], replace(data.manifest.faults, implausible=0.0))
 
@@ -270,6 +272,7 @@ class TrainingBatches:
         seed: of all that is drawn.
         jitter: samples by which a window may begin earlier or later.
         two_sweeps: whether the second view of a window is of another sweep of its object.
+        device: of the samples, offsets and sigmas; a GPU also draws the noise of the samples.
 
     Attributes:
         easy_epochs: The number of epochs in which noise, offset and drift rise to what is said: a
@@ -286,8 +289,10 @@ class TrainingBatches:
         seed: int,
         jitter: int = JITTER,
         two_sweeps: bool = False,
+        device: str = "cpu",
     ) -> None:
         self._data, self._batch, self._seed, self._jitter = data, batch, seed, jitter
+        self._device = device
         self.easy_epochs = 0
         self._faults, self._refusals = data.manifest.faults, data.refusals
         starts = data.noisy_starts
@@ -348,20 +353,21 @@ class TrainingBatches:
             rest = values[:, : data.manifest.lead].mean(axis=1)
         tare = data.tares[0][at], data.tares[1][at]
         rest = np.where(recorded[:, None, None], tare[0], rest)
-        samples = windows(values, start, data.timing)
-        samples -= rest[:, None, None]
         shape = (n, 1, 1, elements, 1)
         gain = 1 + np.float32(faults.gain) * rng.standard_normal(shape, dtype=np.float32)
         alive = rng.random(shape) >= faults.dead
         if faults.dead_row:
             rows = np.array(data.manifest.spec.grid)[:, 0]
             alive &= (rng.random((n, rows.max() + 1)) >= faults.dead_row)[:, None, None, rows, None]
-        samples *= gain * alive
+        # (batch, step, sub-step, element, channel), all that is large, on the device from here on.
+        samples = self._there(windows(values, start, data.timing))
+        samples -= self._there(rest)[:, None, None]
+        samples *= self._there(gain * alive)
         labels = self._spoilt(samples, data.sweeps.labels[at], rng)
         if faults.offset or faults.drift:
-            samples += self._wandered(n, rng, severity)
+            self._wander(samples, rng, severity)
         noise = data.noise * level[:, None, None]  # (batch, 1, channel)
-        samples += noise[:, None, None] * rng.standard_normal(samples.shape, dtype=np.float32)
+        samples.addcmul_(self._normal(samples.shape, rng), self._there(noise)[:, None, None])
         # The tare: a mean and a spread over the quiet samples that happened to come before.
         quiet = rng.integers(20, 60, (n, 1, 1))
         per_channel = (n, elements, channels)
@@ -369,15 +375,28 @@ class TrainingBatches:
         spread = 1 + rng.normal(size=per_channel) / np.sqrt(2 * (quiet - 1))
         sigma = np.maximum(noise * np.abs(spread), data.floor)
         sigma = np.where(recorded[:, None, None], tare[1], sigma)
-        return (
-            torch.from_numpy(samples.astype(np.float32)),
-            torch.from_numpy(offset.astype(np.float32)),
-            torch.from_numpy(sigma.astype(np.float32)),
-            torch.from_numpy(labels),
-        )
+        return samples, self._there(offset), self._there(sigma), torch.from_numpy(labels)
+
+    def _there(self, array: NDArray[Any]) -> Tensor:
+        """In single precision, on the device."""
+        import torch
+
+        tensor = torch.from_numpy(np.asarray(array, dtype=np.float32))
+        if self._device == "cpu":
+            return tensor
+        return tensor.pin_memory().to(self._device, non_blocking=True)
+
+    def _normal(self, shape: Sequence[int], rng: np.random.Generator) -> Tensor:
+        """Standard normal numbers on the device."""
+        import torch
+
+        if self._device == "cpu":
+            return torch.from_numpy(rng.standard_normal(shape, dtype=np.float32))
+        generator = torch.Generator(self._device).manual_seed(int(rng.integers(2**63)))
+        return torch.randn(*shape, generator=generator, device=self._device)
 
     def _spoilt(
-        self, samples: NDArray[np.float32], labels: NDArray[np.int64], rng: np.random.Generator
+        self, samples: Tensor, labels: NDArray[np.int64], rng: np.random.Generator
     ) -> NDArray[np.int64]:
         """Make some of the samples implausible, in place; (n,) the labels that all then have."""
         spec, first = self._data.manifest.spec, len(self._data.manifest.categories)
@@ -388,15 +407,15 @@ class TrainingBatches:
             which = rng.integers(0, len(names), len(samples))
             for number, name in enumerate(names):
                 at = np.flatnonzero(bad & (which == number))
-                samples[at] = IMPLAUSIBLE[name](samples[at], spec, rng)
+                spoilt = IMPLAUSIBLE[name](samples[at].cpu().numpy(), spec, rng)
+                samples[at] = self._there(spoilt)
                 labels[at] = first + self._refusals.index(name)
         return labels
 
-    def _wandered(self, n: int, rng: np.random.Generator, severity: float) -> NDArray[np.float32]:
-        """(n, step, sub-step, element, channel) what has come to the readings since their tare."""
-        data, timing = self._data, self._data.timing
+    def _wander(self, samples: Tensor, rng: np.random.Generator, severity: float) -> None:
+        """Add, in place, what has come to the readings since their tare."""
+        data, timing, n = self._data, self._data.timing, len(samples)
         course = np.arange(1, timing.samples + 1) / timing.samples
-        there = np.zeros((n, timing.samples, *data.manifest.spec.shape), dtype=np.float32)
         for most, over in (
             (self._faults.offset, np.ones_like(course)),
             (self._faults.drift, course),
@@ -404,5 +423,6 @@ class TrainingBatches:
             # half of the sweeps have none
             share = severity * np.maximum(rng.uniform(-1, 1, (n, 1, 1)), 0)
             size = most * share * data.noise
-            there += (size * rng.normal(size=(n, *there.shape[2:])))[:, None] * over[:, None, None]
-        return there.reshape(n, timing.steps, timing.substeps, *there.shape[2:])
+            reached = self._there(size * rng.normal(size=(n, *data.manifest.spec.shape)))
+            # (batch, sample, element, channel)
+            samples.flatten(1, 2).addcmul_(reached[:, None], self._there(over)[:, None, None])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.stream import ConfigError
 
-__all__ = ["CLEAN", "OFFSET", "Disturbance"]
+__all__ = ["CLEAN", "OFFSET", "RATED", "Disturbance"]
 
 OFFSET = 2.0  # a unit of offset that appears after the tare, in units of the rated noise
 
@@ -108,6 +108,7 @@ class Disturbance:
 
 
 CLEAN = Disturbance()
+RATED = Disturbance(noise=1.0)
 
 
 def _x_for_y(channels: Sequence[str]) -> list[int]:

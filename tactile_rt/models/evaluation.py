@@ -7,7 +7,9 @@ Predictions are (sweep, step, class) posteriors; a sweep in which no contact was
 decision, and counts as wrong everywhere.
 """
 
-from collections.abc import Callable
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +21,7 @@ from tactile_rt.models.datasets import SweepSet, windows
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 
 __all__ = [
+    "CutWindows",
     "Interval",
     "Step",
     "accuracy",
@@ -28,10 +31,12 @@ __all__ = [
     "auroc",
     "bootstrap",
     "confusion",
+    "cut_windows",
     "deciding_step",
     "expected_calibration_error",
     "fused_accuracy",
     "hits",
+    "posteriors",
     "predict",
     "run_windows",
 ]
@@ -42,6 +47,22 @@ Step = Callable[
     [NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]
 ]
 LEVELS = (2.5, 97.5)  # percentiles of the 95 % interval
+
+
+@dataclass(frozen=True)
+class CutWindows:
+    """Windows of some sweeps, and the tare that the detector had by then.
+
+    Attributes:
+        samples: (sweep, step, sub-step, element, channel), SI.
+        offset, sigma: (sweep, element, channel) Mean and noise at rest, SI.
+        detected: (sweep,) Whether a contact was; where it was not, the samples mean nothing.
+    """
+
+    samples: NDArray[np.float32]
+    offset: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    detected: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -80,11 +101,38 @@ def predict(
     """
     if noise_level:
         disturbance = replace(disturbance, noise=noise_level)
-    logits, found = run_windows(data, run, seed, batch, disturbance)
+    return posteriors(cut_windows(data, seed, batch, disturbance), run)
+
+
+def posteriors(cut: Iterable[CutWindows], run: Step) -> NDArray[np.float32]:
+    """(sweep, step, class) posteriors of windows that are cut; NaN where no contact was detected.
+
+    Args:
+        cut: what `cut_windows` gives.
+        run: as `predict` takes it.
+    """
+    logits, found = _run_over(cut, run)
     raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
     posterior: NDArray[np.float32] = raised / raised.sum(axis=-1, keepdims=True)
     posterior[~found] = np.nan
     return posterior
+
+
+def cut_windows(
+    data: SweepSet, seed: int = 0, batch: int = 64, disturbance: Disturbance = CLEAN
+) -> Iterator[CutWindows]:
+    """The windows of all sweeps as the robot would cut them, so many at a time.
+
+    Args:
+        data, seed, batch, disturbance: as `predict` takes them.
+    """
+    rng = np.random.default_rng(seed)
+    for i in range(0, len(data.sweeps), batch):
+        part = data[i : i + batch]
+        values = disturbance.of_samples(part.sweeps.values, part, rng)
+        found = part.onsets(values)
+        cut = disturbance.of_windows(windows(values, found.start, data.timing), data, rng)
+        yield CutWindows(cut, found.offset, found.sigma, found.start >= 0)
 
 
 def run_windows(
@@ -96,16 +144,15 @@ def run_windows(
         data, run, seed, batch, disturbance: as `predict` takes them; what `run` gives need not be
             logits.
     """
-    rng = np.random.default_rng(seed)
-    parts, detected = [], []
-    for i in range(0, len(data.sweeps), batch):
-        part = data[i : i + batch]
-        values = disturbance.of_samples(part.sweeps.values, part, rng)
-        found = part.onsets(values)
-        cut = disturbance.of_windows(windows(values, found.start, data.timing), data, rng)
-        parts.append(run(cut, found.offset, found.sigma))
-        detected.append(found.start >= 0)
-    return np.concatenate(parts), np.concatenate(detected)
+    return _run_over(cut_windows(data, seed, batch, disturbance), run)
+
+
+def _run_over(
+    cut: Iterable[CutWindows], run: Step
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    parts = [(run(one.samples, one.offset, one.sigma), one.detected) for one in cut]
+    out, detected = zip(*parts, strict=True)
+    return np.concatenate(out), np.concatenate(detected)
 
 
 def at_temperature(posteriors: NDArray[np.float32], temperature: float) -> NDArray[np.float32]:

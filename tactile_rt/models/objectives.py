@@ -6,8 +6,9 @@ training.
     objective(views, labels, generator) -> loss
 
 `views` are one or two batches of loads (samples, offset, sigma) as `TactileClassifier` takes them,
-`Objective.views` says how many; labels (batch,) count for the supervised objective alone. The
-augmentation of frames happens inside, drawn from the generator.
+`Objective.views` says how many; labels (batch,) count for the supervised objective alone. It is
+done in two: `see` makes the frames, whose augmentation it draws from the generator, and `loss`
+draws nothing but dropout.
 
 - `Supervised`: cross-entropy with the category.
 - `SimCLR` (Chen et al. 2020): two views of a window are to be found among all others' views.
@@ -85,15 +86,22 @@ class Objective(nn.Module):
             return features[:, network.lag :].mean(dim=1)
         return features[:, -1]
 
-    def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
-        """The loss of a batch.
+    def see(self, views: Sequence[Loads], generator: Generator) -> list[Tensor]:
+        """What `loss` takes of a batch: the augmented frames of every view.
 
         Args:
             views: `self.views` batches of loads, SI.
-            labels: (batch,).
             generator: on the loads' device; the augmentation of frames draws from it.
         """
+        return [self.frames(view, generator) for view in views]
+
+    def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
+        """The loss of a batch of what `see` gave and labels (batch,)."""
         raise NotImplementedError
+
+    def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
+        """The loss of a batch; arguments as `see` and `loss` take them."""
+        return self.loss(self.see(views, generator), labels)
 
 
 def anytime_loss(logits: Tensor, labels: Tensor, smoothing: float, lag: int) -> Tensor:
@@ -106,7 +114,7 @@ def anytime_loss(logits: Tensor, labels: Tensor, smoothing: float, lag: int) -> 
     n = steps.shape[1]
     each = F.cross_entropy(
         steps.flatten(0, 1).float(),
-        labels.repeat_interleave(n),
+        labels[:, None].expand(-1, n).flatten(),
         reduction="none",
         label_smoothing=smoothing,
     ).view(-1, n)
@@ -133,9 +141,9 @@ class Supervised(Objective):
         super().__init__(model, augmentation)
         self._anytime, self._smoothing = loss == "anytime", smoothing
 
-    def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
-        (loads,) = views
-        logits = self.model.network(self.frames(loads, generator))
+    def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
+        (frames,) = seen
+        logits = self.model.network(frames)
         with _in_single_precision(logits):
             if self._anytime:
                 return anytime_loss(logits, labels, self._smoothing, self.model.network.lag)
@@ -177,9 +185,8 @@ class SimCLR(Objective):
             if isinstance(layer, nn.Linear):
                 nn.init.normal_(layer.weight, std=NECK_SPREAD)
 
-    def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
-        frames = torch.cat([self.frames(view, generator) for view in views])
-        first, second = self.neck(self.embedding(frames)).chunk(2)
+    def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
+        first, second = self.neck(self.embedding(torch.cat(list(seen)))).chunk(2)
         with _in_single_precision(first):
             return nt_xent(_of_all_devices(first), _of_all_devices(second))
 
@@ -234,10 +241,8 @@ class SimSiam(Objective):
             nn.Linear(hidden, out),
         )
 
-    def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
-        first, second = (
-            self.projector(self.embedding(self.frames(view, generator))) for view in views
-        )
+    def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
+        first, second = (self.projector(self.embedding(frames)) for frames in seen)
         predicted = self.predictor(first), self.predictor(second)
         with _in_single_precision(first):
             return 0.5 * (_distance(predicted[0], second) + _distance(predicted[1], first))
@@ -268,9 +273,8 @@ class Autoencoder(Objective):
             layers.append(nn.ConvTranspose2d(channels if n else first, channels, 3, padding=1))
         self.decoder = nn.Sequential(*layers)
 
-    def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
-        (loads,) = views
-        frames = self.frames(loads, generator)
+    def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
+        (frames,) = seen
         latent = self.model.features(frames)
         rebuilt = self.decoder(latent.flatten(0, 1)).view(frames.shape)
         with _in_single_precision(frames):
@@ -299,11 +303,14 @@ class Predictive(Objective):
         channels, rows, columns = model.network.config.frame
         self.head = nn.Linear(model.feature_size(), PREDICTED * channels * rows * columns)
 
-    def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
-        (loads,) = views
-        frames = self.frames(loads, generator)  # (batch, step, channel, row, column)
-        seen = mask_steps(frames, self._masking, generator) if self._masking else frames
-        told = self.head(self.model.features(seen)).unflatten(-1, (PREDICTED, -1))
+    def see(self, views: Sequence[Loads], generator: Generator) -> list[Tensor]:
+        """The frames that are to be told, and those that the network sees."""
+        (frames,) = super().see(views, generator)
+        return [frames, mask_steps(frames, self._masking, generator) if self._masking else frames]
+
+    def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
+        frames, shown = seen  # (batch, step, channel, row, column) each
+        told = self.head(self.model.features(shown)).unflatten(-1, (PREDICTED, -1))
         flat, first = frames.flatten(2), self.model.network.lag
         with _in_single_precision(frames):
             errors = [

@@ -93,7 +93,7 @@ def plan(data: Path, tmp_path: Path) -> Path:
 
 
 def test_the_shipped_grid_is_the_papers_figure_and_its_controls() -> None:
-    assert shipped_grids() == ("wide24",)
+    assert shipped_grids() == ("wide24", "wide24-full")
     grid = read_grid("wide24")
     names = {cell.name for cell in grid.cells}
     for encoder in ("gru", "s4", "resnet18", "mamba", "zhuang-intersection-ln"):
@@ -275,6 +275,33 @@ seeds = 1
     config = json.loads(next((folder / "runs" / task.slug).glob("*/config.json")).read_text())
     assert config["begin"].startswith(str(folder / "runs" / before.slug))
     assert "after simclr image of 0.5" in table(gather(grid, folder))
+
+
+def test_what_only_its_scores_were_kept_of_is_trained_again(plan: Path, tmp_path: Path) -> None:
+    grid, folder = read_grid(plan), tmp_path / "out"
+    pool.write_subset(Path(grid.data), folder / "sweeps", grid.sweeps)
+    bench, task = Workbench(grid, folder), grid.tasks()[1]
+    first = bench.do(task)
+    outcome_path(folder, task).unlink()
+    for network in (folder / "runs" / task.slug).rglob("best.pt"):
+        network.unlink()
+    told: list[object] = []
+    again = bench.do(task, told.append)
+    assert (again.top1, again.trials) == (first.top1, first.trials)
+    assert again.chosen is not None
+    assert [p.update for p in told if not p.metrics] == [*range(1, again.chosen.updates + 1)]  # type: ignore[attr-defined]
+
+
+def test_of_what_no_processor_trained_no_processor_s_time_is_told(
+    plan: Path, tmp_path: Path
+) -> None:
+    grid, folder = read_grid(plan), tmp_path / "out"
+    pool.write_subset(Path(grid.data), folder / "sweeps", grid.sweeps)
+    Workbench(grid, folder, "auto").do(grid.tasks()[1])
+    (row,) = [row for row in gather(grid, folder).rows if row.top1 is not None]
+    assert row.seconds == 0
+    assert table(gather(grid, folder)).splitlines()[4].endswith("| 1 |  |")
+    draw_curves(gather(grid, folder), folder / "curves.png")
 
 
 def test_the_longest_training_is_not_longer_than_it_helps(

@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import nn
 
-from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.datasets import SweepSet, TrainingBatches
 from tactile_rt.models.evaluation import hits, predict
 from tactile_rt.models.training import (
     ProbeConfig,
@@ -35,6 +35,7 @@ from tactile_rt.models.training.optimizers import (
 )
 from tactile_rt.models.training.probing import linear_probe
 from tactile_rt.models.training.recipes import read_recipe
+from tactile_rt.models.training.replay import replayed
 from tactile_rt.stream import ConfigError, ModelError
 from tests.helpers.tiny_sweeps import write_tiny_set
 
@@ -306,6 +307,39 @@ def test_a_run_of_every_objective_can_be_repeated(tiny, tmp_path, objective, aug
     again = []
     train(config, tmp_path / "a", again.append)
     assert not again, "a finished run is finished"
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("encoder", ["zhuang-intersection-ln", "gru", "mamba", "resnet18"])
+@pytest.mark.parametrize("objective", ["supervised", "simclr", "simsiam", "autoencoder"])
+def test_an_update_is_replayed_on_a_gpu_with_the_gradients_of_its_kernels(tiny, encoder, objective):
+    config = TrainingConfig(
+        tiny, encoder=encoder, width=1 / 32, objective=objective, augmentation="tactile",
+        dropout=0.0, precision="fp32",
+    )  # fmt: skip
+    training, _ = read_splits(config)
+    learning = build_objective(config, training).cuda().train()
+    batches = TrainingBatches(training, 6, 0, device="cuda")
+    views = [loads for *loads, labels in [next(batches.epoch(0, v)) for v in (0, 1)]]
+    draws = torch.Generator("cuda").manual_seed(0)
+    seen, labels = learning.see(views[: learning.views], draws), torch.arange(6).cuda() % 3
+    with torch.no_grad():
+        for module in learning.modules():  # what is drawn in the network is another draw
+            if hasattr(module, "p"):
+                module.p = 0.0
+    before = {name: buffer.clone() for name, buffer in learning.named_buffers()}
+    loss_of = replayed(learning, seen, labels, bf16=False)
+    assert loss_of is not None
+    assert all(torch.equal(b, before[name]) for name, b in learning.named_buffers())
+    losses, gradients = [], []
+    for loss in (learning.loss(seen, labels), loss_of(*seen, labels)):
+        learning.zero_grad()
+        loss.backward()
+        losses.append(float(loss))
+        gradients.append([p.grad.clone() for p in learning.parameters() if p.grad is not None])
+    assert losses[1] == pytest.approx(losses[0], rel=1e-4)
+    for one, other in zip(*gradients, strict=True):
+        assert torch.allclose(one, other, rtol=1e-3, atol=1e-5)
 
 
 def test_a_contrast_is_of_two_sweeps_of_an_object(tmp_path):

@@ -104,13 +104,14 @@ def kernels(blocks: Sequence[S4Block], steps: int) -> Tensor:
 
     # log_dt (block * channel,); p, b, c (block * channel, 2, state / 2)
     log_dt, p, b, c = (joined(name) for name in ("log_dt", "P", "B", "C"))
-    conjugate = p.new_tensor([1.0, -1.0])[:, None]
+    part = torch.arange(2, device=p.device, dtype=p.dtype)[:, None]  # real, imaginary
+    conjugate = 1 - 2 * part
     dt = torch.exp(log_dt)[:, None]
     re, im = -torch.exp(joined("log_decay")) * dt / 2, joined("frequency") * dt / 2
     # r = 1 / (1 - Δ/2 Λ), and e = (1 + Δ/2 Λ) r, the diagonal part's share of Ā
     size = (1 - re) ** 2 + im**2
     r = torch.stack([(1 - re) / size, im / size], 1)
-    e = 2 * r - p.new_tensor([1.0, 0.0])[:, None]
+    e = 2 * r - (1 - part)
     # Woodbury: (I - Δ/2 A)^-1 z = r z - v (w · z). A conjugate pair adds twice a real part, so
     # w · z is a sum over real numbers.
     w = 2 * conjugate * product(r, p * conjugate)

@@ -31,7 +31,8 @@ class Training(msgspec.Struct, frozen=True):
         learning_rate, warmup, updates: The settings of the training, as in `TrainingConfig`.
         score: Top-1 of the validation split, 0 to 1, the mean of clean and noisy; of a
             self-supervised network by its probe. 0 if it diverged.
-        seconds: The CPU time of its updates, and of what it was validated by, s.
+        seconds: The CPU time of its updates, and of what it was validated by, s; 0 if something
+            else than a CPU trained it.
     """
 
     learning_rate: float
@@ -50,7 +51,7 @@ class Outcome(msgspec.Struct, frozen=True):
         top1, top5, noisy: Hits as text, a 0 or 1 per test sweep: right, among the first five, right
             at the rated noise.
         parameters: The number of parameters of encoder, attender and decoder.
-        seconds: The CPU time of the training that was scored, s.
+        seconds: The CPU time of the training that was scored, s, as in `Training`.
         trials: The trials that chose rate and warm-up; of the first seed alone.
         growth: The trainings with more and more updates; of the first seed alone.
         chosen: The training that was scored.

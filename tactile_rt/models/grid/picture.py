@@ -88,7 +88,8 @@ def draw_curves(results: GridResults, path: Path) -> None:
         scores = [100 * point.score for point in row.growth]
         how = _line(row)
         axes[0, 0].plot([point.updates for point in row.growth], scores, **how)
-        axes[0, 1].plot([point.seconds for point in row.growth], scores, **how)
+        if row.seconds:
+            axes[0, 1].plot([point.seconds for point in row.growth], scores, **how)
     whole = [row for row in networks if row.share == 1 and row.top1 is not None]
     for row in whole:
         if row.learning == SUPERVISED and row.top1 is not None:

@@ -39,6 +39,7 @@ def run_grid(
     folder: Path,
     processes: int = 1,
     report: Callable[[Outcome, int, int], None] = lambda found, done, total: None,
+    accelerator: str = "cpu",
 ) -> None:
     """Do everything that a grid has not done yet.
 
@@ -47,17 +48,22 @@ def run_grid(
         folder: where its sweeps, runs and outcomes go.
         processes: to share the tasks; one works in this process.
         report: called with each outcome as it comes, and how many of all there are.
+        accelerator: what trains, as `train` takes it.
 
     Raises:
         ConfigError: the folder holds outcomes of another grid, or another process works in it.
         RecordingError: the sweep set cannot be read.
     """
     with alone_in(folder):
-        _run(grid, folder, processes, report)
+        _run(grid, folder, processes, report, accelerator)
 
 
 def _run(
-    grid: Grid, folder: Path, processes: int, report: Callable[[Outcome, int, int], None]
+    grid: Grid,
+    folder: Path,
+    processes: int,
+    report: Callable[[Outcome, int, int], None],
+    accelerator: str,
 ) -> None:
     tasks = grid.tasks()
     folder.mkdir(parents=True, exist_ok=True)
@@ -80,7 +86,7 @@ def _run(
         report(found, len(finished), len(tasks))
 
     if processes == 1:
-        bench = Workbench(grid, folder)
+        bench = Workbench(grid, folder, accelerator)
         while task := ready():
             conclude(bench.do(task), task)
         return
@@ -89,7 +95,7 @@ def _run(
     todo: Any = context.Queue()
     outcomes: Any = context.Queue()
     workers = [
-        context.Process(target=_work, args=(grid, folder, todo, outcomes), daemon=True)
+        context.Process(target=_work, args=(grid, folder, accelerator, todo, outcomes), daemon=True)
         for _ in range(min(processes, len(waiting)))
     ]
     # Ctrl-C is this process's to handle: the others hear it not even while they begin.
@@ -165,7 +171,7 @@ def _next(outcomes: Any, workers: list[Any]) -> Any:
                 ) from None
 
 
-def _work(grid: Grid, folder: Path, todo: Any, outcomes: Any) -> None:
+def _work(grid: Grid, folder: Path, accelerator: str, todo: Any, outcomes: Any) -> None:
     import torch
 
     torch.set_num_threads(1)
@@ -176,7 +182,7 @@ def _work(grid: Grid, folder: Path, todo: Any, outcomes: Any) -> None:
             os._exit(1)
 
     try:
-        bench = Workbench(grid, folder)
+        bench = Workbench(grid, folder, accelerator)
         while True:
             orphaned()
             try:

@@ -33,7 +33,7 @@ class Row:
             noise. None where there is no figure.
         random: The top-1 accuracy of a linear probe on the untrained network, 0 to 1.
         parameters: The number of parameters of the network.
-        seconds: The mean CPU time of a seed's training, s.
+        seconds: The mean CPU time of a seed's training, s, of the seeds that a CPU trained; else 0.
         share: The share of the training objects that it learnt from.
         chosen: The settings of its training, which its trials chose; None if there were none.
         growth: The trainings with more and more updates.
@@ -148,7 +148,7 @@ def _row(
         estimate(outcomes, "noisy"),
         estimate(random, "top1"),
         first.parameters,
-        float(np.mean([one.seconds for one in outcomes])),
+        float(np.mean([one.seconds for one in outcomes if one.seconds] or [0.0])),
         cell.share if cell else 1.0,
         first.chosen,
         first.growth,
@@ -195,7 +195,7 @@ def table(results: GridResults) -> str:
             _percent(row.top1) if row.top1 else "failed" if row.failed else "",
             *(_percent(one) for one in (row.random, row.top5, row.noisy)),
             str(row.seeds),
-            f"{row.seconds:.0f}",
+            f"{row.seconds:.0f}" if row.seconds else "",
         ]
         lines.append("| " + " | ".join(cells) + " |")
     failed = [row for row in results.rows if row.failed]

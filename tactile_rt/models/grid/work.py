@@ -18,10 +18,10 @@ from tactile_rt.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.data_checks import check_sets, check_split
-from tactile_rt.models.datasets import SweepSet, windows
-from tactile_rt.models.disturbances import CLEAN, Disturbance
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.disturbances import CLEAN, RATED
 from tactile_rt.models.ead import count_parameters
-from tactile_rt.models.evaluation import Step, hits
+from tactile_rt.models.evaluation import among, cut_windows, hits, posteriors
 from tactile_rt.models.grid.outcomes import (
     SUBSET,
     Outcome,
@@ -31,7 +31,6 @@ from tactile_rt.models.grid.outcomes import (
     settings_of,
 )
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
-from tactile_rt.models.onsets import find_onsets
 from tactile_rt.models.svm import fit_svm
 from tactile_rt.models.training import (
     ProbeConfig,
@@ -46,7 +45,6 @@ from tactile_rt.sweep_set import SweepManifest
 __all__ = ["Workbench"]
 
 BATCH = 128
-RATED = Disturbance(noise=1.0)
 RUNS = "runs"  # a folder of a grid
 POINT = "point.json"
 
@@ -57,10 +55,11 @@ class Workbench:
     Args:
         grid: the grid.
         folder: of the grid, with its sweeps.
+        accelerator: what trains, as `train` takes it.
     """
 
-    def __init__(self, grid: Grid, folder: Path) -> None:
-        self.grid, self.folder = grid, folder
+    def __init__(self, grid: Grid, folder: Path, accelerator: str = "cpu") -> None:
+        self.grid, self.folder, self.accelerator = grid, folder, accelerator
         self.data = folder / SUBSET
         check_split(self.data, SweepManifest.read(self.data))
         self.splits = SweepSet.read(self.data, "train"), SweepSet.read(self.data, "validation")
@@ -70,7 +69,9 @@ class Workbench:
             if task.cell is not None:  # an array that cannot be augmented so is told now
                 build(grid.config(task, self.data).augmentation, self.test.manifest.spec)
         self._shares: dict[float, tuple[SweepSet, SweepSet]] = {}
-        self._windows = {key: self._cut(d) for key, d in (("clean", CLEAN), ("noisy", RATED))}
+        self._clean, self._noisy = (
+            list(cut_windows(self.test, batch=BATCH, disturbance=one)) for one in (CLEAN, RATED)
+        )
 
     def do(self, task: Task, report: Callable[..., None] = lambda _: None) -> Outcome:
         """Do a task and keep its outcome; a network that diverges is an outcome too.
@@ -108,10 +109,13 @@ class Workbench:
         if not chosen.score:
             raise ModelError("every training of it diverged")
         run = self._run(task, chosen)
-        if task.cell is not None and task.cell.objective != SUPERVISED:
-            run = run / "probe"
+        assert task.cell is not None
+        best = run / ("" if task.cell.objective == SUPERVISED else "probe") / "best.pt"
+        if not best.exists():  # where only what its trainings scored was kept
+            (run / POINT).unlink()
+            chosen = self._train(task, chosen, report)
         return self._scored(
-            msgspec.structs.replace(found, chosen=chosen, seconds=chosen.seconds), run / "best.pt"
+            msgspec.structs.replace(found, chosen=chosen, seconds=chosen.seconds), best
         )
 
     def _search(self, task: Task, report: Callable[..., None]) -> tuple[Training, ...]:
@@ -166,9 +170,11 @@ class Workbench:
 
         splits = self.splits_of(cell.share)
         try:
-            best = train(config, run, count, device="cpu", splits=splits)
+            best = train(config, run, count, device=self.accelerator, splits=splits)
             # what was done before an interruption cost as much
             seconds = (time.process_time() - began) * at.updates / max(updates, 1)
+            if self.accelerator != "cpu":  # a processor's time for starting kernels says nothing
+                seconds = 0.0
             if cell.objective != SUPERVISED:
                 best = probe(best, run / "probe", ProbeConfig(**self.grid.probe), report, splits)
             metrics = load_checkpoint(best)[1]["metrics"]
@@ -223,32 +229,21 @@ class Workbench:
     def _scored(self, found: Outcome, best: Path) -> Outcome:
         """The outcome with what a checkpoint's network makes of the test split."""
         model, _ = load_checkpoint(best)
-        run: Step = run_on(model)
-        labels = self.test.sweeps.labels
-        last, classes = {}, len(self.test.manifest.categories)
-        for name, (cut, offset, sigma, touched) in self._windows.items():
-            parts = [slice(i, i + BATCH) for i in range(0, len(cut), BATCH)]
-            logits = np.concatenate([run(cut[p], offset[p], sigma[p])[:, -1] for p in parts])
-            logits[~touched] = np.nan
-            last[name] = logits[:, :classes]  # had it to name one
+        run, labels, classes = (
+            run_on(model),
+            self.test.sweeps.labels,
+            len(self.test.manifest.categories),
+        )
+        clean, noisy = (  # had it to name one
+            among(posteriors(cut, run)[:, -1], classes) for cut in (self._clean, self._noisy)
+        )
         return msgspec.structs.replace(
             found,
-            top1=_as_text(hits(last["clean"], labels)),
-            top5=_as_text(hits(last["clean"], labels, 5)),
-            noisy=_as_text(hits(last["noisy"], labels)),
+            top1=_as_text(hits(clean, labels)),
+            top5=_as_text(hits(clean, labels, 5)),
+            noisy=_as_text(hits(noisy, labels)),
             parameters=count_parameters(model.network),
         )
-
-    def _cut(self, disturbance: Disturbance) -> tuple[NDArray[Any], ...]:
-        rng = np.random.default_rng(0)
-        parts = []
-        for i in range(0, len(self.test.sweeps), BATCH):
-            part = self.test[i : i + BATCH]
-            values = disturbance.of_samples(part.sweeps.values, part, rng)
-            at = find_onsets(values, self.test.floor)
-            cut = windows(values, at.start, self.test.timing)
-            parts.append((cut, at.offset, at.sigma, at.start >= 0))
-        return tuple(np.concatenate(part) for part in zip(*parts, strict=True))
 
 
 def _score(point: Training) -> float:

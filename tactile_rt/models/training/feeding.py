@@ -58,12 +58,12 @@ class BatchFeed:
     """Epochs of batches, each view augmented afresh, on the device.
 
     Args:
-        batches: where windows are drawn.
+        batches: where windows are drawn, on the device.
         augmentation: of the loads.
         views: of every window.
         seed: of the augmentation.
         share: what this device takes of each batch.
-        device: where the batches go.
+        device: where the labels go.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class BatchFeed:
                 yield batch
 
     def _draw(self, number: int) -> Iterator[Batch]:
-        share, device = self._share, self._device
+        share = self._share
         drawn = [self._batches.epoch(number, view) for view in range(self._views)]
         for index, batches in enumerate(zip(*drawn, strict=True)):
             generator = generator_of(CPU, self._seed, number, index, share.rank)
@@ -103,8 +103,7 @@ class BatchFeed:
                 self._augmentation.loads((share.of(a), share.of(b), share.of(c)), generator)
                 for a, b, c, _ in batches
             ]
-            labels = share.of(batches[0][3]).to(device)
-            yield Batch([_to(v, device) for v in views], labels, index)
+            yield Batch(views, share.of(batches[0][3]).to(self._device), index)
 
 
 def generator_of(device: torch.device, *seed: int) -> Generator:
@@ -149,10 +148,3 @@ def prefetched(
     finally:
         left.set()
         thread.join()
-
-
-def _to(loads: Loads, device: torch.device) -> Loads:
-    if device.type == "cpu":
-        return loads
-    a, b, c = (t.pin_memory().to(device, non_blocking=True) for t in loads)
-    return a, b, c

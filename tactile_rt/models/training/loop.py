@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 import torch
+from torch import Generator, Tensor
 from torch.optim.lr_scheduler import LRScheduler
 
 from tactile_rt.files import write_whole
@@ -45,9 +46,10 @@ from tactile_rt.models.objectives import (
 )
 from tactile_rt.models.training.config import Progress, TrainingConfig, manifests_of
 from tactile_rt.models.training.devices import is_first, launched
-from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
+from tactile_rt.models.training.feeding import Batch, BatchFeed, Share, generator_of
 from tactile_rt.models.training.logs import Board, log_epoch
 from tactile_rt.models.training.optimizers import build_optimizer, build_schedule
+from tactile_rt.models.training.replay import replayed
 from tactile_rt.models.training.validation import Validation
 from tactile_rt.stream import ConfigError, ModelError
 from tactile_rt.sweep_set import OUTLIERS
@@ -111,7 +113,9 @@ def _train(
         begin_from(objective.model, Path(config.begin), labels_of(training))
     share = Share(fabric.global_rank, fabric.world_size)
     two_sweeps = config.pairs == "two-sweeps"
-    batches = TrainingBatches(training, config.batch, config.seed, config.jitter, two_sweeps)
+    batches = TrainingBatches(
+        training, config.batch, config.seed, config.jitter, two_sweeps, str(fabric.device)
+    )
     if config.easy:
         updates = config.updates or config.epochs * len(batches)
         batches.easy_epochs = round(config.easy * updates / len(batches))
@@ -126,7 +130,7 @@ def _train(
     run.resume(folder / "last.pt")
     board.begin(run.done)
     wrapped, _ = fabric.setup(objective, optimizer)
-    bf16 = config.precision == "bf16"
+    loss_of = _loss_of(fabric, wrapped, objective, config, feed)
 
     while run.done < run.updates:
         epoch, began, losses = run.epoch, time.monotonic(), []
@@ -138,9 +142,7 @@ def _train(
                 generator = generator_of(
                     fabric.device, config.seed, epoch, batch.index, share.rank, AUGMENTED
                 )
-                # Not Fabric's, which casts a recurrent network's weights anew at every step.
-                with torch.autocast(fabric.device.type, torch.bfloat16, enabled=bf16):
-                    loss = wrapped(batch.views, batch.labels, generator)
+                loss = loss_of(batch, generator)
                 optimizer.zero_grad()
                 fabric.backward(loss)
                 norm = fabric.clip_gradients(
@@ -185,6 +187,39 @@ def _train(
         report(Progress(epoch + 1, run.epochs, run.done, run.updates, metrics["loss"], shown))
     fabric.barrier()
     return folder / "best.pt"
+
+
+def _loss_of(
+    fabric: "Fabric",
+    wrapped: Callable[..., Tensor],
+    objective: Objective,
+    config: TrainingConfig,
+    feed: BatchFeed,
+) -> Callable[[Batch, Generator], Tensor]:
+    """The loss of a batch, whose augmentation is drawn from the generator: ready for `backward`."""
+    device, bf16 = fabric.device.type, config.precision == "bf16"
+
+    def by_kernels(batch: Batch, generator: Generator) -> Tensor:
+        # Not Fabric's, which casts a recurrent network's weights anew at every step.
+        with torch.autocast(device, torch.bfloat16, enabled=bf16):
+            loss: Tensor = wrapped(batch.views, batch.labels, generator)
+            return loss
+
+    if device != "cuda" or fabric.world_size > 1:
+        return by_kernels
+    with closing(feed.epoch(0)) as drawn:
+        batch = next(drawn)
+    seen = objective.see(batch.views, generator_of(fabric.device, config.seed))
+    graph = replayed(objective, seen, batch.labels, bf16)
+    if graph is None:
+        return by_kernels
+
+    def by_graph(batch: Batch, generator: Generator) -> Tensor:
+        with torch.autocast(device, torch.bfloat16, enabled=bf16):
+            seen = objective.see(batch.views, generator)
+        return graph(*seen, batch.labels)
+
+    return by_graph
 
 
 def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = None) -> Path:

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from tactile_rt.models.augmentation import Augmentation, Loads
 from tactile_rt.models.checkpoints import run_on
 from tactile_rt.models.datasets import SweepSet, partners, windows
-from tactile_rt.models.evaluation import among, hits, predict
+from tactile_rt.models.disturbances import CLEAN, RATED
+from tactile_rt.models.evaluation import among, cut_windows, hits, posteriors
 from tactile_rt.models.objectives import Objective
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.feeding import Share, generator_of
@@ -48,7 +49,12 @@ class Validation:
         self._share, self._device = share, device
         supervised = config.objective == "supervised"
         self._measure: Callable[[Objective], Score] = self._top1 if supervised else self._loss
-        if not supervised:
+        if supervised:
+            # Cut once, since they are the same after every epoch.
+            self._clean, self._noisy = (
+                list(cut_windows(data, disturbance=one)) for one in (CLEAN, RATED)
+            )
+        else:
             self._found = data.onsets(data.sweeps.values)
             usable = self._usable = np.flatnonzero(self._found.start >= 0)
             self._other = np.arange(len(data.sweeps))  # what the second view is of
@@ -65,8 +71,10 @@ class Validation:
         data, run = self._data, run_on(objective.model)
         labels, classes = data.sweeps.labels, len(data.manifest.categories)
         # Whether a model may refuse to decide is another question.
-        clean = hits(among(predict(data, run)[:, -1], classes), labels).mean()
-        noisy = hits(among(predict(data, run, 1.0)[:, -1], classes), labels).mean()
+        clean, noisy = (
+            hits(among(posteriors(cut, run)[:, -1], classes), labels).mean()
+            for cut in (self._clean, self._noisy)
+        )
         metrics = {"validation_top1": float(clean), "validation_top1_noisy": float(noisy)}
         return metrics, float(clean + noisy) / 2 if data.manifest.faults.noise else float(clean)
 
