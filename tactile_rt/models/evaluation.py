@@ -54,9 +54,9 @@ class CutWindows:
     """Windows of some sweeps, and the tare that the detector had by then.
 
     Attributes:
-        samples: (sweep, step, sub-step, element, channel), SI.
-        offset, sigma: (sweep, element, channel) Mean and noise at rest, SI.
-        detected: (sweep,) Whether a contact was; where it was not, the samples mean nothing.
+        samples: The (sweep, step, sub-step, element, channel) samples of the windows, SI.
+        offset, sigma: The (sweep, element, channel) mean and noise at rest, SI.
+        detected: The (sweep,) flags whether a contact was detected; where it was not, the samples mean nothing.
     """
 
     samples: NDArray[np.float32]
