@@ -56,7 +56,8 @@ class CutWindows:
     Attributes:
         samples: The (sweep, step, sub-step, element, channel) samples of the windows, SI.
         offset, sigma: The (sweep, element, channel) mean and noise at rest, SI.
-        detected: The (sweep,) flags whether a contact was detected; where it was not, the samples mean nothing.
+        detected: The (sweep,) flags whether a contact was detected; where it was not, the samples
+            mean nothing.
     """
 
     samples: NDArray[np.float32]
