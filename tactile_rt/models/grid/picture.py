@@ -32,9 +32,9 @@ def draw_grid(results: GridResults, path: Path) -> None:
     svm = next((row.top1 for row in results.rows if row.name == SVM), None)
     networks = [row for row in results.rows if row.name != SVM]
     groups = {
-        "trained with labels": [r for r in networks if r.learning == SUPERVISED],
+        "trained with labels": [r for r in networks if r.learning.startswith(SUPERVISED)],
         "trained without labels, read out by a linear probe": [
-            r for r in networks if r.learning != SUPERVISED
+            r for r in networks if not r.learning.startswith(SUPERVISED)
         ],
     }
     groups = {title: rows for title, rows in groups.items() if rows}
