@@ -119,6 +119,8 @@ def test_killed_at_any_moment_it_loses_the_touch_under_way_at_most(tmp_path):
             reader.join()
             process.stdout.close()
         told = sum(bool(re.match(r" *\d+  press \d", one)) for one in said)
+        if not kept + told and not (folder / "features.onnx").exists():
+            continue  # before there was anything to lose
         again = Lesson.read(folder)
         assert kept + told <= len(again.touches) <= kept + told + 1, (seed, k, said)
         assert not again.lost, (seed, k)
