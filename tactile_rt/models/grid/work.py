@@ -173,8 +173,6 @@ class Workbench:
             best = train(config, run, count, device=self.accelerator, splits=splits)
             # what was done before an interruption cost as much
             seconds = (time.process_time() - began) * at.updates / max(updates, 1)
-            if self.accelerator != "cpu":  # a processor's time for starting kernels says nothing
-                seconds = 0.0
             if cell.objective != SUPERVISED:
                 best = probe(best, run / "probe", ProbeConfig(**self.grid.probe), report, splits)
             metrics = load_checkpoint(best)[1]["metrics"]
@@ -182,6 +180,8 @@ class Workbench:
         except ModelError:
             run.mkdir(parents=True, exist_ok=True)
             score, seconds = 0.0, time.process_time() - began
+        if self.accelerator != "cpu":  # a processor's time for starting kernels says nothing
+            seconds = 0.0
         done = msgspec.structs.replace(at, score=score, seconds=seconds)
         write_whole(run / POINT, lambda file: file.write(msgspec.json.encode(done)))
         for path in run.rglob("last.pt"):  # what is done needs not go on
