@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-__all__ = ["DaemonProcess", "Usage", "free_port", "until"]
+__all__ = ["DaemonProcess", "Usage", "free_port", "messages_of", "until"]
 
 PATIENCE_S = 60.0
 MAIN = "from tactile_rt.cli import main; main()"
@@ -166,6 +166,15 @@ class DaemonProcess:
         if self.process.poll() is None:
             self.process.kill()
         self.process.wait()
+
+
+def messages_of(file: Path, kind: str) -> list[dict[str, Any]]:
+    """The messages of one type in a file that publisher `jsonl` may be writing just now.
+
+    Its last line counts once it has its end.
+    """
+    *lines, _ = file.read_text().split("\n") if file.exists() else [""]
+    return [m for m in map(json.loads, lines) if m["type"] == kind]
 
 
 def free_port() -> int:

@@ -3,7 +3,6 @@
 python -m bench.daemon.stopping [--quick]
 """
 
-import json
 import random
 import subprocess
 import sys
@@ -20,7 +19,7 @@ from rich.console import Console
 from bench.daemon.disturbed import CONFIGURATION
 from bench.daemon.models import finger_array, whisker_array, write_wide_model
 from bench.daemon.overload import HOG, HOGS_PER_CORE, STEP_MS, slow_down
-from bench.daemon.process import DaemonProcess, free_port, until
+from bench.daemon.process import DaemonProcess, free_port, messages_of, until
 from bench.emulated import ArrayScript, play
 from bench.processes import Helper
 from tactile_rt.classifier.model_file import shipped_model
@@ -158,8 +157,7 @@ def _exchanges(times: int) -> Record:
         folder, port = Path(temporary), free_port()
 
         def said(kind: str) -> list[dict[str, Any]]:
-            lines = (folder / "said.jsonl").read_text().splitlines()
-            return [m for m in map(json.loads, lines) if m["type"] == kind]
+            return messages_of(folder / "said.jsonl", kind)
 
         def admitted() -> int:
             return sum(m["state"] == "admitted" for m in said("health"))

@@ -1,6 +1,5 @@
 """A daemon whose model is replaced: nothing waits for the new one, and nothing is lost for it."""
 
-import json
 import signal
 import time
 
@@ -9,7 +8,7 @@ import pytest
 pytest.importorskip("mcap")
 pytest.importorskip("onnx")
 
-from bench.daemon.process import DaemonProcess, free_port
+from bench.daemon.process import DaemonProcess, free_port, messages_of
 from tactile_rt.classifier.model_file import shipped_model
 from tests.helpers.hostile_models import BURNERS, GREEDY, write_burdened
 from tests.helpers.waiting import until
@@ -47,8 +46,7 @@ def hostile(folder, burden):
 
 
 def said(folder, kind):
-    lines = (folder / "said.jsonl").read_text().splitlines()
-    return [m for m in map(json.loads, lines) if m["type"] == kind]
+    return messages_of(folder / "said.jsonl", kind)
 
 
 def events(folder, state):

@@ -1,7 +1,6 @@
 """A daemon that was stopped, or whose model is too slow: what it decides is about now, what it left
 out is recorded, and a replay decides the same."""
 
-import json
 import os
 import signal
 import subprocess
@@ -14,7 +13,7 @@ import pytest
 pytest.importorskip("mcap")
 pytest.importorskip("onnx")
 
-from bench.daemon.process import DaemonProcess, free_port
+from bench.daemon.process import DaemonProcess, free_port, messages_of
 from tactile_rt.recording.reader import Recording
 
 CONFIGURATION = """version = 1
@@ -79,8 +78,7 @@ def replayed(folder: Path) -> str:
 
 
 def said(folder: Path, kind: str) -> list[dict]:
-    lines = (folder / "said.jsonl").read_text().splitlines()
-    return [m for m in map(json.loads, lines) if m["type"] == kind]
+    return messages_of(folder / "said.jsonl", kind)
 
 
 def test_after_a_stop_decisions_are_about_now_and_a_replay_decides_the_same(overloaded):

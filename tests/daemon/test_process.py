@@ -13,6 +13,7 @@ import time
 
 import pytest
 
+from bench.daemon.process import messages_of
 from tactile_rt.cli import main
 from tactile_rt.daemon.config import EXAMPLE
 from tactile_rt.daemon.process import SIGNALS
@@ -87,9 +88,7 @@ def started(folder):
 
 
 def told(folder):
-    file = folder / "out.jsonl"
-    lines = file.read_text().splitlines() if file.exists() else []
-    return [m for m in map(json.loads, lines) if m["type"] == "health"]
+    return messages_of(folder / "out.jsonl", "health")
 
 
 def await_told(folder, part, state):
