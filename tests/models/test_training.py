@@ -335,11 +335,29 @@ def test_an_update_is_replayed_on_a_gpu_with_the_gradients_of_its_kernels(tiny, 
     for loss in (learning.loss(seen, labels), loss_of(*seen, labels)):
         learning.zero_grad()
         loss.backward()
-        losses.append(float(loss))
+        losses.append(loss.item())
         gradients.append([p.grad.clone() for p in learning.parameters() if p.grad is not None])
     assert losses[1] == pytest.approx(losses[0], rel=1e-4)
     for one, other in zip(*gradients, strict=True):
         assert torch.allclose(one, other, rtol=1e-3, atol=1e-5)
+
+
+def test_an_update_that_is_no_graph_is_told_and_leaves_the_objective(tiny, monkeypatch, caplog):
+    training, _ = read_splits(config := TrainingConfig(tiny, encoder="resnet18", width=1 / 32))
+    learning = build_objective(config, training)
+    *loads, labels = next(TrainingBatches(training, 6, 0).epoch(0))
+    seen = learning.see([loads], torch.Generator())
+    before = {name: buffer.clone() for name, buffer in learning.named_buffers()}
+
+    def tried(loss, tensors, **_):
+        loss(*tensors)  # batch norm's means move
+        raise RuntimeError("operation not permitted when stream is capturing\nCompile with ...")
+
+    monkeypatch.setattr(torch.cuda, "make_graphed_callables", tried)
+    assert replayed(learning, seen, labels, bf16=False) is None
+    (said,) = caplog.messages
+    assert "(operation not permitted when stream is capturing)" in said
+    assert all(torch.equal(b, before[name]) for name, b in learning.named_buffers())
 
 
 def test_a_contrast_is_of_two_sweeps_of_an_object(tmp_path):

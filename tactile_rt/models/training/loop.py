@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 import torch
-from torch import Generator, Tensor
 from torch.optim.lr_scheduler import LRScheduler
 
 from tactile_rt.files import write_whole
@@ -46,10 +45,10 @@ from tactile_rt.models.objectives import (
 )
 from tactile_rt.models.training.config import Progress, TrainingConfig, manifests_of
 from tactile_rt.models.training.devices import is_first, launched
-from tactile_rt.models.training.feeding import Batch, BatchFeed, Share, generator_of
+from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
 from tactile_rt.models.training.logs import Board, log_epoch
 from tactile_rt.models.training.optimizers import build_optimizer, build_schedule
-from tactile_rt.models.training.replay import replayed
+from tactile_rt.models.training.replay import batch_loss
 from tactile_rt.models.training.validation import Validation
 from tactile_rt.stream import ConfigError, ModelError
 from tactile_rt.sweep_set import OUTLIERS
@@ -130,7 +129,7 @@ def _train(
     run.resume(folder / "last.pt")
     board.begin(run.done)
     wrapped, _ = fabric.setup(objective, optimizer)
-    loss_of = _loss_of(fabric, wrapped, objective, config, feed)
+    loss_of = batch_loss(fabric, wrapped, objective, config, feed)
 
     while run.done < run.updates:
         epoch, began, losses = run.epoch, time.monotonic(), []
@@ -187,39 +186,6 @@ def _train(
         report(Progress(epoch + 1, run.epochs, run.done, run.updates, metrics["loss"], shown))
     fabric.barrier()
     return folder / "best.pt"
-
-
-def _loss_of(
-    fabric: "Fabric",
-    wrapped: Callable[..., Tensor],
-    objective: Objective,
-    config: TrainingConfig,
-    feed: BatchFeed,
-) -> Callable[[Batch, Generator], Tensor]:
-    """The loss of a batch, whose augmentation is drawn from the generator: ready for `backward`."""
-    device, bf16 = fabric.device.type, config.precision == "bf16"
-
-    def by_kernels(batch: Batch, generator: Generator) -> Tensor:
-        # Not Fabric's, which casts a recurrent network's weights anew at every step.
-        with torch.autocast(device, torch.bfloat16, enabled=bf16):
-            loss: Tensor = wrapped(batch.views, batch.labels, generator)
-            return loss
-
-    if device != "cuda" or fabric.world_size > 1:
-        return by_kernels
-    with closing(feed.epoch(0)) as drawn:
-        batch = next(drawn)
-    seen = objective.see(batch.views, generator_of(fabric.device, config.seed))
-    graph = replayed(objective, seen, batch.labels, bf16)
-    if graph is None:
-        return by_kernels
-
-    def by_graph(batch: Batch, generator: Generator) -> Tensor:
-        with torch.autocast(device, torch.bfloat16, enabled=bf16):
-            seen = objective.see(batch.views, generator)
-        return graph(*seen, batch.labels)
-
-    return by_graph
 
 
 def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = None) -> Path:
