@@ -5,10 +5,12 @@ import pkgutil
 import subprocess
 import sys
 import tomllib
+from importlib.metadata import distributions
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from packaging.specifiers import SpecifierSet
 
 import tactile_rt
 
@@ -156,3 +158,18 @@ def test_every_error_a_user_can_make_is_one_line() -> None:
     assert done.stdout == ""
     assert len(done.stderr.strip().splitlines()) == 1
     assert "did you mean sim:?" in done.stderr
+
+
+def test_what_is_pinned_installs_with_the_oldest_python() -> None:
+    """Such as Debian 12's, which is older than what these tests mostly run with."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    oldest = project["requires-python"].removeprefix(">=") + ".0"
+    pins = (ROOT / "requirements" / "constraints.txt").read_text().splitlines()
+    pinned = {line.partition("==")[0] for line in pins if not line.startswith("#")}
+    needs = {
+        one.name: SpecifierSet(one.metadata["Requires-Python"])
+        for one in distributions()
+        if one.name in pinned and "Requires-Python" in one.metadata
+    }
+    assert len(needs) > 100
+    assert [name for name, versions in needs.items() if oldest not in versions] == []
