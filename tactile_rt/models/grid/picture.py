@@ -85,11 +85,14 @@ def draw_curves(results: GridResults, path: Path) -> None:
     for row in networks:
         if row.learning != SUPERVISED or not row.growth:
             continue
-        scores = [100 * point.score for point in row.growth]
         how = _line(row)
-        axes[0, 0].plot([point.updates for point in row.growth], scores, **how)
-        if row.seconds:
-            axes[0, 1].plot([point.seconds for point in row.growth], scores, **how)
+        timed = [point for point in row.growth if point.seconds]  # not what a GPU has trained
+        for at, points, unit in (
+            (axes[0, 0], row.growth, "updates"),
+            (axes[0, 1], timed, "seconds"),
+        ):
+            scores = [100 * point.score for point in points]
+            at.plot([getattr(point, unit) for point in points], scores, **how)
     whole = [row for row in networks if row.share == 1 and row.top1 is not None]
     for row in whole:
         if row.learning == SUPERVISED and row.top1 is not None:
@@ -97,7 +100,7 @@ def draw_curves(results: GridResults, path: Path) -> None:
             axes[1, 0].plot(row.parameters, 100 * row.top1.value, **how)
             axes[1, 0].annotate(
                 row.network, (row.parameters, 100 * row.top1.value), fontsize=7.5,
-                xytext=(4, 4), textcoords="offset points",
+                xytext=(0, 5), textcoords="offset points", ha="center",
             )  # fmt: skip
     for network in dict.fromkeys(row.network for row in networks if row.share < 1):
         of = sorted(
@@ -126,7 +129,7 @@ def draw_curves(results: GridResults, path: Path) -> None:
             at.text(0.5, 0.5, "no shares were trained on", ha="center", transform=at.transAxes)
         above = at in axes[0]
         at.set_ylabel(f"top-1 (%), {'validation' if above else 'test'} objects")
-    axes[1, 0].margins(x=0.15)  # for the names
+    axes[1, 0].margins(0.15, 0.1)  # for the names
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
     figure.suptitle(
