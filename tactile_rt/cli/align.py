@@ -179,14 +179,13 @@ def score_models(
         from tactile_rt.models.alignment.stimuli_input import read_stimuli
 
         felt, frozen = read_stimuli(stimuli), load_benchmark(benchmark)
-        check_models(models)
+        names = check_models(models)
         done: list[ModelResult] = []
         with progress_bar(Console(stderr=True), "scoring", len(models)) as update:
-            for path, told in zip(models, given, strict=True):
-                update(description=path.name)
+            for path, name, told in zip(models, names, given, strict=True):
+                update(description=name)
                 layers, own = load_layers(path, felt)
-                if any(layers.name == one.name for one in done):
-                    layers = replace(layers, name=f"{layers.name} ({path.name})")
+                layers = replace(layers, name=name)
                 before = load_untrained(path, felt, seed) if untrained else None
                 done.append(model_result(frozen, layers, before, told or own)[0])
                 update(advance=1)
@@ -283,7 +282,7 @@ def decode_stimuli(
         felt = read_stimuli(stimuli)
         targets = load_benchmark(benchmark).targets if benchmark else ()
         recorded, notes = animal_means(animals) if animals else ({}, [])
-        check_models(models)
+        names = check_models(models)
         rows: list[tuple[str, str, Any]] = []
 
         def add(name: str, patterns: Any) -> None:
@@ -292,10 +291,10 @@ def decode_stimuli(
                 rows.append((name, "paper", decode_paper(patterns)))
 
         add("raw sensor input", felt.raw())
-        for path in models:
+        for path, own in zip(models, names, strict=True):
             layers, _ = load_layers(path, felt)
             for layer, patterns in layers.patterns.items():
-                add(f"{layers.name}: {layer}" if len(models) > 1 else layer, patterns)
+                add(f"{own}: {layer}" if len(models) > 1 else layer, patterns)
         for name, patterns in recorded.items():
             add(name, patterns)
         for variant in ("", "paper"):

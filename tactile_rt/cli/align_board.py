@@ -1,7 +1,6 @@
 """`tactile-rt align board`: models by datasets by metrics; the datasets, and how they are got."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -177,14 +176,14 @@ def _board(
     named = [_named(text) for text in data]
     datasets = [(find_dataset(name), path) for name, path in named]
     felt = read_stimuli(stimuli)
-    check_models(models)
+    files = list(zip(models, check_models(models), strict=True))
     boards = []
     console = Console(stderr=True)
     for dataset, path in datasets:
         with progress_bar(console, f"reading {dataset.name}", total=1.0) as update:
             read = dataset.read([path], felt, _shown(update))
-        with progress_bar(console, f"models on {dataset.name}", max(len(models), 1)) as update:
-            rows = _rows(models, read.stimuli or felt, untrained, seed, update)
+        with progress_bar(console, f"models on {dataset.name}", max(len(files), 1)) as update:
+            rows = _rows(files, read.stimuli or felt, untrained, seed, update)
         with progress_bar(console, f"scoring on {dataset.name}", total=1.0) as update:
             boards.append(
                 with_cells(
@@ -200,21 +199,19 @@ def _shown(update: Any) -> Callable[[float], None]:
 
 
 def _rows(
-    models: list[Path], felt: "StimuliInput", untrained: bool, seed: int, update: Any
+    files: list[tuple[Path, str]], felt: "StimuliInput", untrained: bool, seed: int, update: Any
 ) -> list[tuple["BoardRow", Any]]:
     from tactile_rt.models.alignment.board import BoardRow, traces_of, traces_of_stimuli
     from tactile_rt.models.alignment.loading import load_layers, load_untrained
 
     rows: list[tuple[BoardRow, Any]] = []
-    for path in models:
-        update(description=path.name)
+    for path, name in files:
+        update(description=name)
         layers: Layers = load_layers(path, felt)[0]
-        if any(layers.name == row.name for row, _ in rows):
-            layers = replace(layers, name=f"{layers.name} ({path.name})")
         before = load_untrained(path, felt, seed) if untrained else None
         # The same network: a file keeps some of its numbers in other places than a checkpoint.
         size = before.parameters if before else layers.parameters
-        row = BoardRow(layers.name, "model", layers.sha256, size, layers.notes)
+        row = BoardRow(name, "model", layers.sha256, size, layers.notes)
         rows.append((row, traces_of(layers)))
         if before is not None:
             rows.append((BoardRow(before.name, "untrained", "", size), traces_of(before)))

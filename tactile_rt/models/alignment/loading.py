@@ -1,7 +1,7 @@
 """Layers of any model file: a checkpoint, an ONNX file, or responses computed elsewhere."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 from tactile_rt.classifier.model_file import read_model
@@ -13,25 +13,42 @@ from tactile_rt.stream import ConfigError, ModelError
 
 __all__ = ["check_models", "load_layers", "load_untrained"]
 
-CHECKPOINT = ".pt"
+CHECKPOINT, BEST = ".pt", "best.pt"
 FIGURES = re.compile(r"(test_|validation_)?top1")
 
 
-def check_models(paths: Iterable[Path]) -> None:
+def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
     """Refuse what is no model file before the first is scored, and before torch is loaded.
+
+    Returns:
+        What to call each: what a file calls itself; a training run by its folder, and by as many of
+        the folders above as tell all runs apart. Of two that are called alike the second has its
+        file's name, too.
 
     Raises:
         ModelError, ConfigError: one is not such a file.
     """
+    names: list[str] = []
+    runs = {path: path.resolve().parent.parts for path in paths if path.name == BEST}
+    depth = 1
+    while len({parts[-depth:] for parts in runs.values()}) < len(set(runs.values())):
+        depth += 1
     for path in paths:
-        if path.suffix == CHECKPOINT:
-            describe_checkpoint(path)
-        elif path.suffix == RESPONSES:
-            responses_layers(path)
-        elif path.suffix == ".npy":
-            raise ModelError(f"{path}: name responses by layer, in an .npz: numpy.savez")
-        else:
-            read_model(path, None)
+        own = _own_name(path)
+        name = "/".join(runs[path][-depth:]) if path in runs else own
+        names.append(f"{name} ({path.name})" if name in names else name)
+    return tuple(names)
+
+
+def _own_name(path: Path) -> str:
+    if path.suffix == RESPONSES:
+        return responses_layers(path).name
+    if path.suffix == ".npy":
+        raise ModelError(f"{path}: name responses by layer, in an .npz: numpy.savez")
+    if path.suffix == CHECKPOINT:
+        describe_checkpoint(path)
+        return path.stem
+    return read_model(path)[0].name
 
 
 def load_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, tuple[float, str] | None]:

@@ -1,0 +1,50 @@
+"""What models are called where several stand in one table."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.models.alignment.loading import check_models
+from tests.helpers.source_tree import ROOT
+
+CHECKPOINT = ROOT / "bench" / "shipped" / "mouse44.pt"
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A function (folder) -> the best.pt of a training run in that folder."""
+
+    def made(folder):
+        path = tmp_path / folder / "best.pt"
+        path.parent.mkdir(parents=True)
+        shutil.copy(CHECKPOINT, path)
+        return path
+
+    return made
+
+
+def test_a_run_is_called_by_its_folder(run, monkeypatch, tmp_path):
+    assert check_models([run("runs/mine"), run("others/yours")]) == ("mine", "yours")
+    monkeypatch.chdir(tmp_path / "runs" / "mine")
+    assert check_models([Path("best.pt")]) == ("mine",)
+
+
+def test_runs_of_a_grid_are_told_apart_by_the_folders_above(run):
+    folders = ["gru_seed0/rate0.005", "gru_seed1/rate0.005", "s4_seed0/rate0.015"]
+    assert check_models([run(f"runs/{folder}") for folder in folders]) == tuple(folders)
+
+
+def test_a_file_says_its_own_name(run, tmp_path):
+    np.savez(tmp_path / "brain.npz", hidden=np.ones((6, 3)))
+    paths = [shipped_model(), CHECKPOINT, run("mouse44"), tmp_path / "brain.npz"]
+    assert check_models(paths) == (
+        "mouse44", "mouse44 (mouse44.pt)", "mouse44 (best.pt)", "brain"
+    )  # fmt: skip
+
+
+def test_one_run_named_twice_is_one_run(run):
+    path = run("runs/mine")
+    assert check_models([path, path]) == ("mine", "mine (best.pt)")
