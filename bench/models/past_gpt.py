@@ -1,9 +1,9 @@
-"""Why does a GPT cost so much? A GRU alone, with a GPT, and with GPTs of which one part is changed.
+"""Why does a GPT cost so much? An encoder alone, with a GPT, and with one of which a part differs.
 
-Run: python -m bench.models.past_gpt SWEEP_SET FOLDER [--updates N] [--only KIND ...]
+Run: python -m bench.models.past_gpt SWEEP_SET FOLDER [--encoder NAME] [--only KIND ...]
 
 Each is trained from the same seed at two peak rates with their warm-ups, those that the grid has
-found for the GRU and for the GRU with a GPT. What a folder holds is not trained again.
+found for the encoder and for the encoder with a GPT. What a folder holds is not trained again.
 """
 
 import argparse
@@ -20,8 +20,12 @@ from torch.nn import functional as F
 from tactile_rt.models import attenders
 from tactile_rt.models.attenders.gpt import GPT, LAYERS, TOKENS, TransformerBlock
 from tactile_rt.models.training import TrainingConfig, train
+from tactile_rt.models.training.loop import read_splits
 
-RATES = ((5e-3, 0.3), (1.5e-3, 0.05))  # peak rate, warm-up
+RATES = {  # peak rate, warm-up; alone, and with a GPT
+    "gru": ((5e-3, 0.3), (1.5e-3, 0.05)),
+    "zhuang-intersection-ln": ((5e-3, 0.05), (5e-4, 0.3)),
+}
 
 
 class PastGPT(GPT):
@@ -101,23 +105,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     parser.add_argument("data", type=Path, help="the sweep set")
     parser.add_argument("folder", type=Path, help="where the runs go")
+    parser.add_argument("--encoder", choices=list(RATES), default="gru")
     parser.add_argument("--updates", type=int, default=1000)
     parser.add_argument("--only", nargs="+", choices=list(KINDS), default=list(KINDS))
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    typer.echo("| a GRU and | rate | training loss | validation top-1, clean, at rated noise (%) |")
+    columns = "rate", "training loss", "validation top-1, clean, at rated noise (%)"
+    typer.echo(f"| {asked.encoder} and | {' | '.join(columns)} |")
     typer.echo("|---|---|---|---|")
+    splits = read_splits(TrainingConfig(str(asked.data)))
     for name in asked.only:
         kind = KINDS[name]
-        for rate, warmup in RATES:
+        for rate, warmup in RATES[asked.encoder]:
             config = TrainingConfig(
-                str(asked.data), encoder="gru", attender="gpt" if kind else "none",
+                str(asked.data), encoder=asked.encoder, attender="gpt" if kind else "none",
                 width=1 / 16, batch=64, precision="fp32", learning_rate=rate, warmup=warmup,
                 updates=asked.updates,
             )  # fmt: skip
-            run = asked.folder / f"{name}, {rate:g}, {asked.updates}".replace(" ", "_")
+            called = f"{asked.encoder}, {name}, {rate:g}, {asked.updates}"
+            run = asked.folder / called.replace(" ", "_")
             with mock.patch.object(attenders, "GPT", kind or GPT):
-                train(config, run, device="cpu")
+                train(config, run, device="cpu", splits=splits)
             with (run / "history.csv").open(newline="") as file:
                 *_, last = csv.DictReader(file)
             clean, noisy = (100 * float(last[f"validation_top1{end}"]) for end in ("", "_noisy"))
