@@ -6,7 +6,7 @@ import secrets
 import shutil
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -74,7 +74,8 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
             write(file)
         os.replace(hidden, path)
     except BaseException as error:
-        hidden.unlink(missing_ok=True)
+        with suppress(OSError):  # where nothing may be written it may not be removed either
+            hidden.unlink(missing_ok=True)
         _name(error, hidden, path)
         raise
 

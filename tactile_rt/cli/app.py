@@ -26,6 +26,7 @@ __all__ = [
     "Pace",
     "Seconds",
     "app",
+    "check_folder",
     "check_new",
     "check_output",
     "leaving",
@@ -154,6 +155,19 @@ def check_output(file: Path | None) -> None:
         raise ConfigError(f"{file} is a folder: name a file to write")
     if not os.access(file.parent, os.W_OK | os.X_OK):
         raise ConfigError(f"{file} cannot be written: {file.parent} may not be written into")
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder that nothing can be written into, now rather than after seconds of work.
+
+    Raises:
+        ConfigError: it is a file, or it, or the one that it would be made in, is not one's own.
+    """
+    above = next(one for one in (folder.absolute(), *folder.absolute().parents) if one.exists())
+    if not above.is_dir():
+        raise ConfigError(f"{above}: is not a folder")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise ConfigError(f"{folder} cannot be written: {above} may not be written into")
 
 
 def check_new(file: Path, force: bool) -> None:

@@ -6,14 +6,16 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.app import app, check_folder, check_output, needs
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, told_as_json
 
 
 @app.command()
 def grid(
-    plan: Annotated[str, typer.Argument(help="A TOML file, or the shipped `wide24`.")],
+    plan: Annotated[
+        str, typer.Argument(help="A TOML file, or a shipped one: wide24, wide24-full.")
+    ],
     folder: Annotated[Path, typer.Argument(help="Where it goes; what is done is kept.")],
     processes: Annotated[int, typer.Option(min=1, help="That train side by side.")] = 2,
     accelerator: Annotated[str, typer.Option(help="auto, cpu, cuda ...")] = "cpu",
@@ -34,6 +36,8 @@ def grid(
 
     for file in (report, json):
         check_output(file)
+    if report is None:
+        check_folder(folder)
     wanted = read_grid(plan)
     if report is None and waiting_tasks(wanted, folder):
         SweepManifest.read(Path(wanted.data))

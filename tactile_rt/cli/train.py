@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import LARGEST_SEED, MOST_THREADS, app, check_output, needs, set_option
+from tactile_rt.cli.app import (
+    LARGEST_SEED,
+    MOST_THREADS,
+    app,
+    check_folder,
+    check_output,
+    needs,
+    set_option,
+)
 from tactile_rt.cli.progress import progress_bar, working
 from tactile_rt.cli.tables import Json, show_table, told_as_json
 from tactile_rt.settings import take_sets
@@ -56,7 +64,7 @@ def train(
     json: Json = None,
 ) -> None:
     """Train an Encoder-Attender-Decoder network on a sweep set."""
-    from tactile_rt.models.checkpoint_files import network_of
+    from tactile_rt.models.checkpoint_files import describe_checkpoint, network_of
     from tactile_rt.models.training.config import manifests_of
     from tactile_rt.models.training.recipes import read_recipe
 
@@ -77,7 +85,11 @@ def train(
     if begin is not None:
         given = {**network_of(begin), **given, "begin": str(begin)}
     config = read_recipe(recipe, str(data), sets or (), **given)
-    manifests_of(config)  # what cannot be is refused before torch has taken its seconds
+    # What cannot be is refused before torch has taken its seconds.
+    manifests_of(config)
+    if config.begin:
+        describe_checkpoint(Path(config.begin))
+    check_folder(folder)
     try:
         import torch
 

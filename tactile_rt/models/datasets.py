@@ -279,7 +279,8 @@ class TrainingBatches:
             network that meets them at once takes far longer to learn.
 
     Raises:
-        ConfigError: not even one batch of sweeps with a touch, or no object that has two.
+        ConfigError: a jitter longer than a sweep, not even one batch of sweeps with a touch, or no
+            object that has two.
     """
 
     def __init__(
@@ -291,6 +292,8 @@ class TrainingBatches:
         two_sweeps: bool = False,
         device: str = "cpu",
     ) -> None:
+        if jitter >= (samples := data.sweeps.values.shape[1]):
+            raise ConfigError(f"jitter is {jitter} samples, but a sweep has {samples}")
         self._data, self._batch, self._seed, self._jitter = data, batch, seed, jitter
         self._device = device
         self.easy_epochs = 0

@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from sklearn.metrics.pairwise import rbf_kernel
 from sklearn.svm import SVC
 
+from tactile_rt.stream import ConfigError
+
 if TYPE_CHECKING:
     from tactile_rt.models.datasets import SweepSet
     from tactile_rt.models.disturbances import Disturbance
@@ -111,8 +113,14 @@ class FittedSVM:
 
 
 def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
-    """Fit one machine per penalty and keep the best on the validation sweeps."""
+    """Fit one machine per penalty and keep the best on the validation sweeps.
+
+    Raises:
+        ConfigError: what there is to learn from is of one category.
+    """
     x, usable = window_features(train)
+    if len(set(train.sweeps.labels[usable].tolist())) < 2:
+        raise ConfigError("a support vector machine needs touches of two categories to learn from")
     tried = [
         FittedSVM(
             fit(x[usable], train.sweeps.labels[usable], c),

@@ -210,11 +210,11 @@ def _build(
     elif isinstance(value, list):
         made = [_build(v, (*path, i), lines, file, folder, line) for i, v in enumerate(value)]
     node = SettingNode(made, file, line, folder)
+    where = f"{node.where}: {named(path)}" if path else node.where
     if isinstance(value, float) and (value != value or value in (float("inf"), -float("inf"))):
-        where = f"{node.where}: {named(path)}" if path else node.where
         raise ConfigError(f"{where}: {value} is no quantity")
     if isinstance(value, int) and not -INT64 <= value < INT64:
-        raise ConfigError(f"{node.where}: {named(path)}: more than 64 bits")
+        raise ConfigError(f"{where}: more than 64 bits")
     return node
 
 

@@ -212,10 +212,10 @@ def test_a_run_cannot_be_made_in_a_file(torch, refused, sweep_set, a_file):
 
 
 @pytest.mark.parametrize("content", [b"", b"junk\n", b"PK\x03\x04 cut short"])
-def test_a_damaged_checkpoint_is_one_line(torch, refused, sweep_set, tmp_path, content):
+def test_a_damaged_checkpoint_is_one_line(torch, call, refused, sweep_set, tmp_path, content):
     folder = tmp_path / "run"
     command = ("train", sweep_set, folder, "--set", f"width={1 / 32}", "--epochs", 1, "--batch", 12)
-    folder.mkdir()
+    assert call(*command)[0] == 0
     for name in ("best.pt", "last.pt"):
         (folder / name).write_bytes(content)
     assert "last.pt is damaged" in refused(*command)

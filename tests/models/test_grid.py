@@ -4,6 +4,7 @@ import csv
 import json
 import shutil
 import signal
+from dataclasses import replace
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
@@ -21,15 +22,19 @@ from tactile_rt.models.grid.outcomes import (
     Training,
     outcome_path,
     read_outcome,
+    read_point,
     settings_of,
+    write_tested,
 )
 from tactile_rt.models.grid.picture import draw_curves, draw_grid
-from tactile_rt.models.grid.plan import Growth, Task, read_grid, shipped_grids
+from tactile_rt.models.grid.plan import Growth, Search, Task, read_grid, shipped_grids
 from tactile_rt.models.grid.pool import run_grid
 from tactile_rt.models.grid.results import gather, put_into, table, write_results
 from tactile_rt.models.grid.work import Workbench
+from tactile_rt.models.training.config import DivergedError, Progress
 from tactile_rt.stream import ArraySpec, ConfigError, ModelError, RecordingError
 from tactile_rt.sweep_set import SweepManifest, write_object
+from tests.helpers.source_tree import ROOT
 
 SPEC = ArraySpec(
     name="row",
@@ -106,6 +111,12 @@ def test_the_shipped_grid_is_the_papers_figure_and_its_controls() -> None:
     assert len({task.slug for task in tasks}) == len(tasks)
 
 
+def test_the_page_of_results_is_what_was_found() -> None:
+    kept, page = ROOT / "bench" / "models" / "wide24", ROOT / "docs" / "explain" / "results.md"
+    shown = page.read_text().split(results.BEGIN + "\n")[1].split(results.END)[0]
+    assert table(gather(read_grid("wide24"), kept)) == shown
+
+
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
@@ -121,6 +132,23 @@ def test_the_shipped_grid_is_the_papers_figure_and_its_controls() -> None:
         ('than = "svm"', 'than = "svn"', "compares 'svn', which no cell is"),
         ("[supervised]", "[supervised", "Expected ']'"),
         ('objective = "simclr"\naugmentation = "image"', "", "two cells are 'gru'"),
+        ("[1e-3, 1e-2]", "[1e-3, -1e-2]", "cell 'gru': learning_rate must be positive"),
+        ("[0.1, 0.3]", "[0.1, 1.5]", "cell 'gru': warmup must be in [0, 1)"),
+        ("most = 2", "most = 0", "growth goes from 1 updates to 0, which is less"),
+        ("drop_epochs = 1", "drop_epoch = 1", "no key 'drop_epoch'; did you mean drop_epochs?"),
+        ("drop_epochs = 1", 'readout = "first"', "probe: readout is 'first', not one of"),
+        ("train = 2", "train = -1", "sweeps are counted from 0"),
+        ("clip_norm = 2", "dropout = 2", "cell 'gru': dropout is 2"),
+        (
+            'augmentation = "image"',
+            'augmentation = "image"\nbegin = "gru"\nseeds = 3',
+            "begins with 'gru', which is trained with 2 of 3 seeds",
+        ),
+        (
+            'augmentation = "image"',
+            'augmentation = "image"\noptions = { preprocessing = "paper" }',
+            "another than that of a cell before it that is called 'gru'",
+        ),
     ],
 )
 def test_a_slip_in_a_grid_is_named(plan: Path, old: str, new: str, said: str) -> None:
@@ -145,9 +173,6 @@ def test_a_grid_is_done_once_and_told(
     grid, folder = read_grid(plan), tmp_path / "out"
     names = [task.name for task in grid.tasks()]
     assert names == ["svm", *["gru", "random gru"] * 2, *["gru simclr image"] * 2]
-
-    class KilledError(Exception):
-        pass
 
     told: list[tuple[str, int, int]] = []
 
@@ -223,10 +248,10 @@ def test_a_network_that_diverges_is_an_outcome(
     plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grid, folder = read_grid(plan), tmp_path / "out"
-    pool.write_subset(Path(grid.data), folder / "sweeps", grid.sweeps)
+    pool.prepare(grid, folder)
 
     def diverge(*_: object, **__: object) -> Path:
-        raise ModelError("training diverged in epoch 1")
+        raise DivergedError("training diverged in epoch 1")
 
     monkeypatch.setattr("tactile_rt.models.grid.work.train", diverge)
     bench = Workbench(grid, folder)
@@ -237,6 +262,153 @@ def test_a_network_that_diverges_is_an_outcome(
     assert rows[1].failed == "every training of it diverged"
     assert "`gru`: every training of it diverged" in table(gather(grid, folder))
     draw_grid(gather(grid, folder), folder / "picture.png")
+
+
+def begun(plan: Path, folder: Path) -> Workbench:
+    """The workbench of a plan, its sweeps in the folder."""
+    grid = read_grid(plan)
+    pool.prepare(grid, folder)
+    return Workbench(grid, folder)
+
+
+def test_a_training_of_other_settings_is_not_taken_for_one_of_these(
+    plan: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "out"
+    bench = begun(plan, folder)
+    task = bench.grid.tasks()[1]
+    bench.do(task)
+    plan.write_text(plan.read_text().replace("batch = 4", "batch = 3"))
+    with pytest.raises(ConfigError) as error:
+        read_outcome(read_grid(plan), folder, task)
+    outcome, runs = outcome_path(folder, task), folder / "runs" / task.slug
+    assert f"delete {outcome} and {runs} to train it again" in str(error.value)
+    outcome.unlink()
+    with pytest.raises(ConfigError, match="was trained with other settings"):
+        begun(plan, folder).do(task)
+    shutil.rmtree(runs)
+    begun(plan, folder).do(task)
+    for config in runs.glob("*/config.json"):
+        assert json.loads(config.read_text())["batch"] == 3
+
+
+class KilledError(Exception):
+    """What a test stops a training with, after an epoch."""
+
+
+def kill(progress: Progress) -> None:
+    if progress.metrics:
+        raise KilledError
+
+
+def test_a_damaged_checkpoint_is_not_a_training_that_diverged(plan: Path, tmp_path: Path) -> None:
+    bench = begun(plan, tmp_path / "out")
+    task = bench.grid.tasks()[1]
+    with pytest.raises(KilledError):
+        bench.do(task, kill)
+    (last,) = (tmp_path / "out").rglob("last.pt")
+    last.write_bytes(last.read_bytes()[:2000])
+    with pytest.raises(ModelError, match=r"last\.pt is damaged"):
+        bench.do(task)
+    assert not outcome_path(tmp_path / "out", task).exists()
+
+
+def test_the_time_of_a_training_is_kept_while_it_is_not_done(
+    plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = begun(plan, tmp_path / "out")
+    task = bench.grid.tasks()[1]
+    clock = iter(range(10))  # one second between two looks
+    monkeypatch.setattr("tactile_rt.models.grid.work.time.process_time", lambda: next(clock))
+    with pytest.raises(KilledError):
+        bench.do(task, kill)
+    (kept,) = (tmp_path / "out").rglob("seconds")
+    assert float(kept.read_text()) == 1
+    with pytest.raises(KilledError):  # all updates are done: this is of the next training
+        bench.do(task, kill)
+    (point,) = (tmp_path / "out").rglob("point.json")
+    assert json.loads(point.read_text())["seconds"] == 2
+    assert not (point.parent / "seconds").exists()
+
+
+def test_a_score_of_nothing_is_one(plan: Path, tmp_path: Path) -> None:
+    bench = begun(plan, tmp_path / "out")
+    wrong = bench.splits[1]
+    swapped = replace(wrong, sweeps=replace(wrong.sweeps, labels=1 - wrong.sweeps.labels))
+    bench.splits = bench.splits[0], swapped
+    grid = msgspec.structs.replace(
+        bench.grid, search=Search((1e-2,), (0.1,), 20), growth=Growth(40, 40)
+    )
+    bench.grid = grid
+    found = bench.do(grid.tasks()[1])
+    assert found.chosen is not None
+    assert found.chosen.score == 0
+    assert found.top1.count("1") > 12
+
+
+def test_windows_of_the_test_begin_as_those_that_were_learnt_from(
+    plan: Path, tmp_path: Path
+) -> None:
+    bench = begun(plan, tmp_path / "out")
+    config = bench.grid.config(bench.grid.tasks()[1], bench.data)
+    heard, _ = bench._windows(config)
+    set_out, _ = bench._windows(replace(config, window="sweep"))
+    lead = bench.test.manifest.lead
+    np.testing.assert_array_equal(
+        set_out[0].samples[0, 0], bench.test.sweeps.values[0, lead : lead + 5]
+    )
+    assert not np.array_equal(heard[0].samples, set_out[0].samples)
+
+
+def test_the_untrained_network_is_that_of_the_cell(plan: Path, tmp_path: Path) -> None:
+    plan.write_text(plan.read_text().replace("clip_norm = 2", 'preprocessing = "paper"'))
+    plan.write_text(
+        plan.read_text().replace(
+            'augmentation = "image"',
+            'augmentation = "image"\noptions = { preprocessing = "paper", optimizer = "lars" }',
+        )
+    )
+    grid = read_grid(plan)
+    random = next(task for task in grid.tasks() if task.random)
+    assert grid.config(random, Path()).preprocessing == "paper"
+    assert "paper" in settings_of(grid, tmp_path, random)
+    assert "lars" not in settings_of(grid, tmp_path, random)
+
+
+def test_outcomes_of_other_sweeps_and_damaged_ones_are_told(plan: Path, tmp_path: Path) -> None:
+    grid, folder = read_grid(plan), tmp_path / "out"
+    svm = grid.tasks()[0]
+    made_up(folder, grid, svm, "1" * 16)
+    with pytest.raises(ConfigError, match=r"no .*tested\.json: run the grid first"):
+        gather(grid, folder)
+    write_tested(folder, np.repeat([f"mug-{i}" for i in range(8)], 2), 2)
+    assert gather(grid, folder).sweeps == 16
+    draw_grid(gather(grid, folder), folder / "none.png")  # of no network yet
+    draw_curves(gather(grid, folder), folder / "curves.png")
+    made_up(folder, grid, svm, "1" * 15)
+    with pytest.raises(ConfigError, match="'svm', seed 0, was tested on 15 sweeps, of which there"):
+        gather(grid, folder)
+    path = outcome_path(folder, svm)
+    whole = path.read_text()
+    for old, new in (("11", "12"), ('"top5":"1', '"top5":"11'), ("{", "[")):
+        path.write_text(whole.replace(old, new, 1))
+        with pytest.raises(ConfigError, match=r"svm_seed0\.json is damaged"):
+            gather(grid, folder)
+
+
+def test_a_damaged_point_is_told(plan: Path, tmp_path: Path) -> None:
+    path = tmp_path / "point.json"
+    path.write_text('{"learning_rate":')
+    with pytest.raises(ConfigError, match=r"point\.json is damaged .*: delete"):
+        read_point(path, "")
+
+
+def test_a_full_disk_is_one_line_of_a_process_too(plan: Path, tmp_path: Path) -> None:
+    grid, folder = read_grid(plan), tmp_path / "out"
+    pool.prepare(grid, folder)
+    (folder / "runs").write_text("a file where a folder should be")
+    with pytest.raises(OSError, match="runs"):
+        run_grid(grid, folder, 2)
 
 
 def test_a_cell_begins_with_another_and_learns_from_fewer_objects(
@@ -258,7 +430,7 @@ seeds = 1
     assert [task.name for task in grid.tasks()].count(name) == 1, "one seed"
     (task,) = [task for task in grid.tasks() if task.name == name]
     assert grid.needs(task) == ("gru_simclr_image_seed0",)
-    pool.write_subset(Path(grid.data), folder / "sweeps", grid.sweeps)
+    pool.prepare(grid, folder)
     bench = Workbench(grid, folder)
     few = bench.splits_of(0.5)[0]
     assert set(few.sweeps.objects) == {"mug-0", "mug-1", "car-0", "car-1"}
@@ -279,7 +451,7 @@ seeds = 1
 
 def test_what_only_its_scores_were_kept_of_is_trained_again(plan: Path, tmp_path: Path) -> None:
     grid, folder = read_grid(plan), tmp_path / "out"
-    pool.write_subset(Path(grid.data), folder / "sweeps", grid.sweeps)
+    pool.prepare(grid, folder)
     bench, task = Workbench(grid, folder), grid.tasks()[1]
     first = bench.do(task)
     outcome_path(folder, task).unlink()
@@ -296,7 +468,7 @@ def test_of_what_no_processor_trained_no_processor_s_time_is_told(
     plan: Path, tmp_path: Path
 ) -> None:
     grid, folder = read_grid(plan), tmp_path / "out"
-    pool.write_subset(Path(grid.data), folder / "sweeps", grid.sweeps)
+    pool.prepare(grid, folder)
     Workbench(grid, folder, "auto").do(grid.tasks()[1])
     (row,) = [row for row in gather(grid, folder).rows if row.top1 is not None]
     assert row.seconds == 0
@@ -339,7 +511,8 @@ def made_up(folder: Path, grid: results.Grid, task: Task, right: str) -> None:
 
 def test_comparisons_are_of_the_same_sweeps_and_seeds(plan: Path, tmp_path: Path) -> None:
     grid, folder = read_grid(plan), tmp_path / "out"
-    pool.write_subset(Path(grid.data), folder / "sweeps", grid.sweeps)
+    folder.mkdir()
+    write_tested(folder, np.repeat([f"mug-{i}" for i in range(8)], 2), 2)
     right = {
         ("gru", 0): "1111111111111100",
         ("gru", 1): "1111111111110000",
@@ -366,6 +539,9 @@ def test_a_table_goes_between_the_marks_of_a_page(tmp_path: Path) -> None:
     put_into(page, "newer\n")
     marks = "<!-- grid: begin -->\nnewer\n<!-- grid: end -->"
     assert page.read_text() == f"before\n{marks}\nafter\n"
+    page.write_bytes(b"\xff\xfe")
+    with pytest.raises(ConfigError, match="no page of text"):
+        put_into(page, "new\n")
     page.write_text("no marks\n")
     with pytest.raises(ConfigError, match="to put the table between"):
         put_into(page, "new\n")

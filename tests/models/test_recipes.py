@@ -133,6 +133,12 @@ def test_overrides_come_last():
         ("[train]\noptimizer = 'sdg'", "optimizer is 'sdg', not one of sgd, adam"),
         ("[search]\noptimizer = ['sgd', 'sdg']", "optimizer is 'sdg', not one of"),
         ("[train]\nbatch = 0", "batch must be positive"),
+        ("[train]\nencoder = 'foo'", ":1: encoder is 'foo', not one of"),
+        (
+            "[train]\n\n[search]\nlearning_rate = [0.1, -1.0]",
+            ":3: train: learning_rate must be positive",
+        ),
+        ("[search]\ndropout = [0.1, 2.0]", ":1: dropout is 2.0, must be in"),
         ("[train]\ndata = 'set'", "train has no key 'data'"),
         ("[search]\nbatch = 3", "search.batch: expected a list, got 3"),
         ("train = ]", ":1: not TOML"),

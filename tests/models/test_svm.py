@@ -1,11 +1,16 @@
 """Support vector machines that say how far they are from a decision."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 pytest.importorskip("sklearn")
 
-from tactile_rt.models.svm import fit, fit_margins
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.svm import fit, fit_margins, fit_svm
+from tactile_rt.stream import ConfigError
+from tests.helpers.tiny_sweeps import write_tiny_set
 
 
 def blobs(classes: list[int], n: int = 60) -> tuple[np.ndarray, np.ndarray]:
@@ -25,3 +30,11 @@ def test_the_largest_margin_is_the_decision(classes: list[int]) -> None:
     missing = [k for k in range(7) if k not in classes]
     assert np.isneginf(margins[:, missing]).all()
     assert np.isfinite(margins[:, classes]).all()
+
+
+def test_one_category_is_nothing_to_tell_apart(tmp_path: Path) -> None:
+    write_tiny_set(tmp_path / "set")
+    train = SweepSet.read(tmp_path / "set", "train")
+    one = train[np.flatnonzero(train.sweeps.labels == 0)]
+    with pytest.raises(ConfigError, match="needs touches of two categories"):
+        fit_svm(one, one)

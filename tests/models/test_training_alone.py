@@ -265,3 +265,87 @@ def test_what_is_no_checkpoint_is_refused_by_one_wording(trained, tmp_path):
 
 def test_cells_have_the_names_that_are_known_without_torch():
     assert tuple(cells.CELLS) == CELLS
+
+
+# What a run goes on from
+
+
+@pytest.mark.parametrize(
+    ("file", "change", "said"),
+    [
+        ("config.json", None, "config.json is gone, so that nobody knows what run this is"),
+        ("best.pt", None, r"no checkpoint .*: delete .*last.pt to begin the run anew"),
+        ("best.pt", lambda b: b[:900], r"is not a checkpoint .*: delete .*last.pt to begin"),
+        ("history.csv", lambda b: b"\xff\xfe", "history.csv is damaged: delete it to go on"),
+        ("history.csv", lambda b: b.replace(b"epoch", b"era"), "history.csv is damaged"),
+        ("history.csv", lambda b: b"".join(b.splitlines(True)[:-1]), "history.csv is damaged"),
+        ("history.csv", lambda b: b.splitlines(True)[0], "history.csv is damaged"),
+    ],
+)
+def test_a_run_that_has_lost_something_says_so(tiny, tmp_path, file, change, said):
+    config = TrainingConfig(tiny, **SMALL, updates=4)
+    train(config, tmp_path / "run")
+    path = tmp_path / "run" / file
+    whole = path.read_bytes()
+    if change is None:
+        path.unlink()
+    else:
+        path.write_bytes(change(whole))
+    with pytest.raises((ConfigError, ModelError), match=said):
+        train(config, tmp_path / "run")
+    path.write_bytes(whole)
+    train(config, tmp_path / "run")
+
+
+def test_a_run_without_its_history_goes_on(tiny, tmp_path):
+    config = TrainingConfig(tiny, **SMALL, epochs=2)
+
+    def stop(progress):
+        if progress.metrics:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train(config, tmp_path / "run", stop)
+    history = tmp_path / "run" / "history.csv"
+    history.unlink()
+    train(config, tmp_path / "run")
+    assert [line.split(",")[0] for line in history.read_text().splitlines()] == ["epoch", "2"]
+    train(config, tmp_path / "run")
+
+
+def test_a_set_may_be_called_by_another_path(tiny, tmp_path, monkeypatch):
+    train(TrainingConfig(tiny, **SMALL, updates=1), tmp_path / "run")
+    monkeypatch.chdir(Path(tiny).parent)
+    train(TrainingConfig("set", **SMALL, updates=1), tmp_path / "run")
+    (tmp_path / "link").symlink_to(tiny)
+    train(TrainingConfig(str(tmp_path / "link"), **SMALL, updates=1), tmp_path / "run")
+    with pytest.raises(ConfigError, match="other batch"):
+        train(TrainingConfig(tiny, **{**SMALL, "batch": 4}, updates=1), tmp_path / "run")
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        (("--accelerator", "tpu"), "accelerator is 'tpu'"),
+        (("--set", "jitter=99999999"), "jitter is 99999999 samples, but a sweep has"),
+        (("--set", "learning_rate=1e300"), "learning_rate must be below 1e+38"),
+        (("--set", "epochs=99999999999999999999"), "epochs=99999999999999999999: more than 64"),
+        (("--set", "begin=none.pt"), "no checkpoint none.pt"),
+    ],
+)
+def test_what_cannot_be_trained_is_one_line(tiny, refused, tmp_path, asked, said):
+    assert said in refused("train", tiny, tmp_path / "run", *OPTIONS, *asked)
+
+
+def test_a_folder_that_cannot_be_is_refused_before_torch_is_loaded(tiny, refused, tmp_path):
+    (tmp_path / "file").write_text("mine")
+    said = refused("train", tiny, tmp_path / "file" / "run", *OPTIONS)
+    assert f"{tmp_path / 'file'}: is not a folder" in said
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("asked", ["momentum=-1", "momentum=1", "seed=-1"])
+def test_a_probe_s_settings_are_held_to_their_ranges(trained, refused, tmp_path, asked):
+    name = asked.split("=")[0]
+    said = refused("probe", trained / "best.pt", tmp_path / "p", "--set", asked)
+    assert f"{name} must be" in said

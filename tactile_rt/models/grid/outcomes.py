@@ -1,27 +1,40 @@
 """What the tasks of a grid have found, as it is kept in the grid's folder. Needs no torch."""
 
+from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
+from tactile_rt.files import write_whole
+from tactile_rt.models.grid.plan import OF_UNTRAINED, SUPERVISED, Grid, Task
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.stream import ConfigError
 
 __all__ = [
     "SUBSET",
+    "TESTED",
     "Outcome",
+    "Point",
+    "Tested",
     "Training",
     "outcome_path",
     "read_outcome",
+    "read_point",
+    "read_tested",
+    "runs_of",
     "settings_of",
+    "training_settings",
     "waiting_tasks",
+    "write_tested",
 ]
 
-SUBSET, OUTCOMES = "sweeps", "outcomes"  # folders of a grid
+SUBSET, OUTCOMES, RUNS = "sweeps", "outcomes", "runs"  # folders of a grid
+TESTED = "tested.json"  # a file of it
+
+Hits = Annotated[str, msgspec.Meta(pattern="^[01]*$")]
 
 
 class Training(msgspec.Struct, frozen=True):
@@ -33,6 +46,7 @@ class Training(msgspec.Struct, frozen=True):
             self-supervised network by its probe. 0 if it diverged.
         seconds: The CPU time of its updates, and of what it was validated by, s; 0 if something
             else than a CPU trained it.
+        diverged: Whether it did.
     """
 
     learning_rate: float
@@ -40,6 +54,34 @@ class Training(msgspec.Struct, frozen=True):
     updates: int
     score: float
     seconds: float
+    diverged: bool = False
+
+
+class Point(Training, frozen=True):
+    """A training as its own folder keeps it.
+
+    Attributes:
+        key: The settings that it depends on, as JSON.
+    """
+
+    key: str = ""
+
+
+class Tested(msgspec.Struct, frozen=True):
+    """What a grid's outcomes are of: enough to tell of them where its sweeps are not.
+
+    Attributes:
+        objects: The (name, sweeps) of each test object, in the order of the hits.
+        classes: The number of categories.
+    """
+
+    objects: tuple[tuple[str, int], ...]
+    classes: int
+
+    def names(self) -> NDArray[np.str_]:
+        """(sweep,) the object of each."""
+        names, counts = zip(*self.objects, strict=True)
+        return np.repeat(np.array(names, dtype=np.str_), counts)
 
 
 class Outcome(msgspec.Struct, frozen=True):
@@ -61,9 +103,9 @@ class Outcome(msgspec.Struct, frozen=True):
     name: str
     seed: int
     key: str
-    top1: str = ""
-    top5: str = ""
-    noisy: str = ""
+    top1: Hits = ""
+    top5: Hits = ""
+    noisy: Hits = ""
     parameters: int = 0
     seconds: float = 0.0
     trials: tuple[Training, ...] = ()
@@ -82,6 +124,63 @@ def outcome_path(folder: Path, task: Task) -> Path:
     return folder / OUTCOMES / f"{task.slug}.json"
 
 
+def write_tested(folder: Path, objects: NDArray[np.str_], classes: int) -> None:
+    """Keep what a grid tests on in its folder.
+
+    Args:
+        folder: of the grid.
+        objects: (sweep,) the object of each.
+        classes: the number of categories.
+    """
+    counts = tuple((name, len(list(same))) for name, same in groupby(objects.tolist()))
+    text = msgspec.json.encode(Tested(counts, classes))
+    write_whole(folder / TESTED, lambda file: file.write(text))
+
+
+def read_tested(folder: Path) -> Tested:
+    """What a grid tests on.
+
+    Raises:
+        ConfigError: it was never begun here, or the file is damaged.
+    """
+    path = folder / TESTED
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Tested)
+    except FileNotFoundError:
+        raise ConfigError(f"no {path}: run the grid first") from None
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is damaged ({error}): delete it and run the grid") from None
+
+
+def runs_of(folder: Path, task: Task) -> Path:
+    """Where a grid's folder keeps a task's trainings."""
+    return folder / RUNS / task.slug
+
+
+def read_point(path: Path, key: str) -> Point | None:
+    """What a training has found, if it is done.
+
+    Args:
+        path: where its folder keeps it.
+        key: the settings that it should be of.
+
+    Raises:
+        ConfigError: it is of other settings, or damaged.
+    """
+    if not path.exists():
+        return None
+    try:
+        found = msgspec.json.decode(path.read_bytes(), type=Point)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is damaged ({error}): delete {path.parent}") from None
+    if found.key != key:
+        raise ConfigError(
+            f"{path.parent} was trained with other settings: choose another folder for the grid, "
+            "or delete this one to train it again"
+        )
+    return found
+
+
 def read_outcome(grid: Grid, folder: Path, task: Task) -> Outcome | None:
     """What a task found, if it is done.
 
@@ -93,12 +192,14 @@ def read_outcome(grid: Grid, folder: Path, task: Task) -> Outcome | None:
         return None
     try:
         found = msgspec.json.decode(path.read_bytes(), type=Outcome)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is damaged ({error}): delete it to do it again") from None
+    if len({len(hits) for hits in (found.top1, found.top5, found.noisy) if hits}) > 1:
+        raise ConfigError(f"{path} is damaged (hits of other sweeps): delete it to do it again")
     if found.key != settings_of(grid, folder, task):
         raise ConfigError(
             f"{folder} holds {task.name!r} trained with other settings: choose another folder, or "
-            f"delete {path} to train it again"
+            f"delete {path} and {runs_of(folder, task)} to train it again"
         )
     return found
 
@@ -107,19 +208,26 @@ def settings_of(grid: Grid, folder: Path, task: Task) -> str:
     """Everything that an outcome depends on, as JSON."""
     settings: dict[str, Any] = {"sweeps": msgspec.to_builtins(grid.sweeps), "data": grid.data}
     if task.cell is not None:
-        config, usual = (
-            msgspec.to_builtins(one) for one in (grid.config(task, Path()), TrainingConfig(""))
-        )
+        config = training_settings(grid.config(task, Path()))
         if task.random:  # trained for no update at all
-            config = {k: config[k] for k in ("encoder", "attender", "width", "seed")}
+            whole = msgspec.to_builtins(grid.config(task, Path()))
+            config = {k: v for k, v in config.items() if k in OF_UNTRAINED}
+            config |= {k: whole[k] for k in ("encoder", "attender", "width", "seed")}
         else:
-            # A key that was thought of later leaves what was done before as it is.
-            config = {k: v for k, v in config.items() if v != usual[k]}
             settings |= {"search": grid.search, "growth": grid.growth, "cell": task.cell}
         settings |= {"config": config}
         if task.random or task.cell.objective != SUPERVISED:
             settings |= {"probe": grid.probe}
     return msgspec.json.encode(settings, order="sorted").decode()
+
+
+def training_settings(config: TrainingConfig) -> dict[str, Any]:
+    """What of a training's configuration is not as usual, as JSON has it.
+
+    A key that was thought of later leaves what was done before as it is.
+    """
+    plain, usual = (msgspec.to_builtins(one) for one in (config, TrainingConfig("")))
+    return {key: value for key, value in plain.items() if value != usual[key]}
 
 
 def waiting_tasks(grid: Grid, folder: Path) -> list[Task]:

@@ -37,7 +37,7 @@ def draw_grid(results: GridResults, path: Path) -> None:
             r for r in networks if not r.learning.startswith(SUPERVISED)
         ],
     }
-    groups = {title: rows for title, rows in groups.items() if rows}
+    groups = {title: rows for title, rows in groups.items() if rows} or {"": []}
     heights = [len(rows) + 1 for rows in groups.values()]
     figure = Figure(figsize=(9.5, ROW_INCH * sum(heights) + 1.9), layout="constrained")
     all_axes = figure.subplots(len(groups), 1, sharex=True, height_ratios=heights, squeeze=False)

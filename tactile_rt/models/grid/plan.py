@@ -16,8 +16,7 @@ from typing import Any
 
 import msgspec
 
-from tactile_rt.models.ead_config import EADConfig
-from tactile_rt.models.training.config import TrainingConfig
+from tactile_rt.models.training.config import ProbeConfig, TrainingConfig
 from tactile_rt.settings import convert, make_node, parse_toml, read_toml
 from tactile_rt.stream import ConfigError
 
@@ -37,6 +36,11 @@ __all__ = [
 SHIPPED = resources.files("tactile_rt.models.grid")
 SUPERVISED, RANDOM, SVM = "supervised", "random", "svm"
 NAMING = ("pairs",)  # options that tell cells apart in their names
+# what of a training's configuration an untrained network and its probe depend on, too
+OF_UNTRAINED = (
+    "decoder", "readout", "dropout", "graph", "norm_epsilon", "preprocessing", "first_weights",
+    "window", "jitter", "faults",
+)  # fmt: skip
 
 
 class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -216,7 +220,6 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         cell = task.cell
         assert cell is not None
-        common = self.supervised if cell.objective == SUPERVISED else self.self_supervised
         options: dict[str, Any] = {
             "data": str(data),
             "encoder": cell.encoder,
@@ -227,8 +230,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             "width": cell.width or self.width,
             "batch": self.batch,
             "seed": task.seed,
-            **common,
-            **cell.options,
+            **self._options(cell),
             **chosen,
         }
         convert(make_node(options, f"cell {cell.name!r}", 0, Path()), TrainingConfig)
@@ -240,14 +242,27 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         tasks = [Task(SVM, 0, None)] if self.svm else []
         seen: set[tuple[str, int]] = set()
         for cell in self.cells:
-            bare = Candidate(cell.encoder, cell.attender, width=cell.width)
             for seed in range(cell.seeds or self.seeds):
                 tasks.append(Task(cell.name, seed, cell))
-                random = Task(f"{RANDOM} {cell.network}", seed, bare)
+                random = Task(f"{RANDOM} {cell.network}", seed, self.untrained(cell))
                 if (random.name, seed) not in seen:
                     seen.add((random.name, seed))
                     tasks.append(random)
         return tasks
+
+    def untrained(self, cell: Candidate) -> Candidate:
+        """What a cell's network is before it is trained, and how it is probed."""
+        own, usual = self._options(cell), TrainingConfig("")
+        kept = {
+            k: own.get(k, getattr(usual, k))
+            for k in OF_UNTRAINED
+            if k in {**own, **self.supervised}
+        }
+        return Candidate(cell.encoder, cell.attender, width=cell.width, options=kept)
+
+    def _options(self, cell: Candidate) -> dict[str, Any]:
+        common = self.supervised if cell.objective == SUPERVISED else self.self_supervised
+        return {**common, **cell.options}
 
     def needs(self, task: Task) -> tuple[str, ...]:
         """Slugs of the tasks that come before: the first seed, which tunes, and a beginning."""
@@ -280,33 +295,67 @@ def read_grid(name: str | Path) -> Grid:
             f"no grid {name}: name a TOML file, or one of {', '.join(shipped_grids())}"
         )
     grid: Grid = convert(nodes, Grid)
-    names = [cell.name for cell in grid.cells]
+    try:
+        _check(grid)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from None
+    return grid
+
+
+def _check(grid: Grid) -> None:
+    """Refuse what could only be told after hours of training, or never."""
+    search, growth = grid.search, grid.growth
+    if not grid.cells or min(grid.seeds, search.updates, growth.first) < 1:
+        raise ConfigError("a grid needs a cell, a seed and an update")
+    if not search.learning_rate or not search.warmup:
+        raise ConfigError("search needs a learning_rate and a warmup")
+    if growth.most < growth.first:
+        raise ConfigError(
+            f"growth goes from {growth.first} updates to {growth.most}, which is less"
+        )
+    if min(grid.sweeps.train, grid.sweeps.validation, grid.sweeps.test) < 0:
+        raise ConfigError("sweeps are counted from 0, which takes all")
+    convert(make_node(grid.probe, "probe", 0, Path()), ProbeConfig)
+    before: dict[str, Candidate] = {}
+    untrained: dict[str, Candidate] = {}
     for cell in grid.cells:
-        if names.count(cell.name) > 1:
-            raise ConfigError(f"{name}: two cells are {cell.name!r}")
-        try:
-            config = grid.config(Task(cell.name, 0, cell), Path(grid.data))
-            try:
-                EADConfig(2, cell.encoder, cell.attender, config.decoder, config.width)
-            except ConfigError as error:
-                raise ConfigError(f"cell {cell.name!r}: {error}") from None
-        except ConfigError as error:
-            raise ConfigError(f"{name}: {error}") from None
-    for cell in grid.cells:
-        if not 0 < cell.share <= 1:
-            raise ConfigError(f"{name}: share must be above 0, at most 1, not {cell.share}")
-        if cell.begin and cell.begin not in names[: names.index(cell.name)]:
+        if cell.name in before:
+            raise ConfigError(f"two cells are {cell.name!r}")
+        _check_cell(grid, cell, before)
+        bare = grid.untrained(cell)
+        if untrained.setdefault(cell.network, bare) != bare:
             raise ConfigError(
-                f"{name}: cell {cell.name!r} begins with {cell.begin!r}, which no cell before it is"
+                f"cell {cell.name!r}: the network is another than that of a cell before it that "
+                f"is called {cell.network!r} too: give one a width"
             )
+        before[cell.name] = cell
     known = {task.name for task in grid.tasks()}
     for question in grid.questions:
         for one in (name for pair in question.pairs for name in (pair.better, pair.than)):
             if one not in known:
-                raise ConfigError(f"{name}: {question.text!r} compares {one!r}, which no cell is")
-    search, growth = grid.search, grid.growth
-    if not grid.cells or min(grid.seeds, search.updates, growth.first) < 1:
-        raise ConfigError(f"{name}: a grid needs a cell, a seed and an update")
-    if not search.learning_rate or not search.warmup:
-        raise ConfigError(f"{name}: search needs a learning_rate and a warmup")
-    return grid
+                raise ConfigError(f"{question.text!r} compares {one!r}, which no cell is")
+
+
+def _check_cell(grid: Grid, cell: Candidate, before: dict[str, Candidate]) -> None:
+    called = f"cell {cell.name!r}"
+    if not 0 < cell.share <= 1:
+        raise ConfigError(f"{called}: share must be above 0, at most 1, not {cell.share}")
+    if cell.seeds < 0:
+        raise ConfigError(f"{called}: seeds must be 0 (the grid's) or more, not {cell.seeds}")
+    if cell.begin:
+        if cell.begin not in before:
+            raise ConfigError(f"{called} begins with {cell.begin!r}, which no cell before it is")
+        has, wants = (one.seeds or grid.seeds for one in (before[cell.begin], cell))
+        if has < wants:
+            raise ConfigError(
+                f"{called} begins with {cell.begin!r}, which is trained with {has} of {wants} seeds"
+            )
+    task, search = Task(cell.name, 0, cell), grid.search
+    for rate in search.learning_rate:
+        for warmup in search.warmup:
+            config = grid.config(task, Path(grid.data), learning_rate=rate, warmup=warmup)
+    if config.encoder != "graph":  # whose frame is that of an array, which is not read here
+        try:
+            config.network(2)
+        except ConfigError as error:
+            raise ConfigError(f"{called}: {error}") from None

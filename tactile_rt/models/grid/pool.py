@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from tactile_rt.locks import alone_in
-from tactile_rt.models.grid.outcomes import SUBSET, Outcome, waiting_tasks
+from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.grid.outcomes import SUBSET, TESTED, Outcome, waiting_tasks, write_tested
 from tactile_rt.models.grid.plan import Grid, SweepCounts, Task
 from tactile_rt.models.grid.work import Workbench
 from tactile_rt.stream import TactileError
@@ -29,7 +30,7 @@ from tactile_rt.sweep_set import (
     write_skipped,
 )
 
-__all__ = ["run_grid", "write_subset"]
+__all__ = ["prepare", "run_grid", "write_subset"]
 
 PATIENCE_S = 1.0
 
@@ -68,9 +69,9 @@ def _run(
     tasks = grid.tasks()
     folder.mkdir(parents=True, exist_ok=True)
     waiting = waiting_tasks(grid, folder)
-    if not waiting:
+    if not waiting and (folder / TESTED).exists():
         return
-    write_subset(Path(grid.data), folder / SUBSET, grid.sweeps)
+    prepare(grid, folder)
     finished = {task.slug for task in tasks} - {task.slug for task in waiting}
 
     def ready() -> Task | None:
@@ -114,7 +115,7 @@ def _run(
             if not busy:
                 return
             found = _next(outcomes, workers)
-            if isinstance(found, TactileError):
+            if isinstance(found, Exception):
                 raise found
             idle, busy = idle + 1, busy - 1
             conclude(*found)
@@ -122,6 +123,17 @@ def _run(
         for worker in workers:
             worker.terminate()
             worker.join()
+
+
+def prepare(grid: Grid, folder: Path) -> None:
+    """Write, or go on writing, the sweeps of a grid and what of them it tests on.
+
+    Raises:
+        RecordingError, ConfigError: as `write_subset`.
+    """
+    write_subset(Path(grid.data), folder / SUBSET, grid.sweeps)
+    test = SweepSet.read(folder / SUBSET, "test")
+    write_tested(folder, test.sweeps.objects, len(test.manifest.categories))
 
 
 def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
@@ -190,5 +202,5 @@ def _work(grid: Grid, folder: Path, accelerator: str, todo: Any, outcomes: Any) 
             except queue.Empty:
                 continue
             outcomes.put((bench.do(task, orphaned), task))
-    except TactileError as error:
+    except (TactileError, OSError) as error:  # a full disk, for one
         outcomes.put(error)

@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.files import write_whole
-from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import Interval, accuracy
-from tactile_rt.models.grid.outcomes import SUBSET, Outcome, Training, read_outcome
+from tactile_rt.models.grid.outcomes import Outcome, Training, read_outcome, read_tested
 from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid, Growth
 from tactile_rt.stream import ConfigError
 
@@ -90,8 +89,7 @@ def gather(grid: Grid, folder: Path) -> GridResults:
     """Read the outcomes that there are.
 
     Raises:
-        ConfigError: there is none yet, or those of another grid.
-        RecordingError: the grid's sweeps cannot be read.
+        ConfigError: there is none yet, or those of another grid or of other sweeps.
     """
     found: dict[str, list[Outcome]] = {}
     for task in grid.tasks():
@@ -100,8 +98,14 @@ def gather(grid: Grid, folder: Path) -> GridResults:
             found.setdefault(task.name, []).append(outcome)
     if not found:
         raise ConfigError(f"{folder} has no outcome yet: run the grid first")
-    test = SweepSet.read(folder / SUBSET, "test")
-    objects = test.sweeps.objects
+    tested = read_tested(folder)
+    objects = tested.names()
+    for outcome in (one for several in found.values() for one in several):
+        if outcome.top1 and len(outcome.top1) != len(objects):
+            raise ConfigError(
+                f"{folder}: {outcome.name!r}, seed {outcome.seed}, was tested on "
+                f"{len(outcome.top1)} sweeps, of which there are {len(objects)}: delete its outcome"
+            )
     rows = []
     if SVM in found:
         rows.append(_row(SVM, None, found[SVM], [], objects, grid.growth))
@@ -120,7 +124,7 @@ def gather(grid: Grid, folder: Path) -> GridResults:
         tuple(answers),
         len(set(objects.tolist())),
         len(objects),
-        len(test.manifest.categories),
+        tested.classes,
     )
 
 
@@ -251,9 +255,12 @@ def put_into(page: Path, text: str) -> None:
     """Replace what stands between the grid's marks on a page.
 
     Raises:
-        ConfigError: the page has no such marks.
+        ConfigError: the page has no such marks, or is no text.
     """
-    old = page.read_text() if page.exists() else f"{BEGIN}\n{END}\n"
+    try:
+        old = page.read_text(encoding="utf-8") if page.exists() else f"{BEGIN}\n{END}\n"
+    except UnicodeDecodeError:
+        raise ConfigError(f"{page} is no page of text in UTF-8") from None
     before, begin, rest = old.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):

@@ -18,35 +18,40 @@ from tactile_rt.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.data_checks import check_sets, check_split
-from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.datasets import SweepSet, drawn_as, frame_of
 from tactile_rt.models.disturbances import CLEAN, RATED
 from tactile_rt.models.ead import count_parameters
-from tactile_rt.models.evaluation import among, cut_windows, hits, posteriors
+from tactile_rt.models.evaluation import CutWindows, among, cut_windows, hits, posteriors
 from tactile_rt.models.grid.outcomes import (
     SUBSET,
     Outcome,
+    Point,
     Training,
     outcome_path,
     read_outcome,
+    read_point,
+    runs_of,
     settings_of,
+    training_settings,
 )
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.svm import fit_svm
 from tactile_rt.models.training import (
     ProbeConfig,
     Progress,
+    TrainingConfig,
     initialise,
     probe,
     train,
 )
-from tactile_rt.stream import ModelError
+from tactile_rt.models.training.config import DivergedError
 from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["Workbench"]
 
 BATCH = 128
-RUNS = "runs"  # a folder of a grid
 POINT = "point.json"
+SECONDS = "seconds"  # a file of a training that is not done: what it has cost so far
 
 
 class Workbench:
@@ -65,13 +70,14 @@ class Workbench:
         self.splits = SweepSet.read(self.data, "train"), SweepSet.read(self.data, "validation")
         self.test = SweepSet.read(self.data, "test")
         check_sets(self.data, (*self.splits, self.test))
+        manifest = self.test.manifest
         for task in grid.tasks():
-            if task.cell is not None:  # an array that cannot be augmented so is told now
-                build(grid.config(task, self.data).augmentation, self.test.manifest.spec)
+            if task.cell is not None:  # what this array cannot have is told now
+                config = grid.config(task, self.data)
+                build(config.augmentation, manifest.spec)
+                config.network(len(manifest.categories), frame_of(manifest))
         self._shares: dict[float, tuple[SweepSet, SweepSet]] = {}
-        self._clean, self._noisy = (
-            list(cut_windows(self.test, batch=BATCH, disturbance=one)) for one in (CLEAN, RATED)
-        )
+        self._cut: dict[str, tuple[list[CutWindows], list[CutWindows]]] = {}
 
     def do(self, task: Task, report: Callable[..., None] = lambda _: None) -> Outcome:
         """Do a task and keep its outcome; a network that diverges is an outcome too.
@@ -88,7 +94,7 @@ class Workbench:
                 found = self._untrained(found, task)
             else:
                 found = self._trained(found, task, report)
-        except ModelError as error:
+        except DivergedError as error:
             found = msgspec.structs.replace(found, failed=str(error))
         path = outcome_path(self.folder, task)
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -99,31 +105,31 @@ class Workbench:
         if task.seed:
             first = read_outcome(self.grid, self.folder, msgspec.structs.replace(task, seed=0))
             if first is None or first.chosen is None:
-                raise ModelError("its first seed diverged, so nothing is known to train it with")
+                raise DivergedError("its first seed diverged, so nothing is known to train it with")
             chosen = self._train(task, first.chosen, report)
         else:
             trials = self._search(task, report)
             growth = self._grow(task, max(trials, key=_score), report)
             found = msgspec.structs.replace(found, trials=trials, growth=growth)
             chosen = max(growth, key=_score)
-        if not chosen.score:
-            raise ModelError("every training of it diverged")
+        if chosen.diverged:
+            raise DivergedError("every training of it diverged")
         run = self._run(task, chosen)
         assert task.cell is not None
         best = run / ("" if task.cell.objective == SUPERVISED else "probe") / "best.pt"
         if not best.exists():  # where only what its trainings scored was kept
             (run / POINT).unlink()
             chosen = self._train(task, chosen, report)
-        return self._scored(
-            msgspec.structs.replace(found, chosen=chosen, seconds=chosen.seconds), best
-        )
+        found = msgspec.structs.replace(found, chosen=chosen, seconds=chosen.seconds)
+        return self._scored(found, best, self.grid.config(task, self.data))
 
     def _search(self, task: Task, report: Callable[..., None]) -> tuple[Training, ...]:
         """The trials: every rate with the first warm-up, then the other warm-ups with the best."""
         search = self.grid.search
 
         def of(rate: float, warmup: float) -> Training:
-            return self._train(task, Training(rate, warmup, search.updates, 0.0, 0.0), report)
+            at = Training(rate, warmup, search.updates, score=0.0, seconds=0.0)
+            return self._train(task, at, report)
 
         rates = [of(rate, search.warmup[0]) for rate in search.learning_rate]
         best = max(rates, key=_score).learning_rate
@@ -146,52 +152,69 @@ class Workbench:
 
     def _train(self, task: Task, at: Training, report: Callable[..., None]) -> Training:
         """One training, unless it is there; of a diverged one the score is 0."""
-        run = self._run(task, at)
-        if (run / POINT).exists():
-            return msgspec.json.decode((run / POINT).read_bytes(), type=Training)
-        chosen: dict[str, Any] = {
-            "learning_rate": at.learning_rate, "warmup": at.warmup, "updates": at.updates,
-        }  # fmt: skip
-        cell = task.cell
+        cell, run = task.cell, self._run(task, at)
         assert cell is not None
+        begin = ""
         if cell.begin:
             begun = read_outcome(self.grid, self.folder, self._begun(task))
             if begun is None or begun.chosen is None:
-                raise ModelError(f"{cell.begin!r} diverged, and there is nothing to begin with")
-            self._train(self._begun(task), begun.chosen, report)  # where only its outcome was kept
-            chosen["begin"] = str(self._run(self._begun(task), begun.chosen) / "best.pt")
-        config = self.grid.config(task, self.data, **chosen)
-        began, updates = time.process_time(), 0
+                raise DivergedError(f"{cell.begin!r} diverged, and there is nothing to begin with")
+            begin = str(self._run(self._begun(task), begun.chosen) / "best.pt")
+        config = self.grid.config(
+            task, self.data, learning_rate=at.learning_rate, warmup=at.warmup, updates=at.updates,
+            begin=begin,
+        )  # fmt: skip
+        key = self._key(task, config)
+        if (found := read_point(run / POINT, key)) is not None:
+            return _plain(found)
+        if cell.begin:  # where only its outcome was kept
+            assert begun is not None and begun.chosen is not None
+            self._train(self._begun(task), begun.chosen, report)
+        clock = _Clock(run / SECONDS)
 
         def count(progress: Progress) -> None:
-            nonlocal updates
-            updates += not progress.metrics
+            if progress.metrics:
+                clock.keep()
             report(progress)
 
-        splits = self.splits_of(cell.share)
+        splits, diverged = self.splits_of(cell.share), False
         try:
             best = train(config, run, count, device=self.accelerator, splits=splits)
-            # what was done before an interruption cost as much
-            seconds = (time.process_time() - began) * at.updates / max(updates, 1)
+            clock.stop()
             if cell.objective != SUPERVISED:
                 best = probe(best, run / "probe", ProbeConfig(**self.grid.probe), report, splits)
             metrics = load_checkpoint(best)[1]["metrics"]
             score = (metrics["validation_top1"] + metrics["validation_top1_noisy"]) / 2
-        except ModelError:
+        except DivergedError:
             run.mkdir(parents=True, exist_ok=True)
-            score, seconds = 0.0, time.process_time() - began
-        if self.accelerator != "cpu":  # a processor's time for starting kernels says nothing
-            seconds = 0.0
-        done = msgspec.structs.replace(at, score=score, seconds=seconds)
+            score, diverged = 0.0, True
+        done = Point(
+            at.learning_rate, at.warmup, at.updates, score,
+            # a processor's time for starting a GPU's kernels says nothing
+            clock.seconds if self.accelerator == "cpu" else 0.0,
+            diverged, key,
+        )  # fmt: skip
         write_whole(run / POINT, lambda file: file.write(msgspec.json.encode(done)))
-        for path in run.rglob("last.pt"):  # what is done needs not go on
-            path.unlink()
-        return done
+        for path in (*run.rglob("last.pt"), run / SECONDS):  # what is done needs not go on
+            path.unlink(missing_ok=True)
+        return _plain(done)
+
+    def _key(self, task: Task, config: TrainingConfig) -> str:
+        """What a training's score depends on, wherever the grid lies."""
+        settings: dict[str, Any] = {"sweeps": msgspec.to_builtins(self.grid.sweeps)}
+        settings["config"] = training_settings(config)
+        settings["config"].pop("data")
+        if config.begin:
+            settings["config"]["begin"] = "/".join(Path(config.begin).parts[-3:-1])
+        assert task.cell is not None
+        if task.cell.objective != SUPERVISED:
+            settings["probe"] = self.grid.probe
+        return msgspec.json.encode(settings, order="sorted").decode()
 
     def _run(self, task: Task, at: Training) -> Path:
         """The folder of one training."""
         name = f"rate{at.learning_rate:g}_warmup{at.warmup:g}_updates{at.updates}"
-        return self.folder / RUNS / task.slug / name
+        return runs_of(self.folder, task) / name
 
     def _begun(self, task: Task) -> Task:
         """What a task's network begins with."""
@@ -200,10 +223,10 @@ class Workbench:
         return Task(task.cell.begin, task.seed, names[task.cell.begin])
 
     def _untrained(self, found: Outcome, task: Task) -> Outcome:
-        run = self.folder / RUNS / task.slug
-        best = initialise(self.grid.config(task, self.data), run, self.splits)
+        run, config = runs_of(self.folder, task), self.grid.config(task, self.data)
+        best = initialise(config, run, self.splits)
         best = probe(best, run / "probe", ProbeConfig(**self.grid.probe), splits=self.splits)
-        return self._scored(found, best)
+        return self._scored(found, best, config)
 
     def splits_of(self, share: float) -> tuple[SweepSet, SweepSet]:
         """The splits to train and to validate on, with some of the objects to train on."""
@@ -226,7 +249,7 @@ class Workbench:
         seconds = time.process_time() - began
         return msgspec.structs.replace(found, top1=_as_text(right), seconds=seconds)
 
-    def _scored(self, found: Outcome, best: Path) -> Outcome:
+    def _scored(self, found: Outcome, best: Path, config: TrainingConfig) -> Outcome:
         """The outcome with what a checkpoint's network makes of the test split."""
         model, _ = load_checkpoint(best)
         run, labels, classes = (
@@ -235,7 +258,7 @@ class Workbench:
             len(self.test.manifest.categories),
         )
         clean, noisy = (  # had it to name one
-            among(posteriors(cut, run)[:, -1], classes) for cut in (self._clean, self._noisy)
+            among(posteriors(cut, run)[:, -1], classes) for cut in self._windows(config)
         )
         return msgspec.structs.replace(
             found,
@@ -245,9 +268,47 @@ class Workbench:
             parameters=count_parameters(model.network),
         )
 
+    def _windows(self, config: TrainingConfig) -> tuple[list[CutWindows], list[CutWindows]]:
+        """The test windows as a configuration begins them, clean and at the rated noise."""
+        if config.window not in self._cut:
+            test = drawn_as(self.test, {"window": config.window})
+            clean, noisy = (
+                list(cut_windows(test, batch=BATCH, disturbance=one)) for one in (CLEAN, RATED)
+            )
+            self._cut[config.window] = clean, noisy
+        return self._cut[config.window]
 
-def _score(point: Training) -> float:
-    return point.score
+
+class _Clock:
+    """The CPU time of a training, kept in a file from epoch to epoch, since it may be killed."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._before = float(path.read_text()) if path.exists() else 0.0
+        self._began = time.process_time()
+        self._end: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        """So far, or until it was stopped."""
+        end = time.process_time() if self._end is None else self._end
+        return self._before + end - self._began
+
+    def stop(self) -> None:
+        """Count what comes after this no more."""
+        self._end = time.process_time()
+
+    def keep(self) -> None:
+        """Write down what it is so far."""
+        write_whole(self._path, lambda file: file.write(f"{self.seconds}".encode()))
+
+
+def _score(point: Training) -> tuple[bool, float]:
+    return not point.diverged, point.score
+
+
+def _plain(point: Point) -> Training:
+    return msgspec.convert(msgspec.to_builtins(point), Training, strict=False)
 
 
 def _as_text(hits: NDArray[np.bool_]) -> str:

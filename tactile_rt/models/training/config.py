@@ -12,7 +12,7 @@ from tactile_rt.models.data_checks import check_labelled, check_split
 from tactile_rt.models.datasets import frame_of
 from tactile_rt.models.ead_config import MOUSE_FRAME, READOUTS, EADConfig
 from tactile_rt.sensor_faults import SensorFaults
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import ConfigError, ModelError
 from tactile_rt.sweep_set import SweepManifest, join_manifests
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "PRECISIONS",
     "SCHEDULES",
     "WINDOWS",
+    "DivergedError",
     "ProbeConfig",
     "Progress",
     "TrainingConfig",
@@ -40,6 +41,7 @@ FIRST_WEIGHTS = ("kaiming", "paper")
 RATES_PER = ("update", "epoch")
 WINDOWS = ("onset", "sweep")
 PAIRS = ("one-sweep", "two-sweeps")
+LARGEST = 1e38  # numbers of single precision end there
 
 
 @dataclass(frozen=True)
@@ -156,8 +158,7 @@ class TrainingConfig:
             if (value := getattr(self, name)) not in known:
                 raise ConfigError(f"{name} is {value!r}, not one of {', '.join(known)}")
         for name in ("epochs", "batch", "learning_rate", "drop_every"):
-            if not 0 < getattr(self, name) < float("inf"):  # which NaN is not either
-                raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
+            _check_positive(name, getattr(self, name))
         for name in ("updates", "clip_norm", "weight_decay", "jitter"):
             if not (getattr(self, name) >= 0 and isfinite(getattr(self, name))):
                 raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
@@ -172,8 +173,7 @@ class TrainingConfig:
             raise ConfigError(f"pairs are of simclr and simsiam: {self.objective} has no two views")
         if self.schedule == "one-cycle" and self.rate_per == "epoch":
             raise ConfigError("schedule one-cycle changes the rate per update, not per epoch")
-        if not 0 <= self.seed < 2**32:
-            raise ConfigError(f"seed must be 0 to {2**32 - 1}, not {self.seed}")
+        _check_seed(self.seed)
 
     def network(self, classes: int, frame: tuple[int, int, int] = MOUSE_FRAME) -> EADConfig:
         """The network's configuration for so many classes and for frames of a size.
@@ -245,8 +245,26 @@ class ProbeConfig:
         if self.readout not in READOUTS:
             raise ConfigError(f"readout is {self.readout!r}, not one of {', '.join(READOUTS)}")
         for name in ("epochs", "batch", "learning_rate", "drop_epochs"):
-            if not 0 < getattr(self, name) < float("inf"):
-                raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
+            _check_positive(name, getattr(self, name))
+        if not 0 <= self.momentum < 1:
+            raise ConfigError(f"momentum must be in [0, 1), not {self.momentum}")
+        _check_seed(self.seed)
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not value > 0:  # which NaN is not either
+        raise ConfigError(f"{name} must be positive, not {value}")
+    if not value < LARGEST:
+        raise ConfigError(f"{name} must be below {LARGEST:g}, not {value}")
+
+
+def _check_seed(seed: int) -> None:
+    if not 0 <= seed < 2**32:
+        raise ConfigError(f"seed must be 0 to {2**32 - 1}, not {seed}")
+
+
+class DivergedError(ModelError):
+    """A training whose gradients are no numbers any more: a lower rate may help."""
 
 
 @dataclass

@@ -57,7 +57,8 @@ def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
             # window, and always the same ones.
             strategy=DDPStrategy(static_graph=True) if size > 1 else "auto",
         )
-    except (ValueError, RuntimeError) as error:  # no such kind; none of it in this machine
+    # no such kind; none of it in this machine; none of what it needs
+    except (ValueError, RuntimeError, ModuleNotFoundError) as error:
         raise ConfigError(f"accelerator is {device!r}: {error}") from None
     joined = torch.distributed.is_available() and torch.distributed.is_initialized()
     fabric.launch()

@@ -6,16 +6,37 @@ import os
 import socket
 import time
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from tactile_rt.extras import install_line
 from tactile_rt.files import replaced
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import ConfigError, ModelError
 
-__all__ = ["Board", "log_epoch"]
+__all__ = ["Board", "log_epoch", "logged_epochs"]
 
 FORMAT = "brain.Event:2"  # the only one that TensorBoard has ever read
+
+
+def logged_epochs(path: Path, until: float) -> list[dict[str, str]]:
+    """The lines of a run's `history.csv` before an epoch; none if there is no such file.
+
+    Raises:
+        ModelError: it is damaged, or lines are missing.
+    """
+    if until <= 1 or not path.exists():
+        return []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            lines = list(csv.DictReader(file, strict=True))
+        epochs = [int(line["epoch"]) for line in lines]
+        whole = epochs[-1] >= until - 1 and all(b == a + 1 for a, b in pairwise(epochs))
+    except (UnicodeDecodeError, csv.Error, IndexError, KeyError, TypeError, ValueError):
+        whole = False
+    if not whole:
+        raise ModelError(f"{path} is damaged: delete it to go on without what it tells")
+    return [line for line, epoch in zip(lines, epochs, strict=True) if epoch < until]
 
 
 def log_epoch(path: Path, metrics: dict[str, float]) -> None:
@@ -25,10 +46,7 @@ def log_epoch(path: Path, metrics: dict[str, float]) -> None:
         OSError: the medium is full, or failed.
     """
     # A line that was logged before the run was killed, but not yet saved, is written again.
-    old = []
-    if path.exists():
-        with path.open(newline="") as file:
-            old = [r for r in csv.DictReader(file) if int(r["epoch"]) < metrics["epoch"]]
+    old = logged_epochs(path, metrics["epoch"])
     text = io.StringIO()
     writer = csv.DictWriter(text, list(metrics))
     writer.writeheader()

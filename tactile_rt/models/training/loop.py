@@ -23,7 +23,7 @@ from torch.optim.lr_scheduler import LRScheduler
 from tactile_rt.files import write_whole
 from tactile_rt.locks import alone_in
 from tactile_rt.models.augmentation import build
-from tactile_rt.models.checkpoint_files import reason
+from tactile_rt.models.checkpoint_files import describe_checkpoint, reason
 from tactile_rt.models.checkpoints import TactileClassifier, begin_from, save_whole
 from tactile_rt.models.data_checks import check_sets
 from tactile_rt.models.datasets import (
@@ -43,10 +43,15 @@ from tactile_rt.models.objectives import (
     SimSiam,
     Supervised,
 )
-from tactile_rt.models.training.config import Progress, TrainingConfig, manifests_of
+from tactile_rt.models.training.config import (
+    DivergedError,
+    Progress,
+    TrainingConfig,
+    manifests_of,
+)
 from tactile_rt.models.training.devices import is_first, launched
 from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
-from tactile_rt.models.training.logs import Board, log_epoch
+from tactile_rt.models.training.logs import Board, log_epoch, logged_epochs
 from tactile_rt.models.training.optimizers import build_optimizer, build_schedule
 from tactile_rt.models.training.replay import batch_loss
 from tactile_rt.models.training.validation import Validation
@@ -60,6 +65,7 @@ __all__ = ["build_objective", "initialise", "labels_of", "read_splits", "train"]
 
 Report = Callable[[Progress], None]
 Splits = tuple[SweepSet, SweepSet]  # to train and to validate on
+PATHS = ("data", "also", "begin")  # keys of a configuration
 AUGMENTED = 1  # tells the draws of frames from those of loads
 
 
@@ -86,7 +92,8 @@ def train(
         ConfigError: the folder holds a run of another configuration, another process trains in it,
             or the configuration cannot be trained.
         RecordingError: the sweep set is missing, unfinished, damaged or unfit.
-        ModelError: `last.pt` is damaged, or the training diverged.
+        DivergedError: the training diverged.
+        ModelError: `last.pt` or `history.csv` is damaged, or the best network is gone.
         OSError: the medium is full, or failed; the last checkpoint is as it was.
     """
     with (
@@ -126,7 +133,7 @@ def _train(
     if fabric.is_global_zero:
         _begin_run(config, folder)  # when all that may be refused has been
     fabric.barrier()
-    run.resume(folder / "last.pt")
+    run.resume(folder)
     board.begin(run.done)
     wrapped, _ = fabric.setup(objective, optimizer)
     loss_of = batch_loss(fabric, wrapped, objective, config, feed)
@@ -153,7 +160,7 @@ def _train(
                 if norm is None or not torch.isfinite(
                     norm
                 ):  # clipping would turn it into silence or NaN
-                    raise ModelError(
+                    raise DivergedError(
                         f"{folder}: training diverged in epoch {epoch + 1} (gradient norm {norm}); "
                         f"try a learning rate below {config.learning_rate:g}"
                     )
@@ -288,7 +295,8 @@ class _Run:
             "best": self.best,
         }
 
-    def resume(self, last: Path) -> None:
+    def resume(self, folder: Path) -> None:
+        last = folder / "last.pt"
         if not last.exists():
             return
         try:
@@ -301,6 +309,11 @@ class _Run:
             raise ModelError(
                 f"{last} is damaged ({reason(error)}): delete it to begin the run anew"
             ) from None
+        try:
+            describe_checkpoint(folder / "best.pt")
+        except ModelError as error:
+            raise ModelError(f"{error}: delete {last} to begin the run anew") from None
+        logged_epochs(folder / "history.csv", until=self.epoch + 1)  # else told after an epoch
 
 
 def _mean(fabric: "Fabric", losses: list[float]) -> float:
@@ -337,21 +350,36 @@ def _begin_run(config: TrainingConfig, folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     path, mine = folder / "config.json", _as_json(config)
     # Before its first epoch is finished a run has nothing to lose: correct its options and go on.
-    if not (folder / "last.pt").exists() or not path.exists():
+    if not (folder / "last.pt").exists():
         text = msgspec.json.format(msgspec.json.encode(mine), indent=1)
         write_whole(path, lambda file: file.write(text))
         return
     try:
         theirs = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
+    except FileNotFoundError:
+        raise ConfigError(
+            f"{path} is gone, so that nobody knows what run this is: choose another folder, or "
+            f"delete {folder / 'last.pt'} to begin anew"
+        ) from None
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is damaged ({error}): choose another folder") from None
     # a run of before a key was thought of
     defaults = _as_json(TrainingConfig(config.data))
     differing = [
-        key for key in {**mine, **theirs} if theirs.get(key, defaults.get(key)) != mine.get(key)
+        key
+        for key in {**mine, **theirs}
+        if not _same(key, theirs.get(key, defaults.get(key)), mine.get(key))
     ]
     if differing:
         raise ConfigError(
             f"{folder} holds a run of another configuration (other {', '.join(differing)}): choose "
             "another folder, or repeat the options that began it"
         )
+
+
+def _same(key: str, one: Any, other: Any) -> bool:
+    """Whether two values of a key are; a path may be spelt in several ways."""
+    if key in PATHS and one and other:
+        names = [[value] if isinstance(value, str) else value for value in (one, other)]
+        one, other = ([str(Path(name).resolve()) for name in some] for some in names)
+    return bool(one == other)

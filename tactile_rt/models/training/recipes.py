@@ -21,7 +21,16 @@ from typing import Any
 import msgspec
 
 from tactile_rt.models.training.config import TrainingConfig
-from tactile_rt.settings import convert, hint, make_node, no_such, parse_toml, read_toml, set_keys
+from tactile_rt.settings import (
+    SettingNode,
+    convert,
+    hint,
+    make_node,
+    no_such,
+    parse_toml,
+    read_toml,
+    set_keys,
+)
 from tactile_rt.stream import ConfigError
 
 __all__ = ["Recipe", "load_recipe", "read_recipe", "shipped_recipes"]
@@ -93,13 +102,25 @@ def load_recipe(name: str) -> Recipe:
         for key, node in table.value.items():
             if key not in KEYS:
                 raise ConfigError(f"{node.where}: {what} has no key {key!r}; {hint(key, KEYS)}")
+    _check(nodes, train)
     # The first of the values to be tried is not the only one that must be possible.
-    for values in product(*(node.value for node in search.value.values())):
+    for values in product(*(node.value for node in search.value.values())) if search.value else ():
         fields = {**train.value, **dict(zip(search.value, values, strict=True))}
-        fields["data"] = make_node("", nodes.file, 0, nodes.folder)
-        tree = replace(nodes, value={"train": replace(train, value=fields)})
-        convert(tree, TrainingConfig, ["train"])
+        _check(nodes, replace(search, value=fields))
     return recipe
+
+
+def _check(nodes: SettingNode, fields: SettingNode) -> None:
+    """Refuse fields of a training that cannot be, with where they stand."""
+    data = make_node("", nodes.file, 0, nodes.folder)
+    tree = replace(nodes, value={"train": replace(fields, value={**fields.value, "data": data})})
+    config: TrainingConfig = convert(tree, TrainingConfig, ["train"])
+    if config.encoder == "graph":  # whose frame is that of an array, which is not known here
+        return
+    try:
+        config.network(2)
+    except ConfigError as error:
+        raise ConfigError(f"{fields.where}: {error}") from None
 
 
 def read_recipe(name: str, data: str, sets: Sequence[str] = (), **overrides: Any) -> TrainingConfig:
