@@ -3,10 +3,11 @@
 import errno
 import os
 import stat
+import subprocess
 
 import pytest
 
-from tactile_rt.files import whole_folder, write_whole
+from tactile_rt.files import replaced, whole_folder, write_whole
 
 
 @pytest.fixture
@@ -87,3 +88,28 @@ def test_what_is_no_file_is_written_into_and_stays_what_it_is(tmp_path):
     os.close(reader)
     assert stat.S_ISFIFO(pipe.stat().st_mode)
     assert [p.name for p in tmp_path.iterdir()] == ["pipe"]
+
+
+@pytest.fixture
+def read_only(tmp_path):
+    """A folder of a file system that nothing can be written into."""
+    mount = ["mount", "-t", "tmpfs", "-o", "ro,size=1m", "tmpfs", str(tmp_path)]
+    try:
+        mounted = subprocess.run(mount, capture_output=True).returncode == 0
+    except OSError:
+        mounted = False
+    if not mounted:
+        pytest.skip("only root mounts")
+    yield tmp_path
+    subprocess.run(["umount", "-l", str(tmp_path)], check=True)
+
+
+def test_what_cannot_be_written_is_named_by_its_own_name(read_only):
+    path = read_only / "mine.txt"
+    with pytest.raises(OSError) as whole:
+        write_whole(path, lambda file: file.write(b"x"))
+    with pytest.raises(OSError) as slow, replaced(path):
+        pass
+    with pytest.raises(OSError) as folder, whole_folder(path):
+        pass
+    assert {e.value.filename for e in (whole, slow, folder)} == {str(path)}
