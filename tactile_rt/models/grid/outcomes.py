@@ -16,8 +16,8 @@ from tactile_rt.stream import ConfigError
 __all__ = [
     "SUBSET",
     "TESTED",
+    "KeptTraining",
     "Outcome",
-    "Point",
     "Tested",
     "Training",
     "outcome_path",
@@ -46,7 +46,7 @@ class Training(msgspec.Struct, frozen=True):
             self-supervised network by its probe. 0 if it diverged.
         seconds: The CPU time of its updates, and of what it was validated by, s; 0 if something
             else than a CPU trained it.
-        diverged: Whether it did.
+        diverged: Whether the gradients became no numbers, so that nothing was learnt.
     """
 
     learning_rate: float
@@ -57,7 +57,7 @@ class Training(msgspec.Struct, frozen=True):
     diverged: bool = False
 
 
-class Point(Training, frozen=True):
+class KeptTraining(Training, frozen=True):
     """A training as its own folder keeps it.
 
     Attributes:
@@ -157,7 +157,7 @@ def runs_of(folder: Path, task: Task) -> Path:
     return folder / RUNS / task.slug
 
 
-def read_point(path: Path, key: str) -> Point | None:
+def read_point(path: Path, key: str) -> KeptTraining | None:
     """What a training has found, if it is done.
 
     Args:
@@ -170,7 +170,7 @@ def read_point(path: Path, key: str) -> Point | None:
     if not path.exists():
         return None
     try:
-        found = msgspec.json.decode(path.read_bytes(), type=Point)
+        found = msgspec.json.decode(path.read_bytes(), type=KeptTraining)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is damaged ({error}): delete {path.parent}") from None
     if found.key != key:

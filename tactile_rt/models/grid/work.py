@@ -24,8 +24,8 @@ from tactile_rt.models.ead import count_parameters
 from tactile_rt.models.evaluation import CutWindows, among, cut_windows, hits, posteriors
 from tactile_rt.models.grid.outcomes import (
     SUBSET,
+    KeptTraining,
     Outcome,
-    Point,
     Training,
     outcome_path,
     read_outcome,
@@ -188,7 +188,7 @@ class Workbench:
         except DivergedError:
             run.mkdir(parents=True, exist_ok=True)
             score, diverged = 0.0, True
-        done = Point(
+        done = KeptTraining(
             at.learning_rate, at.warmup, at.updates, score,
             # a processor's time for starting a GPU's kernels says nothing
             clock.seconds if self.accelerator == "cpu" else 0.0,
@@ -307,7 +307,7 @@ def _score(point: Training) -> tuple[bool, float]:
     return not point.diverged, point.score
 
 
-def _plain(point: Point) -> Training:
+def _plain(point: KeptTraining) -> Training:
     return msgspec.convert(msgspec.to_builtins(point), Training, strict=False)
 
 
