@@ -18,6 +18,7 @@ from tactile_rt.cli.app import (
 )
 from tactile_rt.cli.progress import progress_bar, working
 from tactile_rt.cli.tables import Json, show_table, told_as_json
+from tactile_rt.locks import alone_in
 from tactile_rt.settings import take_sets
 from tactile_rt.stream import ConfigError
 
@@ -85,11 +86,15 @@ def train(
     if begin is not None:
         given = {**network_of(begin), **given, "begin": str(begin)}
     config = read_recipe(recipe, str(data), sets or (), **given)
+    first = os.environ.get("RANK", "0") == "0"  # of torchrun's processes, or alone
     # What cannot be is refused before torch has taken its seconds.
     manifests_of(config)
     if config.begin:
         describe_checkpoint(Path(config.begin))
     check_folder(folder)
+    if first:
+        with alone_in(folder):  # for a moment: the training takes it again
+            pass
     try:
         import torch
 
@@ -98,7 +103,7 @@ def train(
         raise needs("train", error) from None
     torch.set_num_threads(threads)
     # Under torchrun every process has the same to say.
-    console = Console(stderr=True, quiet=os.environ.get("RANK", "0") != "0")
+    console = Console(stderr=True, quiet=not first)
     history: list[dict[str, Any]] = []
     with progress_bar(console, "finding onsets") as update:
 
