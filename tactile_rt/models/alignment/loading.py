@@ -14,6 +14,7 @@ from tactile_rt.stream import ConfigError, ModelError
 __all__ = ["check_models", "load_layers", "load_untrained"]
 
 CHECKPOINT, BEST = ".pt", "best.pt"
+OF_GRID = "point.json"  # what a grid leaves in a run's folder, which is named for its rate
 FIGURES = re.compile(r"(test_|validation_)?top1")
 
 
@@ -21,23 +22,29 @@ def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
     """Refuse what is no model file before the first is scored, and before torch is loaded.
 
     Returns:
-        What to call each: what a file calls itself; a training run by its folder, and by as many of
-        the folders above as tell all runs apart. Of two that are called alike the second has its
-        file's name, too.
+        What to call each: what a file calls itself; a training run by its folder, one of a grid by
+        its task, and where runs are alike in that, by as many folders as tell them apart. Of two
+        that are called alike all the same the second has its file's name, too.
 
     Raises:
         ModelError, ConfigError: one is not such a file.
     """
     names: list[str] = []
-    runs = {path: path.resolve().parent.parts for path in paths if path.name == BEST}
+    runs = {path: path.resolve().parent for path in paths if path.name == BEST}
+    called = {folder: _run_name(folder) for folder in runs.values()}
     depth = 1
-    while len({parts[-depth:] for parts in runs.values()}) < len(set(runs.values())):
+    while len(set(called.values())) < len(called):
         depth += 1
+        called = {folder: "/".join(folder.parts[-depth:]) for folder in called}
     for path in paths:
         own = _own_name(path)
-        name = "/".join(runs[path][-depth:]) if path in runs else own
+        name = called[runs[path]] if path in runs else own
         names.append(f"{name} ({path.name})" if name in names else name)
     return tuple(names)
+
+
+def _run_name(folder: Path) -> str:
+    return folder.parent.name if (folder / OF_GRID).exists() else folder.name
 
 
 def _own_name(path: Path) -> str:

@@ -14,6 +14,7 @@ from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.stream import ConfigError
 
 __all__ = [
+    "POINT",
     "SUBSET",
     "TESTED",
     "KeptTraining",
@@ -33,6 +34,7 @@ __all__ = [
 
 SUBSET, OUTCOMES, RUNS = "sweeps", "outcomes", "runs"  # folders of a grid
 TESTED = "tested.json"  # a file of it
+POINT = "point.json"  # a file of one of its trainings
 
 Hits = Annotated[str, msgspec.Meta(pattern="^[01]*$")]
 

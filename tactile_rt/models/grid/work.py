@@ -23,6 +23,7 @@ from tactile_rt.models.disturbances import CLEAN, RATED
 from tactile_rt.models.ead import count_parameters
 from tactile_rt.models.evaluation import CutWindows, among, cut_windows, hits, posteriors
 from tactile_rt.models.grid.outcomes import (
+    POINT,
     SUBSET,
     KeptTraining,
     Outcome,
@@ -50,7 +51,6 @@ from tactile_rt.sweep_set import SweepManifest
 __all__ = ["Workbench"]
 
 BATCH = 128
-POINT = "point.json"
 SECONDS = "seconds"  # a file of a training that is not done: what it has cost so far
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.models.alignment.loading import check_models
+from tactile_rt.models.grid.outcomes import POINT
 from tests.helpers.source_tree import ROOT
 
 CHECKPOINT = ROOT / "bench" / "shipped" / "mouse44.pt"
@@ -35,6 +36,17 @@ def test_a_run_is_called_by_its_folder(run, monkeypatch, tmp_path):
 def test_runs_of_a_grid_are_told_apart_by_the_folders_above(run):
     folders = ["gru_seed0/rate0.005", "gru_seed1/rate0.005", "s4_seed0/rate0.015"]
     assert check_models([run(f"runs/{folder}") for folder in folders]) == tuple(folders)
+
+
+def test_a_run_of_a_grid_is_called_by_its_task(run):
+    paths = [run("runs/gru_seed0/rate0.005"), run("runs/s4_seed0/rate0.015")]
+    for path in paths:
+        (path.parent / POINT).write_text("{}")
+    assert check_models(paths) == ("gru_seed0", "s4_seed0")
+    assert check_models([*paths, run("mine")]) == ("gru_seed0", "s4_seed0", "mine")
+    other = run("runs/gru_seed0/rate0.5")
+    (other.parent / POINT).write_text("{}")
+    assert check_models([other, *paths])[:2] == ("gru_seed0/rate0.5", "gru_seed0/rate0.005")
 
 
 def test_a_file_says_its_own_name(run, tmp_path):
