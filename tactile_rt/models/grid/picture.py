@@ -94,13 +94,13 @@ def draw_curves(results: GridResults, path: Path) -> None:
             scores = [100 * point.score for point in points]
             at.plot([getattr(point, unit) for point in points], scores, **how)
     whole = [row for row in networks if row.share == 1 and row.top1 is not None]
-    for row in whole:
+    for k, row in enumerate(sorted(whole, key=lambda row: row.parameters)):
         if row.learning == SUPERVISED and row.top1 is not None:
             how = _line(row)
             axes[1, 0].plot(row.parameters, 100 * row.top1.value, **how)
             axes[1, 0].annotate(
                 row.network, (row.parameters, 100 * row.top1.value), fontsize=7.5,
-                xytext=(0, 5), textcoords="offset points", ha="center",
+                xytext=(0, 5 if k % 2 else -12), textcoords="offset points", ha="center",
             )  # fmt: skip
     for network in dict.fromkeys(row.network for row in networks if row.share < 1):
         of = sorted(
@@ -129,7 +129,7 @@ def draw_curves(results: GridResults, path: Path) -> None:
             at.text(0.5, 0.5, "no shares were trained on", ha="center", transform=at.transAxes)
         above = at in axes[0]
         at.set_ylabel(f"top-1 (%), {'validation' if above else 'test'} objects")
-    axes[1, 0].margins(0.15, 0.1)  # for the names
+    axes[1, 0].margins(0.25, 0.12)  # for the names
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
     figure.suptitle(
