@@ -62,12 +62,12 @@ def release(
     config = saved["config"]
     folders = trained_on(checkpoint, saved, data)
     known = join_manifests([SweepManifest.read(folder) for folder in folders]).categories
-    sets = [
-        relabelled(SweepSet.read(folder, "validation"), known)
+    sets = [  # their windows as the network knows them, for the rules of its decisions, too
+        drawn_as(relabelled(SweepSet.read(folder, "validation"), known), config)
         for folder in folders
         if SweepManifest.read(folder).split.get("validation")
     ]
-    validation = drawn_as(joined(sets), config)
+    validation = joined(sets)
     # Half clean, half at rated noise: what the checkpoint was chosen by, too.
     posteriors = np.concatenate([predict(validation, run_on(model), level) for level in (0.0, 1.0)])
     labels = np.tile(validation.sweeps.labels, 2)

@@ -20,7 +20,7 @@ from tactile_rt.classifier.contact_point import WhiskerShapes
 from tactile_rt.files import write_whole
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.sensor_spec import CHANNEL_FLOOR
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import ConfigError, ModelError
 from tactile_rt.sweep_set import SweepManifest, contacts_of
 
 __all__ = [
@@ -225,6 +225,11 @@ def train_contacts(
         if error < best:
             best = error
             _save(network, data, shapes, config, checkpoint)
+    if best == math.inf:
+        raise ModelError(
+            f"{checkpoint} is not written: no error on the validation sweeps was a number; try a "
+            "lower learning rate"
+        )
     return load_contacts(checkpoint, data)
 
 

@@ -139,6 +139,8 @@ def test_the_page_of_results_is_what_was_found() -> None:
         ("drop_epochs = 1", 'readout = "first"', "probe: readout is 'first', not one of"),
         ("train = 2", "train = -1", "sweeps are counted from 0"),
         ("clip_norm = 2", "dropout = 2", "cell 'gru': dropout is 2"),
+        ("clip_norm = 2", "seed = 2", "supervised: seed is what the grid itself decides"),
+        ("drop_epochs = 1", 'data = "x"', "probe: data is what the grid itself decides"),
         (
             'augmentation = "image"',
             'augmentation = "image"\nbegin = "gru"\nseeds = 3',

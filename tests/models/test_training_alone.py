@@ -23,9 +23,12 @@ from tactile_rt.models.training import (  # noqa: E402
     ProbeConfig,
     TrainingConfig,
     load_checkpoint,
+    loop,
     probe,
     train,
 )
+from tactile_rt.models.training.config import DivergedError  # noqa: E402
+from tactile_rt.models.training.validation import Validation  # noqa: E402
 from tactile_rt.stream import ConfigError, ModelError  # noqa: E402
 from tests.helpers.holding import held_elsewhere  # noqa: E402
 from tests.helpers.tiny_sweeps import write_tiny_set  # noqa: E402
@@ -349,3 +352,20 @@ def test_a_probe_s_settings_are_held_to_their_ranges(trained, refused, tmp_path,
     name = asked.split("=")[0]
     said = refused("probe", trained / "best.pt", tmp_path / "p", "--set", asked)
     assert f"{name} must be" in said
+
+
+def test_a_validation_without_a_touch_is_told_before_the_training(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        loop, "Validation", lambda config, data, *rest: Validation(config, data[:0], *rest)
+    )
+    with pytest.raises(ConfigError, match="in no validation sweep was a touch found"):
+        train(TrainingConfig(tiny, **SMALL, objective="simclr", updates=1), tmp_path / "run")
+
+
+def test_a_validation_that_is_no_number_is_a_divergence(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        "tactile_rt.models.training.loop.Validation.__call__", lambda *_: ({}, float("nan"))
+    )
+    with pytest.raises(DivergedError, match="diverged in epoch 1"):
+        train(TrainingConfig(tiny, **SMALL, updates=1), tmp_path / "run")
+    assert not (tmp_path / "run" / "best.pt").exists()

@@ -36,6 +36,8 @@ __all__ = [
 SHIPPED = resources.files("tactile_rt.models.grid")
 SUPERVISED, RANDOM, SVM = "supervised", "random", "svm"
 NAMING = ("pairs",)  # options that tell cells apart in their names
+# of a training's configuration, what a grid sets task by task
+OWN = ("data", "also", "begin", "seed", "learning_rate", "warmup", "epochs", "updates")
 # what of a training's configuration an untrained network and its probe depend on, too
 OF_UNTRAINED = (
     "decoder", "readout", "dropout", "graph", "norm_epsilon", "preprocessing", "first_weights",
@@ -316,6 +318,13 @@ def _check(grid: Grid) -> None:
     if min(grid.sweeps.train, grid.sweeps.validation, grid.sweeps.test) < 0:
         raise ConfigError("sweeps are counted from 0, which takes all")
     convert(make_node(grid.probe, "probe", 0, Path()), ProbeConfig)
+    tables = {"supervised": grid.supervised, "self_supervised": grid.self_supervised}
+    tables |= {f"options of cell {cell.name!r}": cell.options for cell in grid.cells}
+    for table, fields in tables.items():
+        if taken := [key for key in fields if key in OWN]:
+            raise ConfigError(f"{table}: {', '.join(taken)} is what the grid itself decides")
+    if "data" in grid.probe:
+        raise ConfigError("probe: data is what the grid itself decides")
     before: dict[str, Candidate] = {}
     untrained: dict[str, Candidate] = {}
     for cell in grid.cells:

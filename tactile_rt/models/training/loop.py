@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextlib import closing, nullcontext
 from dataclasses import asdict, dataclass
 from itertools import islice
-from math import ceil, inf
+from math import ceil, inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,7 +55,7 @@ from tactile_rt.models.training.logs import Board, log_epoch, logged_epochs
 from tactile_rt.models.training.optimizers import build_optimizer, build_schedule
 from tactile_rt.models.training.replay import batch_loss
 from tactile_rt.models.training.validation import Validation
-from tactile_rt.stream import ConfigError, ModelError
+from tactile_rt.stream import ConfigError, ModelError, RecordingError
 from tactile_rt.sweep_set import OUTLIERS
 
 if TYPE_CHECKING:
@@ -176,6 +176,11 @@ def _train(
             for buffer in objective.buffers():  # batch norm's means are each device's own
                 torch.distributed.broadcast(buffer, 0)
         found, score = fabric.broadcast(validate(objective))
+        if not isfinite(score):  # nothing would ever be better
+            raise DivergedError(
+                f"{folder}: training diverged in epoch {epoch + 1} (validation {score}); try a "
+                f"learning rate below {config.learning_rate:g}"
+            )
         metrics = {
             "epoch": epoch + 1,
             "loss": _mean(fabric, losses),
@@ -230,6 +235,8 @@ def read_splits(config: TrainingConfig) -> tuple[SweepSet, SweepSet]:
         check_sets(folder, splits)
         training.append(splits[0])
         validating += splits[1:]
+    if not validating:
+        raise RecordingError(f"{folders[0]} and the sets beside it have no validation objects")
     return joined(training), relabelled(joined(validating), whole.categories)
 
 

@@ -14,6 +14,7 @@ from tactile_rt.models.evaluation import among, cut_windows, hits, posteriors
 from tactile_rt.models.objectives import Objective
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.feeding import Share, generator_of
+from tactile_rt.stream import ConfigError
 
 __all__ = ["Validation"]
 
@@ -57,6 +58,8 @@ class Validation:
         else:
             self._found = data.onsets(data.sweeps.values)
             usable = self._usable = np.flatnonzero(self._found.start >= 0)
+            if not len(usable):
+                raise ConfigError("in no validation sweep was a touch found: make more sweeps")
             self._other = np.arange(len(data.sweeps))  # what the second view is of
             if config.pairs == "two-sweeps":
                 rng = np.random.default_rng([config.seed, VIEWS])
