@@ -432,6 +432,8 @@ seeds = 1
     assert [task.name for task in grid.tasks()].count(name) == 1, "one seed"
     (task,) = [task for task in grid.tasks() if task.name == name]
     assert grid.needs(task) == ("gru_simclr_image_seed0",)
+    other = msgspec.structs.replace(grid, self_supervised={"masking": 0.5})
+    assert settings_of(other, folder, task) != settings_of(grid, folder, task)
     pool.prepare(grid, folder)
     bench = Workbench(grid, folder)
     few = bench.splits_of(0.5)[0]

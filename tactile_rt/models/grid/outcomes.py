@@ -217,6 +217,8 @@ def settings_of(grid: Grid, folder: Path, task: Task) -> str:
             config |= {k: whole[k] for k in ("encoder", "attender", "width", "seed")}
         else:
             settings |= {"search": grid.search, "growth": grid.growth, "cell": task.cell}
+            if task.cell.begin:
+                settings |= {"begun": settings_of(grid, folder, grid.begun(task))}
         settings |= {"config": config}
         if task.random or task.cell.objective != SUPERVISED:
             settings |= {"probe": grid.probe}

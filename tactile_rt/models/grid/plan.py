@@ -266,13 +266,19 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         common = self.supervised if cell.objective == SUPERVISED else self.self_supervised
         return {**common, **cell.options}
 
+    def begun(self, task: Task) -> Task:
+        """What a task's network begins with."""
+        assert task.cell is not None
+        (cell,) = (one for one in self.cells if one.name == task.cell.begin)
+        return Task(cell.name, task.seed, cell)
+
     def needs(self, task: Task) -> tuple[str, ...]:
         """Slugs of the tasks that come before: the first seed, which tunes, and a beginning."""
         cell = task.cell
         if cell is None or task.random:
             return ()
         tuned = (Task(task.name, 0, cell),) if task.seed else ()
-        begun = (Task(cell.begin, task.seed, cell),) if cell.begin else ()
+        begun = (self.begun(task),) if cell.begin else ()
         return tuple(one.slug for one in (*tuned, *begun))
 
 

@@ -156,10 +156,10 @@ class Workbench:
         assert cell is not None
         begin = ""
         if cell.begin:
-            begun = read_outcome(self.grid, self.folder, self._begun(task))
+            begun = read_outcome(self.grid, self.folder, self.grid.begun(task))
             if begun is None or begun.chosen is None:
                 raise DivergedError(f"{cell.begin!r} diverged, and there is nothing to begin with")
-            begin = str(self._run(self._begun(task), begun.chosen) / "best.pt")
+            begin = str(self._run(self.grid.begun(task), begun.chosen) / "best.pt")
         config = self.grid.config(
             task, self.data, learning_rate=at.learning_rate, warmup=at.warmup, updates=at.updates,
             begin=begin,
@@ -169,7 +169,7 @@ class Workbench:
             return _plain(found)
         if cell.begin:  # where only its outcome was kept
             assert begun is not None and begun.chosen is not None
-            self._train(self._begun(task), begun.chosen, report)
+            self._train(self.grid.begun(task), begun.chosen, report)
         clock = _Clock(run / SECONDS)
 
         def count(progress: Progress) -> None:
@@ -206,6 +206,7 @@ class Workbench:
         settings["config"].pop("data")
         if config.begin:
             settings["config"]["begin"] = "/".join(Path(config.begin).parts[-3:-1])
+            settings["begun"] = settings_of(self.grid, self.folder, self.grid.begun(task))
         assert task.cell is not None
         if task.cell.objective != SUPERVISED:
             settings["probe"] = self.grid.probe
@@ -215,12 +216,6 @@ class Workbench:
         """The folder of one training."""
         name = f"rate{at.learning_rate:g}_warmup{at.warmup:g}_updates{at.updates}"
         return runs_of(self.folder, task) / name
-
-    def _begun(self, task: Task) -> Task:
-        """What a task's network begins with."""
-        assert task.cell is not None
-        names = {one.name: one for one in self.grid.cells}
-        return Task(task.cell.begin, task.seed, names[task.cell.begin])
 
     def _untrained(self, found: Outcome, task: Task) -> Outcome:
         run, config = runs_of(self.folder, task), self.grid.config(task, self.data)
