@@ -373,8 +373,8 @@ def test_the_untrained_network_is_that_of_the_cell(plan: Path, tmp_path: Path) -
     grid = read_grid(plan)
     random = next(task for task in grid.tasks() if task.random)
     assert grid.config(random, Path()).preprocessing == "paper"
-    assert "paper" in settings_of(grid, tmp_path, random)
-    assert "lars" not in settings_of(grid, tmp_path, random)
+    assert "paper" in settings_of(grid, random)
+    assert "lars" not in settings_of(grid, random)
 
 
 def test_outcomes_of_other_sweeps_and_damaged_ones_are_told(plan: Path, tmp_path: Path) -> None:
@@ -433,7 +433,7 @@ seeds = 1
     (task,) = [task for task in grid.tasks() if task.name == name]
     assert grid.needs(task) == ("gru_simclr_image_seed0",)
     other = msgspec.structs.replace(grid, self_supervised={"masking": 0.5})
-    assert settings_of(other, folder, task) != settings_of(grid, folder, task)
+    assert settings_of(other, task) != settings_of(grid, task)
     pool.prepare(grid, folder)
     bench = Workbench(grid, folder)
     few = bench.splits_of(0.5)[0]
@@ -509,7 +509,7 @@ def made_up(folder: Path, grid: results.Grid, task: Task, right: str) -> None:
     """An outcome as if the task had been done."""
     path = outcome_path(folder, task)
     path.parent.mkdir(parents=True, exist_ok=True)
-    outcome = Outcome(task.name, task.seed, settings_of(grid, folder, task), right, right, right)
+    outcome = Outcome(task.name, task.seed, settings_of(grid, task), right, right, right)
     path.write_bytes(msgspec.json.encode(outcome))
 
 

@@ -2,7 +2,7 @@
 
 from itertools import groupby
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -36,6 +36,7 @@ SUBSET, OUTCOMES, RUNS = "sweeps", "outcomes", "runs"  # folders of a grid
 TESTED = "tested.json"  # a file of it
 POINT = "point.json"  # a file of one of its trainings
 
+Kept = TypeVar("Kept")
 Hits = Annotated[str, msgspec.Meta(pattern="^[01]*$")]
 
 
@@ -146,12 +147,9 @@ def read_tested(folder: Path) -> Tested:
         ConfigError: it was never begun here, or the file is damaged.
     """
     path = folder / TESTED
-    try:
-        return msgspec.json.decode(path.read_bytes(), type=Tested)
-    except FileNotFoundError:
-        raise ConfigError(f"no {path}: run the grid first") from None
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is damaged ({error}): delete it and run the grid") from None
+    if not path.exists():
+        raise ConfigError(f"no {path}: run the grid first")
+    return _decoded(path, Tested, "delete it and run the grid")
 
 
 def runs_of(folder: Path, task: Task) -> Path:
@@ -171,10 +169,7 @@ def read_point(path: Path, key: str) -> KeptTraining | None:
     """
     if not path.exists():
         return None
-    try:
-        found = msgspec.json.decode(path.read_bytes(), type=KeptTraining)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is damaged ({error}): delete {path.parent}") from None
+    found = _decoded(path, KeptTraining, f"delete {path.parent}")
     if found.key != key:
         raise ConfigError(
             f"{path.parent} was trained with other settings: choose another folder for the grid, "
@@ -192,13 +187,10 @@ def read_outcome(grid: Grid, folder: Path, task: Task) -> Outcome | None:
     path = outcome_path(folder, task)
     if not path.exists():
         return None
-    try:
-        found = msgspec.json.decode(path.read_bytes(), type=Outcome)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is damaged ({error}): delete it to do it again") from None
+    found = _decoded(path, Outcome, "delete it to do it again")
     if len({len(hits) for hits in (found.top1, found.top5, found.noisy) if hits}) > 1:
         raise ConfigError(f"{path} is damaged (hits of other sweeps): delete it to do it again")
-    if found.key != settings_of(grid, folder, task):
+    if found.key != settings_of(grid, task):
         raise ConfigError(
             f"{folder} holds {task.name!r} trained with other settings: choose another folder, or "
             f"delete {path} and {runs_of(folder, task)} to train it again"
@@ -206,7 +198,14 @@ def read_outcome(grid: Grid, folder: Path, task: Task) -> Outcome | None:
     return found
 
 
-def settings_of(grid: Grid, folder: Path, task: Task) -> str:
+def _decoded(path: Path, kind: type[Kept], advice: str) -> Kept:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is damaged ({error}): {advice}") from None
+
+
+def settings_of(grid: Grid, task: Task) -> str:
     """Everything that an outcome depends on, as JSON."""
     settings: dict[str, Any] = {"sweeps": msgspec.to_builtins(grid.sweeps), "data": grid.data}
     if task.cell is not None:
@@ -218,7 +217,7 @@ def settings_of(grid: Grid, folder: Path, task: Task) -> str:
         else:
             settings |= {"search": grid.search, "growth": grid.growth, "cell": task.cell}
             if task.cell.begin:
-                settings |= {"begun": settings_of(grid, folder, grid.begun(task))}
+                settings |= {"begun": settings_of(grid, grid.begun(task))}
         settings |= {"config": config}
         if task.random or task.cell.objective != SUPERVISED:
             settings |= {"probe": grid.probe}

@@ -86,7 +86,7 @@ class Workbench:
             task: of the grid, after those that it needs.
             report: called with `training.Progress` after every update.
         """
-        found = Outcome(task.name, task.seed, settings_of(self.grid, self.folder, task))
+        found = Outcome(task.name, task.seed, settings_of(self.grid, task))
         try:
             if task.cell is None:
                 found = self._svm(found)
@@ -206,7 +206,7 @@ class Workbench:
         settings["config"].pop("data")
         if config.begin:
             settings["config"]["begin"] = "/".join(Path(config.begin).parts[-3:-1])
-            settings["begun"] = settings_of(self.grid, self.folder, self.grid.begun(task))
+            settings["begun"] = settings_of(self.grid, self.grid.begun(task))
         assert task.cell is not None
         if task.cell.objective != SUPERVISED:
             settings["probe"] = self.grid.probe
