@@ -19,7 +19,7 @@ from tactile_rt.evidence.promises import familiarity, named_faults, promises
 from tactile_rt.evidence.records import Record
 from tactile_rt.evidence.robustness import measure_robustness, rated_amount, robustness_records
 from tactile_rt.models import evaluation
-from tactile_rt.models.datasets import SweepSet
+from tactile_rt.models.datasets import SweepSet, relabelled
 from tactile_rt.models.disturbances import Disturbance
 from tactile_rt.stream import ConfigError, SpecMismatch
 from tactile_rt.sweep_set import WITHHELD
@@ -57,29 +57,19 @@ def evaluate_model(
     Raises:
         ConfigError: the model was trained on some of the test objects, does not know all of their
             categories, or another sample period; or `accurate` tests on other objects.
-        SpecMismatch: the model was made for another array than the set's.
+        SpecMismatch: the model was made for another array than a set's.
         ModelError, RecordingError: a file cannot be read.
     """
     session, card = load_model(model)
     run = stepped(session, card)
-    test = _labelled(SweepSet.read(data, "test"), card, model, data)
-    differences = card.array.differences(test.manifest.spec, ignore=("name", "rate_hz"))
-    if differences:
-        raise SpecMismatch(f"{model} was made for another array: " + "; ".join(differences))
-    if test.manifest.period_ns != card.period_ns:
-        raise ConfigError(
-            f"{model} takes a sample every {card.period_ns} ns, {data} has one every "
-            f"{test.manifest.period_ns} ns"
-        )
-    if quick:
-        test = _first_of_each(test, QUICK_SWEEPS)
+    test = _tested_on(data, card, model, quick)
     labels, objects = test.sweeps.labels, test.sweeps.objects
     if _met(card, test):
         raise ConfigError(f"{model} may have been trained on objects that {data} tests on")
     # What may fail comes first, lest it fail after minutes.
     other = None
     if accurate is not None:
-        other = _labelled(SweepSet.read(accurate, "test"), card, model, accurate)
+        other = _tested_on(accurate, card, model, quick)
     if other and not set(other.sweeps.objects.tolist()) <= set(objects.tolist()):
         raise ConfigError(f"{accurate} tests on other objects than {data}")
     if pictures is not None:
@@ -155,7 +145,7 @@ def evaluate_model(
         records += _compare_profiles(run, other, test, clean)
     if svm:
         right = evaluation.hits(clean[:, -1], labels)
-        records += _compare_svm(data, SweepSet.read(data, "test"), right, quick)
+        records += _compare_svm(data, card, test, right)
     if pictures is not None:
         from tactile_rt.evidence.pictures import (
             draw_accuracy_over_time,
@@ -179,9 +169,19 @@ def evaluate_model(
     return records
 
 
-def _labelled(test: SweepSet, card: ModelCard, model: Path, data: Path) -> SweepSet:
-    """The set with the labels that the model has for its categories, and its windows."""
-    known = card.classes
+def _tested_on(data: Path, card: ModelCard, model: Path, quick: bool) -> SweepSet:
+    """A set's test split with the labels that the model has for its categories, and its windows."""
+    test, known = SweepSet.read(data, "test"), card.classes
+    differences = card.array.differences(test.manifest.spec, ignore=("name", "rate_hz"))
+    if differences:
+        raise SpecMismatch(
+            f"{model} was made for another array than {data} is of: " + "; ".join(differences)
+        )
+    if test.manifest.period_ns != card.period_ns:
+        raise ConfigError(
+            f"{model} takes a sample every {card.period_ns} ns, {data} has one every "
+            f"{test.manifest.period_ns} ns"
+        )
     strange = [name for name in test.manifest.categories if name not in known]
     if strange:
         raise ConfigError(
@@ -191,11 +191,9 @@ def _labelled(test: SweepSet, card: ModelCard, model: Path, data: Path) -> Sweep
     number = np.array([known.index(name) for name in test.manifest.categories])
     test = replace(test, sweeps=replace(test.sweeps, labels=number[test.sweeps.labels]))
     training = card.provenance.get("training")
-    return (
-        replace(test, window=training.get("window", "onset"))
-        if isinstance(training, dict)
-        else test
-    )
+    if isinstance(training, dict):
+        test = replace(test, window=training.get("window", "onset"))
+    return _first_of_each(test, QUICK_SWEEPS) if quick else test
 
 
 def _met(card: ModelCard, test: SweepSet) -> bool:
@@ -327,12 +325,13 @@ def _compare_profiles(
     run: evaluation.Step, other: SweepSet, test: SweepSet, clean: NDArray[np.float32]
 ) -> list[Record]:
     # The same object's first sweeps are the same draws: compare on those that both sets have.
-    mine = np.concatenate(
-        [
-            np.flatnonzero(test.sweeps.objects == name)[: (other.sweeps.objects == name).sum()]
-            for name in dict.fromkeys(other.sweeps.objects.tolist())
-        ]
-    )
+    both = [
+        (a[: len(b)], b[: len(a)])
+        for name in dict.fromkeys(other.sweeps.objects.tolist())
+        for a, b in [[np.flatnonzero(one.sweeps.objects == name) for one in (test, other)]]
+    ]
+    mine, theirs = (np.concatenate(some) for some in zip(*both, strict=True))
+    other = other[theirs]
     labels = other.sweeps.labels
     there = evaluation.predict(other, run)[:, -1]
     at_profile = evaluation.accuracy(evaluation.hits(there, labels), other.sweeps.objects)
@@ -347,7 +346,7 @@ def _compare_profiles(
 
 
 def _compare_svm(
-    data: Path, test: SweepSet, network: NDArray[np.bool_], quick: bool
+    data: Path, card: ModelCard, test: SweepSet, network: NDArray[np.bool_]
 ) -> list[Record]:
     """A network (sweep,), right or not, beside an RBF support vector machine on the same windows.
 
@@ -356,9 +355,11 @@ def _compare_svm(
     """
     from tactile_rt.models.svm import fit_svm  # scikit-learn takes a second to import
 
-    # by the set's own labels, which it is taught by
-    test = _first_of_each(test, QUICK_SWEEPS) if quick else test
-    svm = fit_svm(SweepSet.read(data, "train"), SweepSet.read(data, "validation"))
+    learnt_from = (  # by the labels that the test's have here, the model's
+        replace(relabelled(SweepSet.read(data, split), card.classes), window=test.window)
+        for split in ("train", "validation")
+    )
+    svm = fit_svm(*learnt_from)
     right, objects = svm.hits(test), test.sweeps.objects
     own = evaluation.accuracy(right, objects)
     above = evaluation.accuracy(network.astype(np.float64) - right, objects)

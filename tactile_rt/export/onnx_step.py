@@ -29,10 +29,10 @@ from tactile_rt.export.precision import Precision, in_precision
 from tactile_rt.export.streaming import streaming
 from tactile_rt.export.windows import window_graph
 from tactile_rt.files import write_whole
-from tactile_rt.models.data_checks import trained_on
+from tactile_rt.models.data_checks import trained_objects, trained_on
 from tactile_rt.models.training import TactileClassifier, load_checkpoint
 from tactile_rt.stream import ModelError
-from tactile_rt.sweep_set import OUTLIERS, SweepManifest, join_manifests
+from tactile_rt.sweep_set import SweepManifest, join_manifests
 from tactile_rt.version import VERSION
 
 __all__ = [
@@ -140,7 +140,7 @@ def export_checkpoint(
             "sweep_set": manifest.recipe,
             **({"also": [other.recipe for other in manifests[1:]]} if manifests[1:] else {}),
             "unseen_objects": list(manifests[0].split["test"]),
-            "trained_objects": _trained_objects(manifests),
+            "trained_objects": trained_objects(manifests, saved),
             "commands": list(commands),
             "tactile_rt": VERSION,
             "torch": str(torch.__version__),  # not a plain str, which msgspec insists on
@@ -152,15 +152,6 @@ def export_checkpoint(
         license=licence,
     )
     return export_step(model, card, path, precision, kind)
-
-
-def _trained_objects(manifests: Sequence[SweepManifest]) -> dict[str, list[str]]:
-    """By where the objects come from, the names of those that were trained on."""
-    found: dict[str, dict[str, None]] = {}
-    for one in manifests:
-        names = (*one.split["train"], *one.split.get(OUTLIERS, ()))
-        found.setdefault(one.source, {}).update(dict.fromkeys(names))
-    return {source: list(names) for source, names in found.items()}
 
 
 def export_step(

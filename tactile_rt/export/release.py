@@ -1,9 +1,7 @@
 """A checkpoint made ready for robots: calibrated on validation sweeps, exported, described."""
 
 from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,18 +16,15 @@ from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.export.precision import Precision
 from tactile_rt.export.promises import fitted_rules
 from tactile_rt.files import write_whole
-from tactile_rt.models.checkpoint_files import NETWORK
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
 from tactile_rt.models.evaluation import Step, among, hits, predict, run_windows
 from tactile_rt.models.training import (
     TactileClassifier,
-    TrainingConfig,
     load_checkpoint,
-    read_recipe,
     run_on,
-    shipped_recipes,
 )
+from tactile_rt.models.training.recipes import training_command
 from tactile_rt.sweep_set import RECORDINGS, SweepManifest, join_manifests
 
 __all__ = ["fit_temperature", "quantisation_figures", "release", "run_file"]
@@ -88,8 +83,7 @@ def release(
         figures={"validation_top1": right[0], "validation_top1_noisy": right[1]},
         commands=(
             *(_making(folder, SweepManifest.read(folder)) for folder in folders),
-            saved.get("made_by")
-            or f"tactile-rt train {config['data']} {checkpoint.parent} {_training_options(config)}",
+            saved.get("made_by") or training_command(config, checkpoint.parent),
             f"tactile-rt export {checkpoint} {path.name} --name {name}{chosen}",
         ),
         precision=precision,
@@ -178,25 +172,6 @@ def _described(path: Path, card: ModelCard, figures: dict[str, float]) -> ModelC
     onnx.helper.set_model_props(proto, {METADATA_KEY: msgspec.json.encode(card).decode()})
     write_whole(path, lambda file: onnx.save(proto, file))
     return card
-
-
-def _training_options(config: dict[str, Any]) -> str:
-    """The options of `tactile-rt train` that train so again; a recipe that ships says it all."""
-    also, begin = tuple(config.get("also", ())), config.get("begin", "")
-    here = {"data": config["data"], "also": also, "begin": begin, "seed": config["seed"]}
-    if begin:  # whose network it is
-        here |= {name: config[name] for name in NETWORK if name in config}
-    told = {f.name: config[f.name] for f in fields(TrainingConfig) if f.name in config}
-    asked = TrainingConfig(**{**told, "also": also})
-    recipe = [name for name in shipped_recipes() if read_recipe(name, **here) == asked]
-    network = ("encoder", "attender", "decoder", "epochs", "batch")
-    told = {"recipe": recipe[0]} if recipe else {name: config[name] for name in network}
-    options = [f"--{key} {value}" for key, value in told.items()]
-    if not recipe:
-        options += [f"--set {key}={config[key]}" for key in ("width", "learning_rate")]
-    options += [f"--also {folder}" for folder in also]
-    options += [f"--from {begin}"] if begin else []
-    return " ".join([*options, f"--seed {config['seed']}"])
 
 
 def _making(folder: Path, manifest: SweepManifest) -> str:

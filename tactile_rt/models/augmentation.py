@@ -70,7 +70,7 @@ def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
 
     Raises:
         ConfigError: the array has no symmetries ("tactile"), or its channels are not the colours
-            of pictures ("image-paper").
+            of pictures or its grid is too small for one ("image-paper").
     """
     colours = len(spec.channels)
     loads: Callable[[Loads, Generator], Loads] = _as_is
@@ -86,6 +86,11 @@ def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
             raise ConfigError(
                 f"augmentation {name} takes channels for the three colours of pictures: this "
                 f"array has {colours}; take image"
+            )
+        if min(spec.grid_shape) < 2:
+            raise ConfigError(
+                f"augmentation {name} blurs pictures of 2 x 2 cells or more: this array has "
+                f"{' x '.join(map(str, spec.grid_shape))}; take image"
             )
         jitter = published_pictures.JITTERS[name]
         frames = partial(published_pictures.augment, jitter=jitter)

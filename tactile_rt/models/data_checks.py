@@ -25,6 +25,7 @@ __all__ = [
     "check_sets",
     "check_split",
     "probed_on",
+    "trained_objects",
     "trained_on",
 ]
 
@@ -85,6 +86,23 @@ def trained_on(
             "it was trained on by --data"
         )
     return folders
+
+
+def trained_objects(
+    manifests: Sequence[SweepManifest], saved: Mapping[str, Any] | None = None
+) -> dict[str, list[str]]:
+    """The names of the objects that a network has learnt from, by where the objects come from.
+
+    Args:
+        manifests: of the sets that it learns from.
+        saved: the checkpoint that it began with.
+    """
+    before = saved.get("trained_objects", {}) if saved else {}
+    found = {source: dict.fromkeys(names) for source, names in before.items()}
+    for one in manifests:
+        names = (*one.split["train"], *one.split.get(OUTLIERS, ()))
+        found.setdefault(one.source, {}).update(dict.fromkeys(names))
+    return {source: list(names) for source, names in found.items()}
 
 
 def probed_on(

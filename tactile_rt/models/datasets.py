@@ -31,6 +31,7 @@ __all__ = [
     "Onsets",
     "SweepSet",
     "TrainingBatches",
+    "check_batches",
     "drawn_as",
     "find_onsets",
     "frame_of",
@@ -64,7 +65,7 @@ class SweepSet:
         noise: (channel,) The rated noise per sample, SI.
         floor: (channel,) The smallest sigma of the detector, SI.
         window: The first sample of a sweep's window: "onset", where the detector hears the touch,
-            or "sweep", where the object sets out, with nothing to be tared.
+            or "sweep", where the object sets out, tared by what was measured until then.
     """
 
     manifest: SweepManifest
@@ -89,9 +90,14 @@ class SweepSet:
         if self.window == "onset":
             return find_onsets(values, self.floor)
         n, shape = len(values), self.manifest.spec.shape
+        # after the lead, and what silence was put before it
+        begin = self.manifest.lead + values.shape[1] - self.sweeps.values.shape[1]
+        offset = np.zeros((n, *shape), dtype=np.float32)
         sigma = np.broadcast_to(self.floor, (n, *shape)).astype(np.float32)
-        start = np.full(n, self.manifest.lead, dtype=np.int64)
-        return Onsets(start, np.zeros((n, *shape), dtype=np.float32), sigma)
+        if begin > 1:
+            offset = values[:, :begin].mean(axis=1)
+            sigma = np.maximum(values[:, :begin].std(axis=1, ddof=1), sigma)
+        return Onsets(np.full(n, begin, dtype=np.int64), offset, sigma)
 
     @property
     def timing(self) -> Timing:
@@ -257,6 +263,32 @@ def partners(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np.int6
     return found
 
 
+def check_batches(data: SweepSet, batch: int, jitter: int, two_sweeps: bool) -> None:
+    """Refuse batches that sweeps in which a touch was found, or all that there are, cannot fill.
+
+    Args:
+        data: the sweeps.
+        batch, jitter, two_sweeps: as `TrainingBatches` takes them.
+
+    Raises:
+        ConfigError: a jitter longer than a sweep, not even one batch of sweeps with a touch, or no
+            object that has two.
+    """
+    n, samples = data.sweeps.values.shape[:2]
+    if jitter >= samples:
+        raise ConfigError(f"jitter is {jitter} samples, but a sweep has {samples}")
+    if n < batch:
+        raise ConfigError(
+            f"a batch of {batch} is more than the {n} sweeps in which a touch was found: take a "
+            "smaller batch, or make more sweeps"
+        )
+    if two_sweeps and len(set(data.sweeps.objects.tolist())) == n:
+        raise ConfigError(
+            'pairs of "two-sweeps": no object has two sweeps in which a touch was found; make '
+            'more of each, or take pairs of "one-sweep"'
+        )
+
+
 class TrainingBatches:
     """Epochs of augmented training windows, each drawn afresh from (seed, epoch).
 
@@ -279,8 +311,7 @@ class TrainingBatches:
             network that meets them at once takes far longer to learn.
 
     Raises:
-        ConfigError: a jitter longer than a sweep, not even one batch of sweeps with a touch, or no
-            object that has two.
+        ConfigError: as `check_batches`.
     """
 
     def __init__(
@@ -292,8 +323,6 @@ class TrainingBatches:
         two_sweeps: bool = False,
         device: str = "cpu",
     ) -> None:
-        if jitter >= (samples := data.sweeps.values.shape[1]):
-            raise ConfigError(f"jitter is {jitter} samples, but a sweep has {samples}")
         self._data, self._batch, self._seed, self._jitter = data, batch, seed, jitter
         self._device = device
         self.easy_epochs = 0
@@ -302,18 +331,8 @@ class TrainingBatches:
         # Too faint to be found at its noise level: learn it from where it is found without.
         self._starts = np.where(starts < 0, starts[0], starts)  # (level, sweep)
         self._usable = np.flatnonzero(self._starts[0] >= 0)
-        if len(self._usable) < batch:
-            raise ConfigError(
-                f"a batch of {batch} is more than the {len(self._usable)} sweeps in which a touch "
-                "was found: take a smaller batch, or make more sweeps"
-            )
+        check_batches(data[self._usable], batch, jitter, two_sweeps)
         self._two_sweeps = two_sweeps
-        objects = data.sweeps.objects[self._usable]
-        if two_sweeps and len(set(objects.tolist())) == len(objects):
-            raise ConfigError(
-                'pairs of "two-sweeps": no object has two sweeps in which a touch was found; make '
-                'more of each, or take pairs of "one-sweep"'
-            )
 
     def __len__(self) -> int:
         return len(self._usable) // self._batch

@@ -18,7 +18,7 @@ from tactile_rt.models.augmentation import (
 )
 from tactile_rt.models.training.config import AUGMENTATIONS
 from tactile_rt.stream import ConfigError
-from tests.helpers.tiny_sweeps import tiny_array
+from tests.helpers.tiny_sweeps import plate, tiny_array
 
 SPEC = tiny_array()
 NAMES = ("columns", "rows", "turn")
@@ -259,6 +259,13 @@ def test_every_augmentation_can_be_built(name, masking):
     y = made.frames(x, generator(4))
     assert y.shape == x.shape
     assert torch.equal(x, y) == (name in ("none", "tactile") and not masking)
+
+
+@pytest.mark.parametrize("name", ["image-paper", "image-paper-weak"])
+def test_a_row_of_whiskers_is_no_picture(name):
+    with pytest.raises(ConfigError, match="this array has 1 x 4; take image"):
+        build(name, plate(1, 4))
+    build(name, plate(2, 4)).frames(torch.rand(2, 3, 30, 2, 4), generator())
 
 
 @pytest.mark.parametrize("grid", [(5, 7), (1, 4), (2, 1)])

@@ -19,6 +19,7 @@ from tactile_rt.models.datasets import (
     partners,
     windows,
 )
+from tactile_rt.models.evaluation import cut_windows
 from tactile_rt.stream import ArraySpec, ConfigError
 from tactile_rt.sweep_set import SweepManifest, Sweeps
 from tactile_rt.timing import MOUSE
@@ -304,6 +305,18 @@ def test_windows_may_begin_with_the_sweep_and_have_nothing_drawn():
     np.testing.assert_array_equal(flat, values[labels, LEAD : LEAD + flat.shape[1]])
     assert not offset.any()
     np.testing.assert_array_equal(sigma, np.broadcast_to(FLOOR, sigma.shape))
+
+
+def test_windows_that_begin_with_the_sweep_are_tared_alike_in_training_and_in_validation():
+    """A magnetometer reads its magnet's field at rest."""
+    values = touches(40) + np.float32(3e-3)
+    data = drawn_as(sweeps(values), {"window": "sweep", "faults": SOUND})
+    samples, offset, *_, labels = drawn(TrainingBatches(data, 40, 0, jitter=0))
+    (cut,) = cut_windows(data)
+    seen = samples - offset[:, None, None]
+    np.testing.assert_allclose(
+        seen, (cut.samples - cut.offset[:, None, None])[labels], rtol=1e-5, atol=1e-7
+    )
 
 
 def test_a_run_says_by_how_much_windows_begin_elsewhere():

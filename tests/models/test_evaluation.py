@@ -193,6 +193,17 @@ def test_an_offset_after_the_tare_is_in_the_windows_and_not_in_the_baseline() ->
     assert np.array_equal(there[2], clean[2])
 
 
+def test_rest_before_a_sweep_tares_it_and_is_not_its_window() -> None:
+    data = replace(a_set(sweeps(30)), window="sweep")
+    plain, rested = (
+        next(evaluation.cut_windows(data, disturbance=Disturbance(rest=rest))) for rest in (0, 80)
+    )
+    assert np.array_equal(plain.samples, rested.samples)
+    noisy = next(evaluation.cut_windows(data, disturbance=Disturbance(rest=80, noise=1.0)))
+    assert noisy.sigma.mean(axis=(0, 1)) == pytest.approx(NOISE, rel=0.02)
+    assert np.abs(noisy.offset).mean(axis=(0, 1)) == pytest.approx(NOISE * 0.08, rel=0.15)
+
+
 def test_dead_whiskers_are_silent_and_as_many_as_said() -> None:
     values = sweeps(40)
     values[:, 20:] += np.float32(1e-9)  # nobody is silent of itself

@@ -294,6 +294,36 @@ def test_a_training_of_other_settings_is_not_taken_for_one_of_these(
         assert json.loads(config.read_text())["batch"] == 3
 
 
+@pytest.mark.parametrize(
+    ("before", "after", "said"),
+    [
+        ("batch = 4", "batch = 40", "a batch of 40 is more than the 16 sweeps"),
+        (
+            "clip_norm = 2",
+            "jitter = 200\n[self_supervised]\njitter = 200",
+            "jitter is 200 samples",
+        ),
+        ("train = 2", "train = 1", 'pairs of "two-sweeps": no object has two sweeps'),
+    ],
+)
+def test_what_the_sweeps_cannot_fill_is_told_before_anything_is_trained(
+    plan: Path, tmp_path: Path, before: str, after: str, said: str
+) -> None:
+    pairs = 'objective = "simclr"\noptions = { pairs = "two-sweeps" }'
+    text = plan.read_text().split("[[question]]")[0].replace('objective = "simclr"', pairs)
+    plan.write_text(text.replace(before, after))
+    with pytest.raises(ConfigError, match=said):
+        begun(plan, tmp_path / "out")
+
+
+def test_an_accelerator_that_is_not_here_is_told_before_anything_is_trained(
+    plan: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(ConfigError, match="accelerator is 'foo'"):
+        run_grid(read_grid(plan), tmp_path / "out", accelerator="foo")
+    assert not list((tmp_path / "out").rglob("*seed0.json"))
+
+
 class KilledError(Exception):
     """What a test stops a training with, after an epoch."""
 

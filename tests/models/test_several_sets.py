@@ -1,5 +1,6 @@
 """Sets that are learnt from together, things of no category, networks that begin with another."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -69,7 +70,7 @@ def test_the_exported_file_refuses_and_promises(run, tmp_path, call):
     unseen = card.provenance["unseen_objects"]  # of the first set
     assert unseen and not any(name.startswith("star") for name in unseen)
     *sweeps, training, _ = card.provenance["commands"]
-    assert len(sweeps) == 2 and "--encoder gru" in training and "other --seed 0" in training
+    assert len(sweeps) == 2 and "encoder=gru" in training and "other --seed 0" in training
     code, shown, _ = call("model", "show", tmp_path / "m.onnx")
     assert "4: ball, cube, cone, star" in shown and "swapped channels" in shown
 
@@ -170,6 +171,28 @@ def test_rows_go_by_name_where_as_many_labels_are_known_in_another_order(tmp_pat
         assert torch.allclose(new[name], old[name][[2, 1, 0]], atol=1e-6)
 
 
+def test_two_profiles_are_compared_on_the_same_sweeps(sets, run, tmp_path, call):
+    call("export", run / "best.pt", tmp_path / "m.onnx")
+    write_tiny_set(tmp_path / "three", sweeps=3)
+    at = ("eval", tmp_path / "m.onnx", tmp_path / "three", "--quick")
+    code, *_ = call(*at, "--accurate", tmp_path / "three", "--json", tmp_path / "figures")
+    assert not code
+    records = {r["name"]: r for r in json.loads((tmp_path / "figures").read_text())}
+    lost = records["models.points lost at the other profile"]
+    assert lost["value"] == 0
+    assert lost["how"].startswith("6 sweeps of 3 unseen objects")
+    write_tiny_set(tmp_path / "robot", spec=plate(1, 4))
+    code, _, said = call(*at, "--accurate", tmp_path / "robot")
+    assert code == 2 and f"was made for another array than {tmp_path / 'robot'} is of" in said
+
+
+def test_a_network_that_began_with_another_has_met_its_objects(sets, run, tmp_path, call):
+    begun = ("--from", run / "best.pt", *QUICK)
+    assert not call("train", sets / "one", tmp_path / "next", *begun)[0]
+    assert not call("export", tmp_path / "next" / "best.pt", tmp_path / "m.onnx")[0]
+    assert "star-0" in load_model(tmp_path / "m.onnx")[1].provenance["trained_objects"][""]
+
+
 def test_sets_of_two_sensors_are_refused(sets, tmp_path, call):
     sensor = SensorSpec(channels=(ChannelSpec(name="fx", unit="N", range=1.0, resolution=1e-3),))
     manifest = SweepManifest.read(sets / "other")
@@ -183,7 +206,11 @@ def test_a_layer_over_categories_is_probed_and_exported_without_refusals(run, tm
     assert not code, said
     code, _, said = call("export", tmp_path / "probe" / "best.pt", tmp_path / "p.onnx")
     assert not code, said
-    assert load_model(tmp_path / "p.onnx")[1].labels == ("ball", "cube", "cone")
+    card = load_model(tmp_path / "p.onnx")[1]
+    assert card.labels == ("ball", "cube", "cone")
+    assert "star-0" in card.provenance["trained_objects"][""], "seen when it was trained"
+    training, probing = card.provenance["commands"][-2].split(" && ")
+    assert training.startswith("tactile-rt train") and "--epochs 2" in probing
 
 
 def test_no_set_is_tested_on_that_the_model_was_trained_on(sets, run, tmp_path, call):

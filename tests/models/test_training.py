@@ -37,7 +37,8 @@ from tactile_rt.models.training.probing import linear_probe
 from tactile_rt.models.training.recipes import read_recipe
 from tactile_rt.models.training.replay import replayed
 from tactile_rt.stream import ConfigError, ModelError
-from tests.helpers.tiny_sweeps import write_tiny_set
+from tactile_rt.sweep_set import SweepManifest, write_object
+from tests.helpers.tiny_sweeps import SAMPLES, write_tiny_set
 
 SMALL = {"encoder": "gru", "decoder": "linear", "width": 1 / 32, "batch": 6}
 CHILD = Path(__file__).parent / "train_child.py"
@@ -479,6 +480,16 @@ def test_a_probed_network_is_a_classifier_of_the_frozen_features(tiny, tmp_path)
     found = hits(predict(train_set, run_on(model))[:, -1], train_set.sweeps.labels).mean()
     assert found > 0.6
     assert saved["metrics"]["validation_top1"] >= 0
+
+
+def test_a_probe_of_few_sweeps_does_without_the_silent_ones(tmp_path):
+    write_tiny_set(tmp_path / "set")
+    name = SweepManifest.read(tmp_path / "set").split["train"][0]
+    (tmp_path / "set" / f"{name}.npz").unlink()
+    write_object(tmp_path / "set", name, np.zeros((1, SAMPLES, 30, 6), np.float32), {})
+    config = TrainingConfig(str(tmp_path / "set"), **SMALL)
+    best = probe(initialise(config, tmp_path / "run"), tmp_path / "probe", ProbeConfig(epochs=2))
+    assert load_checkpoint(best)[1]["metrics"]["epoch"] == 2
 
 
 # Killed and shared: in processes of their own

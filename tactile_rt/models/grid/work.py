@@ -18,7 +18,7 @@ from tactile_rt.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.data_checks import check_sets, check_split
-from tactile_rt.models.datasets import SweepSet, drawn_as, frame_of
+from tactile_rt.models.datasets import SweepSet, check_batches, drawn_as, frame_of
 from tactile_rt.models.disturbances import CLEAN, RATED
 from tactile_rt.models.ead import count_parameters
 from tactile_rt.models.evaluation import CutWindows, among, cut_windows, hits, posteriors
@@ -45,7 +45,8 @@ from tactile_rt.models.training import (
     probe,
     train,
 )
-from tactile_rt.models.training.config import DivergedError
+from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError
+from tactile_rt.models.training.devices import launched
 from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["Workbench"]
@@ -70,14 +71,23 @@ class Workbench:
         self.splits = SweepSet.read(self.data, "train"), SweepSet.read(self.data, "validation")
         self.test = SweepSet.read(self.data, "test")
         check_sets(self.data, (*self.splits, self.test))
-        manifest = self.test.manifest
-        for task in grid.tasks():
-            if task.cell is not None:  # what this array cannot have is told now
-                config = grid.config(task, self.data)
-                build(config.augmentation, manifest.spec)
-                config.network(len(manifest.categories), frame_of(manifest))
         self._shares: dict[float, tuple[SweepSet, SweepSet]] = {}
         self._cut: dict[str, tuple[list[CutWindows], list[CutWindows]]] = {}
+        self._check()
+
+    def _check(self) -> None:
+        """Refuse now what this array, these sweeps or this machine cannot have."""
+        manifest = self.test.manifest
+        for task in self.grid.tasks():
+            if task.cell is None:
+                continue
+            config = self.grid.config(task, self.data)
+            build(config.augmentation, manifest.spec)
+            config.network(len(manifest.categories), frame_of(manifest))
+            training = self.splits_of(task.cell.share)[0]
+            check_batches(training, config.batch, config.jitter, config.pairs == TWO_SWEEPS)
+        with launched(config, self.accelerator):
+            pass
 
     def do(self, task: Task, report: Callable[..., None] = lambda _: None) -> Outcome:
         """Do a task and keep its outcome; a network that diverges is an outcome too.
@@ -231,7 +241,8 @@ class Workbench:
             training, validating = self.splits
             manifest = training.manifest
             of: dict[str, list[str]] = {}
-            for name in manifest.split["train"]:
+            there = set(training.sweeps.objects.tolist())  # some may have been skipped
+            for name in filter(there.__contains__, manifest.split["train"]):
                 of.setdefault(manifest.category(name), []).append(name)
             taken = [n for names in of.values() for n in names[: max(round(share * len(names)), 1)]]
             some = training[np.flatnonzero(np.isin(training.sweeps.objects, taken))]

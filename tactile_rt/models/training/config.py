@@ -23,6 +23,7 @@ __all__ = [
     "PAIRS",
     "PRECISIONS",
     "SCHEDULES",
+    "TWO_SWEEPS",
     "WINDOWS",
     "DivergedError",
     "ProbeConfig",
@@ -40,7 +41,7 @@ PRECISIONS = ("bf16", "fp32")
 FIRST_WEIGHTS = ("kaiming", "paper")
 RATES_PER = ("update", "epoch")
 WINDOWS = ("onset", "sweep")
-PAIRS = ("one-sweep", "two-sweeps")
+PAIRS = ONE_SWEEP, TWO_SWEEPS = ("one-sweep", "two-sweeps")
 LARGEST = 1e38  # numbers of single precision end there
 
 
@@ -121,7 +122,7 @@ class TrainingConfig:
     objective: str = "supervised"
     loss: str = "anytime"
     augmentation: str = "none"
-    pairs: str = "one-sweep"
+    pairs: str = ONE_SWEEP
     masking: float = 0.0
     optimizer: str = "adamw"
     schedule: str = "one-cycle"
@@ -169,7 +170,7 @@ class TrainingConfig:
             raise ConfigError(
                 f"{self.objective} compares sweeps of a batch: batch must be 2 or more"
             )
-        if self.pairs != "one-sweep" and self.objective not in ("simclr", "simsiam"):
+        if self.pairs != ONE_SWEEP and self.objective not in ("simclr", "simsiam"):
             raise ConfigError(f"pairs are of simclr and simsiam: {self.objective} has no two views")
         if self.schedule == "one-cycle" and self.rate_per == "epoch":
             raise ConfigError("schedule one-cycle changes the rate per update, not per epoch")

@@ -25,7 +25,7 @@ from tactile_rt.locks import alone_in
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoint_files import describe_checkpoint, reason
 from tactile_rt.models.checkpoints import TactileClassifier, begin_from, save_whole
-from tactile_rt.models.data_checks import check_sets
+from tactile_rt.models.data_checks import check_sets, trained_objects
 from tactile_rt.models.datasets import (
     SweepSet,
     TrainingBatches,
@@ -44,6 +44,7 @@ from tactile_rt.models.objectives import (
     Supervised,
 )
 from tactile_rt.models.training.config import (
+    TWO_SWEEPS,
     DivergedError,
     Progress,
     TrainingConfig,
@@ -117,8 +118,10 @@ def _train(
     objective = build_objective(config, training)
     if config.begin:
         begin_from(objective.model, Path(config.begin), labels_of(training))
+    before = describe_checkpoint(Path(config.begin)) if config.begin else None
+    met = trained_objects(manifests_of(config)[0], before)
     share = Share(fabric.global_rank, fabric.world_size)
-    two_sweeps = config.pairs == "two-sweeps"
+    two_sweeps = config.pairs == TWO_SWEEPS
     batches = TrainingBatches(
         training, config.batch, config.seed, config.jitter, two_sweeps, str(fabric.device)
     )
@@ -190,7 +193,7 @@ def _train(
         better, run.best = score >= run.best, max(score, run.best)
         if fabric.is_global_zero:
             if better:
-                save_whole(folder / "best.pt", _card(config, objective, training, metrics))
+                save_whole(folder / "best.pt", _card(config, objective, training, met, metrics))
             log_epoch(folder / "history.csv", metrics)
             board.write(run.done, {f"epoch/{k}": v for k, v in metrics.items() if k != "epoch"})
             save_whole(folder / "last.pt", run.state())
@@ -210,7 +213,7 @@ def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = Non
     training = drawn_as((splits or read_splits(config))[0], asdict(config))
     objective = build_objective(config, training)
     folder.mkdir(parents=True, exist_ok=True)
-    save_whole(folder / "best.pt", _card(config, objective, training, {"epoch": 0}))
+    save_whole(folder / "best.pt", _card(config, objective, training, {}, {"epoch": 0}))
     return folder / "best.pt"
 
 
@@ -334,7 +337,11 @@ def _mean(fabric: "Fabric", losses: list[float]) -> float:
 
 
 def _card(
-    config: TrainingConfig, objective: Objective, data: SweepSet, metrics: dict[str, float]
+    config: TrainingConfig,
+    objective: Objective,
+    data: SweepSet,
+    met: dict[str, list[str]],
+    metrics: dict[str, float],
 ) -> dict[str, Any]:
     return {
         "model": objective.model.state_dict(),
@@ -343,6 +350,7 @@ def _card(
         "spec": data.manifest.spec.to_json(),
         "categories": list(data.manifest.categories),
         "refusals": list(data.refusals),
+        "trained_objects": met,
         "metrics": metrics,
     }
 

@@ -7,6 +7,7 @@ seconds. (The published probe left dropout and batch norm in training mode.)
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
+from shlex import quote
 
 import msgspec
 import torch
@@ -15,7 +16,12 @@ from torch.nn import functional as F
 
 from tactile_rt.locks import alone_in
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
-from tactile_rt.models.data_checks import check_sets, check_split, probed_on
+from tactile_rt.models.data_checks import (
+    check_sets,
+    check_split,
+    probed_on,
+    trained_objects,
+)
 from tactile_rt.models.datasets import (
     JITTER,
     SweepSet,
@@ -27,10 +33,12 @@ from tactile_rt.models.datasets import (
 from tactile_rt.models.evaluation import hits, predict
 from tactile_rt.models.training.config import ProbeConfig, Progress
 from tactile_rt.models.training.logs import log_epoch
+from tactile_rt.models.training.recipes import as_options, training_command
 from tactile_rt.stream import ConfigError
 
 __all__ = ["linear_probe", "probe"]
 
+TOLD = ("data", "epochs", "seed")  # by options of their own
 WINDOWS = 32  # at a time, through the frozen network
 
 
@@ -79,7 +87,8 @@ def _probe(
     data, validation = (of_categories(drawn_as(one, saved["config"])) for one in splits)
     torch.manual_seed(config.seed)
     jitter = saved["config"].get("jitter", JITTER)
-    batches = TrainingBatches(data, min(WINDOWS, len(data.sweeps)), config.seed, jitter)
+    touched = int((data.noisy_starts[0] >= 0).sum())  # a few of few sweeps may be silent
+    batches = TrainingBatches(data, max(min(WINDOWS, touched), 1), config.seed, jitter)
     begin = trained.network.encoder.lag if config.readout == "mean" else -1
     drawn = [(_features(trained, begin, *loads), labels) for *loads, labels in batches.epoch(0)]
     features, labels = (torch.cat(part) for part in zip(*drawn, strict=True))
@@ -108,7 +117,12 @@ def _probe(
     folder.mkdir(parents=True, exist_ok=True)
     for line in history:
         log_epoch(folder / "history.csv", line)
+    made_by = saved.get("made_by") or training_command(saved["config"], checkpoint.parent)
+    fitted = as_options({k: v for k, v in asdict(config).items() if k not in TOLD})
     card = {
+        "made_by": f"{made_by} && tactile-rt probe {quote(str(checkpoint))} {quote(str(folder))} "
+        f"--data {quote(str(path))} --epochs {config.epochs} --seed {config.seed} "
+        + " ".join(fitted),
         "model": model.state_dict(),
         "config": {
             **saved["config"],
@@ -120,6 +134,7 @@ def _probe(
         "network": msgspec.to_builtins(network),
         "spec": manifest.spec.to_json(),
         "categories": list(manifest.categories),
+        "trained_objects": trained_objects([manifest], saved),
         "metrics": metrics,
     }
     save_whole(folder / "best.pt", card)

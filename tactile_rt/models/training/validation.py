@@ -12,7 +12,7 @@ from tactile_rt.models.datasets import SweepSet, partners, windows
 from tactile_rt.models.disturbances import CLEAN, RATED
 from tactile_rt.models.evaluation import among, cut_windows, hits, posteriors
 from tactile_rt.models.objectives import Objective
-from tactile_rt.models.training.config import TrainingConfig
+from tactile_rt.models.training.config import TWO_SWEEPS, TrainingConfig
 from tactile_rt.models.training.feeding import Share, generator_of
 from tactile_rt.stream import ConfigError
 
@@ -61,7 +61,7 @@ class Validation:
             if not len(usable):
                 raise ConfigError("in no validation sweep was a touch found: make more sweeps")
             self._other = np.arange(len(data.sweeps))  # what the second view is of
-            if config.pairs == "two-sweeps":
+            if config.pairs == TWO_SWEEPS:
                 rng = np.random.default_rng([config.seed, VIEWS])
                 self._other[usable] = usable[partners(data.sweeps.objects[usable], rng)]
 
