@@ -9,21 +9,19 @@ that was not. Under torchrun every process has a share of each batch:
 import time
 from collections.abc import Callable
 from contextlib import closing, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from itertools import islice
-from math import ceil, inf, isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 import numpy as np
 import torch
-from torch.optim.lr_scheduler import LRScheduler
 
-from tactile_rt.files import write_whole
 from tactile_rt.locks import alone_in
 from tactile_rt.models.augmentation import build
-from tactile_rt.models.checkpoint_files import describe_checkpoint, reason
+from tactile_rt.models.checkpoint_files import describe_checkpoint
 from tactile_rt.models.checkpoints import TactileClassifier, begin_from, save_whole
 from tactile_rt.models.data_checks import check_sets, trained_objects
 from tactile_rt.models.datasets import (
@@ -52,11 +50,12 @@ from tactile_rt.models.training.config import (
 )
 from tactile_rt.models.training.devices import is_first, launched
 from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
-from tactile_rt.models.training.logs import Board, log_epoch, logged_epochs
-from tactile_rt.models.training.optimizers import build_optimizer, build_schedule
+from tactile_rt.models.training.logs import Board, log_epoch
+from tactile_rt.models.training.optimizers import build_optimizer
 from tactile_rt.models.training.replay import batch_loss
+from tactile_rt.models.training.resuming import RunState, as_json, begin_run
 from tactile_rt.models.training.validation import Validation
-from tactile_rt.stream import ConfigError, ModelError, RecordingError
+from tactile_rt.stream import RecordingError
 from tactile_rt.sweep_set import OUTLIERS
 
 if TYPE_CHECKING:
@@ -66,7 +65,6 @@ __all__ = ["build_objective", "initialise", "labels_of", "read_splits", "train"]
 
 Report = Callable[[Progress], None]
 Splits = tuple[SweepSet, SweepSet]  # to train and to validate on
-PATHS = ("data", "also", "begin")  # keys of a configuration
 AUGMENTED = 1  # tells the draws of frames from those of loads
 
 
@@ -132,9 +130,9 @@ def _train(
     feed = BatchFeed(batches, augmentation, objective.views, config.seed, share, fabric.device)
     validate = Validation(config, validating, augmentation, share, fabric.device)
     optimizer = build_optimizer(objective, config)
-    run = _Run(objective, optimizer, config, len(batches))
+    run = RunState(objective, optimizer, config, len(batches))
     if fabric.is_global_zero:
-        _begin_run(config, folder)  # when all that may be refused has been
+        begin_run(config, folder)  # when all that may be refused has been
     fabric.barrier()
     run.resume(folder)
     board.begin(run.done)
@@ -276,56 +274,6 @@ def build_objective(config: TrainingConfig, training: SweepSet) -> Objective:
     return objective
 
 
-@dataclass
-class _Run:
-    """How far a run is, and all that it takes to go on."""
-
-    objective: Objective
-    optimizer: torch.optim.Optimizer
-    config: TrainingConfig
-    per_epoch: int
-    epoch: int = 0
-    done: int = 0
-    best: float = -inf
-
-    def __post_init__(self) -> None:
-        self.updates = self.config.updates or self.config.epochs * self.per_epoch
-        self.epochs = ceil(self.updates / self.per_epoch)
-        self.schedule: LRScheduler = build_schedule(
-            self.optimizer, self.config, self.updates, self.per_epoch
-        )
-
-    def state(self) -> dict[str, Any]:
-        return {
-            "model": self.objective.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "schedule": self.schedule.state_dict(),
-            "epoch": self.epoch,
-            "done": self.done,
-            "best": self.best,
-        }
-
-    def resume(self, folder: Path) -> None:
-        last = folder / "last.pt"
-        if not last.exists():
-            return
-        try:
-            saved = torch.load(last, map_location="cpu", weights_only=True)
-            self.objective.load_state_dict(saved["model"])
-            self.optimizer.load_state_dict(saved["optimizer"])
-            self.schedule.load_state_dict(saved["schedule"])
-            self.epoch, self.done, self.best = saved["epoch"], saved["done"], saved["best"]
-        except Exception as error:  # torch raises many unrelated types for a damaged file
-            raise ModelError(
-                f"{last} is damaged ({reason(error)}): delete it to begin the run anew"
-            ) from None
-        try:
-            describe_checkpoint(folder / "best.pt")
-        except ModelError as error:
-            raise ModelError(f"{error}: delete {last} to begin the run anew") from None
-        logged_epochs(folder / "history.csv", until=self.epoch + 1)  # else told after an epoch
-
-
 def _mean(fabric: "Fabric", losses: list[float]) -> float:
     """Over an epoch's updates and all devices, each of which has its share of every batch."""
     mean = float(np.mean(losses))
@@ -345,7 +293,7 @@ def _card(
 ) -> dict[str, Any]:
     return {
         "model": objective.model.state_dict(),
-        "config": _as_json(config),
+        "config": as_json(config),
         "network": msgspec.to_builtins(objective.model.network.config),
         "spec": data.manifest.spec.to_json(),
         "categories": list(data.manifest.categories),
@@ -353,48 +301,3 @@ def _card(
         "trained_objects": met,
         "metrics": metrics,
     }
-
-
-def _as_json(config: TrainingConfig) -> dict[str, Any]:
-    """As a file has it, which knows no tuples."""
-    plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(config)))
-    return plain
-
-
-def _begin_run(config: TrainingConfig, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    path, mine = folder / "config.json", _as_json(config)
-    # Before its first epoch is finished a run has nothing to lose: correct its options and go on.
-    if not (folder / "last.pt").exists():
-        text = msgspec.json.format(msgspec.json.encode(mine), indent=1)
-        write_whole(path, lambda file: file.write(text))
-        return
-    try:
-        theirs = msgspec.json.decode(path.read_bytes(), type=dict[str, Any])
-    except FileNotFoundError:
-        raise ConfigError(
-            f"{path} is gone, so that nobody knows what run this is: choose another folder, or "
-            f"delete {folder / 'last.pt'} to begin anew"
-        ) from None
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is damaged ({error}): choose another folder") from None
-    # a run of before a key was thought of
-    defaults = _as_json(TrainingConfig(config.data))
-    differing = [
-        key
-        for key in {**mine, **theirs}
-        if not _same(key, theirs.get(key, defaults.get(key)), mine.get(key))
-    ]
-    if differing:
-        raise ConfigError(
-            f"{folder} holds a run of another configuration (other {', '.join(differing)}): choose "
-            "another folder, or repeat the options that began it"
-        )
-
-
-def _same(key: str, one: Any, other: Any) -> bool:
-    """Whether two values of a key are; a path may be spelt in several ways."""
-    if key in PATHS and one and other:
-        names = [[value] if isinstance(value, str) else value for value in (one, other)]
-        one, other = ([str(Path(name).resolve()) for name in some] for some in names)
-    return bool(one == other)
