@@ -69,7 +69,7 @@ def draw_grid(results: GridResults, path: Path) -> None:
     figure.suptitle(
         f"What touched the whiskers? {results.classes} kinds of object, {results.objects} unseen "
         f"objects, {results.sweeps} sweeps\n"
-        "every network tuned alike, trained until more helps no more; "
+        "every network tuned alike, trained until more helps no more (+: as long as was tried)\n"
         + (f"mean of up to {seeds} seeds" if seeds > 1 else "one seed")
         + ", lines: 95 % by object and seed",
         fontsize=11,
@@ -167,8 +167,9 @@ def _bars(axes: Axes, rows: list[Row]) -> None:
         if row.top1 is not None:
             _bar(axes, k + BAR / 2, row.top1, colour, 0.9)
             end = 100 * max(row.top1.high, row.top1.value) + 1
+            told = f"{100 * row.top1.value:.1f}{' +' if row.chosen and not row.flat else ''}"
             axes.text(
-                end, k + BAR / 2, f"{100 * row.top1.value:.1f}", va="center", fontsize=7.5,
+                end, k + BAR / 2, told, va="center", fontsize=7.5,
                 bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},  # on the SVM's line
             )  # fmt: skip
         elif row.failed:
