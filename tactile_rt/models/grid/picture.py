@@ -94,14 +94,9 @@ def draw_curves(results: GridResults, path: Path) -> None:
             scores = [100 * point.score for point in points]
             at.plot([getattr(point, unit) for point in points], scores, **how)
     whole = [row for row in networks if row.share == 1 and row.top1 is not None]
-    for k, row in enumerate(sorted(whole, key=lambda row: row.parameters)):
+    for row in whole:
         if row.learning == SUPERVISED and row.top1 is not None:
-            how = _line(row)
-            axes[1, 0].plot(row.parameters, 100 * row.top1.value, **how)
-            axes[1, 0].annotate(
-                row.network, (row.parameters, 100 * row.top1.value), fontsize=7.5,
-                xytext=(0, 5 if k % 2 else -12), textcoords="offset points", ha="center",
-            )  # fmt: skip
+            axes[1, 0].plot(row.parameters, 100 * row.top1.value, **_line(row))
     for network in dict.fromkeys(row.network for row in networks if row.share < 1):
         of = sorted(
             (row.share, row)
@@ -129,7 +124,6 @@ def draw_curves(results: GridResults, path: Path) -> None:
             at.text(0.5, 0.5, "no shares were trained on", ha="center", transform=at.transAxes)
         above = at in axes[0]
         at.set_ylabel(f"top-1 (%), {'validation' if above else 'test'} objects")
-    axes[1, 0].margins(0.25, 0.12)  # for the names
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
     figure.suptitle(
@@ -147,14 +141,16 @@ def _plainly(value: float, _: object) -> str:
 
 
 def _line(row: Row) -> dict[str, Any]:
-    """How a network's line is drawn: an attender dashes it, another width has open marks."""
+    """How a network's line is drawn: dashed and with squares if it has an attender; another width
+    has open marks."""
     _, colour = _family(row)
+    attender = "+" in row.network
     return {
         "color": colour,
-        "marker": "o",
-        "markersize": 4,
+        "marker": "s" if attender else "o",
+        "markersize": 5,
         "markerfacecolor": "white" if "@" in row.network else colour,
-        "linestyle": "--" if "+" in row.network else "-",
+        "linestyle": "--" if attender else "-",
         "label": _label(row),
     }
 
