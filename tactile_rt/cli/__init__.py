@@ -84,6 +84,7 @@ def _run(told: list[int]) -> None:
     from tactile_rt.cli import (  # noqa: F401
         align,
         align_board,
+        align_gate,
         array,
         bench,
         calibrate,

@@ -1,32 +1,23 @@
 """`tactile-rt align`: does a model represent touch as barrel cortex does?"""
 
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 from rich.table import Column, Table
-from typer.core import TyperCommand
 
 from tactile_rt.cli.app import LARGEST_SEED, app, check_output, needs, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, print_table, told_as_json
 from tactile_rt.settings import take_sets
-from tactile_rt.stream import ConfigError, TactileError
-
-if TYPE_CHECKING:
-    from tactile_rt.models.alignment.layers import Layers
-    from tactile_rt.models.alignment.stimuli_input import StimuliInput
+from tactile_rt.stream import ConfigError
 
 align = typer.Typer(help="Compare a model with recordings of barrel cortex.", no_args_is_help=True)
 app.add_typer(align, name="align")
-
-USAGE = 2  # click's exit code
-INPUT_ERROR = 3  # of the gate, whose 1 and 2 mean something else
 
 Stimuli = Annotated[
     Path | None,
@@ -36,19 +27,6 @@ Benchmark = Annotated[Path, typer.Option(help="What `align build` wrote.")]
 Models = Annotated[
     list[Path], typer.Argument(help="Checkpoints (best.pt), .onnx files, and responses (.npz).")
 ]
-
-
-class GateCommand(TyperCommand):
-    """A command whose misuse is an input error, not an inconclusive test."""
-
-    def make_context(self, *arguments: Any, **more: Any) -> Any:
-        try:
-            return super().make_context(*arguments, **more)
-        except Exception as error:
-            # click's UsageError, which typer brings along under a name of its own.
-            if getattr(error, "exit_code", None) == USAGE:
-                error.exit_code = INPUT_ERROR  # type: ignore[attr-defined]
-            raise
 
 
 @align.command("example")
@@ -167,7 +145,7 @@ def score_models(
     for file in (json, html):
         check_output(file)
     given = _performances(performance, len(models))
-    with _train():
+    with needing_torch():
         from tactile_rt.models.alignment.benchmark_file import load_benchmark
         from tactile_rt.models.alignment.loading import check_models, load_layers, load_untrained
         from tactile_rt.models.alignment.report import write_page
@@ -224,31 +202,6 @@ def write_report(
     Console(stderr=True).print(f"{out}", highlight=False)
 
 
-@align.command("gate", cls=GateCommand)
-def gate_model(
-    model: Annotated[Path, typer.Argument(help="What would be released: .onnx, best.pt or .npz.")],
-    benchmark: Annotated[
-        Path | None, typer.Option(help="Tests 1 and 2: what `align build` wrote.")
-    ] = None,
-    baseline: Annotated[
-        Path | None, typer.Option(help="Test 3: scores of the model before, on this benchmark.")
-    ] = None,
-    reference: Annotated[
-        Path | None,
-        typer.Option(help="Test 4: the checkpoint (or .onnx) that the model was exported from."),
-    ] = None,
-    stimuli: Stimuli = None,
-    json: Json = None,
-) -> None:
-    """Test a model before its release. Exit code: 0 pass, 1 fail, 2 inconclusive, 3 input error."""
-    try:
-        code = _gate(model, benchmark, baseline, reference, stimuli, json)
-    except (TactileError, OSError) as error:
-        typer.secho(f"tactile-rt: {error}", err=True, fg="red")
-        code = INPUT_ERROR
-    sys.exit(code)
-
-
 @align.command("decode")
 def decode_stimuli(
     models: Models,
@@ -267,7 +220,7 @@ def decode_stimuli(
 ) -> None:
     """Decode shape and distance of the stimuli from every layer, with permutation chance."""
     check_output(json)
-    with _train():
+    with needing_torch():
         from tactile_rt.models.alignment.animal_means import animal_means
         from tactile_rt.models.alignment.benchmark_file import load_benchmark
         from tactile_rt.models.alignment.decoding import (
@@ -310,68 +263,9 @@ def decode_stimuli(
         _show_decoded(rows)
 
 
-def _gate(
-    model: Path,
-    benchmark: Path | None,
-    baseline: Path | None,
-    reference: Path | None,
-    stimuli: Path | None,
-    json: Path | None,
-) -> int:
-    check_output(json)
-    if benchmark is None and reference is None:
-        raise ConfigError("name a --benchmark to score on, or the --reference it was exported from")
-    if baseline is not None and benchmark is None:
-        raise ConfigError("--baseline needs the --benchmark that it was scored on")
-    with _train():
-        from tactile_rt.models.alignment.benchmark_file import load_benchmark
-        from tactile_rt.models.alignment.fidelity import export_layers, fidelity_check
-        from tactile_rt.models.alignment.gate import Check, exit_code, neural_checks
-        from tactile_rt.models.alignment.loading import check_models, load_layers
-        from tactile_rt.models.alignment.results import baseline_of
-        from tactile_rt.models.alignment.scoring import score
-        from tactile_rt.models.alignment.stimuli_input import read_stimuli
-
-        felt = read_stimuli(stimuli)
-        frozen = load_benchmark(benchmark) if benchmark else None
-        before = baseline_of(baseline, frozen) if baseline and frozen else None
-        check_models([model, *([reference] if reference else [])])
-        checks: list[Check] = []
-        rows: list[Any] = []
-        ours: Layers | None = None
-        if reference is not None:
-            original, _ = load_layers(reference, felt)
-            ours = _exported(model, felt, original, export_layers)
-            check, found = fidelity_check(original, ours)
-            checks.append(check)
-            rows += found
-        if frozen is not None:
-            ours = ours or load_layers(model, felt)[0]
-            checks = [*neural_checks(score(frozen, ours.patterns), frozen, before), *checks]
-    code = exit_code(checks)
-    colours = {"pass": "green", "fail": "bold red", "inconclusive": "yellow"}
-    told = [{"name": c.name, "verdict": c.verdict, "why": c.why} for c in checks]
-    taps = [asdict(row) for row in rows]
-    if told_as_json({"exit_code": code, "checks": told, "taps": taps}, json):
-        return code
-    console = Console(soft_wrap=True)
-    for check in checks:
-        word = f"[{colours[check.verdict]}]{check.verdict}[/]"
-        console.print(f"{check.name}: {word}: {check.why}", highlight=False)
-    return code
-
-
-def _exported(model: Path, felt: "StimuliInput", original: "Layers", export: Any) -> "Layers":
-    if model.suffix == ".onnx":
-        layers: Layers = export(model, felt, original)
-        return layers
-    from tactile_rt.models.alignment.loading import load_layers
-
-    return load_layers(model, felt)[0]
-
-
 @contextmanager
-def _train() -> Iterator[None]:
+def needing_torch() -> Iterator[None]:
+    """Say which extra brings what the block imports, where it is missing."""
     try:
         yield
     except ModuleNotFoundError as error:
