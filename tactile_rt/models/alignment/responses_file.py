@@ -1,7 +1,6 @@
 """Responses computed elsewhere, as a model to score: an ``.npz`` with one array per layer."""
 
 import hashlib
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ __all__ = ["RESPONSES", "responses_layers"]
 
 RESPONSES = ".npz"
 NUMBERS = "fiu"
+LARGEST = np.finfo(np.float32).max
 
 
 def responses_layers(path: Path) -> Layers:
@@ -25,7 +25,7 @@ def responses_layers(path: Path) -> Layers:
             or ``decoder.`` is one of the encoder's.
 
     Raises:
-        ConfigError: no such file, or an array that is no layer, by name.
+        ConfigError: no such file, an array that is no layer, by name, or two that are one layer.
     """
     try:
         content = path.read_bytes()
@@ -42,18 +42,23 @@ def responses_layers(path: Path) -> Layers:
                     or array.shape[0] != len(STIMULI)
                     or 0 in array.shape
                     or array.shape[-1] < 2
-                    or not np.isfinite(array).all()
+                    or not (np.abs(array) <= LARGEST).all()
                 ):
                     raise ConfigError(
                         f"{path}: array {name} ({array.dtype}, {array.shape}) is no layer: finite "
                         f"numbers ({len(STIMULI)} stimuli, 2 or more units)"
                     )
-                full = (
-                    name if name.partition(".")[0] in PARTS and "." in name else f"encoder.{name}"
-                )
+                part, dot, _ = name.partition(".")
+                full = name if dot and part in PARTS else f"encoder.{name}"
+                if full in traces:
+                    short = full.removeprefix("encoder.")
+                    raise ConfigError(f"{path}: arrays {short} and {full} are one layer: name one")
                 traces[full] = (array if array.ndim == 3 else array[:, None]).astype(np.float32)
-    except (ValueError, zipfile.BadZipFile, EOFError, OSError, AttributeError) as error:
-        raise ConfigError(f"{path}: no archive of arrays ({error})") from None
+    except ConfigError:
+        raise
+    except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"{path}: no archive of arrays ({reason})") from None
     if not traces:
         raise ConfigError(f"{path}: has no array, so no layer")
     return Layers(

@@ -1,0 +1,32 @@
+"""Responses computed elsewhere: which arrays of a file are layers."""
+
+import numpy as np
+import pytest
+
+from tactile_rt.models.alignment.responses_file import responses_layers
+from tactile_rt.stream import ConfigError
+
+RNG = np.random.default_rng(0)
+
+
+def test_a_layer_is_of_the_encoder_unless_its_name_says_so(tmp_path):
+    arrays = {"stem": RNG.normal(size=(6, 4)), "decoder.fc1": RNG.normal(size=(6, 22, 3))}
+    np.savez(tmp_path / "a.npz", **arrays)
+    traces = responses_layers(tmp_path / "a.npz").traces
+    assert {name: trace.shape for name, trace in traces.items()} == {
+        "encoder.stem": (6, 1, 4),
+        "decoder.fc1": (6, 22, 3),
+    }
+
+
+@pytest.mark.parametrize("names", [("stem", "encoder.stem"), ("encoder.stem", "stem")])
+def test_no_layer_takes_the_place_of_another(tmp_path, names):
+    np.savez(tmp_path / "a.npz", **{name: RNG.normal(size=(6, 4)) for name in names})
+    with pytest.raises(ConfigError, match="arrays stem and encoder.stem are one layer"):
+        responses_layers(tmp_path / "a.npz")
+
+
+def test_what_single_precision_cannot_hold_is_refused(tmp_path):
+    np.savez(tmp_path / "a.npz", x=np.full((6, 4), 1e300))
+    with pytest.raises(ConfigError, match="array x .* is no layer: finite"):
+        responses_layers(tmp_path / "a.npz")
