@@ -219,6 +219,7 @@ def test_a_checkpoint_is_described_as_torch_reads_it(trained):
     saved = torch.load(trained / "best.pt", weights_only=True)
     assert describe_checkpoint(trained / "best.pt") == plain(saved)
     assert network_of(trained / "best.pt")["encoder"] == "gru"
+    assert saved["period_ns"] == 9_000_000  # of which the array of weights says nothing
 
 
 class _Command:

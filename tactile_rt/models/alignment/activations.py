@@ -54,7 +54,13 @@ def checkpoint_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, dict[s
     """
     model, saved = load_checkpoint(path)
     timing = model.timing
-    stimuli.check(ArraySpec.from_json(saved["spec"]), timing.steps, timing.substeps, str(path))
+    stimuli.check(
+        ArraySpec.from_json(saved["spec"]),
+        timing.steps,
+        timing.substeps,
+        str(path),
+        saved.get("period_ns"),  # which earlier checkpoints do not say
+    )
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     name = path.resolve().parent.name if path.stem in ("best", "last") else path.stem
     layers = network_layers(model, stimuli, name, sha256)
@@ -84,7 +90,7 @@ def untrained_card_layers(card: ModelCard, stimuli: StimuliInput, seed: int = 0)
         np.asarray(v, dtype=np.float32) for v in (card.scale, card.floor, card.clip)
     )
     spec = ArraySpec.from_json(card.spec)
-    stimuli.check(spec, card.steps, card.substeps, card.name)
+    stimuli.check(spec, card.steps, card.substeps, card.name, card.period_ns)
     try:
         config = EADConfig(**network)
     except TypeError:  # keys of a later release

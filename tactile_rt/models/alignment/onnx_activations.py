@@ -146,7 +146,7 @@ def _opened(
     path: Path, stimuli: StimuliInput
 ) -> tuple[ort.InferenceSession, ModelCard, onnx.ModelProto]:
     session, card = load_model(path, kind=None)
-    stimuli.check(card.array, card.steps, card.substeps, str(path))
+    stimuli.check(card.array, card.steps, card.substeps, str(path), card.period_ns)
     try:
         model = onnx.load(path, load_external_data=False)
     except Exception as error:  # protobuf raises unrelated types; the file may have changed

@@ -49,16 +49,20 @@ class StimuliInput:
         """(6, element, channel) float32: the tare."""
         return np.zeros_like(self.sigma)
 
-    def check(self, spec: ArraySpec, steps: int, substeps: int, model: str) -> None:
+    def check(
+        self, spec: ArraySpec, steps: int, substeps: int, model: str, period_ns: int | None = None
+    ) -> None:
         """Hold the input against what a model was trained on.
 
         Args:
             spec: the model's array.
             steps, substeps: of its windows.
             model: for messages.
+            period_ns: of its samples, ns; None where that is not known.
 
         Raises:
-            ConfigError: they differ in elements, channels or units, or in the cut of a window.
+            ConfigError: they differ in elements, channels or units, in the cut of a window, or in
+                how far samples are apart.
         """
         make = "make its input with `tactile-rt whisk OUT.npz --array ...`, for --stimuli"
         only = "only a model of base forces and moments can be compared with barrel cortex"
@@ -74,6 +78,12 @@ class StimuliInput:
                 f"{model} takes {steps} steps of {substeps} samples, but the stimuli are {STEPS} "
                 f"of {SUBSTEPS}, a sample every {PERIOD_MS} ms: only a model trained on sweeps "
                 f"with period_ms = {PERIOD_MS} can be compared with barrel cortex"
+            )
+        if period_ns not in (None, PERIOD_MS * 1_000_000):
+            raise ConfigError(
+                f"{model} takes a sample every {period_ns / 1e6:g} ms, but the stimuli have one "
+                f"every {PERIOD_MS} ms: only a model trained on sweeps with period_ms = "
+                f"{PERIOD_MS} can be compared with barrel cortex"
             )
 
     def raw(self) -> NDArray[np.float64]:

@@ -296,6 +296,7 @@ def _card(
         "config": as_json(config),
         "network": msgspec.to_builtins(objective.model.network.config),
         "spec": data.manifest.spec.to_json(),
+        "period_ns": data.manifest.period_ns,
         "categories": list(data.manifest.categories),
         "refusals": list(data.refusals),
         "trained_objects": met,

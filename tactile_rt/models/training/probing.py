@@ -133,6 +133,7 @@ def _probe(
         },
         "network": msgspec.to_builtins(network),
         "spec": manifest.spec.to_json(),
+        "period_ns": manifest.period_ns,
         "categories": list(manifest.categories),
         "trained_objects": trained_objects([manifest], saved),
         "metrics": metrics,
