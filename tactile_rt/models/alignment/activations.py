@@ -9,7 +9,7 @@ and on what else is in the batch.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -28,10 +28,11 @@ from tactile_rt.models.attenders.mamba import MambaStack
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, untrained
 from tactile_rt.models.ead import EADConfig, count_parameters
 from tactile_rt.models.encoders.graph import Graph, Node
-from tactile_rt.models.encoders.graph_encoder import GraphEncoder
+from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.encoders.gru import GRUEncoder
 from tactile_rt.sensor_spec import ChannelLimits
-from tactile_rt.stream import ArraySpec
+from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.timing import Timing
 
 __all__ = [
     "checkpoint_layers",
@@ -71,14 +72,15 @@ def untrained_layers(saved: dict[str, Any], stimuli: StimuliInput, seed: int = 0
     """Layers of a checkpoint's network as it might be before training: its random control."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = untrained(saved)
+        model = _begun(untrained(saved), saved.get("config"))
     return network_layers(model, stimuli, f"untrained, seed {seed}")
 
 
 def untrained_card_layers(card: ModelCard, stimuli: StimuliInput, seed: int = 0) -> Layers | None:
     """Layers of the network that an exported file's card describes, with random weights.
 
-    None for a card that does not say of which network it is, as one of another program might.
+    None for a card that describes no network that can be built here, as one of another program or
+    of a later release might.
 
     Raises:
         ConfigError: the stimuli are of another array.
@@ -91,13 +93,16 @@ def untrained_card_layers(card: ModelCard, stimuli: StimuliInput, seed: int = 0)
     )
     spec = ArraySpec.from_json(card.spec)
     stimuli.check(spec, card.steps, card.substeps, card.name, card.period_ns)
-    try:
-        config = EADConfig(**network)
-    except TypeError:  # keys of a later release
-        return None
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = TactileClassifier(spec, config, ChannelLimits(scale, floor, clip, scale))
+        limits = ChannelLimits(scale, floor, clip, scale)
+        try:
+            model = TactileClassifier(spec, EADConfig(**network), limits)
+        except (TypeError, ValueError, ConfigError):
+            return None
+        if model.timing != Timing(card.steps, card.substeps):
+            return None
+        model = _begun(model, card.provenance.get("training"))
     return network_layers(model, stimuli, f"untrained, seed {seed}")
 
 
@@ -137,6 +142,14 @@ def network_layers(
         sha256=sha256,
         network=asdict(network.config),
     )
+
+
+def _begun(model: TactileClassifier, training: object) -> TactileClassifier:
+    """With the first weights that its training drew, as far as that is known."""
+    paper = isinstance(training, Mapping) and training.get("first_weights") == "paper"
+    if paper and isinstance(model.network.encoder, GraphEncoder):
+        draw_as_published(model.network.encoder)
+    return model
 
 
 def reach(graph: Graph) -> dict[str, int]:

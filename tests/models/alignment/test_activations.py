@@ -22,6 +22,7 @@ from tactile_rt.models.alignment.rdm import STIMULI, rdm  # noqa: E402
 from tactile_rt.models.alignment.stimuli_input import SHIPPED, read_stimuli  # noqa: E402
 from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
 from tactile_rt.models.ead import EADConfig  # noqa: E402
+from tactile_rt.models.encoders.graph_encoder import draw_as_published  # noqa: E402
 from tactile_rt.models.encoders.zhuang import zhuang_graph  # noqa: E402
 from tactile_rt.stream import ConfigError, ModelError  # noqa: E402
 from tests.helpers.source_tree import ROOT  # noqa: E402
@@ -226,3 +227,42 @@ def test_a_card_that_names_no_network_has_no_control():
     for network in (None, {"of": "another program"}):
         other = msgspec.structs.replace(card, provenance={"network": network})
         assert untrained_card_layers(other, FELT) is None
+
+
+def test_a_twin_has_the_first_weights_that_its_network_had():
+    """As the paper draws them, where training did: evenly, within 1 / sqrt(fan-in)."""
+    config = EADConfig(7, "zhuang-ugrnn", "none", width=1 / 32)
+    weights = TactileClassifier(SPEC, config).state_dict()
+    network = msgspec.to_builtins(config)
+    card = read_model(shipped_model())[0]
+    for first, others in (("paper", "kaiming"), ("kaiming", "paper")):
+        training = {"first_weights": first}
+        saved = {"spec": SPEC.to_json(), "network": network, "model": weights, "config": training}
+        twin = untrained_layers(saved, FELT, 3)
+        torch.manual_seed(3)
+        model = TactileClassifier(SPEC, config)
+        if first == "paper":
+            draw_as_published(model.network.encoder)
+        expected = network_layers(model, FELT).traces["encoder.conv1"]
+        np.testing.assert_array_equal(twin.traces["encoder.conv1"], expected)
+        other = untrained_layers({**saved, "config": {"first_weights": others}}, FELT, 3)
+        assert not np.allclose(other.traces["encoder.conv1"], expected)
+        said = {"network": network, "training": training}
+        file = untrained_card_layers(msgspec.structs.replace(card, provenance=said), FELT, 3)
+        assert not np.allclose(file.traces["encoder.conv1"], other.traces["encoder.conv1"])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"encoder": "of-a-later-release"},
+        {"frame": [30, "five", 7]},
+        {"frame": [30, 2, 2]},
+        {"width": "wide"},
+        {"max_steps": 3},
+    ],
+)
+def test_a_card_whose_network_cannot_be_built_has_no_control(change):
+    card = read_model(shipped_model())[0]
+    said = {**card.provenance, "network": {**card.provenance["network"], **change}}
+    assert untrained_card_layers(msgspec.structs.replace(card, provenance=said), FELT) is None
