@@ -7,6 +7,7 @@ steps of a stimulus, a window, which is a `Scan` over the same step, once.
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -53,25 +54,22 @@ def onnx_layers(
     taps = named_taps(model) if taps is None else taps
     tensors = list(dict.fromkeys(taps.values()))
     logits, _ = _run(plain, stimuli, card, ())
-    tapped, found = _run(_session(with_outputs(model, tensors)), stimuli, card, tensors)
-    traces: dict[str, Floats] = {}
-    for layer, tensor in taps.items():
-        values = found[tensor]
-        if layer == GRU_LAYERS:
-            traces |= {f"encoder.layer{i}": values[:, :, 0, i] for i in range(values.shape[3])}
-        else:
-            traces[layer] = _trace(layer, values)
+    session = _session(with_outputs(model, tensors))
+    tapped, found = _run(session, stimuli, card, tensors)
+    traces = _traces(taps, found)
+    unlike, found = _run(session, _unlike(stimuli), card, tensors)
+    others = _traces(taps, found)
     notes = []
     if not np.array_equal(logits, tapped):
         worst = float(np.abs(logits - tapped).max())
         notes.append(f"taps changed the logits by up to {worst:.1e}: the runtime fuses otherwise")
     if not traces:
-        traces["decoder.logits"] = logits
+        traces["decoder.logits"], others["decoder.logits"] = logits, unlike
         notes.append("no layer but the logits: the graph's parameters have lost their names")
     return Layers(
         name=card.name,
         traces=traces,
-        first={layer: first_difference(trace) for layer, trace in traces.items()},
+        first={k: first_difference(np.concatenate([t, others[k]])) for k, t in traces.items()},
         logits=logits,
         parameters=sum(int(np.prod(i.dims)) for i in model.graph.initializer if len(i.dims) > 1),
         precision=precision_of(model),
@@ -210,6 +208,28 @@ def _run(
         for k, name in enumerate(tensors):
             found[name].append(np.stack([steps[t][1 + k] for t in keep]))
     return np.stack(logits), {name: np.stack(values) for name, values in found.items()}
+
+
+def _unlike(stimuli: StimuliInput) -> StimuliInput:
+    """Input that differs from the first step on: loads at random, as high as those of the stimuli.
+
+    Stimuli may begin alike, and which steps input can reach is a matter of the network alone.
+    """
+    highest = np.abs(stimuli.samples).max(axis=(0, 1, 2))
+    drawn = np.random.default_rng(0).uniform(-1, 1, stimuli.samples.shape)
+    return replace(stimuli, samples=(drawn * highest).astype(np.float32))
+
+
+def _traces(taps: Mapping[str, str], found: Mapping[str, Floats]) -> dict[str, Floats]:
+    """By layer, (stimulus, step, unit)."""
+    traces: dict[str, Floats] = {}
+    for layer, tensor in taps.items():
+        values = found[tensor]
+        if layer == GRU_LAYERS:
+            traces |= {f"encoder.layer{i}": values[:, :, 0, i] for i in range(values.shape[3])}
+        else:
+            traces[layer] = _trace(layer, values)
+    return traces
 
 
 def _trace(layer: str, values: Floats) -> Floats:

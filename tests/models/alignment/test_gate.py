@@ -214,6 +214,35 @@ def test_a_window_gives_the_layers_of_its_step(exported):
         np.testing.assert_allclose(whole.traces[name], trace, atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "encoder, attender, decoder",
+    [
+        ("gru", "none", "mlp"),
+        pytest.param("zhuang-ugrnn", "none", "linear", marks=pytest.mark.slow),
+    ],
+)
+def test_a_file_averages_the_steps_of_its_checkpoint(tmp_path, encoder, attender, decoder):
+    """Whatever is felt: here three steps of nothing come first."""
+    torch.manual_seed(2)
+    card = load_model(shipped_model())[1]
+    config = EADConfig(len(card.labels), encoder, attender, decoder, width=1 / 32)
+    model = TactileClassifier(card.array, config).eval()
+    stir(model)
+    path = tmp_path / "step.onnx"
+    export_step(
+        model, msgspec.structs.replace(card, provenance={}, figures={}, embeddings=None), path
+    )
+    samples = FELT.samples.copy()
+    samples[:, :3] = 0
+    late = replace(FELT, samples=samples)
+    reference = network_layers(model, late)
+    for felt in (FELT, late):
+        assert onnx_layers(path, felt)[0].first == reference.first
+    found = export_layers(path, late, reference)
+    assert {name: found.first[name] for name in reference.first} == reference.first
+    assert fidelity_check(reference, found)[0].code == PASS
+
+
 def test_layers_whose_names_are_lost_are_found_by_value(exported):
     reference, path = exported
     model = onnx.load(path)

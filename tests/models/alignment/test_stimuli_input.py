@@ -6,17 +6,17 @@ import torch
 
 pytest.importorskip("onnx")
 
-import onnx  # noqa: E402
+import onnx
 
-from tactile_rt.classifier.model_file import METADATA_KEY, read_model, shipped_model  # noqa: E402
-from tactile_rt.models.alignment.activations import (  # noqa: E402
+from tactile_rt.classifier.model_file import METADATA_KEY, read_model, shipped_model
+from tactile_rt.models.alignment.activations import (
     checkpoint_layers,
     untrained_card_layers,
 )
-from tactile_rt.models.alignment.onnx_activations import onnx_layers  # noqa: E402
-from tactile_rt.models.alignment.stimuli_input import read_stimuli  # noqa: E402
-from tactile_rt.stream import ConfigError  # noqa: E402
-from tests.helpers.source_tree import ROOT  # noqa: E402
+from tactile_rt.models.alignment.onnx_activations import onnx_layers
+from tactile_rt.models.alignment.stimuli_input import read_stimuli
+from tactile_rt.stream import ConfigError
+from tests.helpers.source_tree import ROOT
 
 FELT = read_stimuli()
 MS = 1_000_000
