@@ -222,7 +222,7 @@ def decode_stimuli(
     check_output(json)
     with needing_torch():
         from tactile_rt.models.alignment.animal_means import animal_means
-        from tactile_rt.models.alignment.benchmark_file import load_benchmark
+        from tactile_rt.models.alignment.benchmark_file import load_strict
         from tactile_rt.models.alignment.decoding import (
             decode,
             decode_paper,
@@ -233,7 +233,7 @@ def decode_stimuli(
         from tactile_rt.models.alignment.stimuli_input import read_stimuli
 
         felt = read_stimuli(stimuli)
-        targets = load_benchmark(benchmark).targets if benchmark else ()
+        targets = load_strict(benchmark).targets if benchmark else ()
         recorded, notes = animal_means(animals) if animals else ({}, [])
         names = check_models(models)
         rows: list[tuple[str, str, Any]] = []

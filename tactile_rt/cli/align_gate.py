@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from typer.core import TyperCommand
 
 from tactile_rt.cli.align import Stimuli, align, needing_torch
@@ -74,7 +75,7 @@ def _gate(
     if baseline is not None and benchmark is None:
         raise ConfigError("--baseline needs the --benchmark that it was scored on")
     with needing_torch():
-        from tactile_rt.models.alignment.benchmark_file import load_benchmark
+        from tactile_rt.models.alignment.benchmark_file import load_strict
         from tactile_rt.models.alignment.fidelity import export_layers, fidelity_check
         from tactile_rt.models.alignment.gate import Check, exit_code, neural_checks
         from tactile_rt.models.alignment.loading import check_models, load_layers
@@ -83,21 +84,20 @@ def _gate(
         from tactile_rt.models.alignment.stimuli_input import read_stimuli
 
         felt = read_stimuli(stimuli)
-        frozen = load_benchmark(benchmark) if benchmark else None
-        before = baseline_of(baseline, frozen) if baseline and frozen else None
+        frozen = load_strict(benchmark) if benchmark else None
+        before = baseline_of(baseline, frozen, felt) if baseline and frozen else None
         check_models([model, *([reference] if reference else [])])
         checks: list[Check] = []
         rows: list[Any] = []
-        ours: Layers | None = None
         if reference is not None:
             original, _ = load_layers(reference, felt)
-            ours = _exported(model, felt, original, export_layers)
-            check, found = fidelity_check(original, ours)
+            check, found = fidelity_check(original, _exported(model, felt, original, export_layers))
             checks.append(check)
             rows += found
         if frozen is not None:
-            ours = ours or load_layers(model, felt)[0]
-            checks = [*neural_checks(score(frozen, ours.patterns), frozen, before), *checks]
+            # As `align score` has them: a reference names further layers, for test 4 alone.
+            patterns = load_layers(model, felt)[0].patterns
+            checks = [*neural_checks(score(frozen, patterns), frozen, before), *checks]
     code = exit_code(checks)
     colours = {"pass": "green", "fail": "bold red", "inconclusive": "yellow"}
     told = [{"name": c.name, "verdict": c.verdict, "why": c.why} for c in checks]
@@ -107,7 +107,7 @@ def _gate(
     console = Console(soft_wrap=True)
     for check in checks:
         word = f"[{colours[check.verdict]}]{check.verdict}[/]"
-        console.print(f"{check.name}: {word}: {check.why}", highlight=False)
+        console.print(f"{check.name}: {word}: {escape(check.why)}", highlight=False)
     return code
 
 

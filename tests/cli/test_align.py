@@ -7,7 +7,9 @@ import pytest
 
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.models.alignment import save_benchmark
+from tactile_rt.models.alignment.paper_code import freeze_paper_code
 from tactile_rt.models.alignment.published import write_published
+from tactile_rt.models.alignment.stimuli_input import SHIPPED
 from tactile_rt.models.alignment.strict import freeze_strict
 from tests.helpers import brains
 
@@ -60,6 +62,55 @@ def test_the_gate_without_neural_data(call):
     code, out, err = call("align", "gate", MODEL, "--reference", MODEL)
     assert (code, err) == (0, "")
     assert out.startswith("fidelity: pass")
+
+
+def test_a_reference_does_not_change_what_is_scored(call, frozen, tmp_path):
+    """A file that lost its layers' names has further ones by it, for the test of the export."""
+    import onnx
+
+    model, bare = onnx.load(MODEL), tmp_path / "bare.onnx"
+    names = {t.name: f"w{i}" for i, t in enumerate(model.graph.initializer)}
+    for tensor in model.graph.initializer:
+        tensor.name = names[tensor.name]
+    for node in model.graph.node:
+        node.input[:] = [names.get(name, name) for name in node.input]
+    onnx.save(model, bare)
+    found = []
+    for reference in ((), ("--reference", MODEL)):
+        _, out, err = call(
+            "align", "gate", bare, "--benchmark", frozen / "6.json", *reference, "--json", "-"
+        )
+        assert err == ""
+        found.append(json.loads(out))
+    assert found[1]["checks"][: len(found[0]["checks"])] == found[0]["checks"]
+    assert "decoder.fc1" in {tap["layer"] for tap in found[1]["taps"]}
+
+
+def test_a_baseline_of_other_stimuli_is_no_baseline(call, frozen, tmp_path):
+    arrays = dict(np.load(SHIPPED))
+    np.savez(tmp_path / "felt.npz", **arrays | {"values": 1.1 * arrays["values"]})
+    scores, benchmark = tmp_path / "scores.json", ("--benchmark", frozen / "6.json")
+    felt = ("--stimuli", tmp_path / "felt.npz")
+    code, _, err = call("align", "score", MODEL, *benchmark, *felt, "--json", scores)
+    assert code == 0, err
+    code, _, err = call("align", "gate", MODEL, *benchmark, "--baseline", scores)
+    assert code == 3 and "scored on other stimuli (felt.npz)" in err
+
+
+def test_stimuli_without_names_are_neither_gated_nor_decoded_by(call, tmp_path):
+    rng = np.random.default_rng(0)
+    patterns = brains.geometry(rng)
+    rates = {f"animal-{i}": brains.padded(rng, patterns=patterns) for i in range(6)}
+    benchmark = ("--benchmark", tmp_path / "paper.json")
+    save_benchmark(freeze_paper_code(rates, 20), benchmark[1])
+    for command, code in (("gate", 3), ("decode", 2)):
+        found, out, err = call("align", command, MODEL, *benchmark)
+        assert (found, out) == (code, "")
+        assert "paper.json is of protocol paper-code" in err and err.count("\n") == 1
+    code, out, _ = call("align", "score", MODEL, *benchmark, "--json", "-", "--no-untrained")
+    assert code == 0
+    (model,) = json.loads(out)["models"]
+    assert model["score"] is not None and model["turing"] == model["turing_why"] == ""
 
 
 def test_the_gate_on_one_animal_is_inconclusive(call, frozen):

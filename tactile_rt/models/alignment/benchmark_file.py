@@ -23,7 +23,7 @@ from tactile_rt.models.alignment.benchmark import (
 from tactile_rt.models.alignment.rdm import PAIRS, STIMULI
 from tactile_rt.stream import ConfigError
 
-__all__ = ["benchmark_sha256", "load_benchmark", "save_benchmark"]
+__all__ = ["benchmark_sha256", "load_benchmark", "load_strict", "save_benchmark"]
 
 Floats = NDArray[np.float64]
 
@@ -126,6 +126,21 @@ def load_benchmark(path: Path) -> Benchmark:
         notes=file.notes,
         stimuli=file.stimuli,
     )
+
+
+def load_strict(path: Path) -> Benchmark:
+    """Read a benchmark whose stimuli have names, as tests need that ask what each stimulus is.
+
+    Raises:
+        ConfigError: as `load_benchmark`; or the benchmark is of the other protocol.
+    """
+    benchmark = load_benchmark(path)
+    if benchmark.protocol != "strict":
+        raise ConfigError(
+            f"{path} is of protocol {benchmark.protocol}, whose stimuli stand in the order of "
+            "their first appearance, another in each session: build with protocol strict"
+        )
+    return benchmark
 
 
 def _check(file: _File, path: Path) -> None:

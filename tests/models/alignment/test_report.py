@@ -227,17 +227,20 @@ def test_tables_that_do_not_fit(results, tmp_path):
         read_results(path)
 
 
-def test_a_baseline_is_one_model_on_the_same_benchmark(results, benchmark, tmp_path):
-    path = tmp_path / "scores.json"
+def test_a_baseline_is_one_model_on_the_same_benchmark_and_stimuli(results, benchmark, tmp_path):
+    path, felt = tmp_path / "scores.json", read_stimuli()
     write_results(results, path)
     with pytest.raises(ConfigError, match="has 3 models"):
-        baseline_of(path, benchmark)
+        baseline_of(path, benchmark, felt)
     one = msgspec.structs.replace(results, models=results.models[:1])
     write_results(one, path)
-    before = baseline_of(path, benchmark)
+    before = baseline_of(path, benchmark, felt)
     np.testing.assert_array_equal(before, np.array(one.models[0].rdms, dtype=float))
     with pytest.raises(ConfigError, match="another benchmark"):
-        baseline_of(path, replace(benchmark, seed=1))
+        baseline_of(path, replace(benchmark, seed=1), felt)
+    other = replace(felt, name="mine.npz", sha256="0" * 64)
+    with pytest.raises(ConfigError, match=r"on other stimuli \(six_stimuli.npz\) than mine.npz"):
+        baseline_of(path, benchmark, other)
 
 
 def test_an_rdm_as_a_line_is_moved_and_scaled():
