@@ -30,6 +30,7 @@ from tactile_rt.models.alignment.nwb_parts import (
     animal_name,
     contact_times,
     flags,
+    inhibitory_units,
     numbers,
     spike_times,
     starting_time,
@@ -237,8 +238,7 @@ def _session(
         raise ConfigError("; ".join([f"no trial is left in {TRIALS}: correct, not ignored, convex "
                                      "or concave", *notes]))  # fmt: skip
     depth = unit_column(file, "depth", len(units), notes)
-    kind = unit_column(file, "inhibitory", len(units), notes)
-    inhibitory = None if kind is None else kind == 1
+    inhibitory = inhibitory_units(file, len(units), notes)
     chosen = selection.units(depth, inhibitory, len(units))
     spikes = [times - shift for times, wanted in zip(units, chosen, strict=True) if wanted]
     rates, course = _rates(spikes, start[rows], stop[rows], progress)

@@ -28,6 +28,7 @@ __all__ = [
     "animal_name",
     "contact_times",
     "flags",
+    "inhibitory_units",
     "last_time",
     "numbers",
     "spike_times",
@@ -156,6 +157,21 @@ def unit_column(file: "h5py.File", name: str, units: int, notes: list[str]) -> F
         notes.append(f"column units/{name} left out: it is not a number for each of {units} units")
         return None
     return values.astype(np.float64)
+
+
+def inhibitory_units(file: "h5py.File", units: int, notes: list[str]) -> NDArray[np.bool_] | None:
+    """Whether each unit is a putative inhibitory neuron, (unit,); None if that cannot be told."""
+    values = unit_column(file, "inhibitory", units, notes)
+    if values is None:
+        return None
+    odd = np.flatnonzero(~np.isin(values, (0, 1)))
+    if odd.size:
+        notes.append(
+            f"column units/inhibitory left out: {odd.size} of {units} are neither 0 nor 1, unit "
+            f"{odd[0]} is {values[odd[0]]:g}"
+        )
+        return None
+    return values == 1
 
 
 def starting_time(file: "h5py.File") -> float | None:

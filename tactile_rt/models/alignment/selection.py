@@ -85,7 +85,7 @@ class Selection:
             kept &= (depth >= low) & (depth < high)
         if self.cells is not None:
             if inhibitory is None:
-                raise ConfigError("has no column units/inhibitory to select by")
+                raise ConfigError("has no column units/inhibitory of 0 and 1 to select by")
             kept &= inhibitory == (self.cells == "inhibitory")
         return kept
 

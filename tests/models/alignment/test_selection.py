@@ -105,6 +105,23 @@ def test_what_nothing_is_left_of(folder, tmp_path):
         read_nwb([path], selection=Selection.of(depth="L4"))
 
 
+@pytest.mark.parametrize("odd", [np.nan, 2.0])
+def test_a_unit_that_is_neither_of_two_types_is_not_taken_for_excitatory(folder, tmp_path, odd):
+    path = tmp_path / "a.nwb"
+    path.write_bytes(files(folder)[0].read_bytes())
+    with h5py.File(path, "r+") as file:
+        kinds = file["units/inhibitory"][()].astype(float)
+        kinds[2] = odd
+        del file["units/inhibitory"]
+        file["units/inhibitory"] = kinds
+    (reading,), notes = read_nwb([path])
+    assert reading.session.inhibitory is None and reading.session.rates.shape[1] == len(kinds)
+    said = f"are neither 0 nor 1, unit 2 is {odd:g}"
+    assert [note for note in notes if said in note] and "1 of" in " ".join(notes)
+    with pytest.raises(ConfigError, match="no column units/inhibitory of 0 and 1 to select by"):
+        read_nwb([path], selection=Selection.of(cells="excitatory"))
+
+
 # Copies
 
 
