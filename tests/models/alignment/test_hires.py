@@ -137,3 +137,27 @@ def test_a_bad_file_drops_itself(folder, tmp_path):
     for paths, wanted in (([few], "no cell can be used: few"), ([tmp_path / "none"], "no .nwb")):
         with pytest.raises(ConfigError, match=wanted):
             read(paths)
+
+
+@pytest.mark.parametrize(
+    "place, value",
+    [
+        ("general/intracellular_ephys", 1.0),
+        ("acquisition/SpikeTrain/data", np.ones(3)),
+        ("acquisition/behavior/delta_kappa/data", np.array(["a"] * 5, dtype="S1")),
+        ("acquisition/behavior/touch_onset", np.zeros(4)),
+    ],
+)
+def test_a_file_of_another_build_drops_itself_whatever_reading_it_raises(tmp_path, place, value):
+    import h5py
+
+    good, odd = tmp_path / "good.nwb", tmp_path / "odd.nwb"
+    write(good, 1, "anm1", lambda s: 0.05 + 0.2 * (s > 0))
+    odd.write_bytes(good.read_bytes())
+    with h5py.File(odd, "r+") as file:
+        del file[place]
+        file[place] = value
+    contents = read([odd, good])
+    assert sum(len(a.sessions) for a in contents.animals) == 1
+    (note,) = contents.notes
+    assert note.startswith("odd.nwb left out: ") and "\n" not in note

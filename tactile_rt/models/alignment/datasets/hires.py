@@ -74,10 +74,11 @@ def _read(
         try:
             with h5py.File(path, "r") as file:
                 cells.append(_cell(file, path, samples))
-        except (OSError, KeyError, ValueError) as error:
-            notes.append(f"{path.name} left out: it cannot be read as one of these ({error})")
         except ConfigError as error:
             notes.append(f"{path.name} left out: {error}")
+        except Exception as error:  # of a damaged file HDF5 raises a dozen unrelated types
+            reason = " ".join(str(error).split()) or type(error).__name__
+            notes.append(f"{path.name} left out: it cannot be read as one of these ({reason})")
         progress(done / len(files))
     if not cells:
         raise ConfigError("no cell can be used: " + "; ".join(notes))
@@ -97,8 +98,8 @@ def _cell(file: "h5py.File", path: Path, samples: int) -> _Cell:
     """One file: a cell's responses to graded touches.
 
     Raises:
-        ConfigError: it has too few touches.
-        KeyError, ValueError: it is not such a file.
+        ConfigError: it has too few touches, or none that bends the whisker.
+        Exception: it is not such a file, of whatever type.
     """
     onset, offset = (_events(file, name) for name in ("touch_onset", "touch_offset"))
     bend = file["acquisition/behavior/delta_kappa"]
