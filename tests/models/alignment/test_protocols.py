@@ -82,6 +82,18 @@ def test_neither_the_order_of_trials_nor_of_sessions_nor_of_animals_matters():
         np.testing.assert_array_equal(a.unfiltered.rdm, b.unfiltered.rdm)
 
 
+def test_sessions_without_a_spike_are_no_copies_of_each_other():
+    rng = np.random.default_rng(3)
+    made = []
+    for animal in animals(rng, number=2, sessions=1):
+        one = animal.sessions[0]
+        silent = replace(one, name=f"{one.name}-silent", rates=np.zeros_like(one.rates),
+                         stimulus=np.repeat(np.arange(6), 20))  # fmt: skip
+        made.append(Animal(animal.name, (one, silent)))
+    units = [target.unfiltered.units for target in freeze_strict(made, BOOTSTRAPS).targets]
+    assert units == [80, 80]
+
+
 def test_units_that_respond_to_nothing_are_left_out():
     rng = np.random.default_rng(3)
     made = animals(rng, number=2, noise=3, units=40, idle=40)
