@@ -172,8 +172,7 @@ def score_models(
         write_page(results, html)
     for model in done:
         if model.score is None:
-            why = "no score: in no layer do its responses tell the stimuli apart"
-            typer.echo(f"{model.name}: {why}", err=True)
+            typer.echo(f"{model.name}: no score: {_why_none(results)}", err=True)
     if not told_as_json(results, json):
         _show_scores(results)
 
@@ -270,6 +269,17 @@ def needing_torch() -> Iterator[None]:
         yield
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
+
+
+def _why_none(results: Any) -> str:
+    b = results.benchmark
+    reliable = sum(b.reliable[: len(b.a2a)])
+    if b.protocol == "strict" and reliable < 2:
+        return (
+            f"the benchmark has {reliable} reliable animal, and a layer is chosen on the others: "
+            "two are needed"
+        )
+    return "in no layer do its responses tell the stimuli apart"
 
 
 def _performances(text: str | None, number: int) -> list[tuple[float, str] | None]:

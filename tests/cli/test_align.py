@@ -212,6 +212,12 @@ def test_a_model_to_which_all_is_the_same_has_no_score_and_it_says_so(call, froz
     assert "same: no score: in no layer do its responses tell the stimuli apart\n" in err
 
 
+def test_a_model_has_no_score_for_want_of_animals_and_it_says_so(call, frozen):
+    code, _, err = call("align", "score", MODEL, "--benchmark", frozen / "1.json")
+    said = "no score: the benchmark has 1 reliable animal, and a layer is chosen on the others"
+    assert code == 0 and f"mouse44: {said}: two are needed\n" in err
+
+
 def test_an_array_without_a_layer_s_name_is_refused(refused, frozen, tmp_path):
     np.save(tmp_path / "x.npy", np.ones((6, 20)))
     said = refused("align", "score", tmp_path / "x.npy", "--benchmark", frozen / "6.json")
