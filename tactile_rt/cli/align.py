@@ -185,6 +185,7 @@ def write_report(
     """Write one self-contained page of some scores on the same benchmark."""
     import msgspec
 
+    from tactile_rt.models.alignment.loading import told_apart
     from tactile_rt.models.alignment.report import write_page
     from tactile_rt.models.alignment.results import read_results
 
@@ -195,9 +196,13 @@ def write_report(
             raise ConfigError(
                 f"{path} was scored on another benchmark or other stimuli than {scores[0]}"
             )
-    write_page(
-        msgspec.structs.replace(read[0], models=tuple(m for one in read for m in one.models)), out
+    found = [(model, path) for path, one in zip(scores, read, strict=True) for model in one.models]
+    names = told_apart([model.name for model, _ in found], [path for _, path in found])
+    models = tuple(
+        msgspec.structs.replace(model, name=name)
+        for (model, _), name in zip(found, names, strict=True)
     )
+    write_page(msgspec.structs.replace(read[0], models=models), out)
     Console(stderr=True).print(f"{out}", highlight=False)
 
 

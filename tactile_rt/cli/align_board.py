@@ -1,6 +1,7 @@
 """`tactile-rt align board`: models by datasets by metrics; the datasets, and how they are got."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -163,7 +164,7 @@ def _board(
 ) -> "Alignments":
     from tactile_rt.models.alignment.board import joined, with_cells
     from tactile_rt.models.alignment.datasets import find_dataset
-    from tactile_rt.models.alignment.loading import check_models
+    from tactile_rt.models.alignment.loading import check_models, told_apart
     from tactile_rt.models.alignment.metrics import find_metric, metric_names
     from tactile_rt.models.alignment.stimuli_input import read_stimuli
     from tactile_rt.models.alignment.targets import part_of
@@ -174,7 +175,11 @@ def _board(
     for name in parts:
         part_of((), name)
     named = [_named(text) for text in data]
-    datasets = [(find_dataset(name), path) for name, path in named]
+    called = told_apart([name for name, _ in named], [path for _, path in named])
+    datasets = [
+        (replace(find_dataset(name), name=own), path)
+        for (name, path), own in zip(named, called, strict=True)
+    ]
     felt = read_stimuli(stimuli)
     files = list(zip(models, check_models(models), strict=True))
     boards = []

@@ -43,6 +43,10 @@ def test_score_report_and_a_baseline(call, frozen, tmp_path):
     again = tmp_path / "again.html"
     assert call("align", "report", scores, "--out", again)[0] == 0
     assert again.read_text() == page.read_text()
+    other = tmp_path / "other.json"
+    other.write_bytes(scores.read_bytes())
+    assert call("align", "report", scores, other, "--out", again)[0] == 0
+    assert "Fit of the layers of mouse44 (other.json)" in again.read_text()
     # The model is no worse than itself; random geometries are no match for it, though.
     told = tmp_path / "gate.json"
     code, out, _ = call(

@@ -1,6 +1,7 @@
 """`tactile-rt align board` and `align datasets`, on a made-up brain."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -42,6 +43,20 @@ def test_a_board_of_a_model_its_untrained_network_and_responses(call, brain, tmp
     ]
     assert made["datasets"][0]["units"] == 90
     assert "another animal" in out and page.read_text().startswith("<!doctype html>")
+
+
+def test_recordings_of_one_name_are_told_apart(call, brain, tmp_path):
+    other = shutil.copytree(brain / "recordings", tmp_path / "others")
+    files = ("--data", f"example={brain / 'recordings'}", "--data", f"example={other}")
+    board, page = tmp_path / "board.json", tmp_path / "board.html"
+    code, out, err = call(
+        "align", "board", *files, "--metric", "rsa", "--json", board, "--html", page
+    )
+    assert code == 0, err
+    made = json.loads(board.read_text())
+    names = [one["name"] for one in made["datasets"]]
+    assert names == [c["dataset"] for c in made["columns"]] == ["example", "example (others)"]
+    assert out.count("shares of") == page.read_text().count("<table>") == 2
 
 
 def test_another_seed_is_another_untrained_network(call, brain, tmp_path):

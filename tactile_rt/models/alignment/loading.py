@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 
 from tactile_rt.classifier.model_file import read_model
@@ -11,7 +12,7 @@ from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.models.checkpoint_files import describe_checkpoint
 from tactile_rt.stream import ConfigError, ModelError
 
-__all__ = ["check_models", "load_layers", "load_untrained"]
+__all__ = ["check_models", "load_layers", "load_untrained", "told_apart"]
 
 CHECKPOINT, BEST = ".pt", "best.pt"
 OF_GRID = "point.json"  # what a grid leaves in a run's folder, which is named for its rate
@@ -23,8 +24,8 @@ def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
 
     Returns:
         What to call each: what a file calls itself; a training run by its folder, one of a grid by
-        its task, and where runs are alike in that, by as many folders as tell them apart. Of two
-        that are called alike all the same the second has its file's name, too.
+        its task, and where runs are alike in that, by as many folders as tell them apart. What is
+        called alike all the same is told apart as `told_apart` has it.
 
     Raises:
         ModelError, ConfigError: one is not such a file.
@@ -38,9 +39,27 @@ def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
         called = {folder: "/".join(folder.parts[-depth:]) for folder in called}
     for path in paths:
         own = _own_name(path)
-        name = called[runs[path]] if path in runs else own
-        names.append(f"{name} ({path.name})" if name in names else name)
-    return tuple(names)
+        names.append(called[runs[path]] if path in runs else own)
+    return told_apart(names, paths)
+
+
+def told_apart(names: Sequence[str], paths: Sequence[Path]) -> tuple[str, ...]:
+    """Names of which no two are alike: what is called as one before has its file beside its name.
+
+    The file has as many folders as it takes, and one that is named again a number.
+    """
+    found: list[str] = []
+    for k, (name, path) in enumerate(zip(names, paths, strict=True)):
+        alike = [o.resolve().parts for n, o in zip(names[:k], paths[:k], strict=True) if n == name]
+        called = name
+        if name in found:
+            mine = path.resolve().parts
+            depths = range(1, len(mine) + 1)
+            differ = (d for d in depths if all(mine[-d:] != other[-d:] for other in alike))
+            called = f"{name} ({Path(*mine[-next(differ, 1) :])})"
+        again = (f"{called[:-1]}, {number})" for number in count(2))
+        found.append(called if called not in found else next(a for a in again if a not in found))
+    return tuple(found)
 
 
 def _run_name(folder: Path) -> str:

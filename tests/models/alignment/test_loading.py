@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.model_file import shipped_model
-from tactile_rt.models.alignment.loading import check_models
+from tactile_rt.models.alignment.loading import check_models, told_apart
 from tactile_rt.models.grid.outcomes import POINT
 from tests.helpers.source_tree import ROOT
 
@@ -60,3 +60,21 @@ def test_a_file_says_its_own_name(run, tmp_path):
 def test_one_run_named_twice_is_one_run(run):
     path = run("runs/mine")
     assert check_models([path, path]) == ("mine", "mine (best.pt)")
+    assert check_models([path] * 3)[2] == "mine (best.pt, 2)"
+
+
+def test_files_of_one_name_are_told_apart_by_the_folders_above(tmp_path):
+    paths = [tmp_path / folder / "model.npz" for folder in ("a", "b/x", "c/x", "d")]
+    for path in paths:
+        path.parent.mkdir(parents=True)
+        np.savez(path, hidden=np.ones((6, 3)))
+    assert check_models(paths) == (
+        "model", "model (x/model.npz)", "model (c/x/model.npz)", "model (d/model.npz)"
+    )  # fmt: skip
+
+
+def test_no_name_that_is_made_is_one_that_is_there():
+    paths = [Path(f"/runs/{name}") for name in ("a.onnx", "b.onnx", "c.onnx", "b.onnx")]
+    assert told_apart(["m (b.onnx)", "m", "m", "m"], paths) == (
+        "m (b.onnx)", "m", "m (c.onnx)", "m (b.onnx, 2)"
+    )  # fmt: skip
