@@ -1,6 +1,7 @@
 """`tactile-rt align gate`: may a model be released?"""
 
 import sys
+import traceback
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -56,7 +57,10 @@ def gate_model(
     try:
         code = _gate(model, benchmark, baseline, reference, stimuli, json)
     except (TactileError, OSError) as error:
-        typer.secho(f"tactile-rt: {error}", err=True, fg="red")
+        typer.secho(f"tactile-rt: {' '.join(str(error).splitlines())}", err=True, fg="red")
+        code = INPUT_ERROR
+    except Exception:  # a mistake of ours: Python would leave with 1, a verdict
+        traceback.print_exc()
         code = INPUT_ERROR
     sys.exit(code)
 

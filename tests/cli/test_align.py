@@ -2,10 +2,11 @@
 
 import json
 
+import msgspec
 import numpy as np
 import pytest
 
-from tactile_rt.classifier.model_file import shipped_model
+from tactile_rt.classifier.model_file import METADATA_KEY, read_model, shipped_model
 from tactile_rt.models.alignment import save_benchmark
 from tactile_rt.models.alignment.paper_code import freeze_paper_code
 from tactile_rt.models.alignment.published import write_published
@@ -145,6 +146,57 @@ def test_what_the_gate_cannot_read_is_an_input_error(call, frozen, tmp_path):
         assert err.startswith("tactile-rt: ") and err.count("\n") == 1, arguments
     for arguments in (("--no-such-option",), ()):
         assert call("align", "gate", *arguments)[0] == 3
+
+
+def test_a_mistake_of_ours_is_no_verdict(call, monkeypatch):
+    def broken(*_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("tactile_rt.models.alignment.fidelity.fidelity_check", broken)
+    code, out, err = call("align", "gate", MODEL, "--reference", MODEL)
+    assert (code, out) == (3, "") and "ZeroDivisionError" in err
+
+
+def test_a_file_that_only_fails_when_it_runs_is_an_input_error(call, tmp_path):
+    import onnx
+
+    model, odd = onnx.load(MODEL), tmp_path / "odd.onnx"
+    graph = model.graph
+    output = next(node for node in graph.node if "logits" in node.output)
+    output.output[list(output.output).index("logits")] = "before"
+    place = onnx.numpy_helper.from_array(np.array([99]), "place")
+    nought = onnx.numpy_helper.from_array(np.array(0, np.float32), "nought")
+    graph.initializer.extend([place, nought])
+    graph.node.extend(
+        onnx.helper.make_node(kind, inputs, outputs, **more)
+        for kind, inputs, outputs, more in (
+            ("Gather", ["samples", "place"], ["none"], {"axis": 1}),
+            ("ReduceSum", ["none"], ["sum"], {"keepdims": 0}),
+            ("Mul", ["sum", "nought"], ["zero"], {}),
+            ("Add", ["before", "zero"], ["logits"], {}),
+        )
+    )
+    onnx.save(model, odd)
+    for arguments in ((odd, "--reference", MODEL), (MODEL, "--reference", odd)):
+        code, out, err = call("align", "gate", *arguments)
+        assert (code, out) == (3, "")
+        assert "odd.onnx: its layers cannot be read" in err and err.count("\n") == 1
+
+
+def test_a_card_that_says_odd_things_of_its_training_is_scored(call, frozen, tmp_path):
+    import onnx
+
+    card = read_model(MODEL)[0]
+    for what, value in (("training", "none"), ("network", ["gru"]), ("training", {"masking": []})):
+        said = {**card.provenance, what: value}
+        text = msgspec.json.encode(msgspec.structs.replace(card, provenance=said)).decode()
+        model = onnx.load(MODEL)
+        onnx.helper.set_model_props(model, {METADATA_KEY: text})
+        onnx.save(model, tmp_path / "odd.onnx")
+        code, out, err = call(
+            "align", "score", tmp_path / "odd.onnx", "--benchmark", frozen / "6.json"
+        )
+        assert code == 0 and "mouse44" in out, err
 
 
 def test_decode(call, frozen, tmp_path):

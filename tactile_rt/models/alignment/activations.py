@@ -9,7 +9,7 @@ and on what else is in the batch.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tactile_rt.classifier.model_card import ModelCard
-from tactile_rt.models.alignment.layers import Layers
+from tactile_rt.models.alignment.layers import Layers, table
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.models.attenders.gpt import GPT, TOKENS
 from tactile_rt.models.attenders.mamba import MambaStack
@@ -54,18 +54,18 @@ def checkpoint_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, dict[s
         ConfigError: the stimuli are of another array.
     """
     model, saved = load_checkpoint(path)
-    timing = model.timing
+    timing, period = model.timing, saved.get("period_ns")  # which earlier ones do not say
     stimuli.check(
         ArraySpec.from_json(saved["spec"]),
         timing.steps,
         timing.substeps,
         str(path),
-        saved.get("period_ns"),  # which earlier checkpoints do not say
+        period if isinstance(period, int) else None,
     )
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     name = path.resolve().parent.name if path.stem in ("best", "last") else path.stem
     layers = network_layers(model, stimuli, name, sha256)
-    return replace(layers, training=saved.get("config", {})), saved
+    return replace(layers, training=table(saved.get("config"))), saved
 
 
 def untrained_layers(saved: dict[str, Any], stimuli: StimuliInput, seed: int = 0) -> Layers:
@@ -146,7 +146,7 @@ def network_layers(
 
 def _begun(model: TactileClassifier, training: object) -> TactileClassifier:
     """With the first weights that its training drew, as far as that is known."""
-    paper = isinstance(training, Mapping) and training.get("first_weights") == "paper"
+    paper = table(training).get("first_weights") == "paper"
     if paper and isinstance(model.network.encoder, GraphEncoder):
         draw_as_published(model.network.encoder)
     return model

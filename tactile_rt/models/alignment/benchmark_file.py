@@ -103,7 +103,7 @@ def load_benchmark(path: Path) -> Benchmark:
                 "build the benchmark again"
             )
         file = msgspec.json.decode(text, type=_File)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"{path}: not an alignment benchmark ({error})") from None
     if file.sha256 != _sha256(file):
         raise ConfigError(f"{path}: changed since it was built: build it again")

@@ -279,7 +279,7 @@ def read_board(path: Path) -> Alignments:
                 f"{path} has a board of version {head.get('version')!r}, not {VERSION}"
             )
         return msgspec.json.decode(raw, type=Alignments)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(
             f"{path} is damaged, or not what `tactile-rt align board --json` wrote: {error}"
         ) from None

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PARTS", "Layers", "first_difference"]
+__all__ = ["PARTS", "Layers", "first_difference", "table"]
 
 PARTS = ("encoder", "attender", "decoder")  # every layer's name begins with one of them and a dot
 # Lanes of one batch that compute the same may differ by rounding.
@@ -48,6 +48,11 @@ class Layers:
             name: trace[:, self.first[name] :].mean(axis=1, dtype=np.float64)
             for name, trace in self.traces.items()
         }
+
+
+def table(value: object) -> Mapping[str, object]:
+    """What a file says under a name, where that is a table; else an empty one."""
+    return value if isinstance(value, dict) else {}
 
 
 def first_difference(trace: NDArray[np.float32]) -> int:

@@ -171,7 +171,7 @@ def inhibitory_units(file: "h5py.File", units: int, notes: list[str]) -> NDArray
             f"{odd[0]} is {values[odd[0]]:g}"
         )
         return None
-    return values == 1
+    return np.asarray(values == 1)
 
 
 def starting_time(file: "h5py.File") -> float | None:

@@ -6,7 +6,8 @@ steps of a stimulus, a window, which is a `Scan` over the same step, once.
 """
 
 import hashlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_file import ModelCard, load_model
 from tactile_rt.classifier.runtime import FlushDenormals
-from tactile_rt.models.alignment.layers import Layers, first_difference
+from tactile_rt.models.alignment.layers import Layers, first_difference, table
 from tactile_rt.models.alignment.onnx_taps import (
     GRU_LAYERS,
     float_tensors,
@@ -27,12 +28,13 @@ from tactile_rt.models.alignment.onnx_taps import (
     step_graph,
 )
 from tactile_rt.models.alignment.stimuli_input import STEPS, StimuliInput
-from tactile_rt.stream import ModelError
+from tactile_rt.stream import ModelError, TactileError
 
 __all__ = ["nearest_taps", "onnx_layers", "with_outputs"]
 
 Floats = NDArray[np.float32]
 TOKENS = 2  # of a GPT attender's step, the action token last
+REASON = 300  # characters of what onnxruntime says
 TAP = "tap:"  # prefix of the outputs that are added
 
 
@@ -50,15 +52,16 @@ def onnx_layers(
         ModelError: not there, damaged, or not a model of this package.
         ConfigError: the stimuli are of another array.
     """
-    plain, card, model = _opened(path, stimuli)
-    taps = named_taps(model) if taps is None else taps
-    tensors = list(dict.fromkeys(taps.values()))
-    logits, _ = _run(plain, stimuli, card, ())
-    session = _session(with_outputs(model, tensors))
-    tapped, found = _run(session, stimuli, card, tensors)
-    traces = _traces(taps, found)
-    unlike, found = _run(session, _unlike(stimuli), card, tensors)
-    others = _traces(taps, found)
+    with _readable(path):
+        plain, card, model = _opened(path, stimuli)
+        taps = named_taps(model) if taps is None else taps
+        tensors = list(dict.fromkeys(taps.values()))
+        logits, _ = _run(plain, stimuli, card, ())
+        session = _session(with_outputs(model, tensors))
+        tapped, found = _run(session, stimuli, card, tensors)
+        traces = _traces(taps, found)
+        unlike, found = _run(session, _unlike(stimuli), card, tensors)
+        others = _traces(taps, found)
     notes = []
     if not np.array_equal(logits, tapped):
         worst = float(np.abs(logits - tapped).max())
@@ -74,8 +77,8 @@ def onnx_layers(
         parameters=sum(int(np.prod(i.dims)) for i in model.graph.initializer if len(i.dims) > 1),
         precision=precision_of(model),
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
-        network=card.provenance.get("network", {}),
-        training=card.provenance.get("training", {}),
+        network=table(card.provenance.get("network")),
+        training=table(card.provenance.get("training")),
         notes=tuple(notes),
     ), card
 
@@ -94,11 +97,12 @@ def nearest_taps(path: Path, stimuli: StimuliInput, wanted: Mapping[str, Floats]
     Raises:
         ModelError, ConfigError: as `onnx_layers`.
     """
-    _, card, model = _opened(path, stimuli)
-    names = float_tensors(model)
-    # One stimulus and the last step tell them apart, and of all tensors that is much already.
-    session = _session(with_outputs(model, names))
-    _, found = _run(session, stimuli, card, names, (0,), (STEPS - 1,))
+    with _readable(path):
+        _, card, model = _opened(path, stimuli)
+        names = float_tensors(model)
+        # One stimulus and the last step tell them apart, and of all tensors that is much already.
+        session = _session(with_outputs(model, names))
+        _, found = _run(session, stimuli, card, names, (0,), (STEPS - 1,))
     taps: dict[str, str] = {}
     for layer, trace in wanted.items():
         goal = trace[0, -1]
@@ -136,8 +140,21 @@ def with_outputs(model: onnx.ModelProto, tensors: Iterable[str]) -> onnx.ModelPr
         if scan is not None:
             scan.output.append(f"{TAP}{name}_steps")
             copy.graph.output.append(onnx.ValueInfoProto(name=f"{TAP}{name}_steps"))
-            next(a for a in scan.attribute if a.name == "scan_output_axes").ints.append(0)
+            for axes in (a for a in scan.attribute if a.name == "scan_output_axes"):
+                axes.ints.append(0)  # as it is unless told
     return copy
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    """Say of which file it is that onnxruntime cannot run it, or that it is not as ours are."""
+    try:
+        yield
+    except TactileError:
+        raise
+    except Exception as error:  # onnxruntime raises a dozen unrelated types
+        reason = " ".join(str(error).split())[:REASON] or type(error).__name__
+        raise ModelError(f"{path}: its layers cannot be read ({reason})") from None
 
 
 def _opened(

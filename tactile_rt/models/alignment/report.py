@@ -288,7 +288,7 @@ def _masking(results: Results) -> str:
     """Models that differ in the masking of steps alone, beside each other."""
     families: dict[tuple[tuple[str, str], ...], list[ModelResult]] = {}
     for model in results.models:
-        if "masking" in model.groups:
+        if _is_number(model.groups.get("masking", "")):
             rest = tuple(sorted((k, v) for k, v in model.groups.items() if k != "masking"))
             families.setdefault(rest, []).append(model)
     rows = [
@@ -306,6 +306,13 @@ def _masking(results: Results) -> str:
         "<th>steps masked</th><th>task performance</th><th>score ± s.e.m.</th></tr>"
         f"{''.join(rows)}</table></div>"
     )
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def _percent(share: str) -> str:

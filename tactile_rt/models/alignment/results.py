@@ -1,8 +1,9 @@
 """Scores at rest: one JSON file that a report is drawn from and a gate compares with."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -31,7 +32,8 @@ __all__ = [
 ]
 
 VERSION = 1
-Number = float | None  # None in the file where there is no value
+# None in the file where there is no value; what is larger cannot be drawn.
+Number = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)] | None
 
 
 class AlignmentControl(msgspec.Struct, frozen=True):
@@ -225,21 +227,49 @@ def read_results(path: Path) -> Results:
                 f"{path} has scores of version {head.get('version')!r}, not {VERSION}"
             )
         results = msgspec.json.decode(raw, type=Results)
-    except msgspec.MsgspecError as error:
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(
             f"{path} is damaged, or not what `tactile-rt align score --json` wrote: {error}"
         ) from None
-    targets = len(results.benchmark.targets)
-    for model in results.models:
-        shapes = {len(model.rdms), len(model.corrected), len(model.units), len(model.first)}
-        wide = {len(row) for row in model.corrected} | {len(model.per_target)}
-        if (
-            shapes != {len(model.layers)}
-            or wide != {targets}
-            or {len(row) for row in model.rdms} != {len(PAIRS)}
-        ):
-            raise ConfigError(f"{path} is damaged: the tables of {model.name} do not fit")
+    for what, fits in _fitting(results):
+        if not fits:
+            raise ConfigError(f"{path} is damaged: the tables of {what} do not fit")
     return results
+
+
+def _fitting(results: Results) -> Iterator[tuple[str, bool]]:
+    """Whose tables they are, and whether they are of the sizes that the types cannot say."""
+    benchmark, raw = results.benchmark, results.raw
+    targets = len(benchmark.targets)
+    told = (benchmark.reliable, benchmark.factors, benchmark.reliabilities)
+    yield (
+        "the benchmark",
+        {len(values) for values in told} <= {targets}
+        and _is_table(benchmark.rdms, targets, len(PAIRS))
+        and set(benchmark.a2a) == set(benchmark.targets[: len(benchmark.a2a)])
+        and results.stimuli == STIMULI,
+    )
+    yield (
+        raw.name,
+        raw.layers == ("raw",)
+        and _is_table(raw.corrected, 1, targets)
+        and len(results.raw_rdm) == len(PAIRS),
+    )
+    for model in results.models:
+        layers, before = len(model.layers), model.untrained
+        yield (
+            model.name,
+            len(model.units) == len(model.first) == layers
+            and len(model.per_target) == len(model.chosen) == targets
+            and _is_table(model.rdms, layers, len(PAIRS))
+            and _is_table(model.corrected, layers, targets)
+            and _is_table(model.unfiltered, layers, targets)
+            and (before is None or _is_table(before.corrected, len(before.layers), targets)),
+        )
+
+
+def _is_table(rows: Sequence[Sequence[Number]], number: int, width: int) -> bool:
+    return len(rows) == number and all(len(row) == width for row in rows)
 
 
 def baseline_of(path: Path, benchmark: Benchmark, stimuli: StimuliInput) -> NDArray[np.float64]:
@@ -276,7 +306,7 @@ def _groups(layers: Layers) -> dict[str, str]:
     told = {key: layers.network.get(key) for key in ("encoder", "attender")}
     told |= {key: layers.training.get(key) for key in ("objective", "augmentation", "masking")}
     return {
-        key: f"{value:g}" if isinstance(value, float | int) else str(value)
+        key: f"{value:g}" if isinstance(value, float) else str(value)
         for key, value in told.items()
         if value is not None
     }

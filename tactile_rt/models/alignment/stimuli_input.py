@@ -105,7 +105,14 @@ def read_stimuli(path: Path | None = None) -> StimuliInput:
     except FileNotFoundError:
         raise ConfigError(f"no file {path}: make one with `tactile-rt whisk`") from None
     except Exception as error:  # numpy and zipfile raise many unrelated types for a damaged file
-        raise ConfigError(f"{path} is no model input of `tactile-rt whisk`: {error}") from None
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"{path} is no model input of `tactile-rt whisk`: {reason}") from None
+    for what in ("stimuli", "elements", "channels", "units"):
+        text = arrays[what]
+        if text.ndim != 1 or text.dtype.kind != "U":
+            raise ConfigError(f"{path}: {what} are {text.dtype} {text.shape}, not a row of names")
+        if what != "units" and len(set(text.tolist())) < len(text):
+            raise ConfigError(f"{path}: two {what} have one name")
     names = [str(n) for n in arrays["stimuli"]]
     missing = [n for n in STIMULI if n not in names]
     if missing:
@@ -119,7 +126,9 @@ def read_stimuli(path: Path | None = None) -> StimuliInput:
         raise ConfigError(
             f"{path}: values are {values.shape}, not (stimulus, sample, element, channel) {shape}"
         )
-    if not np.isfinite(values).all():
+    if values.dtype.kind not in "fiu":
+        raise ConfigError(f"{path}: values are {values.dtype}, not numbers")
+    if not (np.abs(values) <= np.finfo(np.float32).max).all():
         raise ConfigError(f"{path} has samples that are not finite")
     if unknown := sorted(set(units) - set(CHANNEL_FLOOR)):
         raise ConfigError(f"{path}: channels in {', '.join(unknown)} cannot be scored")
