@@ -1,7 +1,7 @@
 """Scores at rest: one JSON file that a report is drawn from and a gate compares with."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -14,7 +14,7 @@ from tactile_rt.models.alignment.benchmark import Benchmark
 from tactile_rt.models.alignment.benchmark_file import benchmark_sha256
 from tactile_rt.models.alignment.gate import neural_checks
 from tactile_rt.models.alignment.layers import Layers
-from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, rdm
+from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, normalised, rdm
 from tactile_rt.models.alignment.scoring import Score, score
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.stream import ConfigError
@@ -195,11 +195,27 @@ def model_result(
         untrained=(
             _control(untrained.name, score(benchmark, untrained.patterns)) if untrained else None
         ),
-        notes=layers.notes,
+        notes=(*layers.notes, *_without_rdm(patterns)),
         groups=_groups(layers),
         turing=test.verdict if test else "",
         turing_why=test.why if test else "",
     ), made
+
+
+def _without_rdm(patterns: Mapping[str, NDArray[np.float64]]) -> Iterator[str]:
+    """What takes no part in a score, and why: a line for all layers of one reason."""
+    found: dict[tuple[str, ...], list[str]] = {}
+    for layer, responses in patterns.items():
+        there = np.asarray(np.isfinite(normalised(responses)).all(axis=1))
+        if not there.all():
+            alike = tuple(s for s, one in zip(STIMULI, there, strict=True) if not one)
+            found.setdefault(alike, []).append(layer)
+    for alike, layers in found.items():
+        stimuli = "every stimulus" if len(alike) == len(STIMULI) else ", ".join(alike)
+        yield (
+            f"{len(layers)} of {len(patterns)} layers have no RDM and take no part, for all units "
+            f"of each answer {stimuli} alike: {', '.join(layers)}"
+        )
 
 
 def write_results(results: Results, path: Path) -> None:

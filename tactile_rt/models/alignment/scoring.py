@@ -65,7 +65,7 @@ class Score:
 
 
 def layer_rdms(layers: Mapping[str, ArrayLike]) -> Floats:
-    """RDMs (layer, 15) of responses (6, unit) in the order of `STIMULI`.
+    """RDMs (layer, 15) of responses (6, unit) in the order of `STIMULI`; NaN of a single unit's.
 
     Raises:
         ConfigError: a layer of another shape.
@@ -73,10 +73,9 @@ def layer_rdms(layers: Mapping[str, ArrayLike]) -> Floats:
     rdms = np.empty((len(layers), len(PAIRS)))
     for i, (name, values) in enumerate(layers.items()):
         patterns = np.asarray(values, dtype=np.float64)
-        if patterns.ndim != 2 or patterns.shape[0] != len(STIMULI) or patterns.shape[1] < 2:
+        if patterns.ndim != 2 or patterns.shape[0] != len(STIMULI) or patterns.shape[1] < 1:
             raise ConfigError(
-                f"layer {name}: responses {patterns.shape}, not ({len(STIMULI)} stimuli, 2 or "
-                "more units)"
+                f"layer {name}: responses {patterns.shape}, not ({len(STIMULI)} stimuli, units)"
             )
         rdms[i] = rdm(patterns)
     return rdms

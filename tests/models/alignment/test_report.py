@@ -227,6 +227,28 @@ def test_tables_that_do_not_fit(results, tmp_path):
         read_results(path)
 
 
+def test_layers_that_take_no_part_are_told_with_the_stimuli_that_they_are_silent_to(benchmark):
+    """As those of a single whisker, which one stimulus does not touch."""
+    rng = np.random.default_rng(2)
+    traces = {f"encoder.{i}": rng.normal(size=(6, 1, 5)).astype(np.float32) for i in range(3)}
+    traces |= {"encoder.one": rng.normal(size=(6, 1, 1)).astype(np.float32)}
+    for name in ("encoder.0", "encoder.2"):
+        traces[name][2] = 0
+    layers = Layers("m", traces, dict.fromkeys(traces, 0), np.zeros((6, 1, 2), np.float32), 1)
+    result, _ = model_result(benchmark, layers)
+    assert [row[0] is None for row in result.rdms] == [False, False, False, True]
+    assert [None in row for row in result.rdms] == [True, False, True, True]
+    why = "layers have no RDM and take no part, for all units of each answer"
+    assert result.notes == (
+        f"2 of 4 {why} convex-far alike: encoder.0, encoder.2",
+        f"1 of 4 {why} every stimulus alike: encoder.one",
+    )
+    touched = read_stimuli()
+    alone = replace(touched, samples=touched.samples[..., :1, 5:], sigma=touched.sigma[:, :1, 5:])
+    raw = results_of(benchmark, alone, [result]).raw
+    assert raw.score is None and alone.raw().shape == (6, 1)
+
+
 def test_a_baseline_is_one_model_on_the_same_benchmark_and_stimuli(results, benchmark, tmp_path):
     path, felt = tmp_path / "scores.json", read_stimuli()
     write_results(results, path)
