@@ -1,9 +1,11 @@
 """Contact finding on the test objects of a sweep set: the network beside the classical estimates.
 
 Every stored sample after the lead counts, of every whisker. Distances are compared where a whisker
-truly touches, whether or not that was found out. Intervals are 95 % bootstraps over objects.
+truly touches, whether or not that was found out. Intervals are 95 % bootstraps over objects; a
+draw in which no object is touched tells nothing, and is not counted.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -172,6 +174,8 @@ def _distances(
     found["middle"] = np.full(len(wanted), np.median(wanted / length)) * length
     records, felt = [], split.force[true] >= FELT_N
     for where, some in (("all", np.ones_like(felt)), ("felt", felt)):
+        if not some.any():
+            continue
         weights = _draws(int(split.objects.max()) + 1)[:, split.objects[row[some]]]
         for who, estimate in found.items():
             error = np.abs(estimate - wanted)[some]
@@ -195,37 +199,50 @@ def _f1(
     found: NDArray[np.bool_] | float,
     true: NDArray[np.bool_] | float,
 ) -> float:
-    return float(2 * np.sum(both) / max(np.sum(found) + np.sum(true), 1))
+    return float(2 * np.sum(both) / (np.sum(found) + np.sum(true))) if np.any(true) else math.nan
 
 
 def _draws(objects: int) -> Weights:
-    """(1 + RESAMPLES, object) how often each is drawn; first every one once, as it is."""
+    """(1 + RESAMPLES, object) how often each is drawn; first every one once, as it is.
+
+    Of a single object there is that alone: drawing it again tells nothing.
+    """
+    if objects == 1:
+        return np.ones((1, 1))
     rng = np.random.default_rng(0)
     drawn = rng.multinomial(objects, np.full(objects, 1 / objects), RESAMPLES)
     return np.concatenate([np.ones((1, objects)), drawn])
 
 
 def _interval(values: Weights | list[float], how: str, between: str = "; ") -> str:
-    low, high = np.percentile(values[1:], [2.5, 97.5])
+    drawn = np.array(values[1:])
+    if np.isnan(drawn).all():
+        return f"no interval: touches of one object{between}{how}"
+    low, high = np.nanpercentile(drawn, [2.5, 97.5])
     return f"[{low:.4g}, {high:.4g}]{between}{how}"
 
 
 def weighted_quantile(values: NDArray[np.float64], weights: Weights, share: float) -> Weights:
-    """Quantiles (draw,) of values (n,) under each row of weights (draw, n)."""
+    """Quantiles (draw,) of values (n,) under each row of weights (draw, n); NaN where all are 0."""
     order = np.argsort(values)
-    out = np.empty(len(weights))
+    out = np.full(len(weights), np.nan)
     for i, w in enumerate(weights):
-        below = np.cumsum(w[order])
-        out[i] = values[order[np.searchsorted(below, share * below[-1])]]
+        if w.any():
+            below = np.cumsum(w[order])
+            out[i] = values[order[np.searchsorted(below, share * below[-1])]]
     return out
 
 
 def weighted_auroc(score: Floats, true: NDArray[np.bool_], weights: Weights) -> Weights:
-    """AUROC (draw,) of scores (n,) for true against not, under each row of weights (draw, n)."""
+    """AUROC (draw,) of scores (n,) for true against not, under each row of weights (draw, n).
+
+    NaN where the weights leave none of either.
+    """
     _, rank = np.unique(score, return_inverse=True)
-    out = np.empty(len(weights))
+    out = np.full(len(weights), np.nan)
     for i, w in enumerate(weights):
         yes = np.bincount(rank, weights=w * true)
         no = np.bincount(rank, weights=w * ~true)
-        out[i] = yes @ (np.cumsum(no) - no / 2) / (yes.sum() * no.sum())
+        if yes.any() and no.any():
+            out[i] = yes @ (np.cumsum(no) - no / 2) / (yes.sum() * no.sum())
     return out

@@ -1,7 +1,9 @@
 """The contact network on a set whose answer is known in closed form: straight, stiff whiskers."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from tactile_rt.evidence.locating import (
     weighted_auroc,
     weighted_quantile,
 )
+from tactile_rt.evidence.records import Record
 from tactile_rt.models.contact_regression import (
     ContactConfig,
     ContactNetwork,
@@ -172,6 +175,70 @@ def test_weighted_figures_are_those_of_repeated_samples() -> None:
         repeated = np.repeat(score, times)
         assert area == pytest.approx(roc_auc_score(np.repeat(true, times), repeated))
         assert middle == np.quantile(repeated.astype(float), 0.5, method="inverted_cdf")
+
+
+def test_a_draw_without_a_touch_tells_nothing() -> None:
+    score, true = np.array([1.0, 2.0, 3.0], np.float32), np.array([True, False, False])
+    weights = np.array([[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 0.0, 0.0]])
+    assert np.array_equal(
+        weighted_auroc(score, true, weights), [0.0, np.nan, np.nan], equal_nan=True
+    )
+    errors = np.array([0.5, 0.7])
+    found = weighted_quantile(errors, np.array([[1.0, 1.0], [0.0, 0.0], [0.0, 2.0]]), 0.5)
+    assert np.array_equal(found, [0.5, np.nan, 0.7], equal_nan=True)
+    assert np.isnan(weighted_quantile(np.empty(0), np.empty((2, 0)), 0.5)).all()
+
+
+def keep_touches(folder: Path, out: Path, kept: dict[str, int], force: float = 1.0) -> Path:
+    """A copy of a set, of which some objects are touched in their first samples of all alone."""
+    manifest = SweepManifest.read(folder)
+    manifest.write(out)
+    for name in manifest.names():
+        with np.load(folder / f"{name}.npz") as arrays:
+            values, contacts = arrays["values"] * np.float32(force), arrays["contacts"]
+        touched = np.flatnonzero(np.isfinite(contacts))
+        contacts.ravel()[touched[kept.get(name, len(touched)) :]] = np.nan
+        write_object(out, name, values, {}, contacts)
+    return out
+
+
+def lowest(record: Record) -> float:
+    """The lower end of a figure's interval."""
+    return float(record.how.partition("[")[2].partition(",")[0])
+
+
+def test_objects_that_are_not_touched_make_no_interval_lower(
+    folder: Path, trained: Path, tmp_path: Path
+) -> None:
+    test = SweepManifest.read(folder).split["test"]
+    two = keep_touches(folder, tmp_path / "two", dict.fromkeys(test[1:], 0))
+    records = {r.name: r for r in contact_records(trained, two)}
+    # All touches are of one object: whenever it is drawn, its errors are the same.
+    for what in ("median", "p95"):
+        figure = records[f"contact.clean.network.all.{what}"]
+        assert lowest(figure) == pytest.approx(figure.value, rel=1e-3)
+    assert lowest(records["contact.clean.network.f1"]) > 0
+    assert np.isfinite(lowest(records["contact.clean.network.auroc"]))
+
+
+def test_a_set_of_faint_touches_has_no_figures_of_felt_ones(
+    folder: Path, trained: Path, tmp_path: Path
+) -> None:
+    faint = keep_touches(folder, tmp_path / "faint", {}, force=1e-6)
+    names = {r.name for r in contact_records(trained, faint)}
+    assert "contact.clean.network.all.median" in names
+    assert not any(".felt." in name for name in names)
+
+
+def test_one_object_has_figures_but_no_interval(folder: Path, trained: Path) -> None:
+    whole = SweepManifest.read(folder)
+    manifest = replace(whole, split={**whole.split, "test": whole.split["test"][:1]})
+    (folder / "manifest.json").write_bytes(msgspec.json.encode(manifest))
+    try:
+        records = contact_records(trained, folder)
+    finally:
+        (folder / "manifest.json").write_bytes(msgspec.json.encode(whole))
+    assert all(r.how.startswith("no interval: touches of one object; ") for r in records)
 
 
 def test_what_does_not_fit_is_told(folder: Path, trained: Path, tmp_path: Path) -> None:
