@@ -37,6 +37,8 @@ UNITS = ("N",) * 3 + ("N m",) * 3  # force, then moment
 FLOOR = tuple(CHANNEL_FLOOR[unit] for unit in UNITS)  # what the detector takes for least noise
 FAINT_N = 1e-6  # of force: below it the ratio of moment to force fades to nothing
 SHARP = 20.0  # errors of distance beyond 1 / SHARP of the length count linearly (Huber)
+MOST = {"hidden": 1024, "learning_rate": 1.0}  # beyond which nothing is learnt, or nothing fits
+FEWEST_UPDATES = 11  # of a schedule: the rise to its peak, a tenth, must have a step
 UNTOUCHED = 0.1  # of the whiskers that a sweep never touches, how many are learnt from
 
 Floats = NDArray[np.float32]
@@ -66,6 +68,11 @@ class ContactConfig:
         for name in ("hidden", "epochs", "batch", "learning_rate"):
             if not getattr(self, name) > 0:
                 raise ConfigError(f"{name} must be positive, not {getattr(self, name)}")
+        for name, most in MOST.items():
+            if getattr(self, name) > most:
+                raise ConfigError(f"{name} must be at most {most:g}, not {getattr(self, name)}")
+        if not 0 <= self.seed < 2**32:
+            raise ConfigError(f"seed must be 0 to {2**32 - 1}, not {self.seed}")
 
 
 class ContactNetwork(nn.Module):
@@ -194,10 +201,16 @@ def train_contacts(
     updates = config.epochs * (math.ceil(len(rows) / config.batch) + 2)
     optimizer = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=1e-2)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
-        optimizer, config.learning_rate, updates, pct_start=0.1, cycle_momentum=False
+        optimizer,
+        config.learning_rate,
+        max(updates, FEWEST_UPDATES),
+        pct_start=0.1,
+        cycle_momentum=False,
     )
-    held_out = [(tared(validation, level, seed=1), known) for level in (0.0, 1.0)]
     every = np.argwhere(np.isfinite(known).any(axis=1))
+    if not len(every):
+        raise ConfigError("no whisker touches anything in the validation split: make more sweeps")
+    held_out = [(tared(validation, level, seed=1), known) for level in (0.0, 1.0)]
     best = math.inf
     for epoch in range(config.epochs):
         # Half of the whiskers without noise, the others with this epoch's.
@@ -206,7 +219,8 @@ def train_contacts(
         batches = [
             (which, at)
             for which, half in zip(felt, halves, strict=True)
-            for at in np.array_split(half, math.ceil(len(half) / config.batch))
+            for at in np.array_split(half, max(1, math.ceil(len(half) / config.batch)))
+            if len(at)
         ]
         losses = []
         for k in rng.permutation(len(batches)):

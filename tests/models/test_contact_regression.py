@@ -19,6 +19,7 @@ from tactile_rt.evidence.locating import (
     weighted_quantile,
 )
 from tactile_rt.evidence.records import Record
+from tactile_rt.models import contact_regression
 from tactile_rt.models.contact_regression import (
     ContactConfig,
     ContactNetwork,
@@ -177,6 +178,45 @@ def test_weighted_figures_are_those_of_repeated_samples() -> None:
         assert middle == np.quantile(repeated.astype(float), 0.5, method="inverted_cdf")
 
 
+def touched_once(data: SweepSet, times: int = 1) -> SweepSet:
+    """The sweeps, of which one whisker of one is touched, in so many samples."""
+    contacts = np.full_like(data.sweeps.contacts, np.nan)
+    contacts[0, LEAD : LEAD + times, 0] = 0.01
+    return replace(data, sweeps=replace(data.sweeps, contacts=contacts))
+
+
+def test_it_learns_from_a_single_touch(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(contact_regression, "UNTOUCHED", 0.0)
+    train, held = SweepSet.read(folder, "train"), SweepSet.read(folder, "validation")
+    few = ContactConfig(8, 1, 64)
+    train_contacts(touched_once(train), touched_once(held), SHAPES, few, tmp_path / "x.pt")
+    assert (tmp_path / "x.pt").exists()
+
+
+def test_where_nothing_touches_is_told(folder: Path, tmp_path: Path) -> None:
+    train, held = SweepSet.read(folder, "train"), SweepSet.read(folder, "validation")
+    for split, one, other in (
+        ("training", touched_once(train, 0), held),
+        ("validation", train, touched_once(held, 0)),
+    ):
+        with pytest.raises(ConfigError, match=f"no whisker touches anything in the {split} split"):
+            train_contacts(one, other, SHAPES, ContactConfig(8, 1), tmp_path / "x.pt")
+    assert not (tmp_path / "x.pt").exists()
+
+
+@pytest.mark.parametrize("batches", [1, 7, 8, 9])
+def test_every_number_of_updates_has_a_schedule(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batches: int
+) -> None:
+    monkeypatch.setattr(contact_regression, "UNTOUCHED", 0.0)
+    train, held = SweepSet.read(folder, "train"), SweepSet.read(folder, "validation")
+    touched = np.isfinite(train.sweeps.contacts).any(axis=1).sum()
+    some = ContactConfig(4, 1, int(np.ceil(touched / batches)))
+    train_contacts(train, held, SHAPES, some, tmp_path / "x.pt")
+
+
 def test_a_draw_without_a_touch_tells_nothing() -> None:
     score, true = np.array([1.0, 2.0, 3.0], np.float32), np.array([True, False, False])
     weights = np.array([[1.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 0.0, 0.0]])
@@ -250,8 +290,16 @@ def test_what_does_not_fit_is_told(folder: Path, trained: Path, tmp_path: Path) 
     with pytest.raises(ConfigError, match="holds no contacts"):
         train_contacts(plain, plain, SHAPES, ContactConfig(), tmp_path / "x.pt")
     assert not (tmp_path / "x.pt").exists()
-    with pytest.raises(ConfigError, match="hidden must be positive, not 0"):
-        ContactConfig(hidden=0)
+    for wrong, said in (
+        ({"hidden": 0}, "hidden must be positive, not 0"),
+        ({"hidden": 10**9}, "hidden must be at most 1024, not 1000000000"),
+        ({"learning_rate": float("nan")}, "learning_rate must be positive, not nan"),
+        ({"learning_rate": float("inf")}, "learning_rate must be at most 1, not inf"),
+        ({"seed": -1}, "seed must be 0 to 4294967295, not -1"),
+        ({"seed": 2**70}, "seed must be 0 to 4294967295"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            ContactConfig(**wrong)
     (tmp_path / "bad.pt").write_bytes(b"nothing")
     with pytest.raises(ConfigError, match=r"bad\.pt is no network of `tactile-rt locate train`"):
         load_contacts(tmp_path / "bad.pt")
