@@ -41,6 +41,7 @@ Weights = NDArray[np.float64]
 FELT_N = 30e-6  # of transverse force: three times the rated noise
 AVERAGED = 5  # samples that the best classical estimate averages over under noise
 RESAMPLES = 200
+NO_INTERVAL = "no interval: touches of one object"
 LEVELS = {"clean": 0.0, "noisy": 1.0}  # in units of the rated noise
 
 
@@ -217,7 +218,7 @@ def _draws(objects: int) -> Weights:
 def _interval(values: Weights | list[float], how: str, between: str = "; ") -> str:
     drawn = np.array(values[1:])
     if np.isnan(drawn).all():
-        return f"no interval: touches of one object{between}{how}"
+        return how if how.startswith(NO_INTERVAL) else f"{NO_INTERVAL}{between}{how}"
     low, high = np.nanpercentile(drawn, [2.5, 97.5])
     return f"[{low:.4g}, {high:.4g}]{between}{how}"
 

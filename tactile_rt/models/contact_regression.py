@@ -5,6 +5,7 @@ learnt relative to the whisker's length.
 """
 
 import math
+import pickle
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -35,6 +36,7 @@ __all__ = [
 
 UNITS = ("N",) * 3 + ("N m",) * 3  # force, then moment
 FLOOR = tuple(CHANNEL_FLOOR[unit] for unit in UNITS)  # what the detector takes for least noise
+FEWEST_AT_REST = 2  # samples that have a standard deviation
 FAINT_N = 1e-6  # of force: below it the ratio of moment to force fades to nothing
 SHARP = 20.0  # errors of distance beyond 1 / SHARP of the length count linearly (Huber)
 MOST = {"hidden": 1024, "learning_rate": 1.0}  # beyond which nothing is learnt, or nothing fits
@@ -281,6 +283,8 @@ def load_contacts(checkpoint: Path, data: SweepSet | None = None) -> ContactNetw
         raise
     except Exception as error:  # torch and pickle raise a dozen unrelated types for a bad file
         reason = str(error).partition("\n")[0] or type(error).__name__
+        if isinstance(error, pickle.UnpicklingError):  # torch would have us trust the file
+            reason = "it is another file, or damaged"
         raise ConfigError(
             f"{checkpoint} is no network of `tactile-rt locate train`: {reason}"
         ) from None
@@ -322,8 +326,14 @@ def _shares(data: SweepSet, shapes: WhiskerShapes) -> Floats:
 
 
 def _check_loads(manifest: SweepManifest) -> None:
-    """Raise a `ConfigError` where what whiskers measure is not force and moment at the base."""
+    """Raise a `ConfigError` where what whiskers measure is not force and moment at the base, or
+    there is no time at rest to measure their noise in."""
     spec = manifest.spec
+    if manifest.lead < FEWEST_AT_REST:
+        raise ConfigError(
+            f"the sweeps have a lead of {manifest.lead} samples at rest, and the noise needs "
+            f"{FEWEST_AT_REST}: make sweeps of a longer lead_ms"
+        )
     if spec.units != UNITS:
         given = ", ".join(f"{c} ({u})" for c, u in zip(spec.channels, spec.units, strict=True))
         raise ConfigError(

@@ -35,6 +35,11 @@ def test_from_sweeps_to_figures(call, tmp_path):
     names = [r["name"] for r in json.loads(figures.read_text())]
     assert len(names) == len(set(names))
     assert call("sweep", folder, "--processes", 1)[0] == 0  # goes on as it was begun
+    whole = checkpoint.read_bytes()
+    for words in (("train", folder, checkpoint), ("eval", checkpoint, folder)):
+        code, _, err = call("locate", *words, "--json", checkpoint)
+        assert code == 2 and err.endswith("is the network's file: name another\n")
+    assert checkpoint.read_bytes() == whole
 
 
 @pytest.mark.parametrize("arguments", [("train", "set", "x.pt"), ("eval", "x.pt", "set")])

@@ -279,6 +279,7 @@ def test_one_object_has_figures_but_no_interval(folder: Path, trained: Path) -> 
     finally:
         (folder / "manifest.json").write_bytes(msgspec.json.encode(whole))
     assert all(r.how.startswith("no interval: touches of one object; ") for r in records)
+    assert all(r.how.count("no interval") == 1 for r in records)
 
 
 def test_what_does_not_fit_is_told(folder: Path, trained: Path, tmp_path: Path) -> None:
@@ -300,8 +301,12 @@ def test_what_does_not_fit_is_told(folder: Path, trained: Path, tmp_path: Path) 
     ):
         with pytest.raises(ConfigError, match=said):
             ContactConfig(**wrong)
+    short = replace(train, manifest=replace(train.manifest, lead=1))
+    with pytest.raises(ConfigError, match="a lead of 1 samples at rest, and the noise needs 2"):
+        train_contacts(short, held, SHAPES, ContactConfig(), tmp_path / "x.pt")
     (tmp_path / "bad.pt").write_bytes(b"nothing")
-    with pytest.raises(ConfigError, match=r"bad\.pt is no network of `tactile-rt locate train`"):
+    why = r"bad\.pt is no network of `tactile-rt locate train`: it is another file, or damaged$"
+    with pytest.raises(ConfigError, match=why):
         load_contacts(tmp_path / "bad.pt")
 
 
