@@ -18,13 +18,22 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from tactile_rt.classifier.model_card import MAX_PERIOD_NS
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.files import whole_folder
 from tactile_rt.recording.conversion import chunks_of
 from tactile_rt.recording.labels import LABELS, LabelledInterval, label_of_file, read_labels
 from tactile_rt.recording.touches import REST, RecordedTouch, find_touches
 from tactile_rt.sensor_spec import SensorSpec, channel_limits
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, SpecMismatch
+from tactile_rt.stream import (
+    NS_PER_S,
+    ArraySpec,
+    Chunk,
+    ConfigError,
+    ModelError,
+    RecordingError,
+    SpecMismatch,
+)
 from tactile_rt.sweep_set import (
     RECORDED_VERSION,
     RECORDINGS,
@@ -136,15 +145,28 @@ def like(path: Path) -> tuple[ArraySpec, SensorSpec | None, int]:
     """Array, sensor and sample period (ns) of a sweep set, or of a model.
 
     Raises:
-        RecordingError: no such set.
+        RecordingError: no such set, or it is damaged.
         ModelError: the model cannot be read.
     """
     if path.suffix == ".onnx":
         card = read_model(path)[0]
-        sensor = msgspec.convert(card.sensor, SensorSpec) if card.sensor else None
-        return card.array, sensor, card.period_ns
-    manifest = SweepManifest.read(path)
-    return manifest.spec, manifest.sensor, manifest.period_ns
+        spec, period_ns = card.array, card.period_ns
+        try:
+            sensor = msgspec.convert(card.sensor, SensorSpec) if card.sensor else None
+        except (msgspec.ValidationError, ConfigError) as error:
+            why = str(error).removeprefix("sensor: ")
+            raise ModelError(f"{path} has damaged metadata: sensor: {why}") from None
+    else:
+        manifest = SweepManifest.read(path)
+        spec, sensor, period_ns = manifest.spec, manifest.sensor, manifest.period_ns
+    if sensor is not None and len(sensor.channels) != len(spec.channels):
+        raise RecordingError(
+            f"{path} is damaged: its sensor has {len(sensor.channels)} channels, its array "
+            f"{len(spec.channels)}"
+        )
+    if not 0 < period_ns <= MAX_PERIOD_NS:
+        raise RecordingError(f"{path} is damaged: a sample period of {period_ns} ns")
+    return spec, sensor, period_ns
 
 
 def find_labelled(

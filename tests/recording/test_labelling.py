@@ -3,20 +3,23 @@
 import re
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
+from tactile_rt.classifier.model_file import METADATA_KEY, shipped_model
 from tactile_rt.recording.conversion import convert
 from tactile_rt.recording.labelling import (
     find_labelled,
     intervals_beside,
     intervals_by_name,
     intervals_of_all,
+    like,
     write_set,
 )
 from tactile_rt.recording.labels import LabelledInterval
 from tactile_rt.sensor_spec import ChannelSpec, SensorSpec
-from tactile_rt.stream import ConfigError, RecordingError, SpecMismatch
+from tactile_rt.stream import ConfigError, ModelError, RecordingError, SpecMismatch
 from tactile_rt.sweep_set import SweepManifest, read_object, read_sweeps
 from tests.helpers.labelled import ARRAY, KINDS, chunks_of_touches, record_touches, times
 from tests.helpers.recordings import write
@@ -181,6 +184,41 @@ def test_recordings_and_patterns_of_other_arrays_are_refused(night, tmp_path):
     (tmp_path / "bad.mcap").write_bytes(night.read_bytes()[:5000])
     with pytest.raises(RecordingError, match=r"bad.mcap is cut short"):
         find_labelled([tmp_path / "bad.mcap"], {})
+
+
+NEWTON = {"name": "fx", "unit": "N", "range": 1.0, "resolution": 0.01}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "said"),
+    [
+        ({"channels": 5}, r"sensor: Expected `array`, got `int` - at `\$.channels`"),
+        ({"nothing": 5}, "sensor: Object missing required field `channels`"),
+        ({"channels": []}, "sensor: has no channels"),
+        ({"channels": [NEWTON | {"range": -1.0}]}, "sensor: channel 'fx': range must be 0 or more"),
+        ({"channels": [NEWTON], "rate_hz": 9.0}, "is damaged: its sensor has 1 channels, its arr"),
+    ],
+)
+def test_a_model_with_an_odd_sensor_is_told_in_a_line(tmp_path, sensor, said):
+    onnx = pytest.importorskip("onnx")
+    model, path = onnx.load(shipped_model()), tmp_path / "odd.onnx"
+    (card,) = (p for p in model.metadata_props if p.key == METADATA_KEY)
+    card.value = msgspec.json.encode(msgspec.json.decode(card.value) | {"sensor": sensor}).decode()
+    onnx.save(model, path)
+    with pytest.raises((ModelError, RecordingError), match=rf"odd\.onnx .*{said}") as error:
+        like(path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("period_ns", [0, -5, 10**30])
+def test_a_set_whose_samples_come_at_no_period_is_told(tmp_path, period_ns):
+    write_tiny_set(tmp_path / "set", spec=ARRAY)
+    manifest = tmp_path / "set" / "manifest.json"
+    text = manifest.read_text()
+    assert text.count('"period_ns": 9000000') == 1
+    manifest.write_text(text.replace("9000000", str(period_ns)))
+    with pytest.raises(RecordingError, match=f"set is damaged: a sample period of {period_ns} ns"):
+        like(tmp_path / "set")
 
 
 def test_sensor_and_period_are_those_of_the_pattern(night, tmp_path):
