@@ -58,8 +58,6 @@ def label(
     check_output(json)
     parts = _shares(shares)
     _check_out(folder, force)
-    if twice := [one for one in recordings if recordings.count(one) > 1]:
-        raise ConfigError(f"{twice[0]} is named twice: name it once")
     if by_name:
         intervals = intervals_by_name(recordings)
     elif unlabelled:

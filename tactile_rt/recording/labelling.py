@@ -64,6 +64,7 @@ TELL_NS = NS_PER_S  # of the stream, between reports of how far it is
 # why a touch is not used, besides those of `touches`
 OUTSIDE = "outside every interval"
 DISPUTED = "in intervals that overlap and name different things"
+AGAIN = "that an earlier recording holds, too"
 MIXED = "that run into the interval of another thing"
 
 Intervals = dict[Path, list[LabelledInterval]]
@@ -184,11 +185,19 @@ def find_labelled(
         report: is told how far a recording has been read, s.
 
     Raises:
-        ConfigError: a file cannot be read, or channels that cannot be learnt from.
+        ConfigError: a file cannot be read or is there twice, or channels that cannot be learnt
+            from.
         RecordingError: a file is damaged.
         SpecMismatch: recordings of different arrays, or of another than the pattern's.
     """
+    for one in recordings:
+        if one.is_dir():
+            raise ConfigError(
+                f"{one} is a folder: `tactile-rt convert {one} FILE.mcap --episode N` makes a "
+                "recording of an episode of a dataset"
+            )
     opened = [chunks_of(one) for one in recordings]
+    sums = _sums(recordings)
     specs = [about.spec for about, _ in opened]
     first, whose = specs[0], recordings[0]
     sensor, period_ns = None, max(PERIOD_NS, *(round(NS_PER_S / spec.rate_hz) for spec in specs))
@@ -197,12 +206,13 @@ def find_labelled(
     for one, spec in zip(recordings, specs, strict=True):
         if differing := first.differences(spec, ("name", "rate_hz")):
             raise SpecMismatch(f"{one} is of another array than {whose}: {differing[0]}")
-    found = LabelledTouches(specs[0], period_ns, sensor)
+    found = LabelledTouches(specs[0], period_ns, sensor, sums=sums)
     try:
         floor = channel_limits(first, sensor, period_ns).floor
     except ConfigError as error:
         raise ConfigError(f"{error}: --like takes it from a sweep set or model") from None
     reasons, silent = _Reasons(), _Reasons()
+    met: dict[bytes, Path] = {}  # the recording of each touch, by its numbers
     for one, (about, chunks) in zip(recordings, opened, strict=True):
         mine, touched = list(intervals.get(one, ())), set()
         with closing(chunks):
@@ -219,6 +229,8 @@ def find_labelled(
                     why = DISPUTED
                 elif of and not why and _runs_into(of[0], onset_s, end_s, mine):
                     why = MIXED
+                elif of and not why and met.setdefault(_digest(touch), one) != one:
+                    why = AGAIN
                 if why:
                     reasons.add(why, f"{one.name} at {onset_s:.2f} s")
                 else:
@@ -230,7 +242,6 @@ def find_labelled(
             found.left_out.append(f"samples missing in {one.name}: {stream.lost}")
         if not mine:
             found.left_out.append(f"no interval of {one.name} is labelled")
-        found.sums[one] = _sha256(one)
     found.left_out = [*reasons.lines("touches"), *silent.lines("intervals"), *found.left_out]
     others = {one: len(i) for one, i in intervals.items() if one not in recordings}
     if others:
@@ -355,6 +366,10 @@ class _Reasons:
         return [f"{what} {why}: {n}, first {self._first[why]}" for why, n in self._count.items()]
 
 
+def _digest(touch: RecordedTouch) -> bytes:
+    return hashlib.sha256(touch.values.tobytes()).digest()
+
+
 def _runs_into(
     own: LabelledInterval, onset_s: float, end_s: float, intervals: Sequence[LabelledInterval]
 ) -> bool:
@@ -409,6 +424,20 @@ def _split(
     return {split: tuple(names) for split, names in sides.items()}
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+def _sums(recordings: Sequence[Path]) -> dict[Path, str]:
+    """The sha256 of each recording's file.
+
+    Raises:
+        ConfigError: two are the same, whose touches would be on two sides of the split.
+    """
+    sums: dict[Path, str] = {}
+    by_sum: dict[str, Path] = {}
+    for one in recordings:
+        if one in sums:
+            raise ConfigError(f"{one} is named twice: name it once")
+        with one.open("rb") as file:
+            sums[one] = hashlib.file_digest(file, "sha256").hexdigest()
+        other = by_sum.setdefault(sums[one], one)
+        if other != one:
+            raise ConfigError(f"{other} and {one} are the same recording: name one of them")
+    return sums

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -156,6 +157,36 @@ def test_shares_are_of_each_category_and_some_of_each_are_trained(night, tmp_pat
     for bad in ((0.5, 0.5), (0, 1, 0), (1, -1, 0)):
         with pytest.raises(ConfigError, match="--shares is TRAIN,VALIDATION,TEST"):
             write_set(tmp_path / "bad", found, bad)
+
+
+def test_a_recording_is_on_one_side_whatever_it_is_called(night, tmp_path, monkeypatch):
+    link, copy = tmp_path / "link.mcap", tmp_path / "copy.mcap"
+    link.symlink_to(night)
+    copy.write_bytes(night.read_bytes())
+    monkeypatch.chdir(night.parent)
+    for other in (link, copy, Path("night.mcap")):
+        two = [night, other]
+        with pytest.raises(ConfigError, match=f"{night} and {other} are the same recording: name"):
+            find_labelled(two, intervals_of_all(two))
+    with pytest.raises(ConfigError, match="is named twice: name it once"):
+        find_labelled([night, night], intervals_of_all([night]))
+
+
+def test_a_touch_that_is_there_in_two_forms_counts_once(night, tmp_path):
+    other = tmp_path / "again.npz"
+    convert(night, other)
+    found = find_labelled([night, other], intervals_of_all([night, other]))
+    assert [u.recording for u in found.used] == [night] * 4
+    assert found.left_out == [
+        "touches that an earlier recording holds, too: 4, first again.npz at 2.21 s"
+    ]
+
+
+def test_a_folder_is_told_how_to_become_a_recording(night, tmp_path):
+    with pytest.raises(
+        ConfigError, match=r"is a folder: `tactile-rt convert .* --episode N` makes"
+    ):
+        find_labelled([tmp_path], intervals_of_all([tmp_path]))
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".csv", ".h5"])
