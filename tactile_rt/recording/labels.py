@@ -31,8 +31,9 @@ __all__ = [
     "check_name",
     "drop_torn_label",
     "label_of_file",
+    "lines_of",
     "read_labels",
-    "remove_last_label",
+    "remove_label",
 ]
 
 LABELS = "labels.csv"  # beside the recordings
@@ -121,7 +122,7 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Label
     return found
 
 
-def append_label(path: Path, recording: str, interval: LabelledInterval) -> None:
+def append_label(path: Path, recording: str, interval: LabelledInterval) -> str:
     """Add a line to a file, which is made if it is not there; on return it is on the disk.
 
     A line is written at once. What an interruption has left of an earlier one ends where the next
@@ -131,6 +132,9 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> None
         path: the CSV file.
         recording: name of the recording, relative to the file's folder.
         interval: what to say of it.
+
+    Returns:
+        The line, without its end.
 
     Raises:
         ConfigError: a name that cannot be, times out of order, or a file with other columns.
@@ -149,7 +153,7 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> None
             f"{path}:1: columns are {','.join(columns)}, not {','.join(COLUMNS)}: name another file"
         )
     times = (f"{t:.6f}".rstrip("0").rstrip(".") for t in (interval.start_s, interval.end_s))
-    text = _line(recording, *times, interval.label, interval.object)
+    line = text = _line(recording, *times, interval.label, interval.object)
     with path.open("ab+") as file:
         if new:
             text = _line(*COLUMNS) + text
@@ -161,6 +165,7 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> None
         os.fsync(file.fileno())
     if new:
         sync_folder(path.parent)  # the name, too
+    return line.rstrip("\n")
 
 
 def drop_torn_label(path: Path) -> bool:
@@ -181,16 +186,32 @@ def drop_torn_label(path: Path) -> bool:
     return True
 
 
-def remove_last_label(path: Path) -> None:
-    """Take the last line of a file away; it is there with it or without it, never half.
+def lines_of(path: Path) -> list[str]:
+    """The lines of a file with their ends, as `read_labels` counts them; what is no text, too.
+
+    Raises:
+        OSError: the file cannot be read.
+    """
+    return path.read_bytes().decode(errors="surrogateescape").splitlines(keepends=True)
+
+
+def remove_label(path: Path, line: str) -> None:
+    """Take a line of a file away, the last of several; it is there or not, never half.
+
+    Args:
+        path: the CSV file.
+        line: without its end, as `append_label` gave it or `lines_of`; where it is not there,
+            nothing is taken away.
 
     Raises:
         OSError: the file cannot be read or written.
     """
-    lines = path.read_bytes().splitlines(keepends=True)
-    while lines and not lines.pop().strip():
-        pass
-    write_whole(path, lambda file: file.writelines(lines))
+    lines = lines_of(path)
+    there = [k for k, text in enumerate(lines) if text.rstrip("\r\n") == line]
+    if there:
+        del lines[there[-1]]
+        data = "".join(lines).encode(errors="surrogateescape")
+        write_whole(path, lambda file: file.write(data))
 
 
 def read_columns(path: Path) -> tuple[str, ...]:

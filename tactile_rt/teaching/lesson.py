@@ -32,8 +32,9 @@ from tactile_rt.recording.labels import (
     append_label,
     check_name,
     drop_torn_label,
+    lines_of,
     read_labels,
-    remove_last_label,
+    remove_label,
 )
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError
 from tactile_rt.teaching.further import check_further
@@ -71,11 +72,13 @@ class TaughtTouch:
         label: The name of what it was.
         features: (step, feature) What was felt, step by step.
         recording: The name of the recording that it is in.
+        line: The line that tells of it.
     """
 
     label: str
     features: NDArray[np.float32]
     recording: str
+    line: str
 
 
 @dataclass
@@ -159,6 +162,7 @@ class Lesson:
         if not labels.stat().st_size:
             return  # its first line was torn
         recordings = sorted(self.folder.glob("session-*.mcap"), key=_number)
+        lines = lines_of(labels)
         for path, intervals in read_labels(labels, [_whole(one) for one in recordings]).items():
             if not intervals:
                 continue
@@ -167,10 +171,11 @@ class Lesson:
                 inside = [
                     features for at_s, features in felt if interval.start_s <= at_s < interval.end_s
                 ]
-                self.lost += not inside
-                self.touches += (
-                    [TaughtTouch(interval.label, inside[0], path.name)] if inside else []
-                )
+                if not inside:
+                    self.lost += 1
+                    continue
+                line = lines[int(interval.where.rpartition(":")[2]) - 1].rstrip("\r\n")
+                self.touches.append(TaughtTouch(interval.label, inside[0], path.name, line))
 
     def _felt(self, path: Path) -> list[tuple[float, NDArray[np.float32]]]:
         """Onset, in seconds since the beginning, and features of every touch in a recording."""
@@ -206,14 +211,14 @@ class Lesson:
             span_s: where in it, seconds since its first sample.
         """
         interval = LabelledInterval(label=label, start_s=max(0.0, span_s[0]), end_s=span_s[1])
-        append_label(self.folder / LABELS, recording, interval)
-        self.touches.append(TaughtTouch(label, features, recording))
+        line = append_label(self.folder / LABELS, recording, interval)
+        self.touches.append(TaughtTouch(label, features, recording, line))
 
     def undo(self) -> TaughtTouch | None:
         """Take the last touch back; None: there is none."""
         if not self.touches:
             return None
-        remove_last_label(self.folder / LABELS)
+        remove_label(self.folder / LABELS, self.touches[-1].line)
         return self.touches.pop()
 
     def check(self, label: str) -> str:

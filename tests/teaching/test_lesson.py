@@ -110,6 +110,28 @@ def test_what_an_interruption_leaves_is_dropped_and_counted(taught, tmp_path):
     assert [t.recording for t in again.touches][-1] == "session-2.mcap"
 
 
+def test_a_touch_is_taken_back_by_its_own_line(taught, tmp_path):
+    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    teach(lesson, ["press", "slide"], seed=6)
+    path = tmp_path / "b" / LABELS
+    whole = path.read_text().splitlines(keepends=True)
+    lost = "session-1.mcap,99.5,100.5,double,\r\n"  # after all that the recording has kept
+    for text in (whole[0] + lost + "".join(whole[1:]), "".join(whole) + lost):
+        path.write_text(text, newline="")
+        again = Lesson.read(tmp_path / "b")
+        assert again.lost == 1
+        assert again.undo().label == "slide"
+        left = path.read_bytes().decode()
+        assert "slide" not in left and "press" in left and lost in left
+        assert again.undo().label == "press" and again.undo() is None
+        assert path.read_bytes().decode() == whole[0] + lost
+    path.write_text("".join(whole))
+    again = Lesson.read(tmp_path / "b")
+    path.write_text(whole[0] + whole[1])  # somebody took the line away by hand
+    assert again.undo().label == "slide"
+    assert path.read_text() == whole[0] + whole[1]
+
+
 def test_wherever_a_line_was_torn_the_others_stay(taught, tmp_path):
     lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
     teach(lesson, ["press"] * 2, seed=6)
