@@ -308,6 +308,8 @@ def _take_keys(orders: "queue.Queue[str]", descriptor: int, before: list[object]
     import termios
     import tty
 
+    from tactile_rt.teaching.lesson import ORDERS
+
     while True:
         try:
             key = os.read(descriptor, 1).decode(errors="replace")
@@ -322,9 +324,12 @@ def _take_keys(orders: "queue.Queue[str]", descriptor: int, before: list[object]
             while (more := os.read(descriptor, 1)) not in (b"", b"\n"):
                 name += more
             tty.setcbreak(descriptor)
-            if name.strip():
-                orders.put(name.decode(errors="replace").strip())
-        elif key.isdigit() and key != "0":
+            called = name.decode(errors="replace").strip()
+            if called in ORDERS:
+                typer.echo(f"{called!r} is an order: name the class otherwise")
+            elif called:
+                orders.put(called)
+        elif key.isdigit():
             orders.put(key)
         elif key in KEYS:
             orders.put(KEYS[key])

@@ -45,6 +45,7 @@ __all__ = [
     "BEFORE_NS",
     "FEATURES",
     "MODEL",
+    "ORDERS",
     "Lesson",
     "LessonProgress",
     "Listener",
@@ -53,6 +54,7 @@ __all__ = [
     "measured_floor",
 ]
 
+ORDERS = ("next", "undo", "done")  # to a teacher; any other word is the label from now on
 FEATURES, MODEL = "features.onnx", "model.onnx"
 BEFORE_NS = 20_000_000  # before its onset a touch's interval begins
 HASTY_NS = 100_000_000  # after the end of a contact, within which another is not a touch of its own
@@ -452,6 +454,8 @@ def check_label(name: str) -> str:
     """
     if why := check_name(name):
         raise ConfigError(f"label {name!r}: {why}")
+    if name in ORDERS:
+        raise ConfigError(f"label {name!r}: is an order to who teaches; name it otherwise")
     return name
 
 

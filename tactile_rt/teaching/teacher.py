@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from tactile_rt.stream import ConfigError
 from tactile_rt.teaching.lesson import Lesson, LessonProgress
 
-__all__ = ["ORDERS", "Teacher"]
+__all__ = ["Teacher"]
 
-ORDERS = ("next", "undo", "done")  # any other word is the label from now on
+LONG = 9  # digits: more are no class's number
 
 
 @dataclass
@@ -49,7 +49,7 @@ class Teacher:
         self.wanted += [name for name in self.lesson.labels if name not in self.wanted]
 
     def obey(self, order: str) -> str:
-        """Do what is asked: one of `ORDERS`, a class's number, or its name. What to say of it."""
+        """Do what is asked: one of `ORDERS`, a class's name, or its number. What to say of it."""
         return self.note(self._obey(order.strip()))
 
     def note(self, said: str) -> str:
@@ -65,8 +65,11 @@ class Teacher:
             return self._undo()
         if order == "next":
             return self._next()
-        if order.isdigit() and 1 <= int(order) <= len(self.wanted):
-            order = self.wanted[int(order) - 1]
+        if order.isdecimal() and order not in self.wanted:
+            number = int(order) if len(order) < LONG else 0
+            if not 1 <= number <= len(self.wanted):
+                return f"there is no class {order[:LONG]}: there are {len(self.wanted)}"
+            order = self.wanted[number - 1]
         try:
             self.label = self.lesson.check(order)
         except ConfigError as error:

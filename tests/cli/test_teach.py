@@ -141,6 +141,7 @@ def test_mistakes_are_one_line(call, lesson, tmp_path):
         (("synthetic:3x2", tmp_path / "a", "--classes", "a/b"), "cannot be part of a file's name"),
         (("synthetic:3x2", tmp_path / "a", "--classes", "a,a"), "names 'a' twice"),
         (("synthetic:3x2", tmp_path / "a", "--classes", "unknown"), "has a meaning of its own"),
+        (("synthetic:3x2", tmp_path / "a", "--classes", "b,undo"), "is an order to who teaches"),
         (("synthetic:3x2", tmp_path / "a", "--page", "here"), "--page is HOST:PORT"),
         (("synthetic:3x2", folder, "--classes", "a"), "or teach in another folder"),
         (("synthetic:3x2", folder / LABELS, "--classes", "a"), "is not a folder"),
@@ -265,6 +266,13 @@ def test_keys_are_orders(tmp_path):
         time.sleep(0.3)  # the terminal takes lines from now on
         os.write(ours, b"rub\n")
         hear("touch it: rub (1 of 9)")
+        os.write(ours, b"7")
+        hear("there is no class 7: there are 3")
+        os.write(ours, b"a")
+        time.sleep(0.3)
+        os.write(ours, b"undo\n")
+        hear("'undo' is an order: name the class otherwise")
+        time.sleep(0.3)  # the terminal takes keys again
         os.write(ours, b"1")
         os.write(ours, b"q")
         process.wait(20)

@@ -15,7 +15,7 @@ from tactile_rt.recording import StreamWriter
 from tactile_rt.recording.labels import LABELS
 from tactile_rt.stream import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.teaching.head import fit_classes, leave_out
-from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson, measured_floor
+from tactile_rt.teaching.lesson import FEATURES, MODEL, ORDERS, Lesson, measured_floor
 from tactile_rt.teaching.onnx_bytes import OnnxGraph
 from tactile_rt.teaching.teacher import Teacher
 from tactile_rt.testing import ArraySource, cut, small_spec
@@ -277,6 +277,22 @@ def test_who_teaches_is_led_and_obeyed(tmp_path):
     assert quiet.prompt() == "what is touched next? name it, or choose its number"
     assert "nothing was learnt" in quiet.take("", np.zeros((22, size), "f"), "x", (0, 1))
     assert quiet.obey("undo") == "there is no touch to take back"
+
+
+def test_a_class_may_be_a_number_and_none_is_made_of_one(tmp_path):
+    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    teacher = Teacher(lesson, ["press", "2", "1"], 2)
+    assert teacher.obey("1") == "touch it: 1 (1 of 2)", "its name comes before a number"
+    assert teacher.obey("3") == "touch it: 1 (1 of 2)"
+    assert teacher.obey("press") == "touch it: press (1 of 2)"
+    assert teacher.obey("4") == "there is no class 4: there are 3"
+    assert teacher.obey("0") == "there is no class 0: there are 3"
+    assert teacher.obey("9" * 5000).startswith("there is no class 9999")
+    assert teacher.obey("²") == "touch it: ² (1 of 2)", "which is no digit of a number"
+    assert (teacher.label, teacher.wanted) == ("²", ["press", "2", "1", "²"])
+    for order in ORDERS:
+        with pytest.raises(ConfigError, match="is an order to who teaches; name it otherwise"):
+            Teacher(lesson, [order], 2)
 
 
 def test_the_writer_of_graphs_is_understood_by_others():
