@@ -50,6 +50,7 @@ def label(
         intervals_of_all,
         write_set,
     )
+    from tactile_rt.recording.labels import LABELS
     from tactile_rt.sim_backend.datasets.inventory import write_sums
     from tactile_rt.sweep_set import SPLITS
 
@@ -58,6 +59,8 @@ def label(
     check_output(json)
     parts = _shares(shares)
     _check_out(folder, force)
+    beside = (one.parent / LABELS for one in recordings)
+    _check_apart(json, [*recordings, *beside, folder, *filter(None, (labels, like))])
     if by_name:
         intervals = intervals_by_name(recordings)
     elif unlabelled:
@@ -109,6 +112,12 @@ def _shares(text: str) -> tuple[float, ...]:
         ) from None
     check_shares(shares)
     return shares
+
+
+def _check_apart(json: Path | None, others: list[Path]) -> None:
+    """Refuse to write figures over what is read, or where the set goes."""
+    if json is not None and json.resolve() in {one.resolve() for one in others}:
+        raise ConfigError(f"--json {json} is a file that is read, or where the set goes")
 
 
 def _check_out(folder: Path, force: bool) -> None:

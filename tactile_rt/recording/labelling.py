@@ -316,7 +316,8 @@ def check_shares(shares: Sequence[float]) -> None:
     Raises:
         ConfigError: not one for each split, a negative one, or nothing to train on.
     """
-    if len(shares) != len(SPLITS) or not all(0 <= s < inf for s in shares) or not shares[0]:
+    whole = len(shares) == len(SPLITS) and all(s >= 0 for s in shares) and sum(shares) < inf
+    if not whole or not shares[0]:
         raise ConfigError(
             "--shares is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15: 0 or more each, and some to train"
         )

@@ -154,7 +154,7 @@ def test_shares_are_of_each_category_and_some_of_each_are_trained(night, tmp_pat
         assert tuple(mine) == sizes
     none = write_set(tmp_path / "none", found, (1, 0, 0))
     assert not none.split["validation"] and not none.split["test"]
-    for bad in ((0.5, 0.5), (0, 1, 0), (1, -1, 0)):
+    for bad in ((0.5, 0.5), (0, 1, 0), (1, -1, 0), (1, np.nan, 0), (1e308,) * 3):
         with pytest.raises(ConfigError, match="--shares is TRAIN,VALIDATION,TEST"):
             write_set(tmp_path / "bad", found, bad)
 
