@@ -102,6 +102,8 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Label
             raise refusal(node, ["start_s"], f"must be 0 or more, not {row.start_s:g}")
         if row.end_s <= row.start_s:
             raise refusal(node, ["end_s"], f"must be after start_s, {row.start_s:g} s")
+        if not row.recording.isprintable():  # which no path may be
+            raise refusal(node, ["recording"], f"{row.recording!r} is no file's name")
         file = path.parent / row.recording
         if not row.recording and len(recordings) > 1:
             raise refusal(node, ["recording"], "is empty; name one of several recordings")

@@ -237,7 +237,7 @@ def read_csv(path: Path) -> CsvTable:
             names file and line.
     """
     lines = [
-        (number, [cell.strip() for cell in next(csv.reader([line]))])
+        (number, _cells(line, f"{path}:{number}"))
         for number, line in enumerate(read_text(path).splitlines(), start=1)
         if line.strip(" ,") and not line.startswith("#")  # spreadsheets keep empty rows as commas
     ]
@@ -257,6 +257,13 @@ def read_csv(path: Path) -> CsvTable:
         row = dict(zip(columns, cells, strict=True))
         rows.append(make_node(row, str(path), number, path.parent))
     return CsvTable(where, tuple(columns), tuple(rows))
+
+
+def _cells(line: str, where: str) -> list[str]:
+    try:
+        return [cell.strip() for cell in next(csv.reader([line]))]
+    except csv.Error as error:  # a cell that is too long for one
+        raise ConfigError(f"{where}: {error}") from None
 
 
 def check_columns(table: CsvTable, known: Sequence[str], needed: Sequence[str] = ()) -> None:

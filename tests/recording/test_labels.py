@@ -96,7 +96,9 @@ def test_recordings_that_are_not_asked_for_are_kept_apart(night, tmp_path):
         (HEADER + "night.mcap,1,2,mug,../x\n", "labels.csv:2: object: '../x' cannot be part"),
         (HEADER + f"night.mcap,1,2,{'m' * 99},\n", "labels.csv:2: label: .* is too long"),
         (HEADER + "nigth.mcap,1,2,mug,\n", "2: recording: no file 'nigth.mcap' .* mean night.mcap"),
+        (HEADER + "a\0b.mcap,1,2,mug,\n", r"2: recording: 'a\\x00b.mcap' is no file's name"),
         (HEADER + "night.mcap,1,2,mug\n", "labels.csv:2: 4 values for 5 columns"),
+        (HEADER + f"{'n' * 200_000},1,2,mug,\n", "labels.csv:2: field larger than field limit"),
         ("recording;start_s;end_s;label\n", "labels.csv:1: columns are separated by semicolons"),
     ],
 )
