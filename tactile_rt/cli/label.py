@@ -57,6 +57,9 @@ def label(
     if (labels is not None) + by_name + unlabelled > 1:
         raise ConfigError("--labels, --by-name and --unlabelled exclude one another: give one")
     check_output(json)
+    for path in filter(None, (*recordings, folder, labels, like)):
+        if not _is_text(str(path)):  # which the manifest tells
+            raise ConfigError(f"{str(path)!r} is no UTF-8: rename it")
     parts = _shares(shares)
     _check_out(folder, force)
     beside = (one.parent / LABELS for one in recordings)
@@ -112,6 +115,14 @@ def _shares(text: str) -> tuple[float, ...]:
         ) from None
     check_shares(shares)
     return shares
+
+
+def _is_text(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _check_apart(json: Path | None, others: list[Path]) -> None:

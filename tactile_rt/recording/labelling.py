@@ -7,6 +7,7 @@ told, never left out in silence.
 """
 
 import hashlib
+import os
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -60,6 +61,7 @@ PERIOD_NS = 9_000_000  # of a set's samples, unless the sensor is slower
 SHARES = (0.7, 0.15, 0.15)  # of the objects of each category, by split
 ENOUGH = 3  # recordings of a label that may be its objects, one for each split
 DIGITS = 6  # of a recording's checksum, in the names of its objects
+STEM = 100  # bytes of a recording's name, likewise
 TELL_NS = NS_PER_S  # of the stream, between reports of how far it is
 # why a touch is not used, besides those of `touches`
 OUTSIDE = "outside every interval"
@@ -392,7 +394,8 @@ def _objects(touches: LabelledTouches) -> dict[str, list[_Used]]:
     for used in touches.used:
         label, thing = used.interval.thing
         if not thing:
-            thing = f"{used.recording.stem}-{touches.sums[used.recording][:DIGITS]}"
+            stem = os.fsencode(used.recording.stem)[:STEM].decode(errors="ignore")
+            thing = f"{stem}-{touches.sums[used.recording][:DIGITS]}"
             if label == UNLABELLED or len(recordings[label]) < ENOUGH:
                 alone[label] += 1
                 thing += f"-{used.onset_s:.3f}"

@@ -39,7 +39,8 @@ __all__ = [
 LABELS = "labels.csv"  # beside the recordings
 NEEDED = ("start_s", "end_s", "label")
 COLUMNS = ("recording", *NEEDED, "object")
-LONGEST = 60  # characters of a name, as it becomes part of a file's
+# Of a name, as it becomes part of a file's: with a label and an object that has 255 bytes at most.
+LONGEST, MOST_BYTES = 60, 120  # characters, of which some need several bytes
 RESERVED = ("unknown", "unlabelled")  # a model's refusal, and a touch that nobody labelled
 
 
@@ -237,6 +238,8 @@ def check_name(name: str, empty: bool = False) -> str:
         return f"{name!r} cannot be part of a file's name; use letters, digits, -, _ and spaces"
     if len(name) > LONGEST:
         return f"{name!r} is too long: {len(name)} characters, {LONGEST} at most"
+    if len(name.encode()) > MOST_BYTES:
+        return f"{name!r} is too long: {len(name.encode())} bytes, {MOST_BYTES} at most"
     return ""
 
 

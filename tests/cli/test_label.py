@@ -256,6 +256,7 @@ def test_what_is_wrong_is_one_line(here, tmp_path, refused):
         ((recording, out, "--shares", "0,1,1"), "--shares is TRAIN,VALIDATION,TEST"),
         ((tmp_path / "no.mcap", out, "--by-name"), "no recording"),
         ((recording, out, "--like", tmp_path), "is not a sweep set"),
+        ((recording, tmp_path / "o\udcff"), "o\\udcff' is no UTF-8: rename it"),
         ((recording, out, "--json", recording), "is a file that is read, or where"),
         ((recording, out, "--json", here / "labels.csv"), "is a file that is read, or where"),
         ((recording, out, "--json", out), "is a file that is read, or where"),

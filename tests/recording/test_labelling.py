@@ -182,6 +182,19 @@ def test_a_touch_that_is_there_in_two_forms_counts_once(night, tmp_path):
     ]
 
 
+@pytest.mark.parametrize("letter", ["n", "漢"])
+def test_the_longest_names_fit_into_a_file_s(night, tmp_path, letter):
+    path = tmp_path / f"{letter * (245 // len(letter.encode()))}.mcap"
+    path.write_bytes(night.read_bytes())
+    longest = letter * (60 if letter == "n" else 40)
+    intervals = [LabelledInterval(label=longest, end_s=5.0, object=longest)]
+    intervals.append(LabelledInterval(label=longest, start_s=5.0))
+    found = find_labelled([path], {path: intervals})
+    manifest = write_set(tmp_path / "set", found)
+    assert len(manifest.names()) == 4
+    assert sum(len(read_object(tmp_path / "set", n)[0]) for n in manifest.names()) == 4
+
+
 def test_a_folder_is_told_how_to_become_a_recording(night, tmp_path):
     with pytest.raises(
         ConfigError, match=r"is a folder: `tactile-rt convert .* --episode N` makes"

@@ -95,6 +95,7 @@ def test_recordings_that_are_not_asked_for_are_kept_apart(night, tmp_path):
         (HEADER + "night.mcap,1,2,unknown,\n", "labels.csv:2: label: 'unknown' has a meaning"),
         (HEADER + "night.mcap,1,2,mug,../x\n", "labels.csv:2: object: '../x' cannot be part"),
         (HEADER + f"night.mcap,1,2,{'m' * 99},\n", "labels.csv:2: label: .* is too long"),
+        (HEADER + f"night.mcap,1,2,mug,{'漢' * 41}\n", "object: .* too long: 123 bytes, 120 at"),
         (HEADER + "nigth.mcap,1,2,mug,\n", "2: recording: no file 'nigth.mcap' .* mean night.mcap"),
         (HEADER + "a\0b.mcap,1,2,mug,\n", r"2: recording: 'a\\x00b.mcap' is no file's name"),
         (HEADER + "night.mcap,1,2,mug\n", "labels.csv:2: 4 values for 5 columns"),
