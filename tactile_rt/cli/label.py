@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import LARGEST_SEED, app, check_output
+from tactile_rt.cli.app import LARGEST_SEED, app, check_folder, check_output
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import ConfigError, RecordingError
@@ -62,6 +62,7 @@ def label(
             raise ConfigError(f"{str(path)!r} is no UTF-8: rename it")
     parts = _shares(shares)
     _check_out(folder, force)
+    check_folder(folder)
     beside = (one.parent / LABELS for one in recordings)
     _check_apart(json, [*recordings, *beside, folder, *filter(None, (labels, like))])
     if by_name:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
+from tactile_rt.cli.app import Seconds, app, check_folder, check_output, leaving, starting
 from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError, SpecMismatch
 
@@ -72,6 +72,7 @@ def teach(
     _check_labels(wanted)
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder")
+    check_folder(folder)
     base = shipped_model() if model == "shipped" else Path(model) if model else None
     lesson = _begun_before(folder, base)
     with starting():

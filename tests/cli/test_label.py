@@ -1,6 +1,7 @@
 """`tactile-rt label`: from a recording to a model that decides on it, and refusals in one line."""
 
 import json
+import os
 import re
 import shlex
 import shutil
@@ -263,6 +264,14 @@ def test_what_is_wrong_is_one_line(here, tmp_path, refused):
     ):
         assert why in refused("label", *words)
         assert not out.exists()
+
+
+def test_a_folder_of_others_is_refused_before_anything_is_read(
+    here, tmp_path, refused, monkeypatch
+):
+    monkeypatch.setattr("os.access", lambda path, how: not how & os.W_OK)
+    err = refused("label", here / "night.mcap", tmp_path / "set", "--labels", tmp_path / "no.csv")
+    assert "may not be written into" in err
 
 
 def test_a_quiet_recording_holds_no_touch(tmp_path, refused):

@@ -158,6 +158,12 @@ def test_mistakes_are_one_line(call, lesson, tmp_path):
     assert (folder / LABELS).exists()
 
 
+def test_a_folder_of_others_is_refused_before_anything_is_begun(call, tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda path, how: False)
+    code, out, err = call("teach", "synthetic:3x2", tmp_path / "a", "--seconds", "5")
+    assert (code, out, err.count("\n")) == (2, "", 1) and "may not be written into" in err
+
+
 def test_an_address_that_is_taken_is_told_before_anything_is_begun(call, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         at = f"127.0.0.1:{taken.getsockname()[1]}"
