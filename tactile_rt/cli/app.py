@@ -29,6 +29,7 @@ __all__ = [
     "check_folder",
     "check_new",
     "check_output",
+    "check_text",
     "leaving",
     "needs",
     "set_option",
@@ -168,6 +169,19 @@ def check_folder(folder: Path) -> None:
         raise ConfigError(f"{above}: is not a folder")
     if not os.access(above, os.W_OK | os.X_OK):
         raise ConfigError(f"{folder} cannot be written: {above} may not be written into")
+
+
+def check_text(*names: Path | None) -> None:
+    """Refuse names of files that cannot stand in another file.
+
+    Raises:
+        ConfigError: one has bytes that are no UTF-8.
+    """
+    for name in filter(None, names):
+        try:
+            str(name).encode()
+        except UnicodeEncodeError:
+            raise ConfigError(f"{str(name)!r} is no UTF-8: rename it") from None
 
 
 def check_new(file: Path, force: bool) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import LARGEST_SEED, app, check_folder, check_output
+from tactile_rt.cli.app import LARGEST_SEED, app, check_folder, check_output, check_text
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import ConfigError, RecordingError
@@ -57,9 +57,7 @@ def label(
     if (labels is not None) + by_name + unlabelled > 1:
         raise ConfigError("--labels, --by-name and --unlabelled exclude one another: give one")
     check_output(json)
-    for path in filter(None, (*recordings, folder, labels, like)):
-        if not _is_text(str(path)):  # which the manifest tells
-            raise ConfigError(f"{str(path)!r} is no UTF-8: rename it")
+    check_text(*recordings, folder, labels, like)  # which the manifest tells
     parts = _shares(shares)
     _check_out(folder, force)
     check_folder(folder)
@@ -116,14 +114,6 @@ def _shares(text: str) -> tuple[float, ...]:
         ) from None
     check_shares(shares)
     return shares
-
-
-def _is_text(name: str) -> bool:
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _check_apart(json: Path | None, others: list[Path]) -> None:

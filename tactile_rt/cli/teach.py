@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from tactile_rt.cli.app import Seconds, app, check_folder, check_output, leaving, starting
+from tactile_rt.cli.app import (
+    Seconds,
+    app,
+    check_folder,
+    check_output,
+    check_text,
+    leaving,
+    starting,
+)
 from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError, SpecMismatch
 
@@ -60,9 +68,10 @@ def teach(
     """
     from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.locks import alone_in
+    from tactile_rt.recording.labels import LABELS
     from tactile_rt.recording.layout import need_mcap
     from tactile_rt.sources.opening import open_source
-    from tactile_rt.teaching.lesson import MODEL, Lesson
+    from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson
     from tactile_rt.teaching.teacher import Teacher
 
     need_mcap()
@@ -73,7 +82,12 @@ def teach(
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"{folder} is not a folder")
     check_folder(folder)
+    check_text(folder.absolute())
     base = shipped_model() if model == "shipped" else Path(model) if model else None
+    own = (FEATURES, MODEL, LABELS)
+    kept = [*folder.glob("session-*"), *(folder / name for name in own), *filter(None, [base])]
+    if json is not None and json.resolve() in {one.resolve() for one in kept}:
+        raise ConfigError(f"--json {json} is a file of the lesson, or its model: name another")
     lesson = _begun_before(folder, base)
     with starting():
         opened = open_source(source)
@@ -193,7 +207,7 @@ def _check_labels(names: list[str]) -> None:
 
 def _address(given: str) -> tuple[str, int]:
     host, colon, port = given.rpartition(":")
-    if not colon or not host or not port.isdigit() or int(port) > 65535:
+    if not colon or not host or not port.isdecimal() or int(port) > 65535:
         raise ConfigError(f"--page is HOST:PORT, as 127.0.0.1:8791, not {given!r}")
     return host, int(port)
 
