@@ -20,7 +20,7 @@ from pathlib import Path
 
 import msgspec
 
-from tactile_rt.files import sync_folder, write_whole
+from tactile_rt.files import open_regular, sync_folder, write_whole
 from tactile_rt.settings import check_columns, convert, nearest, read_csv, refusal
 from tactile_rt.stream import ConfigError
 
@@ -41,6 +41,7 @@ NEEDED = ("start_s", "end_s", "label")
 COLUMNS = ("recording", *NEEDED, "object")
 # Of a name, as it becomes part of a file's: with a label and an object that has 255 bytes at most.
 LONGEST, MOST_BYTES = 60, 120  # characters, of which some need several bytes
+LONGEST_LINE = 10_000  # bytes, that are looked at
 RESERVED = ("unknown", "unlabelled")  # a model's refusal, and a touch that nobody labelled
 
 
@@ -174,16 +175,21 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> str:
 def drop_torn_label(path: Path) -> bool:
     """Take away what an interruption has left of a last line; whether there was any.
 
-    A line that lacks nothing but its end stays: an editor may have left it so.
+    A line that lacks nothing but its end stays: an editor may have left it so; so does what was
+    never written by `append_label`, which `read_labels` tells.
 
     Raises:
-        OSError: the file cannot be read or written.
+        OSError: the file is none, or cannot be read or written.
     """
-    data = path.read_bytes()
+    with open_regular(path) as file:
+        data = file.read()
     end = data.rfind(b"\n") + 1
-    whole, last = data[:end], data[end:].decode(errors="replace")
-    cells = next(csv.reader([last]), [])
-    if not last or (whole and len(cells) == len(read_columns(path))):
+    whole, last = data[:end], data[end:]
+    if whole:
+        torn = _cells(whole.partition(b"\n")[0]) == COLUMNS and len(_cells(last)) < len(COLUMNS)
+    else:
+        torn = _line(*COLUMNS).encode().startswith(last)
+    if not last or not torn:
         return False
     write_whole(path, lambda file: file.write(whole))
     return True
@@ -219,8 +225,14 @@ def remove_label(path: Path, line: str) -> None:
 
 def read_columns(path: Path) -> tuple[str, ...]:
     """The names of a file's columns."""
-    with path.open(newline="", encoding="utf-8-sig") as file:
-        return tuple(cell.strip() for cell in next(csv.reader(file), []))
+    with path.open("rb") as file:
+        return _cells(file.readline(LONGEST_LINE))
+
+
+def _cells(line: bytes) -> tuple[str, ...]:
+    """What is between the commas, of a line that may be torn."""
+    text = line[:LONGEST_LINE].decode("utf-8-sig", errors="replace")
+    return tuple(cell.strip() for cell in next(csv.reader([text]), []))
 
 
 def check_name(name: str, empty: bool = False) -> str:

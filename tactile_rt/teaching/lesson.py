@@ -472,4 +472,4 @@ def _whole(path: Path) -> Path:
 
 def _number(path: Path) -> int:
     digits = path.stem.removeprefix("session-")
-    return int(digits) if digits.isdigit() else 0
+    return int(digits) if digits.isdecimal() else 0

@@ -1,6 +1,7 @@
 """Touches become a model: features, classes, the folder that keeps them, who teaches."""
 
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -142,6 +143,9 @@ def test_wherever_a_line_was_torn_the_others_stay(taught, tmp_path):
         path.write_bytes(whole[:end])
         assert len(Lesson.read(tmp_path / "b").touches) == 1
         assert path.read_bytes() == whole[:last]
+    path.write_bytes(whole + "session-1.mcap,1,2,ü".encode()[:-1])  # within a character
+    assert len(Lesson.read(tmp_path / "b").touches) == 2
+    assert path.read_bytes() == whole
     path.write_bytes(whole[:-1])  # as an editor may leave it
     assert len(Lesson.read(tmp_path / "b").touches) == 2
     path.write_bytes(whole[:12])
@@ -149,6 +153,34 @@ def test_wherever_a_line_was_torn_the_others_stay(taught, tmp_path):
     assert not again.touches
     teach(again, ["slide"], seed=7)
     assert [t.label for t in Lesson.read(tmp_path / "b").touches] == ["slide"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda text: text.encode("utf-16"), r"labels\.csv:1: not UTF-8 text"),
+        (lambda text: b"\xff\xfe", r"labels\.csv:1: not UTF-8 text"),
+        (lambda text: text.encode() + "\nsession-1.mcap,1,2,ü,\n".encode("latin-1"), "not UTF-8"),
+        (lambda text: b"time,what\n1,2", r"labels\.csv:1: no column 'time'"),
+    ],
+)
+def test_what_nobody_tore_is_told_and_stays(taught, tmp_path, change, said):
+    shutil.copytree(taught.folder, tmp_path / "b")
+    path = tmp_path / "b" / LABELS
+    path.write_bytes(changed := change(path.read_text()))
+    with pytest.raises(ConfigError, match=said):
+        Lesson.read(tmp_path / "b")
+    assert path.read_bytes() == changed
+
+
+def test_odd_files_beside_are_one_line(taught, tmp_path):
+    shutil.copytree(taught.folder, tmp_path / "b")
+    (tmp_path / "b" / LABELS).unlink()
+    (tmp_path / "b" / LABELS).symlink_to("/dev/zero")
+    with pytest.raises(OSError, match="no file"):
+        Lesson.read(tmp_path / "b")
+    (tmp_path / "b" / "session-².mcap").touch()
+    assert Lesson(tmp_path / "b", taught.taught).next_recording().name == "session-2.mcap"
 
 
 def test_a_page_may_look_at_any_moment(taught, tmp_path):
