@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.stream import ConfigError
-from tactile_rt.teaching.lesson import Lesson, LessonProgress
+from tactile_rt.teaching.lesson import ORDERS, Lesson, LessonProgress
 
-__all__ = ["Teacher"]
+__all__ = ["ORDERS", "Teacher"]
 
 LONG = 9  # digits: more are no class's number
 
