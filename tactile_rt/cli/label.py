@@ -62,7 +62,8 @@ def label(
     _check_out(folder, force)
     check_folder(folder)
     beside = (one.parent / LABELS for one in recordings)
-    _check_apart(json, [*recordings, *beside, folder, *filter(None, (labels, like))])
+    if json is not None and json.resolve() in {one.resolve() for one in beside}:
+        raise ConfigError(f"--json {json} holds the labels that are read: name another")
     if by_name:
         intervals = intervals_by_name(recordings)
     elif unlabelled:
@@ -114,12 +115,6 @@ def _shares(text: str) -> tuple[float, ...]:
         ) from None
     check_shares(shares)
     return shares
-
-
-def _check_apart(json: Path | None, others: list[Path]) -> None:
-    """Refuse to write figures over what is read, or where the set goes."""
-    if json is not None and json.resolve() in {one.resolve() for one in others}:
-        raise ConfigError(f"--json {json} is a file that is read, or where the set goes")
 
 
 def _check_out(folder: Path, force: bool) -> None:

@@ -11,7 +11,6 @@ from tactile_rt.cli.app import LARGEST_SEED, MOST_THREADS, app, check_output, ne
 from tactile_rt.cli.progress import progress_bar, working
 from tactile_rt.cli.tables import Json, show_records, told_as_json
 from tactile_rt.settings import take_sets
-from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.contact_point import WhiskerShapes
@@ -38,7 +37,6 @@ def train(
 
     for file in (checkpoint, json):
         check_output(file)
-    _check_apart(checkpoint, json)
     SweepManifest.read(data)
     try:
         import torch
@@ -84,15 +82,9 @@ def evaluate(
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     check_output(json)
-    _check_apart(checkpoint, json)
     with working(Console(stderr=True), "evaluating"):
         records = contact_records(checkpoint, data)
     show_records(records, json)
-
-
-def _check_apart(checkpoint: Path, json: Path | None) -> None:
-    if json is not None and json.resolve() == checkpoint.resolve():
-        raise ConfigError(f"--json {json} is the network's file: name another")
 
 
 def _shapes(manifest: "SweepManifest") -> "WhiskerShapes":

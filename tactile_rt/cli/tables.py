@@ -1,5 +1,6 @@
 """Tables that survive a pipe, a narrow terminal, and a program that reads them."""
 
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,11 +29,26 @@ __all__ = [
     "told_as_json",
 ]
 
+STDOUT = Path("-")
+
+
+def _not_over_another(file: Path | None) -> Path | None:
+    """Refuse to write over a file that the same command line names for something else."""
+    if file is not None and file != STDOUT:
+        words = (word.partition("=")[2] if word[:2] == "--" else word for word in sys.argv[1:])
+        if sum(Path(word).resolve() == file.resolve() for word in words if word) > 1:
+            raise typer.BadParameter(f"{file} is another file of this command: name a new one")
+    return file
+
+
 Json = Annotated[
     Path | None,
-    typer.Option("--json", help="Write what is told as JSON, too; - prints that alone."),
+    typer.Option(
+        "--json",
+        help="Write what is told as JSON, too; - prints that alone.",
+        callback=_not_over_another,
+    ),
 ]
-STDOUT = Path("-")
 WIDE = 10_000  # columns: more than any table has
 
 

@@ -258,9 +258,9 @@ def test_what_is_wrong_is_one_line(here, tmp_path, refused):
         ((tmp_path / "no.mcap", out, "--by-name"), "no recording"),
         ((recording, out, "--like", tmp_path), "is not a sweep set"),
         ((recording, tmp_path / "o\udcff"), "o\\udcff' is no UTF-8: rename it"),
-        ((recording, out, "--json", recording), "is a file that is read, or where"),
-        ((recording, out, "--json", here / "labels.csv"), "is a file that is read, or where"),
-        ((recording, out, "--json", out), "is a file that is read, or where"),
+        ((recording, out, "--json", recording), "is another file of this command"),
+        ((recording, out, "--json", here / "labels.csv"), "holds the labels that are read"),
+        ((recording, out, "--json", out), "is another file of this command"),
     ):
         assert why in refused("label", *words)
         assert not out.exists()

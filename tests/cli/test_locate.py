@@ -38,7 +38,7 @@ def test_from_sweeps_to_figures(call, tmp_path):
     whole = checkpoint.read_bytes()
     for words in (("train", folder, checkpoint), ("eval", checkpoint, folder)):
         code, _, err = call("locate", *words, "--json", checkpoint)
-        assert code == 2 and err.endswith("is the network's file: name another\n")
+        assert code == 2 and "is another file of this command: name a new one" in err
     assert checkpoint.read_bytes() == whole
 
 

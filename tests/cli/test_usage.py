@@ -42,6 +42,26 @@ def test_misuse_of_the_gate_is_not_an_undecided_test(call):
     assert (code, out, err.count("\n")) == (3, "", 1)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("eval", "m.onnx", "set", "--json", "m.onnx"),
+        ("align", "score", "--json=./a.onnx", "a.onnx", "--benchmark", "b"),
+        ("export", "best.pt", "new.onnx", "--json", "sub/../new.onnx"),
+        ("align", "gate", "m.onnx", "--reference=best.pt", "--json", "best.pt"),
+    ],
+)
+def test_json_never_goes_over_another_file_of_the_command(call, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    for name in ("m.onnx", "a.onnx", "best.pt"):
+        (tmp_path / name).write_text("kept")
+    (tmp_path / "sub").mkdir()
+    code, out, err = call(*words)
+    assert (code, out, err.count("\n")) == (3 if "gate" in words else 2, "", 1)
+    assert "is another file of this command: name a new one" in err
+    assert {path.read_text() for path in tmp_path.glob("*.*")} == {"kept"}
+
+
 def test_no_words_at_all_are_answered_by_the_help(call):
     code, out, err = call()
     assert code == 2
