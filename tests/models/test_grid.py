@@ -422,7 +422,7 @@ def test_outcomes_of_other_sweeps_and_damaged_ones_are_told(plan: Path, tmp_path
         gather(grid, folder)
     path = outcome_path(folder, svm)
     whole = path.read_text()
-    for old, new in (("11", "12"), ('"top5":"1', '"top5":"11'), ("{", "[")):
+    for old, new in (('"top1":"1', '"top1":"2'), ('"top5":"1', '"top5":"11'), ("{", "[")):
         path.write_text(whole.replace(old, new, 1))
         with pytest.raises(ConfigError, match=r"svm_seed0\.json is damaged"):
             gather(grid, folder)
