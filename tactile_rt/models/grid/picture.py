@@ -125,7 +125,9 @@ def draw_curves(results: GridResults, path: Path) -> None:
         above = at in axes[0]
         at.set_ylabel(f"top-1 (%), {'validation' if above else 'test'} objects")
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, fontsize=8)
+    figure.legend(
+        handles, labels, loc="outside lower center", ncols=-(-len(handles) // 2) or 1, fontsize=8
+    )
     figure.suptitle(
         "Every point above is a whole training, with a rate and a warm-up of the network's own; "
         "the last of a line gained less than a point, or was the longest tried",
