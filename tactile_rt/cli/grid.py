@@ -31,7 +31,7 @@ def grid(
     task_performance.png and learning_curves.png.
     """
     from tactile_rt.models.grid.outcomes import Outcome, waiting_tasks
-    from tactile_rt.models.grid.plan import read_grid
+    from tactile_rt.models.grid.plan_files import read_grid
     from tactile_rt.sweep_set import SweepManifest
 
     for file in (report, json):

@@ -27,7 +27,8 @@ from tactile_rt.models.grid.outcomes import (
     write_tested,
 )
 from tactile_rt.models.grid.picture import draw_curves, draw_grid
-from tactile_rt.models.grid.plan import Growth, Search, Task, read_grid, shipped_grids
+from tactile_rt.models.grid.plan import Growth, Search, Task
+from tactile_rt.models.grid.plan_files import read_grid, shipped_grids
 from tactile_rt.models.grid.pool import run_grid
 from tactile_rt.models.grid.results import gather, put_into, table, write_results
 from tactile_rt.models.grid.work import Workbench
