@@ -263,18 +263,21 @@ def partners(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np.int6
     return found
 
 
-def check_batches(data: SweepSet, batch: int, jitter: int, two_sweeps: bool) -> None:
+def check_batches(
+    objects: NDArray[np.str_], samples: int, batch: int, jitter: int, two_sweeps: bool
+) -> None:
     """Refuse batches that sweeps in which a touch was found, or all that there are, cannot fill.
 
     Args:
-        data: the sweeps.
+        objects: (sweep,) the object of each.
+        samples: of each sweep.
         batch, jitter, two_sweeps: as `TrainingBatches` takes them.
 
     Raises:
         ConfigError: a jitter longer than a sweep, not even one batch of sweeps with a touch, or no
             object that has two.
     """
-    n, samples = data.sweeps.values.shape[:2]
+    n = len(objects)
     if jitter >= samples:
         raise ConfigError(f"jitter is {jitter} samples, but a sweep has {samples}")
     if n < batch:
@@ -282,7 +285,7 @@ def check_batches(data: SweepSet, batch: int, jitter: int, two_sweeps: bool) -> 
             f"a batch of {batch} is more than the {n} sweeps in which a touch was found: take a "
             "smaller batch, or make more sweeps"
         )
-    if two_sweeps and len(set(data.sweeps.objects.tolist())) == n:
+    if two_sweeps and len(set(objects.tolist())) == n:
         raise ConfigError(
             'pairs of "two-sweeps": no object has two sweeps in which a touch was found; make '
             'more of each, or take pairs of "one-sweep"'
@@ -331,7 +334,8 @@ class TrainingBatches:
         # Too faint to be found at its noise level: learn it from where it is found without.
         self._starts = np.where(starts < 0, starts[0], starts)  # (level, sweep)
         self._usable = np.flatnonzero(self._starts[0] >= 0)
-        check_batches(data[self._usable], batch, jitter, two_sweeps)
+        touched, samples = data.sweeps.objects[self._usable], data.sweeps.values.shape[1]
+        check_batches(touched, samples, batch, jitter, two_sweeps)
         self._two_sweeps = two_sweeps
 
     def __len__(self) -> int:

@@ -84,8 +84,11 @@ class Workbench:
             config = self.grid.config(task, self.data)
             build(config.augmentation, manifest.spec)
             config.network(len(manifest.categories), frame_of(manifest))
-            training = self.splits_of(task.cell.share)[0]
-            check_batches(training, config.batch, config.jitter, config.pairs == TWO_SWEEPS)
+            sweeps = self.splits_of(task.cell.share)[0].sweeps
+            pairs = config.pairs == TWO_SWEEPS
+            check_batches(
+                sweeps.objects, sweeps.values.shape[1], config.batch, config.jitter, pairs
+            )
         with launched(config, self.accelerator):
             pass
 
