@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import termios
 import threading
 import time
 import urllib.request
@@ -268,21 +269,22 @@ def test_keys_are_orders(tmp_path):
         def hear(what: str) -> None:
             until(lambda: any(what in line for line in said))
 
+        def ask_for_a_name() -> None:
+            os.write(ours, b"a")
+            until(lambda: termios.tcgetattr(theirs)[3] & termios.ICANON)  # it takes lines now
+
         hear("keys: 1 to 9 a class")
         hear("touch it: press")
         os.write(ours, b"n")
         hear("touch it: slide (1 of 9)")
-        os.write(ours, b"a")
-        time.sleep(0.3)  # the terminal takes lines from now on
+        ask_for_a_name()
         os.write(ours, b"rub\n")
         hear("touch it: rub (1 of 9)")
         os.write(ours, b"7")
         hear("there is no class 7: there are 3")
-        os.write(ours, b"a")
-        time.sleep(0.3)
+        ask_for_a_name()
         os.write(ours, b"undo\n")
         hear("'undo' is an order: name the class otherwise")
-        time.sleep(0.3)  # the terminal takes keys again
         os.write(ours, b"1")
         os.write(ours, b"q")
         process.wait(20)
