@@ -1,15 +1,11 @@
 """`tactile-rt teach`: touches of any sensor, what each was, and a model that knows them."""
 
-import os
 import queue
 import shlex
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -23,11 +19,11 @@ from tactile_rt.cli.app import (
     starting,
 )
 from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.teach_orders import HELP, Buttons, listening
 from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError, SpecMismatch
 
 if TYPE_CHECKING:
     from tactile_rt.teaching.lesson import Lesson
-    from tactile_rt.teaching.page import TeachingPage
     from tactile_rt.teaching.teacher import Teacher
 
 POLL_S = 0.1
@@ -36,8 +32,6 @@ HINT_S = 20.0  # without a touch, before it is said how strong the readings are;
 DEAF_S = 10.0  # without a sample, before the first one: the device does not talk
 RESTING = f"touch nothing for {REST_S:g} s"
 HASTY = "that came too soon after the last touch to be one: wait a second"
-HELP = "keys: 1 to 9 a class, n the next, a another one, u takes a touch back, q learns and leaves"
-KEYS = {"n": "next", "u": "undo", "q": "done", "\x04": "done"}
 
 
 @app.command()
@@ -91,7 +85,7 @@ def teach(
     lesson = _begun_before(folder, base)
     with starting():
         opened = open_source(source)
-    with opened, alone_in(folder), _Buttons(at) as buttons, leaving(seconds):
+    with opened, alone_in(folder), Buttons(at, RESTING) as buttons, leaving(seconds):
         lesson = lesson or (_begun(folder, opened) if base is None else Lesson.on(folder, base))
         buttons.teacher = Teacher(lesson, wanted, touches)
         _teach(buttons.teacher, opened, source, buttons.orders)
@@ -140,7 +134,7 @@ def _teach(teacher: "Teacher", source: Source, url: str, orders: "queue.Queue[st
         raise SpecMismatch(f"{error}, or teach in another folder") from None
     typer.echo(_greeting(lesson, source))
     path = lesson.next_recording()
-    with StreamWriter(path, source, url=url) as writer, _listening(orders):
+    with StreamWriter(path, source, url=url) as writer, listening(orders):
         if sys.stdin is not None and sys.stdin.isatty() and not teacher.done:
             typer.echo(HELP)
         typer.echo(teacher.prompt())
@@ -214,7 +208,8 @@ def _address(given: str) -> tuple[str, int]:
 
 def _begun(folder: Path, source: Source) -> "Lesson":
     """A new lesson, with the noise of the array at rest."""
-    from tactile_rt.teaching.lesson import Lesson, measured_floor
+    from tactile_rt.teaching.lesson import Lesson
+    from tactile_rt.teaching.listener import measured_floor
 
     typer.echo(RESTING)
     chunks: list[Chunk] = []
@@ -251,100 +246,3 @@ def _greeting(lesson: "Lesson", source: Source) -> str:
 def _say(text: str) -> None:
     if text:
         typer.echo(text)
-
-
-class _Buttons:
-    """A page in a browser, if it is asked for, and what is ordered there.
-
-    Args:
-        at: host and port; None: no page.
-
-    Attributes:
-        orders: What is asked for, there and elsewhere.
-        teacher: The teacher whose state is shown; None: there is none yet.
-    """
-
-    def __init__(self, at: tuple[str, int] | None) -> None:
-        self.orders: queue.Queue[str] = queue.Queue()
-        self.teacher: Teacher | None = None
-        self._at = at
-        self._page: TeachingPage | None = None
-
-    def __enter__(self) -> Self:
-        if self._at is not None:
-            from tactile_rt.teaching.page import TeachingPage
-
-            self._page = TeachingPage(*self._at, self._state, self.orders.put)
-            typer.echo(f"buttons: {self._page.url}")
-        return self
-
-    def __exit__(self, *why: object) -> None:
-        if self._page is not None:
-            self._page.close()
-
-    def _state(self) -> dict[str, Any]:
-        return self.teacher.state() if self.teacher else {"prompt": RESTING}
-
-
-@contextmanager
-def _listening(orders: "queue.Queue[str]") -> Iterator[None]:
-    """Take keys, or lines where stdin is no terminal, until the block ends."""
-    terminal = sys.stdin is not None and sys.stdin.isatty()
-    if sys.stdin is None or sys.stdin.closed:
-        yield
-        return
-    if not terminal:
-        threading.Thread(target=_take_lines, args=(orders,), daemon=True).start()
-        yield
-        return
-    import termios
-    import tty
-
-    descriptor = sys.stdin.fileno()
-    before = termios.tcgetattr(descriptor)
-    threading.Thread(target=_take_keys, args=(orders, descriptor, before), daemon=True).start()
-    tty.setcbreak(descriptor)
-    try:
-        yield
-    finally:
-        termios.tcsetattr(descriptor, termios.TCSADRAIN, before)
-
-
-def _take_lines(orders: "queue.Queue[str]") -> None:
-    try:
-        for line in sys.stdin:
-            if line.strip():
-                orders.put(line.strip())
-    except (OSError, ValueError):
-        return  # closed
-
-
-def _take_keys(orders: "queue.Queue[str]", descriptor: int, before: list[object]) -> None:
-    import termios
-    import tty
-
-    from tactile_rt.teaching.lesson import ORDERS
-
-    while True:
-        try:
-            key = os.read(descriptor, 1).decode(errors="replace")
-        except OSError:
-            return
-        if not key:
-            return
-        if key == "a":
-            termios.tcsetattr(descriptor, termios.TCSADRAIN, before)  # type: ignore[arg-type]
-            typer.echo("name of the class: ", nl=False)
-            name = bytearray()
-            while (more := os.read(descriptor, 1)) not in (b"", b"\n"):
-                name += more
-            tty.setcbreak(descriptor)
-            called = name.decode(errors="replace").strip()
-            if called in ORDERS:
-                typer.echo(f"{called!r} is an order: name the class otherwise")
-            elif called:
-                orders.put(called)
-        elif key.isdigit():
-            orders.put(key)
-        elif key in KEYS:
-            orders.put(KEYS[key])

@@ -28,6 +28,7 @@ __all__ = [
     "LABELS",
     "LabelledInterval",
     "append_label",
+    "check_appendable",
     "check_name",
     "drop_torn_label",
     "label_of_file",
@@ -152,10 +153,8 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> str:
     if not 0 <= interval.start_s < interval.end_s < math.inf:
         raise ConfigError(f"start_s must be 0 or more and before end_s: {interval}")
     new = not path.exists() or not path.stat().st_size
-    if not new and (columns := read_columns(path)) != COLUMNS:
-        raise ConfigError(
-            f"{path}:1: columns are {','.join(columns)}, not {','.join(COLUMNS)}: name another file"
-        )
+    if not new:
+        check_appendable(path)
     times = (f"{t:.6f}".rstrip("0").rstrip(".") for t in (interval.start_s, interval.end_s))
     line = text = _line(recording, *times, interval.label, interval.object)
     with path.open("ab+") as file:
@@ -170,6 +169,22 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> str:
     if new:
         sync_folder(path.parent)  # the name, too
     return line.rstrip("\n")
+
+
+def check_appendable(path: Path) -> None:
+    """Whether `append_label` can add to a file that is there.
+
+    Raises:
+        ConfigError: it has other columns.
+        OSError: it cannot be read.
+    """
+    with path.open("rb") as file:
+        columns = _cells(file.readline(LONGEST_LINE))
+    if columns != COLUMNS:
+        raise ConfigError(
+            f"{path}:1: columns are {','.join(columns)}, not {','.join(COLUMNS)}: nothing can be "
+            "added; name another file, or change them"
+        )
 
 
 def drop_torn_label(path: Path) -> bool:
@@ -221,12 +236,6 @@ def remove_label(path: Path, line: str) -> None:
         del lines[there[-1]]
         data = "".join(lines).encode(errors="surrogateescape")
         write_whole(path, lambda file: file.write(data))
-
-
-def read_columns(path: Path) -> tuple[str, ...]:
-    """The names of a file's columns."""
-    with path.open("rb") as file:
-        return _cells(file.readline(LONGEST_LINE))
 
 
 def _cells(line: bytes) -> tuple[str, ...]:

@@ -14,14 +14,13 @@ A lesson is a folder, so that it can be gone on with, looked at and corrected:
 """
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import hash_of, load_model
 from tactile_rt.files import write_whole
@@ -30,15 +29,17 @@ from tactile_rt.recording.labels import (
     LABELS,
     LabelledInterval,
     append_label,
+    check_appendable,
     check_name,
     drop_torn_label,
     lines_of,
     read_labels,
     remove_label,
 )
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError
+from tactile_rt.stream import ArraySpec, ConfigError, RecordingError
 from tactile_rt.teaching.further import check_further
 from tactile_rt.teaching.head import FEWEST, LeftOut
+from tactile_rt.teaching.listener import Listener
 from tactile_rt.teaching.model import TOUCH, Taught, TaughtFurther, write_features
 
 __all__ = [
@@ -48,20 +49,14 @@ __all__ = [
     "ORDERS",
     "Lesson",
     "LessonProgress",
-    "Listener",
     "TaughtTouch",
     "check_label",
-    "measured_floor",
 ]
 
 ORDERS = ("next", "undo", "done")  # to a teacher; any other word is the label from now on
 FEATURES, MODEL = "features.onnx", "model.onnx"
 BEFORE_NS = 20_000_000  # before its onset a touch's interval begins
-HASTY_NS = 100_000_000  # after the end of a contact, within which another is not a touch of its own
-FELT = 6.0  # times the noise, for two samples running, is felt
-LONG_AGO_NS = 2**62
 ODD = 3.0  # times as far from its class as its others are, a touch is odd
-QUIET = 0.3  # of the noise at rest: the least noise that the contact detector assumes
 
 Floats = NDArray[np.float64]
 
@@ -165,7 +160,9 @@ class Lesson:
             return  # its first line was torn
         recordings = sorted(self.folder.glob("session-*.mcap"), key=_number)
         lines = lines_of(labels)
-        for path, intervals in read_labels(labels, [_whole(one) for one in recordings]).items():
+        told = read_labels(labels, [_whole(one) for one in recordings])
+        check_appendable(labels)
+        for path, intervals in told.items():
             if not intervals:
                 continue
             felt = self._felt(path)
@@ -182,13 +179,14 @@ class Lesson:
     def _felt(self, path: Path) -> list[tuple[float, NDArray[np.float32]]]:
         """Onset, in seconds since the beginning, and features of every touch in a recording."""
         recording = Recording(path)
-        listener = self.listener(recording.spec)
+        # which of them counted, the labels tell
+        listener = Listener(self.folder / FEATURES, recording.spec, self.taught.felt, hasty_ns=0)
         found = []
         for chunk in recording:
             found += [(listener.seconds(onset), felt) for onset, _, felt in listener.push(chunk)]
         return found
 
-    def listener(self, spec: ArraySpec) -> "Listener":
+    def listener(self, spec: ArraySpec) -> Listener:
         """That finds touches in a stream of an array.
 
         Raises:
@@ -324,119 +322,6 @@ def _progress(used: Sequence[int], names: Sequence[str], found: LeftOut) -> Less
         for name in dict.fromkeys(names)
     )
     return LessonProgress(told, tuple(odd), tuple(pairs))
-
-
-class Listener:
-    """Takes a stream, gives the touches in it: onset, end and features of each.
-
-    Args:
-        model: ``features.onnx``.
-        spec: the array of the stream.
-        felt: makes features of a touch's steps.
-
-    Attributes:
-        classifier: The classifier that runs the features, and knows whether something is touched.
-        hasty: The number of touches that came so soon after another that they may be its rest; they
-            are not given.
-
-    Raises:
-        SpecMismatch: the stream is of another array than the lesson.
-    """
-
-    def __init__(
-        self,
-        model: Path,
-        spec: ArraySpec,
-        felt: Callable[[Sequence[Classification]], NDArray[np.float32]],
-    ) -> None:
-        self.classifier, self._felt = Classifier(model, spec, embedding=True), felt
-        self._spec = spec
-        self._first_ns: int | None = None
-        self._heard = 0  # samples since the last hint
-        self._strongest, self._where = 0.0, ""  # since then, in units of the noise
-        self._steps: list[Classification] = []
-        self._released_ns = -LONG_AGO_NS  # stream time
-        self._counts = True  # the touch under way
-        self.hasty = 0
-
-    def push(self, chunk: Chunk) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
-        """Take samples; gives (onset, end, features (step, feature)) of touches that are whole."""
-        if self._first_ns is None and len(chunk):
-            self._first_ns = int(chunk.t_ns[0])
-        self._heard += len(chunk)
-        touched = self.touching
-        decisions = self.classifier.push(chunk)
-        detector = self.classifier.detector
-        if detector.ready and detector.tared.any():
-            now = np.abs(self.classifier.tared / detector.sigma)
-            element, channel = np.unravel_index(now.argmax(), now.shape)
-            if now[element, channel] > self._strongest:
-                self._strongest = float(now[element, channel])
-                self._where = f"{self._spec.elements[element]} {self._spec.channels[channel]}"
-        for decision in decisions:
-            if decision.step == 1:
-                self._steps = []
-                hasty = decision.onset_ns - self._released_ns < HASTY_NS
-                self.hasty, self._counts = self.hasty + hasty, not hasty
-            self._steps.append(decision)
-            if decision.final and self._counts:
-                yield decision.onset_ns, decision.t_ns, self._felt(self._steps)
-        if touched and not self.touching:
-            self._released_ns = int(chunk.t_ns[-1])
-
-    def hint(self) -> str:
-        """Why no touch may have been found for a while."""
-        heard, strongest = self._heard, self._strongest
-        self._heard, self._strongest = 0, 0.0
-        if not heard:
-            return "no sample came for a while: is the device still on?"
-        if self.touching:
-            return "it has been touched all the while: let go for a second"
-        if not self.classifier.detector.ready:
-            return "there was no second at rest yet: let go"
-        advice = "touch more firmly" if strongest < FELT else "touch longer"
-        return (
-            f"no touch was noticed: the strongest reading was {strongest:.1f} times the noise "
-            f"({self._where}), and {FELT:g} is felt: {advice}"
-        )
-
-    @property
-    def touching(self) -> bool:
-        """Whether something is touched now."""
-        return self.classifier.detector.contact
-
-    def seconds(self, t_ns: int) -> float:
-        """Stream time in seconds since the first sample."""
-        return (t_ns - (self._first_ns or 0)) / NS_PER_S
-
-
-def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:
-    """(channel,) the least noise that a contact detector should assume, from an array at rest.
-
-    A share of the noise of the median element; of a channel that never changes, the smallest
-    difference between its readings, or a millionth of the largest.
-
-    Args:
-        chunks: what the array delivers while nothing touches it.
-
-    Raises:
-        RecordingError: there is nothing, or nothing valid.
-    """
-    values = np.concatenate([c.values for c in chunks]) if chunks else np.empty((0, 0, 0))
-    valid = np.concatenate([c.valid for c in chunks]) if chunks else np.empty((0, 0))
-    there = valid.all(axis=0) if len(valid) else np.zeros(0, bool)
-    if len(values) < 2 or not there.any():
-        raise RecordingError("the array delivered nothing at rest: is it connected and powered?")
-    values = values[:, there].astype(float)
-    noise = np.median(values.std(axis=0), axis=0)
-    floor: NDArray[np.float64] = QUIET * noise
-    for channel in range(values.shape[2]):
-        levels = np.unique(values[:, :, channel])
-        steps = np.diff(levels)
-        step = float(steps.min()) if len(steps) else max(1e-6 * float(abs(levels).max()), 1e-9)
-        floor[channel] = max(floor[channel], step / np.sqrt(12))
-    found: NDArray[np.float32] = floor.astype(np.float32)
-    return found
 
 
 def _check_free(folder: Path) -> None:

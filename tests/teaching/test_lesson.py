@@ -16,7 +16,8 @@ from tactile_rt.recording import StreamWriter
 from tactile_rt.recording.labels import LABELS
 from tactile_rt.stream import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.teaching.head import fit_classes, leave_out
-from tactile_rt.teaching.lesson import FEATURES, MODEL, ORDERS, Lesson, measured_floor
+from tactile_rt.teaching.lesson import FEATURES, MODEL, ORDERS, Lesson
+from tactile_rt.teaching.listener import measured_floor
 from tactile_rt.teaching.onnx_bytes import OnnxGraph
 from tactile_rt.teaching.teacher import Teacher
 from tactile_rt.testing import ArraySource, cut, small_spec
@@ -162,6 +163,7 @@ def test_wherever_a_line_was_torn_the_others_stay(taught, tmp_path):
         (lambda text: b"\xff\xfe", r"labels\.csv:1: not UTF-8 text"),
         (lambda text: text.encode() + "\nsession-1.mcap,1,2,ü,\n".encode("latin-1"), "not UTF-8"),
         (lambda text: b"time,what\n1,2", r"labels\.csv:1: no column 'time'"),
+        (lambda text: b"start_s,end_s,label\n1,2,press", r"labels\.csv:1: columns are .* added"),
     ],
 )
 def test_what_nobody_tore_is_told_and_stays(taught, tmp_path, change, said):
@@ -355,12 +357,25 @@ def test_features_of_a_folder_stay_as_they_were(taught):
     assert tuple(card.floor) == pytest.approx(tuple(FLOOR))
 
 
-def test_what_comes_too_soon_is_the_rest_of_a_touch(taught):
+@pytest.mark.parametrize("samples", [1, 10, 100, 10_000])
+def test_what_comes_too_soon_is_the_rest_of_a_touch(taught, samples):
+    """However many samples come together."""
     rng = np.random.default_rng(8)
     rest, touches = felt([], seed=8), [touch("press", rng) for _ in range(3)]
     slow = np.repeat(touches[0], 2, axis=0)  # longer than what is looked at of it
     # the second begins half a second after the first has ended, the third two seconds
     signal = np.concatenate([rest, slow[:-150], touches[1][100:], touches[2]])
     listener = taught.listener(wrench_spec())
-    found = [one for chunk in cut(signal, RATE_HZ) for one in listener.push(chunk)]
+    found = [one for chunk in cut(signal, RATE_HZ, samples) for one in listener.push(chunk)]
     assert (len(found), listener.hasty) == (2, 1)
+
+
+def test_the_strongest_reading_is_told_however_many_samples_come_together(taught):
+    values = felt([], seed=9)
+    values[250, 0, 2] += 5 * NOISE[2]  # too short to be felt
+    said = set()
+    for samples in (1, 30, len(values)):
+        listener = taught.listener(wrench_spec())
+        assert not [one for chunk in cut(values, RATE_HZ, samples) for one in listener.push(chunk)]
+        said.add(listener.hint())
+    assert len(said) == 1 and "(sensor fz)" in said.pop()

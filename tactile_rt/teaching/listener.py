@@ -1,0 +1,148 @@
+"""The touches in a stream that somebody teaches: when each was, and its features."""
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.classifier.classifier import Classification, Classifier
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, RecordingError
+
+__all__ = ["Listener", "measured_floor"]
+
+HASTY_NS = 200_000_000  # after the end of a contact, within which another is not a touch of its own
+FELT = 6.0  # times the noise, for two samples running, is felt
+LONG_AGO_NS = 2**62
+QUIET = 0.3  # of the noise at rest: the least noise that the contact detector assumes
+
+
+class Listener:
+    """Takes a stream, gives the touches in it: onset, end and features of each.
+
+    Args:
+        model: ``features.onnx``.
+        spec: the array of the stream.
+        felt: makes features of a touch's steps.
+        hasty_ns: how soon after the end of a contact another is taken for its rest, ns.
+
+    Attributes:
+        classifier: The classifier that runs the features, and knows whether something is touched.
+        hasty: The number of touches that came so soon after another that they may be its rest; they
+            are not given.
+
+    Raises:
+        SpecMismatch: the stream is of another array than the lesson.
+    """
+
+    def __init__(
+        self,
+        model: Path,
+        spec: ArraySpec,
+        felt: Callable[[Sequence[Classification]], NDArray[np.float32]],
+        hasty_ns: int = HASTY_NS,
+    ) -> None:
+        self.classifier, self._felt = Classifier(model, spec, embedding=True), felt
+        self._spec, self._hasty_ns = spec, hasty_ns
+        # samples between two of the classifier's, whose readings can be seen after each of them
+        self._together = max(1, round(spec.rate_hz * self.classifier.card.period_ns / NS_PER_S))
+        self._first_ns: int | None = None
+        self._heard = 0  # samples since the last hint
+        self._strongest, self._where = 0.0, ""  # since then, in units of the noise
+        self._steps: list[Classification] = []
+        self._released_ns = -LONG_AGO_NS  # stream time
+        self._counts = True  # the touch under way
+        self.hasty = 0
+
+    def push(self, chunk: Chunk) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
+        """Take samples; gives (onset, end, features (step, feature)) of touches that are whole."""
+        if self._first_ns is None:
+            self._first_ns = int(chunk.t_ns[0])
+        self._heard += len(chunk)
+        for k in range(0, len(chunk), self._together):
+            one = slice(k, k + self._together)
+            yield from self._listen(
+                Chunk(chunk.seq[one], chunk.t_ns[one], chunk.values[one], chunk.valid[one])
+            )
+
+    def _listen(self, chunk: Chunk) -> Iterator[tuple[int, int, NDArray[np.float32]]]:
+        decisions = self.classifier.push(chunk)
+        detector = self.classifier.detector
+        if detector.ready and detector.tared.any():
+            now = np.abs(self.classifier.tared / detector.sigma)
+            element, channel = np.unravel_index(now.argmax(), now.shape)
+            if now[element, channel] > self._strongest:
+                self._strongest = float(now[element, channel])
+                self._where = f"{self._spec.elements[element]} {self._spec.channels[channel]}"
+        for decision in decisions:
+            if decision.step == 1:
+                self._steps = []
+                onset = decision.onset_ns
+                hasty = onset - self._released_before(onset) < self._hasty_ns
+                self.hasty, self._counts = self.hasty + hasty, not hasty
+            self._steps.append(decision)
+            if decision.final and self._counts:
+                yield decision.onset_ns, decision.t_ns, self._felt(self._steps)
+
+    def _released_before(self, onset_ns: int) -> int:
+        """The stream time at which the contact before an onset had ended."""
+        changes = self.classifier.touches
+        while changes and changes[0][0] < onset_ns:
+            t_ns, began = changes.popleft()
+            if not began:
+                self._released_ns = t_ns
+        return self._released_ns
+
+    def hint(self) -> str:
+        """Why no touch may have been found for a while."""
+        heard, strongest = self._heard, self._strongest
+        self._heard, self._strongest = 0, 0.0
+        if not heard:
+            return "no sample came for a while: is the device still on?"
+        if self.touching:
+            return "it has been touched all the while: let go for a second"
+        if not self.classifier.detector.ready:
+            return "there was no second at rest yet: let go"
+        advice = "touch more firmly" if strongest < FELT else "touch longer"
+        return (
+            f"no touch was noticed: the strongest reading was {strongest:.1f} times the noise "
+            f"({self._where}), and {FELT:g} is felt: {advice}"
+        )
+
+    @property
+    def touching(self) -> bool:
+        """Whether something is touched now."""
+        return self.classifier.detector.contact
+
+    def seconds(self, t_ns: int) -> float:
+        """Stream time in seconds since the first sample."""
+        return (t_ns - (self._first_ns or 0)) / NS_PER_S
+
+
+def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:
+    """(channel,) the least noise that a contact detector should assume, from an array at rest.
+
+    A share of the noise of the median element; of a channel that never changes, the smallest
+    difference between its readings, or a millionth of the largest.
+
+    Args:
+        chunks: what the array delivers while nothing touches it.
+
+    Raises:
+        RecordingError: there is nothing, or nothing valid.
+    """
+    values = np.concatenate([c.values for c in chunks]) if chunks else np.empty((0, 0, 0))
+    valid = np.concatenate([c.valid for c in chunks]) if chunks else np.empty((0, 0))
+    there = valid.all(axis=0) if len(valid) else np.zeros(0, bool)
+    if len(values) < 2 or not there.any():
+        raise RecordingError("the array delivered nothing at rest: is it connected and powered?")
+    values = values[:, there].astype(float)
+    noise = np.median(values.std(axis=0), axis=0)
+    floor: NDArray[np.float64] = QUIET * noise
+    for channel in range(values.shape[2]):
+        levels = np.unique(values[:, :, channel])
+        steps = np.diff(levels)
+        step = float(steps.min()) if len(steps) else max(1e-6 * float(abs(levels).max()), 1e-9)
+        floor[channel] = max(floor[channel], step / np.sqrt(12))
+    found: NDArray[np.float32] = floor.astype(np.float32)
+    return found
