@@ -44,7 +44,7 @@ CARD_VERSION = 3
 CARD_VERSIONS = (1, 2, 3)  # the older ones without what `ModelCard` says is since 2 or 3
 STATE_TYPES = ("bool", "float16", "float32", "float64", "int32", "int64", "int8", "uint8")
 MAX_STEPS = 1_000_000
-MAX_PERIOD_NS = 10**12
+PERIODS_NS = range(1_000, 10**12 + 1)  # of samples: from a million a second
 MAX_EPISODE = 2**24  # values: checks run one at once, and a robot's has some 20,000
 LISTS = ("commands", "unseen_objects")  # of the provenance, where they are there
 
@@ -271,7 +271,7 @@ def parse_card(path: Path, text: str) -> ModelCard:
         values = np.asarray(getattr(card, what), dtype=np.float64)
         if not (np.all(values > 0) and np.all(np.isfinite(values))):
             raise damaged(f"{what} must be positive")
-    if card.steps > MAX_STEPS or card.period_ns > MAX_PERIOD_NS:
+    if card.steps > MAX_STEPS or card.period_ns not in PERIODS_NS:
         raise damaged(f"{card.steps} steps of {card.substeps} sub-steps of {card.period_ns} ns")
     if not card.labels or len(set(card.labels)) != len(card.labels):
         raise damaged("labels are missing or repeat")

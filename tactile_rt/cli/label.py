@@ -43,12 +43,12 @@ def label(
     and, if you like, object; times are seconds since the recording's
     first sample. What cannot be used is counted on stderr.
     """
+    from tactile_rt.recording.labelled_set import write_set
     from tactile_rt.recording.labelling import (
         find_labelled,
         intervals_beside,
         intervals_by_name,
         intervals_of_all,
-        write_set,
     )
     from tactile_rt.recording.labels import LABELS
     from tactile_rt.sim_backend.datasets.inventory import write_sums
@@ -105,7 +105,7 @@ def label(
 
 
 def _shares(text: str) -> tuple[float, ...]:
-    from tactile_rt.recording.labelling import check_shares
+    from tactile_rt.recording.labelled_set import check_shares
 
     try:
         shares = tuple(map(float, text.split(",")))

@@ -252,6 +252,7 @@ def test_outputs_that_the_card_promises_must_be_there(
         ({"scale": ()}, "0 values of scale for 2 channels"),
         ({"floor": (1e-3, 0.0)}, "floor must be positive"),
         ({"steps": 10**9}, "1000000000 steps"),
+        ({"period_ns": 1}, "4 steps of 3 sub-steps of 1 ns"),
         ({"period_ns": 10**13}, "4 steps of 3 sub-steps of 10000000000000 ns"),
         ({"substeps": 10**12}, "samples of shape 1000000000000x3x2"),
         ({"labels": ("a", "a", "b", "c", "d")}, "labels are missing or repeat"),

@@ -61,7 +61,8 @@ def here(tmp_path_factory):
 @pytest.fixture(scope="module")
 def night(here):
     """The tutorial's set, made by hand of what the command is made of."""
-    from tactile_rt.recording.labelling import find_labelled, intervals_beside, write_set
+    from tactile_rt.recording.labelled_set import write_set
+    from tactile_rt.recording.labelling import find_labelled, intervals_beside
 
     path = here / "night.mcap"
     write_set(here / "set", find_labelled([path], intervals_beside([path])))

@@ -10,13 +10,13 @@ import pytest
 
 from tactile_rt.classifier.model_file import METADATA_KEY, shipped_model
 from tactile_rt.recording.conversion import convert
+from tactile_rt.recording.labelled_set import write_set
 from tactile_rt.recording.labelling import (
     find_labelled,
     intervals_beside,
     intervals_by_name,
     intervals_of_all,
     like,
-    write_set,
 )
 from tactile_rt.recording.labels import LabelledInterval
 from tactile_rt.sensor_spec import ChannelSpec, SensorSpec
@@ -254,7 +254,7 @@ def test_a_model_with_an_odd_sensor_is_told_in_a_line(tmp_path, sensor, said):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("period_ns", [0, -5, 10**30])
+@pytest.mark.parametrize("period_ns", [0, -5, 1, 10**30])
 def test_a_set_whose_samples_come_at_no_period_is_told(tmp_path, period_ns):
     write_tiny_set(tmp_path / "set", spec=ARRAY)
     manifest = tmp_path / "set" / "manifest.json"
