@@ -16,9 +16,10 @@ pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.models.datasets import SweepSet, TrainingBatches, joined
+from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import run_windows
+from tactile_rt.models.training.batches import TrainingBatches
 from tactile_rt.recording import Recording
 from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.stream import ConfigError

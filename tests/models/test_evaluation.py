@@ -11,7 +11,7 @@ from sklearn.metrics import roc_auc_score
 
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.models import evaluation, onsets
-from tactile_rt.models.datasets import SweepSet, find_onsets
+from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import OFFSET, Disturbance
 from tactile_rt.models.evaluation import (
     accuracy,
@@ -20,6 +20,7 @@ from tactile_rt.models.evaluation import (
     bootstrap,
     deciding_step,
 )
+from tactile_rt.models.onsets import find_onsets
 from tactile_rt.sensor_spec import channel_limits
 from tactile_rt.stream import ArraySpec, ConfigError
 from tactile_rt.sweep_set import SweepManifest, Sweeps

@@ -14,7 +14,7 @@ import pytest
 import torch
 from torch import nn
 
-from tactile_rt.models.datasets import SweepSet, TrainingBatches
+from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import hits, predict
 from tactile_rt.models.training import (
     ProbeConfig,
@@ -25,6 +25,7 @@ from tactile_rt.models.training import (
     run_on,
     train,
 )
+from tactile_rt.models.training.batches import TrainingBatches
 from tactile_rt.models.training.feeding import prefetched
 from tactile_rt.models.training.loop import build_objective, read_splits
 from tactile_rt.models.training.optimizers import (

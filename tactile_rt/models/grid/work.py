@@ -18,7 +18,7 @@ from tactile_rt.files import write_whole
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.data_checks import check_sets, check_split
-from tactile_rt.models.datasets import SweepSet, check_batches, drawn_as, frame_of
+from tactile_rt.models.datasets import SweepSet, drawn_as, frame_of
 from tactile_rt.models.disturbances import CLEAN, RATED
 from tactile_rt.models.ead import count_parameters
 from tactile_rt.models.evaluation import CutWindows, among, cut_windows, hits, posteriors
@@ -45,6 +45,7 @@ from tactile_rt.models.training import (
     probe,
     train,
 )
+from tactile_rt.models.training.batches import check_batches
 from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError
 from tactile_rt.models.training.devices import launched
 from tactile_rt.sweep_set import SweepManifest

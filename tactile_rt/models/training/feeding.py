@@ -17,7 +17,7 @@ import torch
 from torch import Generator, Tensor
 
 from tactile_rt.models.augmentation import Augmentation, Loads
-from tactile_rt.models.datasets import TrainingBatches
+from tactile_rt.models.training.batches import TrainingBatches
 
 __all__ = ["Batch", "BatchFeed", "Share", "generator_of", "prefetched"]
 

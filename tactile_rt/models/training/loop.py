@@ -24,14 +24,7 @@ from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoint_files import describe_checkpoint
 from tactile_rt.models.checkpoints import TactileClassifier, begin_from, save_whole
 from tactile_rt.models.data_checks import check_sets, trained_objects
-from tactile_rt.models.datasets import (
-    SweepSet,
-    TrainingBatches,
-    drawn_as,
-    frame_of,
-    joined,
-    relabelled,
-)
+from tactile_rt.models.datasets import SweepSet, drawn_as, frame_of, joined, relabelled
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder, draw_as_published
 from tactile_rt.models.objectives import (
     Autoencoder,
@@ -41,6 +34,7 @@ from tactile_rt.models.objectives import (
     SimSiam,
     Supervised,
 )
+from tactile_rt.models.training.batches import TrainingBatches
 from tactile_rt.models.training.config import (
     TWO_SWEEPS,
     DivergedError,

@@ -22,15 +22,9 @@ from tactile_rt.models.data_checks import (
     probed_on,
     trained_objects,
 )
-from tactile_rt.models.datasets import (
-    JITTER,
-    SweepSet,
-    TrainingBatches,
-    drawn_as,
-    of_categories,
-    windows,
-)
+from tactile_rt.models.datasets import SweepSet, drawn_as, of_categories, windows
 from tactile_rt.models.evaluation import hits, predict
+from tactile_rt.models.training.batches import JITTER, TrainingBatches
 from tactile_rt.models.training.config import ProbeConfig, Progress
 from tactile_rt.models.training.logs import log_epoch
 from tactile_rt.models.training.recipes import as_options, training_command
