@@ -25,7 +25,7 @@ Force = Annotated[bool, typer.Option("--force", help="Replace a file that is the
 @app.command()
 def record(
     source: Annotated[str, typer.Argument(help="URL of a source, e.g. serial:PORT?codec=native.")],
-    output: Annotated[Path, typer.Argument(help="The recording, as a rule .mcap.")],
+    output: Annotated[Path, typer.Argument(help="The recording, a .mcap.")],
     seconds: Seconds = None,
     note: Annotated[
         list[str] | None, typer.Option(help="To keep with it: NAME=VALUE; may be repeated.")
@@ -56,6 +56,8 @@ def record(
     need_mcap()
     for file in (output, json):
         check_output(file)
+    if output.suffix != ".mcap":
+        raise ConfigError(f"{output}: a recording is a .mcap; `tactile-rt convert` makes others")
     rotated = rotate_mb or rotate_s  # which writes over nothing
     if not rotated:  # before a device is opened and started
         check_new(output, force)

@@ -174,6 +174,7 @@ def test_what_another_process_is_recording_is_not_replaced(
     ("arguments", "said"),
     [
         (("record", SOURCE, "none/x.mcap"), "no folder none to write x.mcap in"),
+        (("record", SOURCE, "run.csv"), "run.csv: a recording is a .mcap; `tactile-rt convert`"),
         (("record", SOURCE, "."), "is a folder: name a file"),
         (("record", "syntetic:", "x.mcap"), "did you mean synthetic:?"),
         (("record", SOURCE, "x.mcap", "--note", "who"), "--note is NAME=VALUE, not 'who'"),
