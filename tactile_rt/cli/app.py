@@ -2,6 +2,7 @@
 
 import logging
 import os
+import re
 import shutil
 import signal
 import sys
@@ -27,6 +28,7 @@ __all__ = [
     "Seconds",
     "app",
     "check_folder",
+    "check_named_once",
     "check_new",
     "check_output",
     "check_text",
@@ -184,22 +186,36 @@ def check_text(*names: Path | None) -> None:
             raise ConfigError(f"{str(name)!r} is no UTF-8: rename it") from None
 
 
+def check_named_once(file: Path) -> None:
+    """Refuse to write a file that the command line names for something else, too, be it within a
+    URL.
+
+    Raises:
+        ConfigError: more than one word names it.
+    """
+    where = file.resolve()
+    words = ({word, *re.split("[:?&=@]", word)} - {""} for word in sys.argv[1:])
+    if sum(any(Path(part).resolve() == where for part in word) for word in words) > 1:
+        raise ConfigError(f"{file} is another file of this command: name a new one")
+
+
 def check_new(file: Path, force: bool) -> None:
-    """Refuse to write a recording over a file that is there, or that is just being recorded.
+    """Refuse to write over a file that is there, that is read, or that is just being recorded.
 
     Args:
-        file: the recording to write.
+        file: the file to write.
         force: whether one that is there is to be replaced.
 
     Raises:
-        ConfigError: as `check_output`; it is there, and not to be replaced; or some process is
-            recording into it.
+        ConfigError: as `check_output`; it is there, and not to be replaced; the command line names
+            it twice; or some process is recording into it.
     """
     check_output(file)
     if not file.exists():
         return
     if not force:
         raise ConfigError(f"{file} is there already: name another file, or give --force")
+    check_named_once(file)
     from tactile_rt.recording.writer import check_not_recorded
 
     check_not_recorded(file)

@@ -7,7 +7,7 @@ from urllib.parse import parse_qsl
 
 import typer
 
-from tactile_rt.cli.app import app, check_output, leaving
+from tactile_rt.cli.app import app, check_new, leaving
 from tactile_rt.stream import ConfigError, RecordingError
 
 if TYPE_CHECKING:
@@ -53,9 +53,8 @@ def replay(
     they differ from the recorded ones is told.
     """
     fields = {"speed": _speed(speed)} | _decoding(codec, redecode)
-    check_output(out)
-    if out is not None and out.exists() and not force:
-        raise ConfigError(f"{out} is there already: name another file, or give --force")
+    if out is not None:
+        check_new(out, force)
     told = _Replay(_in_order(files), model, name, check, fields)
     if "from" in fields:
         _compare(told.files, {k: v for k, v in fields.items() if k not in ("from", "speed")})

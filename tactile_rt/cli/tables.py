@@ -1,6 +1,5 @@
 """Tables that survive a pipe, a narrow terminal, and a program that reads them."""
 
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,8 +12,9 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from tactile_rt.cli.app import check_output
+from tactile_rt.cli.app import check_named_once, check_output
 from tactile_rt.files import write_whole
+from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.evidence.records import Record
@@ -35,9 +35,10 @@ STDOUT = Path("-")
 def _not_over_another(file: Path | None) -> Path | None:
     """Refuse to write over a file that the same command line names for something else."""
     if file is not None and file != STDOUT:
-        words = (word.partition("=")[2] if word[:2] == "--" else word for word in sys.argv[1:])
-        if sum(Path(word).resolve() == file.resolve() for word in words if word) > 1:
-            raise typer.BadParameter(f"{file} is another file of this command: name a new one")
+        try:
+            check_named_once(file)
+        except ConfigError as error:
+            raise typer.BadParameter(str(error)) from None
     return file
 
 

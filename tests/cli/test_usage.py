@@ -49,6 +49,8 @@ def test_misuse_of_the_gate_is_not_an_undecided_test(call):
         ("align", "score", "--json=./a.onnx", "a.onnx", "--benchmark", "b"),
         ("export", "best.pt", "new.onnx", "--json", "sub/../new.onnx"),
         ("align", "gate", "m.onnx", "--reference=best.pt", "--json", "best.pt"),
+        ("hz", "replay:a.onnx?speed=0", "--json", "a.onnx"),
+        ("import", "m.onnx", "--as", "codec=can-dbc&mapping=best.pt", "--json", "best.pt"),
     ],
 )
 def test_json_never_goes_over_another_file_of_the_command(call, tmp_path, monkeypatch, words):
@@ -60,6 +62,24 @@ def test_json_never_goes_over_another_file_of_the_command(call, tmp_path, monkey
     assert (code, out, err.count("\n")) == (3 if "gate" in words else 2, "", 1)
     assert "is another file of this command: name a new one" in err
     assert {path.read_text() for path in tmp_path.glob("*.*")} == {"kept"}
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("record", "replay:run.mcap?speed=0", "./run.mcap"),
+        ("replay", "run.mcap", "--out", "run.mcap"),
+        ("replay", "run.mcap", "--out=sub/../run.mcap"),
+    ],
+)
+def test_what_a_command_reads_is_not_replaced_by_force(call, tmp_path, monkeypatch, words):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "run.mcap").write_text("kept")
+    code, out, err = call(*words, "--force")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "run.mcap is another file of this command: name a new one" in err
+    assert (tmp_path / "run.mcap").read_text() == "kept"
 
 
 def test_no_words_at_all_are_answered_by_the_help(call):
