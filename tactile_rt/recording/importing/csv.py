@@ -41,6 +41,7 @@ _UNIT: Final = re.compile(
     r"[\[(].*[\])]||-|s|sec|ms|us|\u00b5s|ns|Hz|\u00b0C?|[munk\u00b5]?(?:N|g|V|A|T|m|rad|Pa|Ohm|F)"
     r"|[mu]?N[ .*\u00b7-]?m{1,2}|deg|degC|kgf?|%|bar|counts?"
 )
+_POINT: Final = re.compile(r"\s*[+-]?\d*\.\d+(?:[eE][+-]?\d+)?\s*")
 _NUMBER_COMMA: Final = re.compile(r"[+-]?\d*,\d+(?:[eE][+-]?\d+)?")
 
 
@@ -92,9 +93,11 @@ def csv_form(
     for one in (told,) if told else DELIMITERS:
         for comma in (decimal == ",",) if decimal else (False, True):
             if comma and one == ",":
-                quoted = any(_COMMA.fullmatch(c) for x in head for c in _cells(x, one, False))
-                if not quoted:
+                cells = [c for x in head for c in _cells(x, one, False)]
+                if not any(map(_COMMA.fullmatch, cells)):
                     continue
+                if not decimal and any(map(_POINT.fullmatch, cells)):
+                    continue  # 0.5,"1,000": a thousand
             if not comma and not decimal and one == " " and all(map(_between_digits, head)):
                 continue  # 5,01 -7 0,25
             found = _tried(head, one, comma)
@@ -204,7 +207,8 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
     if not widths:
         return None
     width, often = max(widths.items(), key=lambda w: (w[1], w[0]))
-    if widths[width + 1] and all(
+    named = any(len(c) == width + 1 for k, c in rows if k < numeric[0][0])
+    if (widths[width + 1] or named) and all(
         head[k].endswith(delimiter) for k, c in numeric if len(c) == width
     ):
         width, often = width + 1, often + widths[width + 1]  # its last column is seldom there
@@ -215,22 +219,29 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
         (k for k, c in numeric if len(c) == width and all(_is_there(c[j]) for j in usual)),
         numeric[0][0],
     )
-    below = sum(k >= first for k, _ in rows)
-    if often < ENOUGH * below:
+    lines = sum(k >= first for k, _ in rows)
+    if often < ENOUGH * lines:
         return None
     share = sum(
         sum(map(_is_number, c)) / width for _, c in numeric if len(c) == width
     ) / often  # fmt: skip
-    names, units = _names(head[:first], delimiter, width)
-    # one cell a line is a table, too, but only if nothing else is
-    score = often / below * share + (0.5 if width > 1 else 0.0) + (0.2 if names else 0.0)
+    names, units, below_names = _names(head[:first], delimiter, width)
+    if names:  # the first rows may lack what is usual
+        below = (k for k, c in numeric if k >= below_names and any(map(_is_number, c)))
+        first = next(below, first)
+    # one cell a line is a table, too, but only if nothing else is; names cut alike tell most
+    score = often / lines * share + (0.0 if width == 1 else 1.1 if names else 0.5)
     return score, CsvForm(delimiter, comma, names, first, width, units=units)
 
 
-def _names(above: list[str], delimiter: str, width: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The names of the columns, and the units below them; empty: there are none."""
+def _names(
+    above: list[str], delimiter: str, width: int
+) -> tuple[tuple[str, ...], tuple[str, ...], int]:
+    """The names of the columns, and the units below them; empty: there are none. The line after
+    these."""
     units: tuple[str, ...] = ()
-    for line in reversed(above):
+    end = 0
+    for k, line in reversed(list(enumerate(above, start=1))):
         text = line
         for mark in ("#", "//"):
             text = text.removeprefix(mark)
@@ -250,9 +261,10 @@ def _names(above: list[str], delimiter: str, width: int) -> tuple[tuple[str, ...
             continue
         if all(_UNIT.fullmatch(c) for c in cells):
             units = units or tuple(c.strip("[]() ") for c in cells)
+            end = end or k
         else:
-            return tuple(_distinct(cells)), units
-    return (), ()
+            return tuple(_distinct(cells)), units, end or k
+    return (), (), 0
 
 
 def _distinct(names: list[str]) -> list[str]:

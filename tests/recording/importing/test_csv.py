@@ -74,6 +74,22 @@ def test_a_column_that_is_seldom_there_is_a_column(tmp_path):
     assert chunk.valid[:, 1].tolist() == [k % 10 == 0 for k in range(N)]
 
 
+@pytest.mark.parametrize("late", [1, 30, 300])
+def test_a_column_that_comes_late_takes_no_row_with_it(tmp_path, late):
+    lines = (f"{k / 100},{k},{k if k >= late else ''}\n" for k in range(310))
+    (tmp_path / "t.csv").write_text("t,a,b\n" + "".join(lines))
+    made, chunk, _ = imported(tmp_path / "t.csv", "t=time:s,a=A0.fx,b=B0.fx")
+    assert (made.samples, made.corrupt) == (310, 0)
+    assert chunk.valid[:, 1].tolist() == [k >= late for k in range(310)]
+
+
+def test_a_word_in_the_first_row_is_counted_as_in_all_others(tmp_path):
+    lines = (f"{k / 100},{'OVERLOAD' if k % 10 == 0 else k},{k}\n" for k in range(N))
+    (tmp_path / "t.csv").write_text("t,x,y\n" + "".join(lines))
+    made, _, _ = imported(tmp_path / "t.csv", "t=time:s,x=S.fx,y=S.fy")
+    assert (made.samples, made.corrupt) == (N - 5, 5)
+
+
 def test_a_time_of_seconds_and_the_rest(tmp_path):
     (tmp_path / "t.csv").write_text(
         "".join(f"{1_700_000_000 + k // 2},{k % 2 * 500_000_001},ft,{k}\n" for k in range(9))
@@ -101,6 +117,12 @@ def test_a_decimal_comma_between_commas_is_quoted(tmp_path):
     (tmp_path / "t.csv").write_text("".join(f'"{k},5","{k},25"\n' for k in range(9)))
     _, chunk, _ = imported(tmp_path / "t.csv", "time:s,S.fx")
     assert chunk.values[3, 0, 0] == 3.25
+
+
+def test_a_comma_of_thousands_is_no_decimal_comma(tmp_path):
+    (tmp_path / "t.csv").write_text("t,x\n" + "".join(f'0.{k},"{k},250"\n' for k in range(1, 9)))
+    with pytest.raises(RecordingError, match="'1,250' is no number"):
+        imported(tmp_path / "t.csv", "t=time:s,x=S.fx")
 
 
 @pytest.mark.parametrize("packed", [gzip.compress, lambda text: text])
