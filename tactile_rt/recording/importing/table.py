@@ -267,7 +267,10 @@ def _time(cell: Any, column: Column) -> int:
         text = in_seconds(cell.strip()) if column.kind == "iso" else cell.strip()
     found = _DECIMAL.fullmatch(text) if column.scale == 1.0 else None
     if found is None:
-        value = float(text) * column.scale * unit
+        try:
+            value = float(text) * column.scale * unit
+        except ValueError:
+            value = np.inf
         if not abs(value) < 2.0**62:
             raise ValueError(f"{cell!r:.40} is no time")
         return round(value)
@@ -302,17 +305,17 @@ def _strictly(
     times: NDArray[np.int64], rate_hz: float, account: Import
 ) -> tuple[NDArray[np.int64], float]:
     """Times that increase strictly, and the rate that they tell, Hz."""
-    n = len(times)
-    if n == 1:
+    if len(times) == 1:
         return times, rate_hz or 1.0
     steps = np.diff(times)
-    forward = steps[steps > 0]
-    if not len(forward):
+    ends = np.flatnonzero(steps)  # a coarse clock has several rows at a time
+    forward = steps[ends] > 0
+    if not forward.any():
         raise ConfigError("all lines have one time: is its column another? or give --rate")
     stretches = int((steps < 0).sum())
-    repeats = int((steps == 0).sum())  # a coarse clock: several rows at a time
-    usual = forward[forward <= GAP * np.median(forward)]
-    period = float(usual.sum()) / (len(usual) + repeats)
+    repeats = int((steps == 0).sum())
+    usual = forward & (steps[ends] <= GAP * np.median(steps[ends][forward]))
+    period = float(steps[ends][usual].sum() / np.diff(ends, prepend=-1)[usual].sum())
     if stretches:
         account.notes.append(f"times go back {stretches} times: there they go on a period later")
         jump = np.where(steps < 0, round(period) - steps, 0)
