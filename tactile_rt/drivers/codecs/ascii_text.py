@@ -22,7 +22,8 @@ NUMBER: Final = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _WITH_UNIT: Final = re.compile(rf"({NUMBER})[A-Za-z%°µμ\ufffd]+(?:/[A-Za-z]+[²2]?)?")
 _HEX: Final = re.compile(r"[+-]?0[xX][0-9A-Fa-f]+")
 _DATE: Final = re.compile(
-    r"(\d{4})[-/.](\d\d)[-/.](\d\d)[T ]+(\d\d):(\d\d):(\d\d)(?:[.,](\d{1,9}))?(Z|[+-]\d\d:?\d\d)?"
+    r"(?:(\d{4})[-/.](\d\d)[-/.](\d\d)|(\d\d)\.(\d\d)\.(\d{4}))"
+    r"[T ]+(\d\d):(\d\d):(\d\d)(?:[.,](\d{1,9}))?(Z|[+-]\d\d:?\d\d)?"
 )
 _CLOCK: Final = re.compile(r"(?<![\d:.-])(\d\d?):(\d\d):(\d\d)(?:[.,](\d{1,9}))?(?![\d:])")
 _NAME: Final = re.compile(r"[A-Za-z_]\w*\s*[:=](?!=)")
@@ -151,8 +152,9 @@ def in_seconds(line: str) -> str:
 
 def _since_1970(found: re.Match[str]) -> str:
     *whole, part, zone = found.groups()
+    date = whole[:3] if whole[0] else whole[5:2:-1]
     try:
-        year, month, day, hour, minute, second = map(int, whole)
+        year, month, day, hour, minute, second = map(int, (*date, *whole[6:]))
         at = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     except ValueError:
         return found[0]

@@ -142,6 +142,7 @@ def test_gzip_and_utf16(tmp_path, packed):
         ("1700000000123.25", "time:ms", 1_700_000_000_123_250_000),
         ("2023-11-14T22:13:20.5Z", "time:iso", 1_700_000_000_500_000_000),
         ("2023-11-14 22:13:20.5", "time:iso", 1_700_000_000_500_000_000),
+        ("14.11.2023 22:13:20.5", "time:iso", 1_700_000_000_500_000_000),
     ],
 )
 def test_times_are_exact_and_those_since_1970_are_utc(tmp_path, cell, column, t_ns):
