@@ -58,6 +58,8 @@ def import_file(
     need_mcap()
     if not log.exists():
         raise ConfigError(f"no file {log}")
+    if log.is_file() and not log.stat().st_size:
+        raise ConfigError(f"{log} is empty")
     output = output or Path(f"{log.name.partition('.')[0] or 'import'}.mcap")
     if output.suffix != ".mcap":
         raise ConfigError(f"{output}: a recording is a .mcap; `tactile-rt convert` makes others")
