@@ -89,7 +89,7 @@ FILES = {
     ),
     "names": (
         lambda: b"".join(b"Fx: %d N\r\nFy: %d N\r\n" % (k * k % 7, k % 5) for k in range(40)),
-        "--as codec=ascii_line&columns=Fy%3DS.fy:N,Fx%3DS.fx:N",
+        "--as codec=ascii_line&columns=Fx%3DS.fx:N,Fy%3DS.fy:N",
     ),
 }  # fmt: skip
 

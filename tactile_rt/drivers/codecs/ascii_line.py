@@ -145,6 +145,7 @@ class AsciiLine(SerialCodec):
         self._joined = self._overlong = False
         self._damaged = 0
         self._open: dict[int, float] = {}  # of a sample of several lines: what has come
+        self._begun = False  # not in the middle of it
         self._lines: list[str] = []
         self._open_ns = 0
 
@@ -305,7 +306,7 @@ class AsciiLine(SerialCodec):
 
     def _gather(self, text: str, t_ns: int) -> None:
         """Numbers by their names: a sample is whole when all have come, and over when one comes
-        again."""
+        again, or that of the first column, with which each begins."""
         assert self._names is not None
         found = self._names.find(text)
         if not found:
@@ -314,8 +315,10 @@ class AsciiLine(SerialCodec):
                 names = ", ".join(repr(c.label) for c in self._columns)
                 self.complaint = f"line {quoted(text)} has none of {names}"
             return
-        if not found.keys().isdisjoint(self._open):
-            self._end_sample()
+        if 0 in found or not found.keys().isdisjoint(self._open):
+            if self._open and self._begun:
+                self._end_sample()
+            self._open, self._begun = {}, True
         self._open |= found
         self._open_ns = t_ns
         if len(self._open) == self._width:

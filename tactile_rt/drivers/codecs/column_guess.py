@@ -106,8 +106,11 @@ def guess_line_columns(data: bytes) -> tuple[list[str], int, int] | None:
     Args:
         data: what came, cut anywhere.
     """
-    lines = data.decode("utf-8", "replace").replace("\r", "\n").split("\n")[1:-1]
-    lines = [x for x in lines if x.strip()][:LOOKED_AT]
+    first, *lines = data.decode("utf-8", "replace").replace("\r", "\n").split("\n")
+    label = _LABELLED.match(first)
+    if label and any(line.startswith(label[1]) for line in lines):  # whole; it may begin a sample
+        lines.insert(0, first)
+    lines = [x for x in lines[:-1] if x.strip()][:LOOKED_AT]
     if len(lines) < LEAST or _unprintable(lines):
         return None
     for guess in (_of_objects, _of_places, _of_labels):

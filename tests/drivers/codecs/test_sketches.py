@@ -128,6 +128,20 @@ def test_a_sketch_is_described_in_a_line(name: str) -> None:
     assert codec.stats.corrupt == 0
 
 
+@pytest.mark.parametrize("lost", range(4))
+def test_of_several_lines_none_comes_into_another_sample(lost: int) -> None:
+    lines = [f"{name}: {k}\n".encode() for k in range(1, 5) for name in "XYZ"]
+    codec = board("X=A0.bx,Y=A0.by,Z=A0.bz")
+    samples = codec.feed(b"joined\n" + b"".join(lines[lost:]), T0)
+    told = samples.values[:, 0].tolist()
+    assert told == [[k, k, k] for k in range(2 if lost else 1, 5)]
+    assert codec.stats.corrupt == 0
+    codec.forget()
+    samples = codec.feed(b"joined\n" + b"".join(lines[:3] + lines[4:]), T0)
+    assert samples.valid[:, 0].tolist() == [True, False, True, True]
+    assert samples.values[2, 0].tolist() == [3, 3, 3]
+
+
 def test_times_are_the_boards() -> None:
     codec = board(SKETCHES["time of the host"][0])
     samples = codec.feed(b"\n" + SKETCHES["time of the host"][1].encode(), T0)
