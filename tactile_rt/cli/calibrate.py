@@ -62,6 +62,7 @@ def tare(
         while isinstance(raw, CalibratedSource):
             before = raw.calibration
             raw = raw.source
+        _check_raw(raw, source)
         name = device or (before.device if before else _own_id(raw))
         path = out or calibration_path(name)
         known = _existing(path, device) or before or Calibration.of(name, raw.spec)
@@ -206,7 +207,19 @@ def _recorded(table: Path, loads: "LoadTable", url: str) -> tuple[Chunk, ArraySp
         raw: Source = opened
         while isinstance(raw, CalibratedSource):
             raw = raw.source
+        _check_raw(raw, url)
         return concatenate(record(raw, float(loads.times.max()))), raw.spec
+
+
+def _check_raw(source: Source, url: str) -> None:
+    """Refuse samples that were calibrated before they were recorded: they are not what the device
+    sent.
+
+    Raises:
+        ConfigError: they are.
+    """
+    if getattr(source, "calibrated", False):
+        raise ConfigError(f"{url}: its samples are calibrated: from=wire gives the raw ones")
 
 
 def _order(channels: tuple[str, ...], known: "Calibration") -> list[int]:

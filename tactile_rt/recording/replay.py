@@ -104,9 +104,10 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
         return Prepared(
             about.spec,
             partial(
-                ReplaySource, about.spec, lambda stats: _recorded(recording, stats), options.speed
+                ReplaySource, about.spec, lambda stats: _recorded(recording, stats), options.speed,
+                about.calibration is not None,
             ),
-        )
+        )  # fmt: skip
     if channel != WIRE:
         raise ConfigError(f"{what}: from must be samples or wire, not {channel!r}")
     if not about.wire:
@@ -171,14 +172,23 @@ class ReplaySource(Source):
         spec: what the samples are.
         timed: makes the chunks and when they are due, ns; what is lost is counted in its argument.
         speed: times the recorded pace; 0: at once.
+        calibrated: whether the samples were calibrated before they were recorded.
+
+    Attributes:
+        calibrated: Whether the samples were calibrated before they were recorded.
     """
 
     live = False
 
     def __init__(
-        self, spec: ArraySpec, timed: Callable[[SourceStats], Timed], speed: float = 1.0
+        self,
+        spec: ArraySpec,
+        timed: Callable[[SourceStats], Timed],
+        speed: float = 1.0,
+        calibrated: bool = False,
     ) -> None:
         super().__init__(spec)
+        self.calibrated = calibrated
         self._speed = speed
         self._timed = timed(self.stats)
         self._next: tuple[int, Chunk] | None = None

@@ -202,6 +202,22 @@ def test_times_in_a_recording_do_as_well(call, device, tmp_path):
     assert stored.units == ("1", "1")
 
 
+def test_samples_that_were_calibrated_as_they_were_recorded_are_no_readings(refused, tmp_path):
+    pytest.importorskip("mcap")
+    from tactile_rt.recording.description import Description
+    from tactile_rt.recording.importing.account import Import, write_chunks
+
+    (chunk,) = cut(np.zeros((50, 2, 2)), SPEC.rate_hz, 50)
+    about = Description(SPEC, 0, "", calibration=Calibration.of("cell", SPEC))
+    write_chunks(tmp_path / "run.mcap", about, chunk, Import(), "run")
+    (tmp_path / "loads.csv").write_text("start_s,end_s,fy,mz\n0,0.1,1,0\n")
+    recorded = f"replay:{tmp_path / 'run.mcap'}?speed=0"
+    for words in (("tare", recorded), ("calibrate", tmp_path / "loads.csv", "--source", recorded)):
+        said = refused(*words, "--out", tmp_path / "cell.toml")
+        assert "its samples are calibrated: from=wire gives the raw ones" in said
+    assert not (tmp_path / "cell.toml").exists()
+
+
 def test_without_a_name_nothing_is_written(call, home, tmp_path, loads):
     table = write_table(tmp_path / "loads.csv", loads)
     code, out, _ = call("calibrate", table)
