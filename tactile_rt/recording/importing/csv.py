@@ -100,6 +100,8 @@ def csv_form(
                     continue  # 0.5,"1,000": a thousand
             if not comma and not decimal and one == " " and all(map(_between_digits, head)):
                 continue  # 5,01 -7 0,25
+            if comma and one == " " and 2 * sum(len(x.split()) > 1 for x in head) < len(head):
+                continue  # 10,2,-1
             found = _tried(head, one, comma)
             if found is not None and (best is None or found[0] > best[0] + 1e-9):
                 best = found

@@ -119,6 +119,15 @@ def test_a_decimal_comma_between_commas_is_quoted(tmp_path):
     assert chunk.values[3, 0, 0] == 3.25
 
 
+def test_commas_alone_are_no_decimal_commas(tmp_path):
+    (tmp_path / "t.csv").write_text(
+        "".join(f"{k},{'!x' if k == 9 else f'2,{-k}'}\n" for k in range(N))
+    )
+    made, chunk, _ = imported(tmp_path / "t.csv", "time:s,S.fx")
+    assert (made.samples, made.corrupt) == (N - 1, 1)
+    assert set(chunk.values[:, 0, 0].tolist()) == {2}
+
+
 def test_a_comma_of_thousands_is_no_decimal_comma(tmp_path):
     (tmp_path / "t.csv").write_text("t,x\n" + "".join(f'0.{k},"{k},250"\n' for k in range(1, 9)))
     with pytest.raises(RecordingError, match="'1,250' is no number"):
