@@ -98,10 +98,9 @@ def csv_form(
                     continue
                 if not decimal and any(map(_POINT.fullmatch, cells)):
                     continue  # 0.5,"1,000": a thousand
-            if not comma and not decimal and one == " " and all(map(_between_digits, head)):
+            between = 2 * sum(map(_between_digits, head)) > len(head)
+            if not comma and not decimal and one == " " and between:
                 continue  # 5,01 -7 0,25
-            if comma and one == " " and 2 * sum(len(x.split()) > 1 for x in head) < len(head):
-                continue  # 10,2,-1
             found = _tried(head, one, comma)
             if found is not None and (best is None or found[0] > best[0] + 1e-9):
                 best = found
@@ -131,7 +130,7 @@ def _rows(table: Table, form: CsvForm) -> Iterator[Sequence[Any]]:
             if line.startswith(REMARKS) or not line.strip(" \t,;"):
                 continue
             cells = _cells(line, form.delimiter, form.comma)
-            if len(cells) == form.width - 1 and line.endswith(form.delimiter):
+            if len(cells) == form.width - 1 and line.rstrip(" ").endswith(form.delimiter):
                 cells.append("")
             if form.names and all(number(c.strip()) is None for c in cells):
                 continue  # units below the names, or names once more
@@ -169,7 +168,7 @@ def _cells(line: str, delimiter: str, comma: bool) -> list[str]:
         cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
     else:
         cells = line.split(delimiter)
-    if len(cells) > 1 and not cells[-1].strip():
+    if len(cells) > 1 and line.rstrip(" ").endswith(delimiter):
         del cells[-1]  # a delimiter at the end of each line
     return [c.replace(",", ".") if _NUMBER_COMMA.fullmatch(c.strip()) else c for c in cells] \
         if comma else cells  # fmt: skip
@@ -211,7 +210,7 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
     width, often = max(widths.items(), key=lambda w: (w[1], w[0]))
     named = any(len(c) == width + 1 for k, c in rows if k < numeric[0][0])
     if (widths[width + 1] or named) and all(
-        head[k].endswith(delimiter) for k, c in numeric if len(c) == width
+        head[k].rstrip(" ").endswith(delimiter) for k, c in numeric if len(c) == width
     ):
         width, often = width + 1, often + widths[width + 1]  # its last column is seldom there
         numeric = [(k, [*c, ""] if len(c) == width - 1 else c) for k, c in numeric]
@@ -224,15 +223,15 @@ def _tried(head: list[str], delimiter: str, comma: bool) -> tuple[float, CsvForm
     lines = sum(k >= first for k, _ in rows)
     if often < ENOUGH * lines:
         return None
-    share = sum(
-        sum(map(_is_number, c)) / width for _, c in numeric if len(c) == width
-    ) / often  # fmt: skip
+    share = sum(sum(map(_is_there, c)) / width for _, c in numeric if len(c) == width) / often
     names, units, below_names = _names(head[:first], delimiter, width)
     if names:  # the first rows may lack what is usual
         below = (k for k, c in numeric if k >= below_names and any(map(_is_number, c)))
         first = next(below, first)
-    # one cell a line is a table, too, but only if nothing else is; names cut alike tell most
-    score = often / lines * share + (0.0 if width == 1 else 1.1 if names else 0.5)
+    # one cell a line is a table, too, but only if nothing else is
+    score = often / lines * share + (0.5 if width > 1 else 0.0) + (0.2 if names else 0.0)
+    if delimiter == " ":  # which cuts what all others cut, too
+        score -= 0.3 if 2 * sum(len(x.split()) > 1 for x in head) > len(head) else 0.6
     return score, CsvForm(delimiter, comma, names, first, width, units=units)
 
 
@@ -248,7 +247,7 @@ def _names(
         for mark in ("#", "//"):
             text = text.removeprefix(mark)
         if delimiter == " ":
-            cells = re.findall(r'"[^"]*"|\S+', text)
+            cells = re.findall(r'"[^"]*"|[^\s,;]+', text)
         else:
             cells = _cells(text, delimiter, False)
         cells = [c.strip().strip('"').strip() for c in cells]
@@ -259,7 +258,8 @@ def _names(
         if len(cells) == width + 1 and cells[-1].lower() in REMARKED:
             del cells[-1]
         words = [c for c in cells if c and not _is_number(c)]
-        if len(cells) != width or 2 * len(words) < width:
+        numbers = sum(map(_is_number, cells))
+        if len(cells) != width or 2 * len(words) < width or 2 * numbers >= width:
             continue
         if all(_UNIT.fullmatch(c) for c in cells):
             units = units or tuple(c.strip("[]() ") for c in cells)

@@ -119,6 +119,29 @@ def test_a_decimal_comma_between_commas_is_quoted(tmp_path):
     assert chunk.values[3, 0, 0] == 3.25
 
 
+@pytest.mark.parametrize("delimiter", [",", ", ", ";", "; ", "\t", "|"])
+@pytest.mark.parametrize("quote", ["", '"'])
+def test_cells_that_are_empty_move_none(tmp_path, delimiter, quote):
+    rows = [[k, "" if k % 4 == 3 else 10 + k, "" if k % 5 == 3 else 20 + k] for k in range(N)]
+    lines = [delimiter.join(f"{quote}{cell}{quote}" for cell in row) for row in rows]
+    (tmp_path / "t.csv").write_text("Serial 12345\nDevice: Foo 3\n" + "\n".join(lines) + "\n")
+    made, chunk, _ = imported(tmp_path / "t.csv", "time:s,A0.fx,B0.fx")
+    assert (made.samples, made.corrupt) == (N, 0)
+    for j in (0, 1):
+        read = chunk.values[chunk.valid[:, j], j, 0].tolist()
+        assert read == [row[j + 1] for row in rows if row[j + 1]]
+
+
+def test_what_stands_above_is_no_reason_to_cut_at_decimal_commas(tmp_path):
+    (tmp_path / "t.csv").write_text("Serial 12345\n" + "".join(f"{k}  {k},25\n" for k in range(9)))
+    assert imported(tmp_path / "t.csv", "time:s,S.fx")[1].values[3, 0, 0] == 3.25
+
+
+def test_names_between_commas_above_spaces(tmp_path):
+    (tmp_path / "t.txt").write_text("# t, x, y\n" + rows("{s:.2f} {a} {b}\n"))
+    assert csv_form(tmp_path / "t.txt").names == ("t", "x", "y")
+
+
 def test_commas_alone_are_no_decimal_commas(tmp_path):
     (tmp_path / "t.csv").write_text(
         "".join(f"{k},{'!x' if k == 9 else f'2,{-k}'}\n" for k in range(N))
