@@ -87,6 +87,12 @@ FILES = {
         ),
         "--columns time:s,time:ns,-,T0.value",
     ),
+    "columns that are there in turn, or never": (
+        lambda: b"t,a,b,c\n" + b"".join(
+            b"0.%02d,%s,\n" % (k, b"%d," % k if k % 2 else b",%d" % k) for k in range(40)
+        ),
+        "--columns t=time:s,a=a.value:1,b=b.value:1",
+    ),
     "names": (
         lambda: b"".join(b"Fx: %d N\r\nFy: %d N\r\n" % (k * k % 7, k % 5) for k in range(40)),
         "--as codec=ascii_line&columns=Fx%3DS.fx:N,Fy%3DS.fy:N",

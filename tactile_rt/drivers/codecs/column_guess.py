@@ -231,7 +231,8 @@ def _column(rows: Rows, k: int) -> NDArray[np.float64] | None:
     there = sum(c is not None for c in cells)
     if not cells or there < MOSTLY * len(cells):
         return None
-    return np.array([np.nan if c is None else c for c in cells], np.float64)
+    column = np.array([np.nan if c is None else c for c in cells], np.float64)
+    return None if np.isnan(column).all() else column
 
 
 def _bare(name: str) -> str:

@@ -89,7 +89,7 @@ def propose_line_columns(data: bytes) -> ProposedColumns | None:
 
 def _of_table(path: Path, form: CsvForm) -> ProposedColumns | None:
     rows = [r for r in islice(read_table(path, form).rows, LOOKED_AT) if len(r) == form.width]
-    cells = [[number(in_seconds(c.strip())) for c in row] for row in rows]
+    cells = [[number(in_seconds(c.strip()) or "nan") for c in row] for row in rows]
     numbers = sum(c is not None for row in cells for c in row)
     if len(rows) < LEAST or 2 * numbers < len(rows) * form.width:
         return None
