@@ -111,7 +111,8 @@ def told_of(path: Path) -> tuple[Description, dict[str, Any], dict[str, list[str
                 texts[name] = [bytes(item).decode() for item in items]
     except FileNotFoundError:
         raise ConfigError(
-            f"no {path}, which says what array {path.stem} is of: `tactile-rt convert` makes both"
+            f"no {path}, which says what array {path.stem} is of: `tactile-rt convert` makes both; "
+            "`tactile-rt import` reads tables of others"
         ) from None
     except (msgspec.MsgspecError, KeyError, UnicodeDecodeError) as error:
         raise RecordingError(f"{path} is damaged ({error})") from None

@@ -291,7 +291,10 @@ def test_text_without_what_is_beside_it_is_named(path, tmp_path):
     with pytest.raises(RecordingError, match=r"x.csv.json is damaged"):
         convert(tmp_path / "x.csv", tmp_path / "back.mcap")
     (tmp_path / "x.csv.json").unlink()
-    with pytest.raises(ConfigError, match=r"no .*x.csv.json, which says what array"):
+    with pytest.raises(
+        ConfigError,
+        match=r"no .*x.csv.json, which says .*`tactile-rt import` reads",
+    ):
         convert(tmp_path / "x.csv", tmp_path / "back.mcap")
 
 

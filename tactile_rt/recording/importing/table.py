@@ -311,7 +311,7 @@ def _strictly(
     ends = np.flatnonzero(steps)  # a coarse clock has several rows at a time
     forward = steps[ends] > 0
     if not forward.any():
-        raise ConfigError("all lines have one time: is its column another? or give --rate")
+        raise ConfigError("all lines have one time: leave its column out, and give --rate")
     stretches = int((steps < 0).sum())
     repeats = int((steps == 0).sum())
     usual = forward & (steps[ends] <= GAP * np.median(steps[ends][forward]))
