@@ -55,7 +55,7 @@ from tactile_rt.sim_backend.arrays.whisker_array import (
     centred_mount,
     place,
 )
-from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, REQUIRED, Whisker
+from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, REQUIRED, TURN, Whisker
 from tactile_rt.stream import ConfigError
 
 __all__ = ["load_animals", "load_array", "read_animals"]
@@ -159,7 +159,11 @@ def _toml_animals(path: Path, nodes: SettingNode) -> tuple[WhiskerArray, ...]:
                 f"{path}: beside [[animal]] tables there is nothing else; name, head, mirror, "
                 f"mount, sensor and defaults belong in the file of an array"
             )
-        return place([_animal(path, animal) for animal in file.animal])
+        animals = [_animal(path, animal) for animal in file.animal]
+        try:
+            return place(animals)
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
     if file.defaults:
         _check_columns(nodes, ["defaults"])
     whiskers = []
@@ -199,6 +203,12 @@ def _head(path: Path, name: str) -> Path | None:
 
 
 def _mount(path: Path, mount: _Mount) -> Mount:
+    for angle in mount.roll_pitch_yaw_rad:
+        if abs(angle) > TURN:
+            raise ConfigError(
+                f"{path}: mount.roll_pitch_yaw_rad must be within a turn, 6.28, not {angle:g}: "
+                "mind the unit"
+            )
     try:
         return Mount(mount.position_mm, mount.roll_pitch_yaw_rad)
     except ConfigError as error:

@@ -22,6 +22,7 @@ __all__ = [
     "PLAUSIBLE",
     "REQUIRED",
     "SOFTEST_MOUNT",
+    "TURN",
     "YOUNG_MODULUS_PA",
     "Whisker",
     "keratin_radii",
@@ -67,6 +68,7 @@ PLAUSIBLE = {
     "density_base_kg_m3": (100.0, 1e5),
     "density_tip_kg_m3": (100.0, 1e5),
 }
+TURN = 2 * math.pi  # rad, beyond which an angle is in degrees
 SOFTEST_MOUNT = 1e-12  # N m / rad: a mouse's whisker has 1e-6 at its base
 NAME = re.compile(r"[\w.+-]+")  # MuJoCo's names are cut at spaces and joined by slashes
 TAKEN = ("world", "head", "object")  # bodies that share a model with the whiskers
@@ -206,9 +208,9 @@ class Whisker:
                 _number(given, "base_z_mm"),
             ),
             angles=(
-                _number(given, "base_theta_rad"),
-                _number(given, "base_phi_rad"),
-                _number(given, "base_zeta_rad"),
+                _angle(given, "base_theta_rad"),
+                _angle(given, "base_phi_rad"),
+                _angle(given, "base_zeta_rad"),
             ),
             **fields,
         )
@@ -281,6 +283,13 @@ def _number(values: Mapping[str, object], column: str) -> float:
         raise ConfigError(f"{column} is not a number: {value!r}") from None
     if isinstance(value, bool) or not math.isfinite(number):
         raise ConfigError(f"{column} is not a finite number: {value!r}")
+    return number
+
+
+def _angle(values: Mapping[str, object], column: str) -> float:
+    number = _number(values, column)
+    if abs(number) > TURN:
+        raise ConfigError(f"{column} must be within a turn, 6.28, not {number:g}: mind the unit")
     return number
 
 

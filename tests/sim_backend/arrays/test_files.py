@@ -351,6 +351,10 @@ def test_a_toml_array_has_a_mount_a_head_and_defaults(tmp_path: Path) -> None:
             "[mount]\nposition_mm = [0,0,nan]" + DEFAULTS + WHISKERS,
             r"a.toml:2: mount.position_mm\[2\]: nan is no quantity",
         ),
+        (
+            "[mount]\nroll_pitch_yaw_rad = [0,0,-90]" + DEFAULTS + WHISKERS,
+            r"a.toml: mount.roll_pitch_yaw_rad must be within a turn, 6.28, not -90: mind the unit",
+        ),
         ("name = 3" + DEFAULTS + WHISKERS, r"name: expected text, got 3"),
         ("head = 'x.glb'" + DEFAULTS + WHISKERS, "head 'x.glb' must be one of .obj, .ply, .stl"),
         ("head = 'x.stl'" + DEFAULTS + WHISKERS, "head 'x.stl': no such file"),
@@ -373,7 +377,7 @@ def test_a_toml_array_has_a_mount_a_head_and_defaults(tmp_path: Path) -> None:
         ("[[animal]]\narray = 'a.toml'", "another file, not this one"),
         ("[[animal]]\narray = 'muose'", "did you mean mouse?"),
         ("[[animal]]\narray = 'no.csv'", "no.csv: no such file"),
-        ("[[animal]]\narray = 'rat'\n[[animal]]\narray = 'rat'", "animal 2 .* stands in another"),
+        ("[[animal]]\narray = 'rat'\n[[animal]]\narray = 'rat'", "a.toml: animal 2 .* in another"),
     ],
 )
 def test_a_mistake_in_a_toml_file_is_one_line(tmp_path: Path, text: str, said: str) -> None:

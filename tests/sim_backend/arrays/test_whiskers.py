@@ -228,6 +228,8 @@ def test_what_a_row_leaves_out_is_keratin_or_goes_on_to_the_tip() -> None:
         ({"base_phi_rad": "nan"}, "base_phi_rad is not a finite number: 'nan'"),
         ({"base_phi_rad": 10**400}, "base_phi_rad is not a number"),
         ({"base_phi_rad": [1]}, "base_phi_rad is not a finite number"),
+        ({"base_theta_rad": "57.3"}, "base_theta_rad must be within a turn, .*: mind the unit"),
+        ({"base_zeta_rad": -30}, "base_zeta_rad must be within a turn, 6.28, not -30"),
         ({"whisker": 3}, "in quotes, not 3"),
         ({"row": 0}, "row must be a whole number from 1, not 0"),
         ({"col": "1.5"}, "col must be a whole number from 0, not '1.5'"),
