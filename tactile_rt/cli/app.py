@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
+from urllib.parse import unquote
 
 import typer
 
@@ -194,9 +195,14 @@ def check_named_once(file: Path) -> None:
         ConfigError: more than one word names it.
     """
     where = file.resolve()
-    words = ({word, *re.split("[:?&=@]", word)} - {""} for word in sys.argv[1:])
-    if sum(any(Path(part).resolve() == where for part in word) for word in words) > 1:
+    if sum(where in _files(word) for word in sys.argv[1:]) > 1:
         raise ConfigError(f"{file} is another file of this command: name a new one")
+
+
+def _files(word: str) -> set[Path]:
+    """What files a word may name: alone, as an option, or in a URL."""
+    parts = (word, *map(unquote, re.split("[:?&=@,]", word)))
+    return {Path(part).resolve() for part in parts if part and "\0" not in part}
 
 
 def check_new(file: Path, force: bool) -> None:

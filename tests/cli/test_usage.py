@@ -51,6 +51,8 @@ def test_misuse_of_the_gate_is_not_an_undecided_test(call):
         ("align", "gate", "m.onnx", "--reference=best.pt", "--json", "best.pt"),
         ("hz", "replay:a.onnx?speed=0", "--json", "a.onnx"),
         ("import", "m.onnx", "--as", "codec=can-dbc&mapping=best.pt", "--json", "best.pt"),
+        ("hil", "--source=sim:mouse?objects=mug,sub/../%61.onnx&sweeps=1", "--json=a.onnx"),
+        ("hz", "replay:%00a.onnx?speed=0", "x.json", "--json", "x.json"),
     ],
 )
 def test_json_never_goes_over_another_file_of_the_command(call, tmp_path, monkeypatch, words):
