@@ -65,8 +65,12 @@ def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
         OSError: naming `path`: its folder cannot be written into, or the medium is full.
     """
     if path.exists() and not (path.is_file() or path.is_dir()):
-        with path.open("wb") as file:
-            write(file)
+        try:
+            with path.open("wb") as file:
+                write(file)
+        except OSError as error:
+            _name(error, path, path)
+            raise
         return
     hidden = _hidden(path)
     try:

@@ -4,6 +4,7 @@ import errno
 import os
 import stat
 import subprocess
+from pathlib import Path
 
 import pytest
 
@@ -88,6 +89,12 @@ def test_what_is_no_file_is_written_into_and_stays_what_it_is(tmp_path):
     os.close(reader)
     assert stat.S_ISFIFO(pipe.stat().st_mode)
     assert [p.name for p in tmp_path.iterdir()] == ["pipe"]
+
+
+def test_a_device_that_takes_nothing_is_named():
+    with pytest.raises(OSError, match="No space left on device") as failed:
+        write_whole(Path("/dev/full"), lambda out: out.write(b"{}"))
+    assert failed.value.filename == "/dev/full"
 
 
 @pytest.fixture
