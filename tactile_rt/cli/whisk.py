@@ -77,8 +77,11 @@ def whisk(
         raise ConfigError(f"{out}: name a file that ends in .npz")
     if target is not None and stimulus is not None:
         raise ConfigError("--object and --stimulus exclude each other: name one of them")
-    for file in (out, out.with_suffix(".json"), json):
+    beside = out.with_suffix(".json")
+    for file in (out, beside, json):
         check_output(file)
+    if json is not None and json.resolve() == beside.resolve():
+        raise ConfigError(f"{json} goes beside {out} and says what is in it: name another for --json")
     try:
         with starting():
             import numpy as np
@@ -164,7 +167,7 @@ def whisk(
             f"{one['stimulus']}: first contact at {one['first_ms']} ms, {one['whiskers']} of "
             f"{len(animal.whiskers)} whiskers touch it"
         )
-    console.print(f"{out} and {out.with_suffix('.json')}: {len(felt)} stimuli")
+    console.print(f"{out} and {beside}: {len(felt)} stimuli")
 
 
 def _three(text: str, key: str) -> tuple[float, float, float]:
