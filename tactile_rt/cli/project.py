@@ -1,5 +1,6 @@
 """`tactile-rt new` and `make`: from the description of an array to a model that decides."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -34,7 +35,8 @@ def new(
         raise needs("sim", error) from None
     chosen = tuple(k.strip() for k in kinds.split(",") if k.strip()) or KINDS
     new_project(folder, array, chosen)
-    typer.echo(f"{folder}: edit array.toml and sweeps.toml, then `tactile-rt make {folder}`")
+    again = shlex.join(["tactile-rt", "make", str(folder)])
+    typer.echo(f"{folder}: edit array.toml and sweeps.toml, then `{again}`")
 
 
 @app.command()
@@ -82,7 +84,5 @@ def make(
                 f"{record.name.removeprefix('models.')}: {record.value:.1f} {record.unit}"
                 f" ({record.anchor})"
             )
-    console.print(
-        f"{project.report / 'report.html'} tells the rest; `tactile-rt run "
-        f"{folder / 'robot.toml'}` decides"
-    )
+    decides = shlex.join(["tactile-rt", "run", str(folder / "robot.toml")])
+    console.print(f"{project.report / 'report.html'} tells the rest; `{decides}` decides")

@@ -9,13 +9,14 @@ model.onnx, report/, build/  what `tactile-rt make` makes
 fit.json         what `tactile-rt array fit` has measured of the device
 """
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from string import Template
 from types import MappingProxyType
-from urllib.parse import urlencode
+from urllib.parse import quote, urlencode
 
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.daemon.loading import load_config
@@ -23,7 +24,7 @@ from tactile_rt.drivers.codec import codec_class
 from tactile_rt.files import write_whole
 from tactile_rt.sensor_faults import LARGEST
 from tactile_rt.sensor_spec import channel_limits
-from tactile_rt.settings import no_such, split_url
+from tactile_rt.settings import no_such, read_text, split_url
 from tactile_rt.sim_backend.arrays.files import ARRAY_FILES, load_animals, read_animals
 from tactile_rt.sim_backend.arrays.robots import ROBOTS, robot_text
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
@@ -40,6 +41,7 @@ __all__ = ["KINDS", "DeviceLine", "Project", "new_project"]
 
 RANGES = {"N": "range_n", "N m": "range_nm"}  # options of the native codec
 KINDS = ("bottle", "car", "chair", "gear", "mug", "pumpkin")
+NO_NAME = re.compile(r"[^\w.+-]+")  # what a URL or a file in TOML would take for something else
 FILES = ("sweeps.toml", "robot.toml", "test_robot.py", "README.md")
 # What robot.toml says of a device: a robot's codec does not know the places of its whiskers.
 DECLARED = 'array = "model.onnx"         # whose whiskers they are: the codec does not know'
@@ -136,7 +138,8 @@ class Project:
         meshes = choose_objects(self.recipe().objects).mesh_options
         recipe = self.folder / "sweeps.toml"
         asked = {"objects": ",".join(objects), "recipe": recipe, "seed": seed, **meshes, **options}
-        return f"sim:{self.array}?{urlencode(asked, safe=',')}"
+        query = urlencode(asked, safe=",/", quote_via=quote)  # a + is no space in our URLs
+        return f"sim:{quote(str(self.array))}?{query}"
 
     def unseen(self) -> tuple[str, ...]:
         """Objects that the model has never met, as a ``sim:`` URL calls them.
@@ -211,7 +214,7 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
     """
     templates = resources.files("tactile_rt.project") / "templates"
     with resources.as_file(templates / "array.toml.txt") as example:
-        described = _described(array) if array else example.read_text("utf-8")
+        described = _described(array, folder) if array else example.read_text("utf-8")
         animals = load_animals(array) if array else read_animals(example)
     spec = device_spec(animals)
     known = (*CATEGORIES, *added_categories())
@@ -226,8 +229,10 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
     near, far = (f"{share * distance:.3g}" for share in SPREAD)
     size = usual_size(animals)
     slow, fast = (f"{speed * size / Sweep.size_mm:.3g}" for speed in SPEEDS)
+    name = NO_NAME.sub("-", folder.resolve().name)
     words = {
-        "name": folder.resolve().name,
+        "name": name,
+        "kind": kinds[0],
         "kinds": ", ".join(f'"{kind}"' for kind in kinds),
         "near": near,
         "far": far,
@@ -237,7 +242,7 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
         "offset": f"{_wandering(animals):.2g}",
         "profiles": ", ".join(PROFILES),
         "whiskers": str(len(spec.elements)),
-        "link": f"/tmp/{folder.resolve().name}",
+        "link": f"/tmp/{name}",
         "device": ROBOTS.get(array, "codec=native"),
         "declared": DECLARED if array in ROBOTS else UNDECLARED,
     }
@@ -265,8 +270,8 @@ def _wandering(animals: tuple[WhiskerArray, ...]) -> float:
     return min(most, LARGEST)
 
 
-def _described(array: str) -> str:
-    """The text of the project's own array.toml."""
+def _described(array: str, folder: Path) -> str:
+    """The text of array.toml in a project's folder."""
     if array in ROBOTS:
         return robot_text(array)
     path = Path(array)
@@ -281,13 +286,19 @@ def _described(array: str) -> str:
             f"{array}: a project's array is a .toml file, which can say what reads the whiskers; "
             "copy the columns into [[whisker]] tables as in docs/arrays/robot.toml"
         )
-    text = path.read_text("utf-8")
-    whiskers = load_animals(array)
-    if any(animal.head for animal in whiskers):
+    text = read_text(path)
+    if any(animal.head for animal in load_animals(array)):
         raise ConfigError(
             f"{array}: takes a head from another file, which a project's copy would not find; "
             "remove `head`, which only pictures need"
         )
+    try:
+        read_animals(folder / "array.toml", text)
+    except ConfigError:
+        raise ConfigError(
+            f"{array}: an [[animal]] is another file, which a project's copy would not find: give "
+            "its array by the whole path"
+        ) from None
     return text
 
 

@@ -181,6 +181,44 @@ def test_what_is_taken_for_what_worst_first() -> None:
     assert confused(np.eye(3, dtype=np.int64), ("a", "b", "c")) == []
 
 
+@pytest.mark.parametrize("name", ["my arm", 'the "arm"', "100%41", "arm?#&=+", "a\\b", "größe"])
+def test_a_folder_may_have_any_name(name: str, tmp_path: Path) -> None:
+    project = new_project(tmp_path / name)
+    assert project.line().port == "/tmp/" + project.recipe().name
+    load_config(project.folder / "robot.toml")
+    with open_source(project.source_url(project.unseen()[:1], pace="fast")) as source:
+        assert len(source.spec.elements) == 8
+
+
+def test_an_array_of_other_files_is_copied_only_if_the_copy_finds_them(tmp_path: Path) -> None:
+    pair = tmp_path / "pair.toml"
+    pair.write_text('[[animal]]\narray = "magnets.toml"\n')
+    (tmp_path / "magnets.toml").write_text(MAGNETS.read_text())
+    with pytest.raises(ConfigError, match=r"pair\.toml: an \[\[animal\]\] is another file"):
+        new_project(tmp_path / "mine", str(pair))
+    assert not (tmp_path / "mine").exists()
+    pair.write_text(f'[[animal]]\narray = "{MAGNETS}"\n')
+    mine = new_project(tmp_path / "mine", str(pair))
+    assert load_array(str(mine.array)).whiskers == load_array(str(MAGNETS)).whiskers
+
+
+def test_an_array_in_another_encoding_is_told_with_its_line(refused, tmp_path: Path) -> None:
+    array = tmp_path / "array.toml"
+    array.write_bytes(b'name = "x"\n# Gr\xf6\xdfe\n')
+    assert "array.toml:2: not UTF-8" in refused("new", tmp_path / "mine", "--array", array)
+
+
+def test_the_commands_of_its_readme_are_commands(project: Project, call) -> None:
+    words = re.findall(r"`tactile-rt ([^`]+)`", (project.folder / "README.md").read_text())
+    assert len(words) > 5
+    for line in words:
+        command = [word for word in line.split() if word in ("array", "fit")] or [line.split()[0]]
+        code, helped, _ = call(*command, "--help")
+        assert code == 0, line
+        for option in re.findall(r"--\w+", line):
+            assert f" {option} " in helped, line
+
+
 def test_a_full_disk_leaves_a_folder_that_can_be_named_again(tmp_path, monkeypatch) -> None:
     write = folder_module.write_whole
 
