@@ -18,6 +18,7 @@ says where each is from. No mesh comes with this package.
 import csv
 import hashlib
 import io
+import math
 import subprocess
 import tempfile
 import urllib.error
@@ -110,14 +111,16 @@ def read_list(name: str) -> tuple[ListedObject, ...]:
     files: list[ListedFile] = [convert(row, ListedFile) for row in table.rows]
     for row, file in zip(table.rows, files, strict=True):
         parts = Path(file.path).parts
-        if ".." in parts or file.path.startswith("/") or "/" in file.category + file.name:
+        if ".." in parts or file.path.startswith("/"):
             raise ConfigError(f"{row.where}: {file.path!r} leads out of its repository")
+        if "/" in file.category + file.name or ".." in (file.category, file.name):
+            raise ConfigError(f"{row.where}: category and name may hold no / and not be ..")
         try:
-            float(file.scale or 1)
+            scale = float(file.scale or 1)
         except ValueError:
-            raise ConfigError(
-                f"{row.where}: scale is a number of metres, not {file.scale!r}"
-            ) from None
+            scale = math.nan
+        if not 0 < scale < math.inf:
+            raise ConfigError(f"{row.where}: scale is a number of metres, not {file.scale!r}")
     ordered = sorted(files, key=lambda f: (f.category, f.name))
     grouped = groupby(ordered, key=lambda f: (f.category, f.name))
     return tuple(ListedObject(tuple(group)) for _, group in grouped)
