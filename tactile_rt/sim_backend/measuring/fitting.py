@@ -4,6 +4,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.settings import parse_toml, read_text, read_toml
 from tactile_rt.sim_backend.arrays.editing import edited
 from tactile_rt.sim_backend.arrays.files import load_array, read_animals
@@ -90,9 +93,23 @@ def fit_array(
     if restless := [e for e in spec.elements if e not in measured.rests]:
         note = f"never at rest for 3 s, or often invalid: {listed(restless)}"
         findings.append(ArrayFinding("rest", "", None, None, note))
+    findings += _beyond_range(sensor, recorded)
     text = edited(path, text, [e for f in findings for e in f.edits])
     read_animals(path, text)  # what no array can have is told now, not when the file is written
     return Fitted(findings, text)
+
+
+def _beyond_range(sensor: SensorSpec, recorded: Chunk) -> list[ArrayFinding]:
+    """The channels that read what they cannot by their description, even after a tare."""
+    largest = np.nanmax(np.abs(recorded.values[recorded.valid]), axis=0, initial=0.0)
+    return [
+        ArrayFinding(
+            f"range of {c.name}", c.unit, c.range, None,
+            f"reads up to {value:.3g}: is the recording in {c.unit}, and is that the range?",
+        )
+        for c, value in zip(sensor.channels, largest.tolist(), strict=True)
+        if value > 2 * c.range
+    ]  # fmt: skip
 
 
 def _tables(text: str) -> dict[str, tuple[int, Mapping[str, Any]]]:

@@ -61,8 +61,8 @@ def measure(spec: ArraySpec, recorded: Chunk, bandwidth_hz: float = 0.0) -> Meas
         away.append(((values - np.stack(levels, axis=1)) / noise).astype(np.float32))
     if not rests:
         raise ConfigError(
-            f"{spec.name}: no whisker is at rest for 3 s; record the array untouched for a minute, "
-            "then pluck its whiskers, with some seconds between"
+            f"{spec.name}: no whisker is valid, and at rest for 3 s; record the array untouched "
+            "for a minute, then pluck its whiskers, with some seconds between"
         )
     rings: dict[str, list[Ring]] = {}
     for swing in find_swings(away, hz):

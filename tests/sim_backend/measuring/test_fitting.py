@@ -256,6 +256,17 @@ def test_whiskers_that_deviate_are_named(described: Path) -> None:
     assert note == "unlike most: A2; always read the same: B1"
 
 
+def test_readings_beyond_the_range_are_in_another_unit(described: Path) -> None:
+    spec, chunk = plucked(described, ("A0",), rest_s=20)
+    told = {f.what: f for f in fit_array(described, spec, chunk).findings}
+    assert not any(what.startswith("range") for what in told)
+    values = chunk.values * np.array([1, 1000], np.float32)
+    values[7] = np.nan
+    told = {f.what: f for f in fit_array(described, spec, replace(chunk, values=values)).findings}
+    assert "range of my" not in told
+    assert told["range of bridge"].note.endswith("is the recording in V, and is that the range?")
+
+
 def test_both_sides_of_a_mirrored_file_are_one_description(described: Path, tmp_path: Path) -> None:
     path, device = tmp_path / "both.toml", tmp_path / "device.toml"
     path.write_text(described.read_text().replace("name = ", "mirror = true\nname = ", 1))
