@@ -85,9 +85,11 @@ def demo(
 
     check_output(json)
     console = Console(stderr=json == STDOUT)
-    recorded |= not (find_spec("mujoco") and find_spec("trimesh"))
-    if recorded and (fast or seed):
-        raise ConfigError(f"--fast and --seed are for a simulation: {install_extra('sim')}")
+    simulated = find_spec("mujoco") and find_spec("trimesh")
+    if (recorded or not simulated) and (fast or seed):
+        do = "leave out --recorded" if simulated else install_extra("sim")
+        raise ConfigError(f"--fast and --seed are for a simulation: {do}")
+    recorded |= not simulated
     try:
         with starting(), console.status("building the array and the objects"):
             demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)

@@ -118,6 +118,10 @@ def test_without_mujoco_a_recording_is_played_over_a_serial_port(call, monkeypat
     assert code == 2 and f"are for a simulation: {install_extra('sim')}" in err
 
 
+def test_a_recording_that_is_asked_for_is_as_fast_as_it_was(refused) -> None:
+    assert "for a simulation: leave out --recorded" in refused("demo", "--recorded", "--fast")
+
+
 def test_the_view_of_a_recording_says_that_it_is_one() -> None:
     pytest.importorskip("mcap")
     screen = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, record=True)
