@@ -1,5 +1,7 @@
 """Views of a simulation, checked in the pixels: projections, arrows, the map, files."""
 
+import resource
+
 import numpy as np
 import pytest
 
@@ -386,6 +388,23 @@ def test_an_image_is_what_was_drawn(tmp_path, suffix):
             3 if suffix == ".jpg" else 0
         )
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("name", ["a.png", "a.mp4", "a.gif"])
+def test_a_full_disk_is_told_with_the_name_of_the_file(tmp_path, name):
+    path = tmp_path / name
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as failed:
+            if name == "a.png":
+                write_image(path, FRAMES[0])
+            else:
+                write_video(path, iter(FRAMES), 25, FRAMES[0])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert failed.value.filename == str(path)
+    assert not list(tmp_path.iterdir())
 
 
 def test_other_files_are_refused(tmp_path):

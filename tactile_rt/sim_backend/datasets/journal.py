@@ -78,14 +78,21 @@ class Journal:
             self._file.truncate(valid)
 
     def append(self, index: int, record: SweepRecord) -> None:
-        """Keep a finished sweep."""
+        """Keep a finished sweep.
+
+        Raises:
+            OSError: naming the journal: the medium is full.
+        """
         values = np.ascontiguousarray(record.values, dtype=np.float32)
         contacts = None if record.contacts is None else record.contacts.astype("<f4").tobytes()
         stored = _Stored(index, values.shape, record.parameters, values.tobytes(), contacts)
         payload = msgspec.msgpack.encode(stored)
         whole = memoryview(HEADER.pack(len(payload), zlib.crc32(payload)) + payload)
-        while whole:
-            whole = whole[self._file.write(whole) :]
+        try:
+            while whole:
+                whole = whole[self._file.write(whole) :]
+        except OSError as error:
+            raise OSError(error.errno, error.strerror, str(self.path)) from None
         self.records[index] = record
 
     def remove(self) -> None:

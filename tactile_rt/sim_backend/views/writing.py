@@ -1,16 +1,15 @@
 """Pictures and videos as files, complete or not at all."""
 
-import os
-import tempfile
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any, BinaryIO
 
 import av
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from tactile_rt.files import write_whole
 from tactile_rt.stream import ConfigError
 
 __all__ = ["IMAGES", "VIDEOS", "check_suffix", "write_image", "write_video"]
@@ -41,8 +40,8 @@ def check_suffix(path: Path) -> str:
 
 def write_image(path: Path, pixels: Pixels) -> None:
     """Write a picture (height, width, 3) RGB as .png or .jpg."""
-    with _whole(path) as partial:
-        Image.fromarray(pixels).save(partial, optimize=True)
+    kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
+    write_whole(path, lambda file: Image.fromarray(pixels).save(file, kind, optimize=True))
 
 
 def write_video(path: Path, pictures: Iterable[Pixels], fps: int, sample: Pixels) -> None:
@@ -54,15 +53,15 @@ def write_video(path: Path, pictures: Iterable[Pixels], fps: int, sample: Pixels
         fps: pictures a second. A GIF counts time in 10 ms: 25, 20 and 10 are exact.
         sample: one that has the colours of them all; a GIF, which loops, gets its palette from it.
     """
-    with _whole(path) as partial:
-        if path.suffix.lower() == ".gif":
-            _write_gif(partial, pictures, fps, sample)
-        else:
-            _write_mp4(partial, pictures, fps)
+    if path.suffix.lower() == ".gif":
+        write_whole(path, lambda file: _write_gif(file, pictures, fps, sample))
+    else:
+        write_whole(path, lambda file: _write_mp4(file, pictures, fps))
 
 
-def _write_mp4(path: Path, pictures: Iterable[Pixels], fps: int) -> None:
-    with av.open(str(path), "w", options={"movflags": "+faststart"}) as file:
+def _write_mp4(out: BinaryIO, pictures: Iterable[Pixels], fps: int) -> None:
+    # by its name, as what comes first is moved there at the end
+    with av.open(str(out.name), "w", "mp4", options={"movflags": "+faststart"}) as file:
         stream = file.add_stream("libx264", rate=fps, options={"crf": QUALITY})
         stream.pix_fmt = "yuv420p"  # what every player plays
         for k, pixels in enumerate(pictures):
@@ -73,7 +72,7 @@ def _write_mp4(path: Path, pictures: Iterable[Pixels], fps: int) -> None:
         file.mux(stream.encode())
 
 
-def _write_gif(path: Path, pictures: Iterable[Pixels], fps: int, sample: Pixels) -> None:
+def _write_gif(out: BinaryIO, pictures: Iterable[Pixels], fps: int, sample: Pixels) -> None:
     palette = Image.fromarray(sample).quantize(COLOURS)
     colours = np.array(palette.getpalette()).reshape(-1, 3)
     colours[(colours > PAPER).all(axis=1)] = 255  # paper is white, not nearly so
@@ -83,19 +82,10 @@ def _write_gif(path: Path, pictures: Iterable[Pixels], fps: int, sample: Pixels)
         Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures
     )
     first = next(indexed)
-    first.save(path, save_all=True, append_images=indexed, duration=round(1000 / fps), loop=0)
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A name to write to; the file appears under its own name when it is complete."""
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".", suffix=path.suffix.lower())
-    os.close(handle)
-    partial = Path(name)
-    try:
-        yield partial
-        partial.chmod(0o644)  # a temporary file is its owner's alone
-        os.replace(partial, path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+    every: dict[str, Any] = {
+        "save_all": True,
+        "append_images": indexed,
+        "duration": round(1000 / fps),
+        "loop": 0,
+    }
+    first.save(out, "GIF", **every)

@@ -1,5 +1,6 @@
 import fcntl
 import os
+import resource
 import threading
 import time
 from pathlib import Path
@@ -62,6 +63,19 @@ def test_a_journal_cut_anywhere_keeps_its_whole_records(tmp_path: Path) -> None:
         assert path.stat().st_size == cut // size * size, "the torn tail is cut off"
         fill(tmp_path, [7])
         assert list(read(tmp_path)) == [*range(cut // size), 7]
+
+
+def test_a_full_disk_is_told_with_the_name_of_the_journal(tmp_path: Path) -> None:
+    fill(tmp_path, [0])
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, ((tmp_path / "mug-0.part").stat().st_size, before[1]))
+    try:
+        with pytest.raises(OSError, match="File too large") as failed:
+            fill(tmp_path, [1])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert failed.value.filename == str(tmp_path / "mug-0.part")
+    assert list(read(tmp_path)) == [0]
 
 
 @given(st.integers(0, 10_000), st.integers(1, 255))
