@@ -219,6 +219,7 @@ def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
     def counted(given: float | None, of_a_folder: float, of_shapes: float) -> float:
         return (of_a_folder if all_of_it else of_shapes) if given is None else given
 
+    drawn = {name: _choice(nodes, name, file.sweeps, usual[name]) for name in PARAMETERS}
     try:
         return SweepRecipe(
             name=file.name,
@@ -249,7 +250,7 @@ def _recipe(nodes: SettingNode, folder: Path | None = None) -> SweepRecipe:
                 ),
             ),
             sweeps=SweepChoice(
-                **{n: _choice(nodes, n, file.sweeps, usual[n]) for n in PARAMETERS},
+                **drawn,
                 draws=file.sweeps.draws,
                 held_out_draws=file.sweeps.held_out_draws,
                 least_whiskers=file.sweeps.least_whiskers,

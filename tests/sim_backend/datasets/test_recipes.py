@@ -397,6 +397,7 @@ def test_a_mistake_is_one_line_with_file_key_and_remedy(tmp_path, text, complain
     with pytest.raises(ConfigError, match=complaint) as refused:
         read_recipe(path)
     assert str(refused.value).startswith(path)
+    assert str(refused.value).count(path) == 1
     assert "\n" not in str(refused.value)
 
 
