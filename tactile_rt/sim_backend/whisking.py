@@ -37,6 +37,7 @@ __all__ = ["ENDLESS", "HEAD", "WhiskSimulation"]
 HEAD = Mount((0.0, 0.0, 0.0), (0.0, float(np.radians(15.0)), 0.0))
 # mg mm^2; a whisker has 10 at most. From 1e8 on the solver converges badly.
 BASE_INERTIA = 1e6
+NO_MASS = 1e-9  # mg and mg mm^2, that nothing feels
 ENDLESS: Final = 1 << 62  # samples
 # Of the solver. Its usual 1e-8 counts in the bases' inertia and is met before a contact is solved.
 TOLERANCE = 1e-16
@@ -167,10 +168,12 @@ def _add_base_joints(world: mujoco.MjSpec, whisker: Whisker) -> None:
     *_, zeta = whisker.angles
     c = rotation("x", zeta + np.pi / 2)
     axes = (whisker.orientation[2], -c[1], np.array([1.0, 0.0, 0.0]))
+    base = world.body(whisker.name)
     for angle, axis in zip(ANGLES, axes, strict=True):
-        world.body(whisker.name).add_joint(
-            name=f"{whisker.name} {angle}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis
-        )
+        base.add_joint(name=f"{whisker.name} {angle}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis)
+    if whisker.mount_stiffness:  # nothing is fixed to the base then, and a body that moves has mass
+        base.explicitinertial = True
+        base.mass, base.inertia = NO_MASS, (NO_MASS, NO_MASS, NO_MASS)
 
 
 def _add_object(world: mujoco.MjSpec, pieces: tuple[NDArray[np.float64], ...]) -> None:

@@ -199,10 +199,12 @@ def test_tracking_is_exact_even_in_contact():
 # ---- dynamics
 
 
-def test_a_stiff_whisker_loads_its_base_with_its_inertia():
+@pytest.mark.parametrize("mount", [0.0, 1e-2])
+def test_a_stiff_whisker_loads_its_base_with_its_inertia(mount):
     stiff = dataclasses.replace(
-        MOUSE["C2"], curvature=0.0, angles=(1.2, 0.0, -np.pi / 2), young_modulus=5e12
-    )
+        MOUSE["C2"], curvature=0.0, angles=(1.2, 0.0, -np.pi / 2), young_modulus=5e12,
+        mount_stiffness=mount, mount_damping=1e-3 * mount,
+    )  # fmt: skip
     s = np.linspace(0, stiff.length, 20001)
     r = stiff.radius(s)
     line = stiff.density(s) * np.pi * (r * 1e-3) ** 2  # kg / m
@@ -284,6 +286,20 @@ def test_turning_against_a_post_is_the_same_as_a_post_that_comes():
     for part in (slice(0, 3), slice(3, 6)):
         error = np.sqrt(np.square(turned[:, 0, part] - still[:, part]).sum())
         assert error < 0.02 * np.sqrt(np.square(still[:, part]).sum())
+
+
+def test_a_mount_that_gives_is_held_by_the_loads_that_its_spring_tells():
+    """Turned against a post, the moment at the base is the spring's stiffness times its turn."""
+    c2 = dataclasses.replace(MOUSE["C2"], mount_stiffness=2e-6, mount_damping=2e-8)
+    move = Whisk(frequency_hz=1, protraction_deg=12, retraction_deg=0, ramp_s=0.1, duration_s=0.4)
+    here = point(c2, np.radians(6), 10.0) + AHEAD
+    sim = WhiskSimulation((c2,), move, DATASET, (prism(here),))
+    clamped = WhiskSimulation((MOUSE["C2"],), move, DATASET, (prism(here),))
+    (loads, touch), (stiffer, _) = sim.advance(400), clamped.advance(400)
+    assert touch[-1, 0]
+    turn = sim.data.qpos[[sim.model.joint(f"C2 0 {axis}").qposadr[0] for axis in "yz"]]
+    np.testing.assert_allclose(np.abs(loads[-1, 0, 4:]), 2e-6 * np.abs(turn), rtol=0.05, atol=1e-9)
+    assert np.linalg.norm(loads[-1, 0, :3]) < 0.9 * np.linalg.norm(stiffer[-1, 0, :3])
 
 
 def test_contact_does_not_depend_on_the_bases_inertia(monkeypatch):

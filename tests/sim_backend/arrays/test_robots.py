@@ -162,6 +162,13 @@ def test_drag_bends_the_second_bridge_and_the_grid_is_that_of_the_wires() -> Non
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_its_whiskers_whisk(name: str) -> None:
+    with open_source(f"whisking:{name}?seconds=0.05&pace=fast") as source:
+        values = np.concatenate([chunk.values for chunk in source])
+    assert len(values) == 50 and np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_the_page_says_how_to_begin(name: str) -> None:
     page = ROOT / "docs" / "reference" / "published-arrays.md"
     (row,) = [r for r in page.read_text("utf-8").splitlines() if r.endswith(f"{ROBOTS[name]}` |")]
