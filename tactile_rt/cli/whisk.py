@@ -81,7 +81,7 @@ def whisk(
     for file in (out, beside, json):
         check_output(file)
     if json is not None and json.resolve() == beside.resolve():
-        raise ConfigError(f"{json} goes beside {out} and says what is in it: name another for --json")
+        raise ConfigError(f"{json} goes beside {out} and says what is in it: name another")
     try:
         with starting():
             import numpy as np

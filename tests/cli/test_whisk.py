@@ -84,7 +84,7 @@ def test_an_object_and_a_recorded_trajectory(call, tmp_path, robot):
     [
         (("out.txt",), "name a file that ends in .npz"),
         (("none/out.npz",), "no folder none"),
-        (("out.npz", "--json", "./out.json"), "out.json goes beside out.npz and says what is in it: name"),
+        (("out.npz", "--json", "./out.json"), "out.json goes beside out.npz and says what is in"),
         (("out.npz", "--stimulus", "convex"), "no stimulus 'convex': there are convex-close"),
         (("out.npz", "--stimulus", "all", "--object", "mug"), "exclude each other"),
         (("out.npz", "--object", "mugg"), "no object called 'mugg'"),
