@@ -29,6 +29,7 @@ __all__ = [
     "Seconds",
     "app",
     "check_folder",
+    "check_is_mcap",
     "check_named_once",
     "check_new",
     "check_output",
@@ -203,6 +204,16 @@ def _files(word: str) -> set[Path]:
     """What files a word may name: alone, as an option, or in a URL."""
     parts = (word, *map(unquote, re.split("[:?&=@,]", word)))
     return {Path(part).resolve() for part in parts if part and "\0" not in part}
+
+
+def check_is_mcap(file: Path) -> None:
+    """Refuse a recording's name that would say that it is something else.
+
+    Raises:
+        ConfigError: it does not end in ``.mcap``.
+    """
+    if file.suffix != ".mcap":
+        raise ConfigError(f"{file}: a recording is a .mcap; `tactile-rt convert` makes others")
 
 
 def check_new(file: Path, force: bool) -> None:

@@ -7,7 +7,7 @@ from urllib.parse import parse_qsl
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_new, check_output, starting
+from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, starting
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.stream import ConfigError
@@ -61,8 +61,7 @@ def import_file(
     if log.is_file() and not log.stat().st_size:
         raise ConfigError(f"{log} is empty")
     output = output or Path(f"{log.name.partition('.')[0] or 'import'}.mcap")
-    if output.suffix != ".mcap":
-        raise ConfigError(f"{output}: a recording is a .mcap; `tactile-rt convert` makes others")
+    check_is_mcap(output)
     check_output(json)
     check_new(output, force)
     if decimal not in ("", ",", "."):

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import Seconds, app, check_new, check_output, leaving, starting
+from tactile_rt.cli.app import (
+    Seconds,
+    app,
+    check_is_mcap,
+    check_new,
+    check_output,
+    leaving,
+    starting,
+)
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.settings import no_such
@@ -56,8 +64,7 @@ def record(
     need_mcap()
     for file in (output, json):
         check_output(file)
-    if output.suffix != ".mcap":
-        raise ConfigError(f"{output}: a recording is a .mcap; `tactile-rt convert` makes others")
+    check_is_mcap(output)
     rotated = rotate_mb or rotate_s  # which writes over nothing
     if not rotated:  # before a device is opened and started
         check_new(output, force)
