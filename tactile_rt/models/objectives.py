@@ -46,7 +46,6 @@ __all__ = [
 # Sizes of the heads, at width 1.
 CONTRASTED = (2048, 128)  # SimCLR's neck: inside, and what comes out
 LEAST = 32  # the neck's output at any width: fewer directions cannot tell a batch apart
-TEMPERATURE = 0.1  # of SimCLR
 PROJECTED, BOTTLENECK = 2048, 512  # SimSiam's projector and predictor
 NECK_SPREAD = 0.01  # standard deviation of the neck's first weights
 DECONVOLUTIONS = 3
@@ -150,10 +149,11 @@ class Supervised(Objective):
             return last_loss(logits, labels, self._smoothing)
 
 
-def nt_xent(first: Tensor, second: Tensor, temperature: float = TEMPERATURE) -> Tensor:
+def nt_xent(first: Tensor, second: Tensor, temperature: float) -> Tensor:
     """Normalised temperature-scaled cross-entropy: of 2 n views, which is the other of the pair?
 
-    first, second (n, feature): the two views of each of n windows -> scalar.
+    first, second (n, feature): the two views of each of n windows -> scalar. Their cosines count
+    divided by the temperature.
     """
     z = F.normalize(torch.cat([first, second]).float(), dim=1)
     n = len(first)
@@ -166,12 +166,19 @@ class SimCLR(Objective):
     """Contrast of two views; the neck (Linear, BN, ReLU, Linear, BN) is thrown away afterwards.
 
     Both views are one batch, to batch norms in the network, too.
+
+    Args:
+        model, augmentation: as in `Objective`.
+        temperature: as `nt_xent` takes it.
     """
 
     views = 2
 
-    def __init__(self, model: TactileClassifier, augmentation: Augmentation) -> None:
+    def __init__(
+        self, model: TactileClassifier, augmentation: Augmentation, temperature: float
+    ) -> None:
         super().__init__(model, augmentation)
+        self._temperature = temperature
         width, features = model.network.config.width, model.feature_size()
         hidden, out = _scaled(CONTRASTED[0], width), _scaled(CONTRASTED[1], width, LEAST)
         self.neck = nn.Sequential(
@@ -188,7 +195,7 @@ class SimCLR(Objective):
     def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
         first, second = self.neck(self.embedding(torch.cat(list(seen)))).chunk(2)
         with _in_single_precision(first):
-            return nt_xent(_of_all_devices(first), _of_all_devices(second))
+            return nt_xent(_of_all_devices(first), _of_all_devices(second), self._temperature)
 
 
 def _of_all_devices(rows: Tensor) -> Tensor:

@@ -47,29 +47,30 @@ def objectives(model):
     plain, tactile = build("none", SPEC), build("tactile", SPEC)
     return (
         Supervised(model, plain, "anytime", 0.1),
-        SimCLR(model, tactile),
+        SimCLR(model, tactile, 0.1),
         SimSiam(model, tactile),
         Autoencoder(model, plain),
         Predictive(model, plain, 0.25),
     )
 
 
-def test_nt_xent_is_that_of_a_plain_loop():
+@pytest.mark.parametrize("temperature", [0.1, 1.0])
+def test_nt_xent_is_that_of_a_plain_loop(temperature):
     rng = np.random.default_rng(0)
     first, second = rng.normal(size=(2, 5, 7))
     views = [v / np.sqrt((v * v).sum()) for v in (*first, *second)]
     total = 0.0
     for i in range(10):
         partner = (i + 5) % 10
-        others = [math.exp(views[i] @ views[k] / 0.1) for k in range(10) if k != i]
-        total -= math.log(math.exp(views[i] @ views[partner] / 0.1) / sum(others))
-    found = nt_xent(torch.from_numpy(first), torch.from_numpy(second))
+        others = [math.exp(views[i] @ views[k] / temperature) for k in range(10) if k != i]
+        total -= math.log(math.exp(views[i] @ views[partner] / temperature) / sum(others))
+    found = nt_xent(torch.from_numpy(first), torch.from_numpy(second), temperature)
     assert found.item() == pytest.approx(total / 10, rel=1e-5)
 
 
 def test_views_that_agree_cost_less():
     rows = torch.randn(8, 16, generator=generator())
-    assert nt_xent(rows, rows) < 0.1 * nt_xent(rows, rows.roll(1, 0))
+    assert nt_xent(rows, rows, 0.1) < 0.1 * nt_xent(rows, rows.roll(1, 0), 0.1)
 
 
 def test_supervised_losses_are_those_of_a_plain_loop():
@@ -160,7 +161,7 @@ def test_what_is_masked_is_predicted_all_the_same():
 
 def test_heads_have_the_published_sizes_at_full_width():
     model = classifier(width=1.0)
-    neck = SimCLR(model, build("none", SPEC)).neck
+    neck = SimCLR(model, build("none", SPEC), 0.1).neck
     assert [tuple(p.shape) for p in neck.parameters() if p.dim() == 2] == [(2048, 512), (128, 2048)]
     simsiam = SimSiam(model, build("none", SPEC))
     assert [tuple(p.shape) for p in simsiam.projector.parameters() if p.dim() == 2] == [

@@ -77,6 +77,7 @@ def equal(a, b):
         ({"masking": 1.0}, r"masking must be in \[0, 1\)"),
         ({"objective": "simclr", "batch": 1}, "batch must be 2 or more"),
         ({"objective": "simclr", "pairs": "three"}, "pairs is 'three', not one of one-sweep, two"),
+        ({"objective": "simclr", "temperature": 0.0}, "temperature must be positive"),
         ({"objective": "predictive", "pairs": "two-sweeps"}, "predictive has no two views"),
     ],
 )
@@ -367,15 +368,17 @@ def test_a_contrast_is_of_two_sweeps_of_an_object(tmp_path):
     for sweeps, name in ((2, "two"), (1, "one")):
         write_tiny_set(tmp_path / name, sweeps=sweeps)
     runs = []
-    for pairs in ("two-sweeps", "one-sweep"):
+    for pairs, temperature in (("two-sweeps", 0.1), ("one-sweep", 0.1), ("two-sweeps", 1.0)):
         config = TrainingConfig(
             str(tmp_path / "two"), **SMALL, objective="simclr", augmentation="image", pairs=pairs,
-            updates=2,
+            temperature=temperature, updates=2,
         )  # fmt: skip
         seen = []
-        train(config, tmp_path / pairs, seen.append)
+        train(config, tmp_path / f"{pairs}-{temperature}", seen.append)
         runs.append([p.metrics["validation_loss"] for p in seen if p.metrics])
-    assert np.isfinite(runs).all() and runs[0] != runs[1]
+    assert np.isfinite(runs).all()
+    assert runs[0] != runs[1], "pairs are of two sweeps"
+    assert runs[0] != runs[2], "at the temperature that is told"
     config = replace(config, data=str(tmp_path / "one"), pairs="two-sweeps")
     with pytest.raises(ConfigError, match="no object has two sweeps"):
         train(config, tmp_path / "refused")

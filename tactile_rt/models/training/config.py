@@ -74,6 +74,8 @@ class TrainingConfig:
         pairs: What the two views of "simclr" and "simsiam" are of: "one-sweep", the same window
             twice, or "two-sweeps", windows of two sweeps of the same object, as a robot has them
             that touches a thing twice.
+        temperature: The temperature of "simclr": a similarity counts divided by it. 0.1 in the
+            paper; where two views are hard to tell as a pair, as two sweeps are, a higher one.
         masking: The share of the steps of a window that is blanked, from 0 to less than 1.
         optimizer, schedule: Names of the optimizer and of the schedule of its rate, as in
             `optimizers`.
@@ -123,6 +125,7 @@ class TrainingConfig:
     loss: str = "anytime"
     augmentation: str = "none"
     pairs: str = ONE_SWEEP
+    temperature: float = 0.1
     masking: float = 0.0
     optimizer: str = "adamw"
     schedule: str = "one-cycle"
@@ -158,7 +161,7 @@ class TrainingConfig:
         ):
             if (value := getattr(self, name)) not in known:
                 raise ConfigError(f"{name} is {value!r}, not one of {', '.join(known)}")
-        for name in ("epochs", "batch", "learning_rate", "drop_every"):
+        for name in ("epochs", "batch", "learning_rate", "drop_every", "temperature"):
             _check_positive(name, getattr(self, name))
         for name in ("updates", "clip_norm", "weight_decay", "jitter"):
             if not (getattr(self, name) >= 0 and isfinite(getattr(self, name))):

@@ -259,13 +259,9 @@ def build_objective(config: TrainingConfig, training: SweepSet) -> Objective:
     model.network.decoder.requires_grad_(False)  # it has no part in these
     if predictive:
         return Predictive(model, augmentation, config.masking)
-    kinds: dict[str, type[Any]] = {
-        "simclr": SimCLR,
-        "simsiam": SimSiam,
-        "autoencoder": Autoencoder,
-    }
-    objective: Objective = kinds[config.objective](model, augmentation)
-    return objective
+    if config.objective == "simclr":
+        return SimCLR(model, augmentation, config.temperature)
+    return {"simsiam": SimSiam, "autoencoder": Autoencoder}[config.objective](model, augmentation)
 
 
 def _mean(fabric: "Fabric", losses: list[float]) -> float:
