@@ -5,6 +5,7 @@
 """
 
 from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -58,7 +59,9 @@ PICTURES = [
     )
     for k in range(12)
 ]
-LOSSES = {"simclr": SimCLR, "simsiam": SimSiam, "autoencoder": Autoencoder}
+LOSSES: dict[str, Callable[..., Objective]] = {
+    "simclr": partial(SimCLR, temperature=0.1), "simsiam": SimSiam, "autoencoder": Autoencoder,
+}  # fmt: skip
 SHAPES = {"weight": (4, 3), "bias": (4,), "gamma": (2, 5)}  # of parameters that LARS moves
 RATE, DECAY, UPDATES = 0.1, 1e-4, 5
 EPOCHS, WARMUP = 100, 10
@@ -149,8 +152,7 @@ def loss(
         run: computes it otherwise, of our objective, the features and the frames.
     """
     model = _Known()
-    kind: type[Objective] = LOSSES[name]
-    objective = kind(model, Augmentation(lambda x, _: x, lambda x, _: x))  # type: ignore[arg-type]
+    objective = LOSSES[name](model, Augmentation(lambda x, _: x, lambda x, _: x))
     with torch.no_grad():
         for k, parameter in enumerate(objective.parameters()):
             inputs = parameter[0].numel()
