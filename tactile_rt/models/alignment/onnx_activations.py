@@ -250,7 +250,11 @@ def _traces(taps: Mapping[str, str], found: Mapping[str, Floats]) -> dict[str, F
 
 
 def _trace(layer: str, values: Floats) -> Floats:
-    """(stimulus, step, 1, ...) -> (stimulus, step, unit); of a GPT's tokens the action token."""
-    if layer.startswith("attender.") and values.ndim == 5 and values.shape[3] == TOKENS:
-        values = values[:, :, :, -1]
+    """(stimulus, step, 1, ...) -> (stimulus, step, unit); of a GPT's tokens the action token.
+
+    The exporter may have made one axis of batch and token.
+    """
+    if layer.startswith("attender."):
+        rows = values.reshape(*values.shape[:2], -1, values.shape[-1])
+        values = rows[:, :, -1] if rows.shape[2] == TOKENS else values
     return values.reshape(*values.shape[:2], -1)

@@ -218,6 +218,7 @@ def test_a_window_gives_the_layers_of_its_step(exported):
     "encoder, attender, decoder",
     [
         ("gru", "none", "mlp"),
+        ("gru", "gpt", "mlp"),
         pytest.param("zhuang-ugrnn", "none", "linear", marks=pytest.mark.slow),
     ],
 )
@@ -239,6 +240,20 @@ def test_a_file_averages_the_steps_of_its_checkpoint(tmp_path, encoder, attender
     for felt in (FELT, late):
         assert onnx_layers(path, felt)[0].first == reference.first
     found = export_layers(path, late, reference)
+    assert {name: found.first[name] for name in reference.first} == reference.first
+    assert fidelity_check(reference, found)[0].code == PASS
+
+
+def test_the_checkpoint_says_which_steps_count(exported, monkeypatch):
+    """Where a network hardly responds, a file seems to hear its input later than it does."""
+    reference, path = exported
+
+    def late(*asked):
+        layers, card = onnx_layers(*asked)
+        return replace(layers, first=dict.fromkeys(layers.first, 9)), card
+
+    monkeypatch.setattr("tactile_rt.models.alignment.onnx_activations.onnx_layers", late)
+    found = export_layers(path, FELT, reference)
     assert {name: found.first[name] for name in reference.first} == reference.first
     assert fidelity_check(reference, found)[0].code == PASS
 
