@@ -160,8 +160,8 @@ def _touched(groups: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
     kept = [tuple(part[there] for part in group) for group, there in found if there.any()]
     if not kept:
         raise RecordingError(
-            "in no validation sweep a contact was found, so that nothing can be promised: are "
-            "the loads of the sweep set in SI units?"
+            "in no validation sweep a contact was found and answered by numbers, so that nothing "
+            "can be promised: are the loads of the sweep set in SI units? did training converge?"
         )
     return kept
 

@@ -198,8 +198,13 @@ def fit_temperature(posteriors: NDArray[np.float32], labels: NDArray[np.int64]) 
     Args:
         posteriors: (sweep, class) at temperature 1; undecided sweeps (NaN) are left out.
         labels: (sweep,).
+
+    Returns:
+        One of `TEMPERATURES`; 1 if no sweep is decided.
     """
     decided = ~np.isnan(posteriors[:, 0])
+    if not decided.any():
+        return 1.0
     logits = np.log(np.clip(posteriors[decided], 1e-12, None))
     right = labels[decided]
 

@@ -106,15 +106,17 @@ def predict(
 
 
 def posteriors(cut: Iterable[CutWindows], run: Step) -> NDArray[np.float32]:
-    """(sweep, step, class) posteriors of windows that are cut; NaN where no contact was detected.
+    """(sweep, step, class) posteriors of windows that are cut; NaN where no contact was detected,
+    or the network overflows.
 
     Args:
         cut: what `cut_windows` gives.
         run: as `predict` takes it.
     """
     logits, found = _run_over(cut, run)
-    raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
-    posterior: NDArray[np.float32] = raised / raised.sum(axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
+        posterior: NDArray[np.float32] = raised / raised.sum(axis=-1, keepdims=True)
     posterior[~found] = np.nan
     return posterior
 

@@ -407,9 +407,11 @@ def test_another_configuration_is_named(tiny, tmp_path):
         train(TrainingConfig(tiny, **SMALL, updates=2, seed=1), tmp_path / "run")
 
 
-def test_a_run_that_diverges_says_so(tiny, tmp_path):
+@pytest.mark.parametrize("updates", [1, 6])
+def test_a_run_that_diverges_says_so(tiny, tmp_path, updates):
+    """By its gradients, or after its last update by what the network answers."""
     config = TrainingConfig(
-        tiny, **SMALL, optimizer="sgd", schedule="constant", learning_rate=1e30, updates=6
+        tiny, **SMALL, optimizer="sgd", schedule="constant", learning_rate=9e37, updates=updates
     )
     with pytest.raises(ModelError, match="training diverged in epoch"):
         train(config, tmp_path / "run")

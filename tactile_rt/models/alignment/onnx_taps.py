@@ -65,13 +65,13 @@ def named_taps(model: onnx.ModelProto) -> dict[str, str]:
             readers.setdefault(source, []).append(node)
     place = {o: i for i, node in enumerate(graph.node) for o in node.output}
     # The node of a module is the last that reads one of its parameters: a sum after a product.
-    # Parameters that are equal are one to the exporter, under the first one's name, so only the
-    # first that reads one counts.
+    # Parameters that are equal, as an untrained network's are, are one to the exporter, under the
+    # name of any of them: what several nodes read tells nothing.
     modules: dict[str, onnx.NodeProto] = {}
     for initializer in (*model.graph.initializer, *graph.initializer):
         match = PARAMETER.match(initializer.name)
-        if match and initializer.name in readers:
-            node = readers[initializer.name][0]
+        if match and len(reading := readers.get(initializer.name, ())) == 1:
+            node = reading[0]
             known = modules.get(match[1])
             if known is None or place[node.output[0]] > place[known.output[0]]:
                 modules[match[1]] = node
@@ -145,7 +145,8 @@ def _found(
         before, after = name.split()
         yield from ((before, node.input[0]), (after, out))
     elif where == "sum":
-        total = _next(out, readers, "Add")
+        # Behind a product whose bias is lost comes that bias, not the sum.
+        total = None if node.op_type == "MatMul" else _next(out, readers, "Add")
         if total is not None:
             yield name.format(number), _activated(total.output[0], readers)
     elif where == "activation":

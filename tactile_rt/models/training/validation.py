@@ -1,6 +1,7 @@
 """How good a network is by the validation split: what chooses the checkpoint that is kept."""
 
 from collections.abc import Callable
+from math import nan
 
 import numpy as np
 import torch
@@ -67,18 +68,22 @@ class Validation:
                 self._other[usable] = usable[partners(data.sweeps.objects[usable], rng)]
 
     def __call__(self, objective: Objective) -> Score:
-        """Metrics by name, and the score: the higher the better."""
+        """Metrics by name, and the score: the higher the better; NaN if it answers no numbers."""
         objective.eval()
         return self._measure(objective)
 
     def _top1(self, objective: Objective) -> Score:
         data, run = self._data, run_on(objective.model)
         labels, classes = data.sweeps.labels, len(data.manifest.categories)
-        # Whether a model may refuse to decide is another question.
-        clean, noisy = (
-            hits(among(posteriors(cut, run)[:, -1], classes), labels).mean()
-            for cut in (self._clean, self._noisy)
-        )
+        shares = []
+        for cut in (self._clean, self._noisy):
+            answers = posteriors(cut, run)[:, -1]
+            touched = np.concatenate([one.detected for one in cut])
+            if not np.isfinite(answers[touched]).all():
+                return {}, nan  # it overflows: no gradient says so, if training's windows do not
+            # Whether a model may refuse to decide is another question.
+            shares.append(hits(among(answers, classes), labels).mean())
+        clean, noisy = shares
         metrics = {"validation_top1": float(clean), "validation_top1_noisy": float(noisy)}
         return metrics, float(clean + noisy) / 2 if data.manifest.faults.noise else float(clean)
 

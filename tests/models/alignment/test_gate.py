@@ -258,6 +258,22 @@ def test_the_checkpoint_says_which_steps_count(exported, monkeypatch):
     assert fidelity_check(reference, found)[0].code == PASS
 
 
+def test_an_untrained_network_s_export_passes(tmp_path):
+    """Its norms are all alike, and one to the exporter, under the last one's name."""
+    torch.manual_seed(2)
+    card = load_model(shipped_model())[1]
+    config = EADConfig(len(card.labels), "gru", "gpt", "linear", width=1 / 32)
+    model = TactileClassifier(card.array, config).eval()
+    path = tmp_path / "step.onnx"
+    card = msgspec.structs.replace(card, provenance={}, figures={}, embeddings=None)
+    export_step(model, card, path)
+    assert "attender.norm" not in onnx_layers(path, FELT)[0].traces
+    reference = network_layers(model, FELT)
+    check, rows = fidelity_check(reference, export_layers(path, FELT, reference))
+    assert check.code == PASS
+    assert {"attender.block0", "attender.norm"} <= {row.layer for row in rows}
+
+
 def test_layers_whose_names_are_lost_are_found_by_value(exported):
     reference, path = exported
     model = onnx.load(path)
