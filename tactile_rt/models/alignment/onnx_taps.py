@@ -70,7 +70,10 @@ def named_taps(model: onnx.ModelProto) -> dict[str, str]:
     modules: dict[str, onnx.NodeProto] = {}
     for initializer in (*model.graph.initializer, *graph.initializer):
         match = PARAMETER.match(initializer.name)
-        if match and len(reading := readers.get(initializer.name, ())) == 1:
+        reading = readers.get(initializer.name, [])
+        while len(reading) == 1 and reading[0].op_type == "Cast":  # of weights stored in 16 bits
+            reading = readers.get(reading[0].output[0], [])
+        if match and len(reading) == 1:
             node = reading[0]
             known = modules.get(match[1])
             if known is None or place[node.output[0]] > place[known.output[0]]:

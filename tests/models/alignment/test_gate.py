@@ -29,6 +29,7 @@ onnx = pytest.importorskip("onnx")
 
 from tactile_rt.classifier.model_file import METADATA_KEY, load_model, shipped_model  # noqa: E402
 from tactile_rt.export.onnx_step import export_step  # noqa: E402
+from tactile_rt.export.precision import in_precision  # noqa: E402
 from tactile_rt.export.windows import window_graph  # noqa: E402
 from tactile_rt.models.alignment.activations import network_layers  # noqa: E402
 from tactile_rt.models.alignment.fidelity import (  # noqa: E402
@@ -256,6 +257,24 @@ def test_the_checkpoint_says_which_steps_count(exported, monkeypatch):
     found = export_layers(path, FELT, reference)
     assert {name: found.first[name] for name in reference.first} == reference.first
     assert fidelity_check(reference, found)[0].code == PASS
+
+
+@pytest.mark.parametrize("precision", ["fp16", "bf16"])
+def test_a_gpt_of_weights_in_16_bits_passes(tmp_path, precision):
+    """A weight that is stored in 16 bits is no response of the layer that it is of."""
+    torch.manual_seed(2)
+    card = load_model(shipped_model())[1]
+    config = EADConfig(len(card.labels), "gru", "gpt", "linear", width=1 / 16)
+    model = TactileClassifier(card.array, config).eval()
+    stir(model)
+    path = tmp_path / "step.onnx"
+    card = msgspec.structs.replace(card, provenance={}, figures={}, embeddings=None)
+    export_step(model, card, path)
+    onnx.save(in_precision(onnx.load(path), precision), path)
+    reference = network_layers(model, FELT)
+    layers = export_layers(path, FELT, reference)
+    assert layers.precision == precision
+    assert fidelity_check(reference, layers)[0].code == PASS
 
 
 def test_an_untrained_network_s_export_passes(tmp_path):
