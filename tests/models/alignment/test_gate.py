@@ -148,18 +148,24 @@ def test_exit_code_of_every_combination():
         assert exit_code([Check("x", code, "") for code in these]) == expected
 
 
+def written(path, encoder, attender, decoder, width=1 / 32, trained=True):
+    """A small network whose export is at a path now."""
+    torch.manual_seed(2)
+    card = load_model(shipped_model())[1]
+    config = EADConfig(len(card.labels), encoder, attender, decoder, width=width)
+    model = TactileClassifier(card.array, config).eval()
+    if trained:
+        stir(model)
+    plain = msgspec.structs.replace(card, provenance={}, figures={}, embeddings=None)
+    export_step(model, plain, path)
+    return model
+
+
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     """A small network and its export."""
-    torch.manual_seed(2)
-    card = load_model(shipped_model())[1]
-    model = TactileClassifier(
-        card.array, EADConfig(len(card.labels), "gru", "none", "mlp", width=1 / 16)
-    ).eval()
-    stir(model)
     path = tmp_path_factory.mktemp("gate") / "step.onnx"
-    card = msgspec.structs.replace(card, provenance={}, figures={}, embeddings=None)
-    export_step(model, card, path)
+    model = written(path, "gru", "none", "mlp", width=1 / 16)
     return network_layers(model, FELT), path
 
 
@@ -225,15 +231,8 @@ def test_a_window_gives_the_layers_of_its_step(exported):
 )
 def test_a_file_averages_the_steps_of_its_checkpoint(tmp_path, encoder, attender, decoder):
     """Whatever is felt: here three steps of nothing come first."""
-    torch.manual_seed(2)
-    card = load_model(shipped_model())[1]
-    config = EADConfig(len(card.labels), encoder, attender, decoder, width=1 / 32)
-    model = TactileClassifier(card.array, config).eval()
-    stir(model)
     path = tmp_path / "step.onnx"
-    export_step(
-        model, msgspec.structs.replace(card, provenance={}, figures={}, embeddings=None), path
-    )
+    model = written(path, encoder, attender, decoder)
     samples = FELT.samples.copy()
     samples[:, :3] = 0
     late = replace(FELT, samples=samples)
@@ -262,14 +261,8 @@ def test_the_checkpoint_says_which_steps_count(exported, monkeypatch):
 @pytest.mark.parametrize("precision", ["fp16", "bf16"])
 def test_a_gpt_of_weights_in_16_bits_passes(tmp_path, precision):
     """A weight that is stored in 16 bits is no response of the layer that it is of."""
-    torch.manual_seed(2)
-    card = load_model(shipped_model())[1]
-    config = EADConfig(len(card.labels), "gru", "gpt", "linear", width=1 / 16)
-    model = TactileClassifier(card.array, config).eval()
-    stir(model)
     path = tmp_path / "step.onnx"
-    card = msgspec.structs.replace(card, provenance={}, figures={}, embeddings=None)
-    export_step(model, card, path)
+    model = written(path, "gru", "gpt", "linear", width=1 / 16)
     onnx.save(in_precision(onnx.load(path), precision), path)
     reference = network_layers(model, FELT)
     layers = export_layers(path, FELT, reference)
@@ -279,13 +272,8 @@ def test_a_gpt_of_weights_in_16_bits_passes(tmp_path, precision):
 
 def test_an_untrained_network_s_export_passes(tmp_path):
     """Its norms are all alike, and one to the exporter, under the last one's name."""
-    torch.manual_seed(2)
-    card = load_model(shipped_model())[1]
-    config = EADConfig(len(card.labels), "gru", "gpt", "linear", width=1 / 32)
-    model = TactileClassifier(card.array, config).eval()
     path = tmp_path / "step.onnx"
-    card = msgspec.structs.replace(card, provenance={}, figures={}, embeddings=None)
-    export_step(model, card, path)
+    model = written(path, "gru", "gpt", "linear", trained=False)
     assert "attender.norm" not in onnx_layers(path, FELT)[0].traces
     reference = network_layers(model, FELT)
     check, rows = fidelity_check(reference, export_layers(path, FELT, reference))
