@@ -21,6 +21,7 @@ from tactile_rt.models import attenders
 from tactile_rt.models.attenders.gpt import GPT, LAYERS, TOKENS, TransformerBlock
 from tactile_rt.models.training import TrainingConfig, train
 from tactile_rt.models.training.loop import read_splits
+from tactile_rt.stream import ConfigError
 
 RATES = {  # peak rate, warm-up; alone, and with a GPT
     "gru": ((5e-3, 0.3), (1.5e-3, 0.05)),
@@ -134,4 +135,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except ConfigError as error:  # as of a set with fewer sweeps than a batch
+        raise SystemExit(str(error)) from None

@@ -135,12 +135,18 @@ def _of_project(
 ) -> tuple[str, Path, str, str, dict[str, str]]:
     """Source, model and device that a project has, unless others are asked for."""
     try:
+        from tactile_rt.project.budget import read_budget
         from tactile_rt.project.folder import Project
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
     made = Project(folder)
     if model is None and not made.model.exists():
         raise ConfigError(f"{folder} has no model yet: `tactile-rt make {folder}`")
+    if model is None:
+        try:
+            read_budget(made)
+        except ConfigError as error:  # as when the array has been fitted to the device since
+            typer.echo(f"the model is of before: {error}", err=True)
     url = source or made.source_url(made.unseen(), seed)
     wire = wire or ("serial" if made.line().wire == "serial" else "slcan")
     return url, model or made.model, wire, *made.spoken(codec, fields)

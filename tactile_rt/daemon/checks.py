@@ -209,7 +209,11 @@ def _check_domains(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
 
 
 def _check_outputs(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
-    """Refuse a file that cannot be one, or that another writes already."""
+    """Refuse a file that cannot be one, that is read, or that another writes already."""
+    config = loaded.config
+    read = [str(loaded.path), *(m.file for m in config.model)]
+    read += [file for s in config.source for file in (s.calibration, s.array)]
+    inputs = {os.path.realpath(file) for file in read if file}
     taken: dict[str, str] = {}
     for one in wanted:
         if one.kind not in ("log", "jsonl"):
@@ -225,6 +229,8 @@ def _check_outputs(loaded: Loaded, wanted: Sequence[Wanted]) -> None:
         if file and os.path.isdir(file):
             loaded.refuse(path, f"{file} is a folder")
         place = os.path.realpath(file) if file else "standard output"
+        if place in inputs:
+            loaded.refuse(path, f"{place} is read by this configuration: name another file")
         if place in taken:
             loaded.refuse(path, f"{place} is where {taken[place]} writes")
         taken[place] = one.name

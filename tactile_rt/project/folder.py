@@ -137,7 +137,8 @@ class Project:
         """
         meshes = choose_objects(self.recipe().objects).mesh_options
         recipe = self.folder / "sweeps.toml"
-        asked = {"objects": ",".join(objects), "recipe": recipe, "seed": seed, **meshes, **options}
+        named = ",".join(name.replace(",", "%2C") for name in objects)
+        asked = {"objects": named, "recipe": recipe, "seed": seed, **meshes, **options}
         query = urlencode(asked, safe=",/", quote_via=quote)  # a + is no space in our URLs
         return f"sim:{quote(str(self.array))}?{query}"
 

@@ -142,7 +142,8 @@ class SimOptions(SensorModel, Randomisation, MeshDetail):
 
     Attributes:
         objects: Comma-separated names (``mug-50``), categories (``mug``: its first instance) or
-            mesh files (see `mesh_files`), drawn in random order; empty: all categories.
+            mesh files (see `mesh_files`), drawn in random order; empty: all categories. A comma in
+            a file's name is written ``%2C``, in a URL ``%252C``.
         sweeps: The number of different objects that pass before the stream ends; 0: endless.
         repeat: The number of sweeps of the same object in succession.
         seed: The seed of the drawn objects, sweep parameters, arrays and sensor imperfections; the
@@ -399,4 +400,5 @@ def _check_turns(animals: tuple[WhiskerArray, ...], options: SimOptions) -> None
 
 def _objects(options: SimOptions) -> list[Callable[[], TactileObject]]:
     """The objects that the options name, each made when it comes by; none: all categories."""
-    return [promised_object(name, options) for name in options.objects.split(",") if name]
+    names = [name.replace("%2C", ",") for name in options.objects.split(",") if name]
+    return [promised_object(name, options) for name in names]

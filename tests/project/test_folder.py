@@ -114,7 +114,7 @@ def test_one_s_own_meshes_are_swept_by_the_device_too(project: Project) -> None:
     for kind, extents in (("box", (20, 30, 40)), ("slab", (40, 40, 10))):
         (project.folder / "things" / kind).mkdir(parents=True)
         for number in range(4):
-            file = project.folder / "things" / kind / f"{number}.stl"
+            file = project.folder / "things" / kind / f"{kind}, no. {number}.stl"
             trimesh.creation.box(extents=extents).export(file)
     sweeps = project.folder / "sweeps.toml"
     text = sweeps.read_text().replace('"shapes"', '"things"').replace("per_category = 200", "")
@@ -123,8 +123,10 @@ def test_one_s_own_meshes_are_swept_by_the_device_too(project: Project) -> None:
     assert len(describe_set(recipe).names()) == 8
     unseen = project.unseen()
     assert len(unseen) == 2 and all(Path(file).is_file() for file in unseen)
-    with open_source(project.source_url(unseen, pace="fast")) as source:
-        assert len(source.spec.elements) == 8
+    with open_source(project.source_url(unseen, pace="fast", sweeps=2)) as source:
+        for _ in source:
+            pass
+        assert {passed.name for passed in source.passes} == {Path(file).stem for file in unseen}
 
 
 def test_what_cannot_begin_is_one_line(refused, tmp_path: Path) -> None:

@@ -61,9 +61,13 @@ def folder(tmp_path_factory) -> Path:
     return here
 
 
+def called(here: Path, words: list[str]) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*CLI, *words], cwd=here, capture_output=True, text=True, timeout=600)
+
+
 def done(here: Path, words: list[str]) -> str:
     """What a command prints, once it has left with 0."""
-    run = subprocess.run([*CLI, *words], cwd=here, capture_output=True, text=True, timeout=600)
+    run = called(here, words)
     assert run.returncode == 0, run.stderr
     return run.stdout
 
@@ -147,5 +151,8 @@ def test_an_array_that_changes_after_that_is_told(folder: Path) -> None:
     try:
         with pytest.raises(ConfigError, match="has been changed since"):
             make(project, 10)
+        words = ["1" if word == "4" else word for word in commands()["hil"]]
+        told = called(folder, words).stderr
+        assert "the model is of before: array.toml or sweeps.toml of" in told
     finally:
         project.array.write_text(text)
