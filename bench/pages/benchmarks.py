@@ -38,7 +38,8 @@ comes from (the anchor). *Of its bar* is the figure over the bar's: what must be
 1, what must be large above. A figure is of the machine and the day that stand above its table; run
 the command on yours. What is not met reads **MISSED**.
 
-Real things, by every method, have [a page of their own](realtouch.md).
+Real things, by every method, have [a page of their own](realtouch.md), and so have
+[networks that are tuned alike](../explain/results.md).
 """
 
 
