@@ -163,11 +163,12 @@ def test_a_real_daemon_tells_a_manager_that_goes_and_comes(manager, tmp_path, mo
     daemon = Daemon(loaded)
     daemon.start()
     lines = []
-    until(lambda: lines.extend(told()) or ("READY=1" in lines and lines.count("WATCHDOG=1") > 1))
+    # On a busy machine it is ready before its log keeps up, and says so.
+    wanted = {"READY=1", "STATUS=running: 1 source, 0 models, 0 publishers"}
+    until(lambda: lines.extend(told()) or (wanted <= {*lines} and lines.count("WATCHDOG=1") > 1))
     assert daemon.stop() == []
     lines += told()
     assert lines.index("READY=1") < lines.index("STOPPING=1")
-    assert "STATUS=running: 1 source, 0 models, 0 publishers" in lines
 
 
 class Hanging(Source):

@@ -38,6 +38,10 @@ class Changed:
 def changes(setup: str, command: str) -> Changed:
     """Run two shell scripts as root on copies of ``/``; tell what the second one changed."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    # Where chroot and the programs of administration are, which not everybody's path names.
+    environment["PATH"] = os.pathsep.join(
+        [os.environ.get("PATH", os.defpath), "/usr/sbin", "/sbin"]
+    )
     with tempfile.TemporaryDirectory() as folder:
         done = subprocess.run(
             ["unshare", "--mount", "--propagation", "private", sys.executable, __file__,

@@ -254,6 +254,30 @@ def test_a_read_waits_no_longer_than_asked(clock: Clock) -> None:
             assert took == 2_000_000 if chunk is None else took < 2_000_000 + 1
 
 
+def test_a_simulation_without_a_processor_stands_still_and_counts_it(clock: Clock) -> None:
+    with (
+        SimSource("mouse", SimOptions(objects="mug", seed=2)) as source,
+        fast(objects="mug", seed=2) as whole,
+    ):
+        chunks = []
+        for number in range(90):
+            if number == 30:
+                clock.sleep(0.09)  # late, and caught up with
+            if number == 60:
+                clock.sleep(0.5)
+            chunk = source.read()
+            assert chunk is not None and chunk.t_ns[-1] <= clock.now_ns
+            chunks.append(chunk)
+        stream = concatenate(chunks)
+        (at,) = np.flatnonzero(np.diff(stream.seq) != 1)
+        left_out = int(stream.seq[at + 1] - stream.seq[at]) - 1
+        assert 400 < left_out <= 500, "a sample a millisecond"
+        assert source.stats == SourceStats(delivered=len(stream), dropped=left_out)
+        assert np.array_equal(stream.t_ns - stream.t_ns[0], 1_000_000 * stream.seq)
+        # What it felt goes on from where it stood.
+        np.testing.assert_array_equal(stream.values, first(whole, len(stream)).values)
+
+
 def test_its_url_takes_randomised_arrays() -> None:
     """Drawn afresh for every sweep; objects come as they would, and the spec is the design's."""
     url = "sim:mouse?objects=mug-1,bowl-1&pace=fast&sweeps=2&seed=3&young_modulus=0.3&mount_mm=0.2"

@@ -85,8 +85,10 @@ CASES = {
     "replay sweeps": Case(sweeps, 150),
     "sim fast": Case(lambda: open_source(f"{SIM}&pace=fast")),
     "sim whisking fast": Case(lambda: open_source("whisking:mouse?seconds=0.5&pace=fast"), 500),
-    "sim whisking realtime": Case(lambda: open_source("whisking:mouse?seconds=0.5"), 500),
-    "sim realtime": Case(lambda: open_source(f"{SIM}&pace=realtime")),
+    "sim whisking realtime": Case(
+        lambda: open_source("whisking:mouse?seconds=0.5"), 500, stands_still=True
+    ),
+    "sim realtime": Case(lambda: open_source(f"{SIM}&pace=realtime"), stands_still=True),
 }
 NEEDS = {"sim": "mujoco", "replay": "mcap"}
 
