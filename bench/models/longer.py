@@ -16,23 +16,33 @@ import typer
 
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.grid.outcomes import read_outcome
+from tactile_rt.models.grid.plan import SUPERVISED, Task
 from tactile_rt.models.grid.plan_files import read_grid
 from tactile_rt.models.training import TrainingConfig, train
 from tactile_rt.models.training.loop import read_splits
+from tactile_rt.stream import TactileError
 
 KEPT = Path(__file__).parent / "wide24"
+FOUR = ["gru", "s4", "mamba", "mamba+gpt"]
+
+
+def whole(task: Task) -> bool:
+    """Whether it learns from all objects and their labels, from nothing learnt before."""
+    cell = task.cell
+    plain = cell is not None and (cell.objective, cell.share, cell.begin) == (SUPERVISED, 1, "")
+    return plain and not task.random
 
 
 def main() -> None:
+    grid = read_grid("wide24")
+    tasks = {t.name: t for t in grid.tasks() if t.seed == 0 and whole(t)}
     parser = argparse.ArgumentParser(description=__doc__, allow_abbrev=False)
     parser.add_argument("data", type=Path, help="the sweep set")
     parser.add_argument("folder", type=Path, help="where the runs go")
-    parser.add_argument("--network", nargs="+", default=["gru", "s4", "mamba", "mamba+gpt"])
+    parser.add_argument("--network", nargs="+", choices=list(tasks), default=FOUR)
     parser.add_argument("--updates", nargs="+", type=int, default=[8000])
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    grid = read_grid("wide24")
-    tasks = {task.name: task for task in grid.tasks() if task.seed == 0}
     splits = read_splits(TrainingConfig(str(asked.data)))
     typer.echo("| network | updates | training loss | validation top-1 (%) |")
     typer.echo("|---|---|---|---|")
@@ -53,4 +63,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except TactileError as error:  # such as a set with fewer sweeps than a batch
+        raise SystemExit(str(error)) from None

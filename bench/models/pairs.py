@@ -18,7 +18,7 @@ from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.training import ProbeConfig, TrainingConfig, probe, train
 from tactile_rt.models.training.config import ONE_SWEEP, TWO_SWEEPS
 from tactile_rt.models.training.loop import read_splits
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import TactileError
 
 RATE, WARMUP = 5e-3, 0.3
 KINDS = (  # pairs, augmentation, temperatures
@@ -58,5 +58,5 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except ConfigError as error:  # as of a set with fewer sweeps than a batch
+    except TactileError as error:  # such as a set with fewer sweeps than a batch
         raise SystemExit(str(error)) from None

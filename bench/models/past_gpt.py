@@ -21,7 +21,7 @@ from tactile_rt.models import attenders
 from tactile_rt.models.attenders.gpt import GPT, LAYERS, TOKENS, TransformerBlock
 from tactile_rt.models.training import TrainingConfig, train
 from tactile_rt.models.training.loop import read_splits
-from tactile_rt.stream import ConfigError
+from tactile_rt.stream import TactileError
 
 RATES = {  # peak rate, warm-up; alone, and with a GPT
     "gru": ((5e-3, 0.3), (1.5e-3, 0.05)),
@@ -137,5 +137,5 @@ def main() -> None:
 if __name__ == "__main__":
     try:
         main()
-    except ConfigError as error:  # as of a set with fewer sweeps than a batch
+    except TactileError as error:  # such as a set with fewer sweeps than a batch
         raise SystemExit(str(error)) from None

@@ -146,7 +146,7 @@ def _of_project(
         try:
             read_budget(made)
         except ConfigError as error:  # as when the array has been fitted to the device since
-            typer.echo(f"the model is of before: {error}", err=True)
+            typer.echo(f"{error}; until then the model is the one made before", err=True)
     url = source or made.source_url(made.unseen(), seed)
     wire = wire or ("serial" if made.line().wire == "serial" else "slcan")
     return url, model or made.model, wire, *made.spoken(codec, fields)

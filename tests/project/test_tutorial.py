@@ -153,6 +153,6 @@ def test_an_array_that_changes_after_that_is_told(folder: Path) -> None:
             make(project, 10)
         words = ["1" if word == "4" else word for word in commands()["hil"]]
         told = called(folder, words).stderr
-        assert "the model is of before: array.toml or sweeps.toml of" in told
+        assert "array.toml or sweeps.toml of" in told and "the model is the one made before" in told
     finally:
         project.array.write_text(text)
