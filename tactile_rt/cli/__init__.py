@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-AGAIN_S = 0.01  # after which a signal that was dropped comes again
+AGAIN_S = 0.01  # after which a signal that was dropped comes again, until it is obeyed
 
 
 def main() -> None:
@@ -38,9 +39,16 @@ def _signals() -> Iterator[list[int]]:
     """Let Ctrl-C, SIGTERM and SIGHUP alike end the block, so that what is half-written is taken
     away; gives the signals that have come."""
     told: list[int] = []
+    insisting: list[int] = []  # the signal that comes until it is obeyed
 
     def leave(number: int, frame: FrameType | None) -> None:
         told.append(number)
+        while frame is not None:
+            if frame.f_code is again.__code__:  # what is raised there is dropped, too
+                insisting[:] = [number]
+                return
+            frame = frame.f_back
+        insisting.clear()
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         _leave(number)
@@ -49,12 +57,18 @@ def _signals() -> Iterator[list[int]]:
         if told and isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
             # It came while an object was taken away, where Python drops what is raised; and would
             # do so at once again.
-            main = threading.main_thread().ident or 0
-            later = threading.Timer(AGAIN_S, signal.pthread_kill, (main, told[-1]))
-            later.daemon = True
-            later.start()
+            insisting[:] = [told[-1]]
         else:
             dropped(unraisable)
+        if insisting:
+            threading.Thread(target=insist, daemon=True).start()
+
+    def insist() -> None:
+        main = threading.main_thread().ident or 0
+        time.sleep(AGAIN_S)
+        while number := next(iter(insisting), 0):
+            signal.pthread_kill(main, number)
+            time.sleep(AGAIN_S)
 
     untouched = signal.SIG_DFL, signal.default_int_handler
     alike = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
@@ -67,6 +81,7 @@ def _signals() -> Iterator[list[int]]:
     except KeyboardInterrupt:
         _leave(signal.SIGINT)
     finally:
+        insisting.clear()
         sys.unraisablehook = dropped
         for number, handler in before.items():
             signal.signal(number, handler)
