@@ -26,21 +26,17 @@ if TYPE_CHECKING:
     from tactile_rt.classifier.model_file import load_model, shipped_model
     from tactile_rt.classifier.session import Session
     from tactile_rt.drivers.codec import Codec
-    from tactile_rt.recording.reader import Recording
-    from tactile_rt.sources.opening import open_source
-    from tactile_rt.stream import (
-        ArraySpec,
-        Chunk,
+    from tactile_rt.errors import (
         ConfigError,
-        EndOfStream,
         ModelError,
         RecordingError,
-        Source,
         SourceError,
-        SourceStats,
         SpecMismatch,
         TactileError,
     )
+    from tactile_rt.recording.reader import Recording
+    from tactile_rt.sources.opening import open_source
+    from tactile_rt.stream import ArraySpec, Chunk, EndOfStream, Source, SourceStats
 
 __all__ = [
     "ArraySpec",
@@ -66,13 +62,19 @@ __all__ = [
     "shipped_model",
 ]
 
-_STREAM = "tactile_rt.stream"
+_STREAM, _ERRORS = "tactile_rt.stream", "tactile_rt.errors"
 _WHERE = {
     "Classification": "tactile_rt.classifier.classifier",
     "Classifier": "tactile_rt.classifier.classifier",
     "Codec": "tactile_rt.drivers.codec",
+    "ConfigError": _ERRORS,
+    "ModelError": _ERRORS,
     "Recording": "tactile_rt.recording.reader",
+    "RecordingError": _ERRORS,
     "Session": "tactile_rt.classifier.session",
+    "SourceError": _ERRORS,
+    "SpecMismatch": _ERRORS,
+    "TactileError": _ERRORS,
     "fuse": "tactile_rt.classifier.classifier",
     "load_model": "tactile_rt.classifier.model_file",
     "open_source": "tactile_rt.sources.opening",

@@ -9,7 +9,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = ["install_extra", "install_line", "lacking"]
 

@@ -4,15 +4,6 @@
 
 A `Source` hides where samples come from (simulation, serial port, CAN bus, recording).
 Everything downstream sees `Chunk`s described by one `ArraySpec`.
-
-Errors:
-
-    TactileError
-      +-- ConfigError       the user asked for something that cannot be (name, option, file)
-      +-- SourceError       a device or stream broke
-      +-- SpecMismatch      two array descriptions that must agree do not
-      +-- RecordingError    a stored stream is damaged or of another version
-      +-- ModelError        a model file is damaged or of another version
 """
 
 import abc
@@ -25,49 +16,21 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
+
 __all__ = [
     "NS_PER_S",
     "ArraySpec",
     "Chunk",
-    "ConfigError",
     "EndOfStream",
-    "ModelError",
-    "RecordingError",
     "Source",
-    "SourceError",
     "SourceStats",
-    "SpecMismatch",
-    "TactileError",
     "concatenate",
 ]
 
 NS_PER_S = 1_000_000_000
 SPEC_VERSION = 1
 POSE_TOLERANCE = 1e-6  # m and quaternion units: below what anyone can mount or measure
-
-
-class TactileError(Exception):
-    """Base of all errors that a caller may want to handle; the message is one clear line."""
-
-
-class ConfigError(TactileError):
-    """The user asked for something that cannot be: the message names it and what to do."""
-
-
-class SourceError(TactileError):
-    """A device or stream broke; the message names it."""
-
-
-class SpecMismatch(TactileError):
-    """Two array descriptions that must agree differ; the message lists where."""
-
-
-class RecordingError(TactileError):
-    """A stored stream is damaged or of another version; the message names the file."""
-
-
-class ModelError(TactileError):
-    """A model file is damaged, incomplete or of another version; the message names the file."""
 
 
 class EndOfStream(Exception):

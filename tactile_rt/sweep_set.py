@@ -21,10 +21,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.files import write_whole
 from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.sensor_spec import ChannelLimits, SensorSpec, channel_limits
-from tactile_rt.stream import ArraySpec, ConfigError, RecordingError
+from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "OUTLIERS",

@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 import msgspec
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings import (
     check_columns,
     convert,
@@ -21,7 +22,6 @@ from tactile_rt.settings import (
     split_url,
     take_options,
 )
-from tactile_rt.stream import ConfigError
 from tests.helpers.refusals import refusal
 
 

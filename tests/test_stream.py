@@ -6,15 +6,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_rt.errors import ConfigError, TactileError
 from tactile_rt.stream import (
     NS_PER_S,
     ArraySpec,
     Chunk,
-    ConfigError,
     EndOfStream,
     Source,
     SourceStats,
-    TactileError,
     concatenate,
 )
 from tactile_rt.testing import ArraySource, cut, small_spec

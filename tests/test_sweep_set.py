@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.files import write_whole
-from tactile_rt.stream import ConfigError, RecordingError
 from tactile_rt.sweep_set import (
     SPLITS,
     SweepManifest,

@@ -26,9 +26,9 @@ import numpy as np
 
 from bench.daemon.kills import Killed, killed_once
 from bench.daemon.process import DaemonProcess
+from tactile_rt.errors import RecordingError
 from tactile_rt.evidence.records import Record
 from tactile_rt.recording import recover
-from tactile_rt.stream import RecordingError
 
 __all__ = ["can_mount", "power_cuts", "power_noted", "preloaded"]
 

@@ -15,8 +15,8 @@ from rich.console import Console
 
 from bench.perception.area import FOLDER, measure, records_of
 from bench.perception.page import PAGE, write_page
+from tactile_rt.errors import TactileError
 from tactile_rt.evidence.records import show
-from tactile_rt.stream import TactileError
 
 
 def main() -> int:

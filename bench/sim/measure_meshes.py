@@ -20,11 +20,11 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES, read_triangles
 from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.solids import TactileObject
-from tactile_rt.stream import ConfigError
 
 POINTS, SAMPLES, LEAST, NEAREST = 3000, 60_000, 30, 12
 MEDIAN_MM, WORST_MM = 0.2, 1.0

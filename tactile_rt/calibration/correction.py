@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.calibration.mirroring import Mirror
+from tactile_rt.errors import ConfigError, SpecMismatch
 from tactile_rt.settings import no_such
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError, SpecMismatch
+from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["Calibration", "check_device"]
 

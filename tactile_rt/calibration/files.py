@@ -15,9 +15,9 @@ import msgspec
 
 from tactile_rt.calibration.correction import Calibration, check_device
 from tactile_rt.calibration.mirroring import Mirror
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.settings import SettingNode, convert, nearest, read_toml
-from tactile_rt.stream import ConfigError
 
 __all__ = ["calibration_path", "load_calibration", "save_calibration"]
 

@@ -12,8 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings import convert, nearest, read_csv
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["AXES", "LoadTable", "raw_readings", "read_loads"]
 

@@ -3,7 +3,7 @@
 import re
 from dataclasses import dataclass, field
 
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = ["Mirror"]
 

@@ -17,15 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.calibration.calibrated_source import CalibratedSource
-from tactile_rt.stream import (
-    ArraySpec,
-    Chunk,
-    ConfigError,
-    EndOfStream,
-    Source,
-    SourceError,
-    concatenate,
-)
+from tactile_rt.errors import ConfigError, SourceError
+from tactile_rt.stream import ArraySpec, Chunk, EndOfStream, Source, concatenate
 
 __all__ = ["Tare", "record", "tare"]
 

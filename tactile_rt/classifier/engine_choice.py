@@ -16,8 +16,8 @@ import msgspec
 
 from tactile_rt.classifier.engines import DEFAULT, ENGINES, check_engine
 from tactile_rt.classifier.model_file import hash_of
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import open_regular, write_whole
-from tactile_rt.stream import ConfigError
 
 __all__ = ["EngineChoice", "KeptEngine", "choices_file", "choose_engine", "keep_engine"]
 

@@ -15,8 +15,8 @@ from tactile_rt.classifier import model_file
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.network import Network, OnnxruntimeNetwork
 from tactile_rt.classifier.runtime import PROVIDERS
+from tactile_rt.errors import ConfigError
 from tactile_rt.extras import install_extra
-from tactile_rt.stream import ConfigError
 
 __all__ = ["DEFAULT", "ENGINES", "Engine", "check_engine", "import_engine", "open_network"]
 

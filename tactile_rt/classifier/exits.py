@@ -35,7 +35,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = ["IN_A_ROW", "Deadline", "EarlyExit", "ExitCurve", "Lanes", "Policy", "early_exit_curve"]
 

@@ -23,8 +23,9 @@ from tactile_rt.classifier.decision_rules import (
     named,
 )
 from tactile_rt.classifier.onnx_check import MAX_ELEMENTS
+from tactile_rt.errors import ConfigError, ModelError, SpecMismatch
 from tactile_rt.sensor_spec import SensorSpec, channel_limits
-from tactile_rt.stream import ArraySpec, ConfigError, ModelError, SpecMismatch
+from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "EmbeddingStatistics",

@@ -13,7 +13,7 @@ from tactile_rt.classifier.model_card import ModelCard, one_line
 from tactile_rt.classifier.model_file import check_graph, read_model
 from tactile_rt.classifier.network import Network, Tensor
 from tactile_rt.classifier.runtime import FlushDenormals
-from tactile_rt.stream import ModelError
+from tactile_rt.errors import ModelError
 
 __all__ = ["open_openvino"]
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.network import Network, OnnxruntimeNetwork, Tensor
 from tactile_rt.classifier.runtime import FlushDenormals
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = ["Stepper"]
 

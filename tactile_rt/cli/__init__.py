@@ -128,7 +128,7 @@ def _run(told: list[int]) -> None:
         whisk,
     )
     from tactile_rt.cli.app import app
-    from tactile_rt.stream import TactileError
+    from tactile_rt.errors import TactileError
 
     # Typer brings a copy of click since 0.29: whose these are depends on its release.
     usage_error: Any = typer.BadParameter.__base__

@@ -13,8 +13,8 @@ from rich.table import Column, Table
 from tactile_rt.cli.app import LARGEST_SEED, app, check_output, needs, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, print_table, told_as_json
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings import take_sets
-from tactile_rt.stream import ConfigError
 
 align = typer.Typer(help="Compare a model with recordings of barrel cortex.", no_args_is_help=True)
 app.add_typer(align, name="align")

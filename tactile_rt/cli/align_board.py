@@ -13,7 +13,7 @@ from tactile_rt.cli.align import align
 from tactile_rt.cli.app import LARGEST_SEED, check_output, needs
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, print_table, told_as_json
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.models.alignment.board import Alignments, BoardRow

@@ -14,7 +14,7 @@ from typer.core import TyperCommand
 from tactile_rt.cli.align import Stimuli, align, needing_torch
 from tactile_rt.cli.app import check_output
 from tactile_rt.cli.tables import Json, told_as_json
-from tactile_rt.stream import ConfigError, TactileError
+from tactile_rt.errors import ConfigError, TactileError
 
 if TYPE_CHECKING:
     from tactile_rt.models.alignment.layers import Layers

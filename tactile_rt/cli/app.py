@@ -15,8 +15,8 @@ from urllib.parse import unquote
 
 import typer
 
+from tactile_rt.errors import ConfigError, TactileError
 from tactile_rt.extras import lacking
-from tactile_rt.stream import ConfigError, TactileError
 from tactile_rt.version import VERSION
 
 __all__ = [

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output, needs, starting
 from tactile_rt.cli.tables import STDOUT, Json, print_table, show_table, told_as_json
-from tactile_rt.stream import ConfigError, concatenate
+from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.sim_backend.measuring.findings import ArrayFinding
@@ -96,6 +96,7 @@ def fit(
     from tactile_rt.calibration.taring import record
     from tactile_rt.files import write_whole
     from tactile_rt.sources.opening import open_source
+    from tactile_rt.stream import concatenate
 
     url = f"replay:{recording}?speed=0" if Path(recording).is_file() else recording
     with starting():

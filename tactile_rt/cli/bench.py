@@ -14,7 +14,7 @@ from rich.console import Console
 from tactile_rt.cli.app import app, check_output, needs
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import Json, show_records
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 CHECKOUT = Path(__file__).parents[2]
 # Each area, and the extra that its `run(quick) -> list[Record]` needs.

@@ -5,7 +5,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
@@ -14,12 +13,14 @@ from rich.table import Table
 from tactile_rt.cli.app import app, check_output, starting
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import STDOUT, Json, print_table, told_as_json
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError, Source, concatenate
+from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import NDArray
 
     from tactile_rt.calibration import Calibration, Fit, LoadTable, Tare
+    from tactile_rt.stream import ArraySpec, Chunk, Source
 
 LOUDER = 3.0  # noise over that of the last tare that is worth a word
 
@@ -176,7 +177,7 @@ def calibrate(
     typer.echo(said, err=json == STDOUT)
 
 
-def _own_id(source: Source) -> str:
+def _own_id(source: "Source") -> str:
     """What a device calls itself; of one that has no id, what its array is called."""
     own = str(getattr(source, "device_id", "") or source.spec.name)
     return re.sub(r"[^\w.:+-]+", "-", own).lstrip(".")
@@ -193,11 +194,12 @@ def _existing(path: Path, device: str) -> "Calibration | None":
     return known
 
 
-def _recorded(table: Path, loads: "LoadTable", url: str) -> tuple[Chunk, ArraySpec]:
+def _recorded(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArraySpec]":
     """The raw samples that the times of a table are of."""
     from tactile_rt.calibration import CalibratedSource
     from tactile_rt.calibration.taring import record
     from tactile_rt.sources.opening import open_source
+    from tactile_rt.stream import concatenate
 
     if not url:
         raise ConfigError(f"{table} has times: name the recording they are in with --source")
@@ -211,7 +213,7 @@ def _recorded(table: Path, loads: "LoadTable", url: str) -> tuple[Chunk, ArraySp
         return concatenate(record(raw, float(loads.times.max()))), raw.spec
 
 
-def _check_raw(source: Source, url: str) -> None:
+def _check_raw(source: "Source", url: str) -> None:
     """Refuse samples that were calibrated before they were recorded: they are not what the device
     sent.
 
@@ -275,6 +277,8 @@ def _now() -> str:
 
 def _show_tare(measured: "Tare", console: Console) -> None:
     """Offsets and noise, channel by channel."""
+    import numpy as np
+
     spec = measured.spec
     counted = np.array([e not in measured.untared for e in spec.elements])
     offset, noise = measured.offset[counted], measured.noise[counted]

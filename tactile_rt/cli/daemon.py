@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from tactile_rt.cli.app import app, check_output, set_option
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = ["Settings", "serve"]
 

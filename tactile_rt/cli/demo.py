@@ -7,9 +7,8 @@ alike on dark and on light terminals; no meaning hangs on colour alone.
 
 import time
 from importlib.util import find_spec
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich.columns import Columns
 from rich.console import Console, Group, RenderableType
@@ -28,10 +27,12 @@ from tactile_rt.cli.app import (
     needs,
     starting,
 )
-from tactile_rt.cli.demonstration import Demonstration, SweepOutcome
 from tactile_rt.cli.tables import STDOUT, Json, told_as_json
+from tactile_rt.errors import ConfigError
 from tactile_rt.extras import install_extra
-from tactile_rt.stream import ConfigError
+
+if TYPE_CHECKING:
+    from tactile_rt.cli.demonstration import Demonstration, SweepOutcome
 
 __all__ = ["WIDTH", "draw", "watch"]
 
@@ -82,6 +83,7 @@ def demo(
     whiskers is played by an emulated device, over a serial port.
     """
     from tactile_rt.classifier.model_file import shipped_model
+    from tactile_rt.cli.demonstration import Demonstration
 
     check_output(json)
     console = Console(stderr=json == STDOUT)
@@ -116,7 +118,7 @@ def demo(
         typer.echo(f"the machine is busy: {late} for the model to be right{wait}", err=True)
 
 
-def watch(demo: Demonstration, console: Console) -> None:
+def watch(demo: "Demonstration", console: Console) -> None:
     """Run the demonstration and redraw as it goes."""
     with Live(console=console, auto_refresh=False) as live:
         due = 0.0
@@ -129,7 +131,7 @@ def watch(demo: Demonstration, console: Console) -> None:
             live.update(draw(demo), refresh=True)
 
 
-def draw(demo: Demonstration) -> RenderableType:
+def draw(demo: "Demonstration") -> RenderableType:
     """The view at this moment."""
     what = "objects that the model has never met" if demo.unseen else "objects"
     whiskers = "30 recorded whiskers felt" if demo.recorded else "30 simulated whiskers feel"
@@ -149,8 +151,10 @@ def _level(force_un: float) -> tuple[str, str]:
     return background, text
 
 
-def _forces(demo: Demonstration) -> Text:
+def _forces(demo: "Demonstration") -> Text:
     """The array as a heat map: rows from the top of the face down, columns from rear to nose."""
+    import numpy as np
+
     spec = demo.classifier.card.array
     newtons = [i for i, unit in enumerate(spec.units) if unit == "N"]
     force_un = 1e6 * np.linalg.norm(demo.classifier.tared[:, newtons], axis=1)  # (element,)
@@ -179,7 +183,7 @@ def _forces(demo: Demonstration) -> Text:
     return text
 
 
-def _guess(demo: Demonstration) -> Text:
+def _guess(demo: "Demonstration") -> Text:
     """What is passing, what the model makes of it, and whether that is right."""
     detector = demo.classifier.detector
     if not detector.ready:
@@ -215,7 +219,7 @@ def _guess(demo: Demonstration) -> Text:
     return text.append(verdict + "\n", f"bold {GREEN if right else RED}")
 
 
-def _score(demo: Demonstration) -> Text:
+def _score(demo: "Demonstration") -> Text:
     """The figures since the start."""
     card, done = demo.classifier.card, len(demo.outcomes)
     text = Text(no_wrap=True, overflow="ellipsis")
@@ -237,7 +241,7 @@ def _score(demo: Demonstration) -> Text:
     return text
 
 
-def _latest(outcomes: list[SweepOutcome]) -> Text:
+def _latest(outcomes: "list[SweepOutcome]") -> Text:
     """The newest outcomes, newest first, as many as fit."""
     text = Text()
     for outcome in reversed(outcomes[-8:]):

@@ -76,50 +76,36 @@ def codecs(
     json: Json = None,
 ) -> None:
     """Show what devices can speak: a line a codec; of one, its options and what it cannot show."""
-    from tactile_rt.drivers.codec import CODECS, codec_class
-    from tactile_rt.stream import ConfigError
+    from tactile_rt.drivers.catalogue import CODECS, FRAMES
+    from tactile_rt.errors import ConfigError
 
     if frame:
-        from tactile_rt.drivers.codecs.binary_frame import FRAMES
-
         described = {path.stem: path for path in sorted(FRAMES.glob("*.toml"))}
-        with starting():
-            if frame not in described:
-                raise ConfigError(f"--frame {frame}: described are {', '.join(described)}")
+        if frame not in described:
+            raise ConfigError(f"--frame {frame}: described are {', '.join(described)}")
         typer.echo(described[frame].read_text("utf-8"), nl=False)
         return
     names = sorted({name for _, name in CODECS})
     if codec and codec not in names:
         raise ConfigError(f"no codec {codec!r}: there are {', '.join(names)}")
-    found: list[dict[str, Any]] = []
-    for wire, name in sorted(CODECS, key=lambda key: key[::-1]):
-        if codec and name != codec:
-            continue
-        try:
-            kind = codec_class(wire, name)
-        except ConfigError as error:  # somebody else's, or it needs an extra
-            found.append({"codec": name, "wire": wire, "device": str(error)})
-            continue
-        found.append(
-            {
-                "codec": name,
-                "wire": wire,
-                "device": _about(kind),
-                "options": list(kind.Options.__dataclass_fields__),
-                "cannot_detect": kind.cannot_detect,
-            }
-        )
+    found: list[dict[str, Any]] = [
+        {"codec": name, "wire": wire, "device": CODECS[wire, name].device}
+        for wire, name in sorted(CODECS, key=lambda key: key[::-1])
+        if codec in ("", name)
+    ]
+    if codec or json is not None:  # which takes their classes
+        from tactile_rt.drivers.codec import codec_class
+
+        for one in found:
+            kind = codec_class(one["wire"], one["codec"])
+            one["options"] = list(kind.Options.__dataclass_fields__)
+            one["cannot_detect"] = kind.cannot_detect
     show_table(found, {"codec": "codec", "wire": "wire", "device": "device"}, json)
     if codec and json is None:
         for one in found:
-            options = ", ".join(one.get("options", ())) or "none"
+            options = ", ".join(one["options"]) or "none"
             typer.echo(f"\noptions over {one['wire']}: {options}")
-            typer.echo(f"cannot detect: {one.get('cannot_detect', 'unknown')}")
-
-
-def _about(kind: type) -> str:
-    """The first line of a class's own docstring; under ``python -OO`` it has none."""
-    return (kind.__doc__ or "").strip().partition("\n")[0].replace("``", "")
+            typer.echo(f"cannot detect: {one['cannot_detect']}")
 
 
 @app.command()

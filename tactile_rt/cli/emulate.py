@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import Pace, app, leaving, needs, set_option, starting
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.drivers.emulation.device import EmulatedDevice
@@ -59,7 +59,8 @@ def emulate(
 
     Ctrl-C leaves.
     """
-    from tactile_rt.drivers.codec import CODECS, codec_class
+    from tactile_rt.drivers.catalogue import CODECS
+    from tactile_rt.drivers.codec import codec_class
     from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
     from tactile_rt.drivers.emulation.faults import read_faults
     from tactile_rt.drivers.opening import make_codec

@@ -22,7 +22,7 @@ from tactile_rt.cli.app import (
 from tactile_rt.cli.emulate import codec_options
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import Json, print_table, told_as_json
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.evidence.hil import LoopReport

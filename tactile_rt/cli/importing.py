@@ -10,7 +10,7 @@ from rich.console import Console
 from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, starting
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import Json, told_as_json
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 
 @app.command("import")

@@ -10,7 +10,7 @@ from rich.console import Console
 from tactile_rt.cli.app import LARGEST_SEED, app, check_folder, check_output, check_text
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, told_as_json
-from tactile_rt.stream import ConfigError, RecordingError
+from tactile_rt.errors import ConfigError, RecordingError
 
 
 @app.command()

@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 import typer
 from rich.console import Console
 
@@ -89,6 +88,8 @@ def evaluate(
 
 def _shapes(manifest: "SweepManifest") -> "WhiskerShapes":
     """Of the whiskers that a set was made with, from mm to SI."""
+    import numpy as np
+
     from tactile_rt.classifier.contact_point import WhiskerShapes
     from tactile_rt.sim_backend.arrays.files import load_animals
 

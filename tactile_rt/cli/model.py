@@ -12,8 +12,8 @@ from rich.table import Table
 from tactile_rt.cli.app import app, check_output
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import STDOUT, Json, print_table, show_records, told_as_json
+from tactile_rt.errors import ConfigError, ModelError
 from tactile_rt.extras import install_extra
-from tactile_rt.stream import ConfigError, ModelError
 
 model = typer.Typer(help="Look into a model file, check it, time it.", no_args_is_help=True)
 app.add_typer(model, name="model")

@@ -18,11 +18,12 @@ from tactile_rt.cli.app import (
 )
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings import no_such
-from tactile_rt.stream import ConfigError, EndOfStream, Source
 
 if TYPE_CHECKING:
     from tactile_rt.recording import StreamWriter
+    from tactile_rt.stream import Source
 
 POLL_S = 0.1
 TELL_S = 1.0
@@ -94,8 +95,10 @@ def record(
         typer.echo(f"{files}: {_told(opened, writer)}")
 
 
-def _copy(source: Source, writer: "StreamWriter") -> None:
+def _copy(source: "Source", writer: "StreamWriter") -> None:
     """Record until the stream ends, and tell how it goes."""
+    from tactile_rt.stream import EndOfStream
+
     tell_at = time.monotonic() + TELL_S
     while True:
         try:
@@ -109,7 +112,7 @@ def _copy(source: Source, writer: "StreamWriter") -> None:
             typer.echo(_told(source, writer), err=True)
 
 
-def _told(source: Source, writer: "StreamWriter") -> str:
+def _told(source: "Source", writer: "StreamWriter") -> str:
     done, stats = writer.stats, source.stats
     health = getattr(source, "health", None)
     said = [f"{health.state}"] if health is not None else []

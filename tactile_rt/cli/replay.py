@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl
 import typer
 
 from tactile_rt.cli.app import app, check_new, leaving
-from tactile_rt.stream import ConfigError, RecordingError
+from tactile_rt.errors import ConfigError, RecordingError
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.classifier import Classification, Classifier

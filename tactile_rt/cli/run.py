@@ -7,7 +7,7 @@ import typer
 
 from tactile_rt.cli.app import Model, Seconds, app, leaving, starting
 from tactile_rt.cli.daemon import Settings, serve
-from tactile_rt.stream import ConfigError, SpecMismatch
+from tactile_rt.errors import ConfigError, SpecMismatch
 
 
 @app.command()

@@ -9,7 +9,7 @@ from rich.console import Console
 from tactile_rt.cli.app import app, check_output, needs, set_option, starting
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, told_as_json
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.sim_backend.datasets.recipes import SweepRecipe

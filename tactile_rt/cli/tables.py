@@ -13,8 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from tactile_rt.cli.app import check_named_once, check_output
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
-from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.evidence.records import Record

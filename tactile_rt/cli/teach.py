@@ -20,9 +20,10 @@ from tactile_rt.cli.app import (
 )
 from tactile_rt.cli.tables import Json, told_as_json
 from tactile_rt.cli.teach_orders import HELP, Buttons, listening
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError, SpecMismatch
+from tactile_rt.errors import ConfigError, SourceError, SpecMismatch
 
 if TYPE_CHECKING:
+    from tactile_rt.stream import Chunk, Source
     from tactile_rt.teaching.lesson import Lesson
     from tactile_rt.teaching.teacher import Teacher
 
@@ -122,9 +123,10 @@ def teach(
     )
 
 
-def _teach(teacher: "Teacher", source: Source, url: str, orders: "queue.Queue[str]") -> None:
+def _teach(teacher: "Teacher", source: "Source", url: str, orders: "queue.Queue[str]") -> None:
     """Take touches until there are enough, the stream ends, or who teaches has had enough."""
     from tactile_rt.recording import StreamWriter
+    from tactile_rt.stream import EndOfStream
     from tactile_rt.teaching.lesson import BEFORE_NS
 
     lesson = teacher.lesson
@@ -166,7 +168,7 @@ def _teach(teacher: "Teacher", source: Source, url: str, orders: "queue.Queue[st
                 _say(teacher.note(HASTY))
 
 
-def _losses(source: Source) -> list[str]:
+def _losses(source: "Source") -> list[str]:
     stats = source.stats
     if not stats.corrupt and not stats.missing:
         return []
@@ -206,8 +208,9 @@ def _address(given: str) -> tuple[str, int]:
     return host, int(port)
 
 
-def _begun(folder: Path, source: Source) -> "Lesson":
+def _begun(folder: Path, source: "Source") -> "Lesson":
     """A new lesson, with the noise of the array at rest."""
+    from tactile_rt.stream import EndOfStream
     from tactile_rt.teaching.lesson import Lesson
     from tactile_rt.teaching.listener import measured_floor
 
@@ -229,7 +232,7 @@ def _begun(folder: Path, source: Source) -> "Lesson":
     return Lesson.begun(folder, source.spec, measured_floor(chunks))
 
 
-def _greeting(lesson: "Lesson", source: Source) -> str:
+def _greeting(lesson: "Lesson", source: "Source") -> str:
     spec = source.spec
     size = f"{len(spec.elements)} elements x {len(spec.channels)} channels at {spec.rate_hz:g} Hz"
     noise = ", ".join(

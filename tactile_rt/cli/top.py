@@ -14,7 +14,7 @@ from rich.text import Text
 
 from tactile_rt.cli.app import app, check_output
 from tactile_rt.cli.tables import Json, fitting, print_table, told_as_json
-from tactile_rt.stream import ConfigError, SourceError
+from tactile_rt.errors import ConfigError, SourceError
 
 if TYPE_CHECKING:
     from tactile_rt.daemon.health import Latency, PartState, QueueState, Snapshot

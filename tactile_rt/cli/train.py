@@ -18,9 +18,9 @@ from tactile_rt.cli.app import (
 )
 from tactile_rt.cli.progress import progress_bar, working
 from tactile_rt.cli.tables import Json, show_table, told_as_json
+from tactile_rt.errors import ConfigError
 from tactile_rt.locks import alone_in
 from tactile_rt.settings import take_sets
-from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.models.training.config import Progress

@@ -10,8 +10,8 @@ from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needs, set_option, starting
 from tactile_rt.cli.progress import progress_bar
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings import take_sets
-from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     import numpy as np

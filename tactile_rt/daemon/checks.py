@@ -17,10 +17,11 @@ from tactile_rt.daemon.config import Config, ModelConfig, SourceConfig, is_loopb
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.service_folders import MADE
+from tactile_rt.errors import SpecMismatch, TactileError
 from tactile_rt.locks import device_keys
 from tactile_rt.settings import no_such
 from tactile_rt.sources.opening import check_source
-from tactile_rt.stream import ArraySpec, SpecMismatch, TactileError
+from tactile_rt.stream import ArraySpec
 
 __all__ = ["check_config"]
 

@@ -10,8 +10,8 @@ from tactile_rt.daemon.config import Config, PublisherConfig
 from tactile_rt.daemon.consumer import Consumer
 from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.publishers import load_class, publisher_class
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings import convert, make_node
-from tactile_rt.stream import ConfigError
 
 __all__ = ["Wanted", "wanted_consumers"]
 

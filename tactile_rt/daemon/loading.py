@@ -15,8 +15,8 @@ from typing import NoReturn
 import msgspec
 
 from tactile_rt.daemon.config import CONFIG_VERSION, Config
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings import SettingNode, convert, merge, read_toml, refusal, set_key
-from tactile_rt.stream import ConfigError
 
 __all__ = ["Loaded", "load_config"]
 

@@ -21,7 +21,7 @@ from tactile_rt.daemon.http import HttpLimits, HttpServer, Refused, Request, Res
 from tactile_rt.daemon.items import Item
 from tactile_rt.daemon.messages import encode, state_message
 from tactile_rt.drivers.health import State
-from tactile_rt.stream import SourceError
+from tactile_rt.errors import SourceError
 
 __all__ = ["ALERTS", "Metrics", "exposition"]
 

@@ -22,16 +22,9 @@ from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.source_part import keeps_host_time
 from tactile_rt.daemon.troubles import LossWindow
+from tactile_rt.errors import ConfigError, SpecMismatch, TactileError
 from tactile_rt.sensor_spec import SensorSpec
-from tactile_rt.stream import (
-    NS_PER_S,
-    Chunk,
-    ConfigError,
-    Source,
-    SpecMismatch,
-    TactileError,
-    concatenate,
-)
+from tactile_rt.stream import NS_PER_S, Chunk, Source, concatenate
 
 __all__ = ["ModelPart"]
 

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from tactile_rt.daemon.config import LimitsConfig
 from tactile_rt.daemon.health import PartState
-from tactile_rt.stream import SpecMismatch, TactileError
+from tactile_rt.errors import SpecMismatch, TactileError
 
 __all__ = ["Part", "Report", "reason_of"]
 

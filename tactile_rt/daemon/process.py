@@ -151,7 +151,7 @@ def _reload(daemon: "Daemon", path: Path, sets: Sequence[str]) -> None:
     """In a thread of its own: whatever it takes, signals are obeyed meanwhile."""
     from tactile_rt.daemon.checks import check_config
     from tactile_rt.daemon.loading import load_config
-    from tactile_rt.stream import TactileError
+    from tactile_rt.errors import TactileError
 
     try:
         loaded = load_config(path, sets)

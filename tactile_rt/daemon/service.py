@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from tactile_rt.daemon.config import Config
 from tactile_rt.daemon.service_folders import MADE, made_by_systemd, written_folders
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = ["install_script", "unit_text"]
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from tactile_rt.daemon.config import Config
 from tactile_rt.daemon.loading import Loaded
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = ["MADE", "check_folders", "made_by_systemd", "written_folders"]
 

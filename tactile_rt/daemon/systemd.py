@@ -10,7 +10,7 @@ from typing import Any
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.items import Event, Item
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = ["Systemd", "hanging", "status_of"]
 

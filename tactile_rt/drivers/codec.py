@@ -13,18 +13,17 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from importlib import import_module
-from pathlib import Path
 from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt import extensions
-from tactile_rt.extras import lacking
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+from tactile_rt.drivers.catalogue import CODECS
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = [
-    "CODECS",
     "CanCodec",
     "CanFrame",
     "Codec",
@@ -36,33 +35,6 @@ __all__ = [
     "codec_class",
     "six_axis",
 ]
-
-_HERE = "tactile_rt.drivers.codecs"
-
-# (wire, name): where the class is; imported when used
-CODECS = {
-    ("serial", "native"): f"{_HERE}.native:NativeSerial",
-    ("can", "native"): f"{_HERE}.native_can:NativeCan",
-    ("serial", "bota"): f"{_HERE}.bota:Bota",
-    ("serial", "optoforce"): f"{_HERE}.optoforce:OptoForceSerial",
-    ("can", "optoforce"): f"{_HERE}.optoforce:OptoForceCan",
-    ("serial", "anyskin"): f"{_HERE}.anyskin:AnySkin",
-    ("serial", "mlx_hex"): f"{_HERE}.mlx_hex:MlxHex",
-    ("serial", "hx711_whisker"): f"{_HERE}.hx711_whisker:Hx711Whisker",
-    ("serial", "ascii_line"): f"{_HERE}.ascii_line:AsciiLine",
-    ("serial", "binary_frame"): f"{_HERE}.binary_frame:BinaryFrame",
-    ("serial", "ft300"): f"{_HERE}.ft300:Ft300",
-    ("serial", "tsf85"): f"{_HERE}.tsf85:Tsf85",
-    ("serial", "ati_485"): f"{_HERE}.ati_485:Ati485",
-    ("can", "xela"): f"{_HERE}.xela:Xela",
-    ("can", "can-dbc"): f"{_HERE}.can_dbc:CanDbc",
-    ("can", "ati_can"): f"{_HERE}.ati_can:AtiCan",
-    ("can", "aft200"): f"{_HERE}.aft200:Aft200",
-    ("can", "icub_skin"): f"{_HERE}.icub_skin:IcubSkin",
-}
-# a device whose frame is described, and which needs no more: NAME.toml
-for _frame in sorted(Path(__file__).with_name("codecs").glob("frames/*.toml")):
-    CODECS.setdefault(("serial", _frame.stem), f"{_HERE}.binary_frame:{_frame.stem}.toml")
 
 
 class Command(StrEnum):
@@ -341,19 +313,15 @@ def codec_class(wire: str, name: str) -> type[Codec[Any]]:
     """The codec of this name for ``serial`` or ``can``.
 
     Raises:
-        ConfigError: there is none, or what it needs is not installed.
+        ConfigError: there is none.
     """
     if (wire, name) in CODECS:
-        module, _, attribute = CODECS[wire, name].partition(":")
-        try:
-            there = import_module(module)
-            if attribute.endswith(".toml"):
-                described: type[Codec[Any]] = there.frame_codec(name)
-                return described
-            found: type[Codec[Any]] = getattr(there, attribute)
-        except ModuleNotFoundError as error:
-            # Of ours only those of DBC files need an extra.
-            raise lacking(f"codec {name} needs", "dbc", error) from None
+        module, attribute, _ = CODECS[wire, name]
+        there = import_module(module)
+        if attribute.endswith(".toml"):
+            described: type[Codec[Any]] = there.frame_codec(name)
+            return described
+        found: type[Codec[Any]] = getattr(there, attribute)
         return found
     theirs: type[Codec[Any]] | None = extensions.added(extensions.CODECS, f"{wire}.{name}")
     if theirs is not None:

@@ -10,7 +10,7 @@ from typing import Any, Generic
 
 from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.slcan import SlcanDecoder, closing, encode, opening
-from tactile_rt.stream import ConfigError, SourceError
+from tactile_rt.errors import ConfigError, SourceError
 
 __all__ = ["CanLink", "Link", "SerialLink", "SlcanLink"]
 

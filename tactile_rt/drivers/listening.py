@@ -5,12 +5,14 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any, Final
 
-from tactile_rt.drivers.codec import CODECS, CanFrame, Codec, Command, codec_class
+from tactile_rt.drivers.catalogue import CODECS
+from tactile_rt.drivers.codec import CanFrame, Codec, Command, codec_class
 from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
 from tactile_rt.drivers.links import Link, SerialLink
 from tactile_rt.drivers.opening import make_codec, open_line
 from tactile_rt.drivers.sniffing import NEEDS_A_FILE
-from tactile_rt.stream import ConfigError, EndOfStream, SourceError
+from tactile_rt.errors import ConfigError, SourceError
+from tactile_rt.stream import EndOfStream
 
 __all__ = ["SPEEDS", "ask_devices", "hear_bus", "hear_port", "line_speeds"]
 

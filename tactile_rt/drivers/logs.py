@@ -30,8 +30,9 @@ from tactile_rt.drivers.log_lines import (
     of_hex,
     of_slcan,
 )
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import open_regular
-from tactile_rt.stream import NS_PER_S, ConfigError
+from tactile_rt.stream import NS_PER_S
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 

@@ -19,8 +19,9 @@ from tactile_rt.calibration import (
 from tactile_rt.drivers.codec import CanCodec, Codec, SerialCodec, codec_class
 from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
 from tactile_rt.drivers.links import CanLink, Link, SerialLink, SlcanLink
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings import no_such, split_url, take_options
-from tactile_rt.stream import ArraySpec, ConfigError, Source
+from tactile_rt.stream import ArraySpec, Source
 
 __all__ = [
     "CanOptions",

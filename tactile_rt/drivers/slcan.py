@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from typing import Final
 
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = ["SlcanAdapter", "SlcanDecoder", "closing", "encode", "opening"]
 

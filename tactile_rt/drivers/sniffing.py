@@ -19,9 +19,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.drivers.codec import CODECS, CanFrame, Codec, Samples, codec_class
+from tactile_rt.drivers.catalogue import CODECS
+from tactile_rt.drivers.codec import CanFrame, Codec, Samples, codec_class
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = [
     "LOOK_BYTES",

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
+from tactile_rt.errors import ConfigError, SpecMismatch
 from tactile_rt.evidence.model_windows import stepped
 from tactile_rt.evidence.promises import familiarity, named_faults, promises
 from tactile_rt.evidence.records import Record
@@ -21,7 +22,6 @@ from tactile_rt.evidence.robustness import measure_robustness, rated_amount, rob
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet, relabelled
 from tactile_rt.models.disturbances import Disturbance
-from tactile_rt.stream import ConfigError, SpecMismatch
 from tactile_rt.sweep_set import WITHHELD
 
 __all__ = ["evaluate_model"]

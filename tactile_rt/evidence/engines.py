@@ -12,9 +12,9 @@ from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.engines import DEFAULT, ENGINES, open_network
 from tactile_rt.classifier.model_card import ModelCard, decided
 from tactile_rt.classifier.stepper import Stepper
+from tactile_rt.errors import ConfigError, ModelError
 from tactile_rt.evidence.records import Record
 from tactile_rt.sources.opening import check_model, open_source
-from tactile_rt.stream import ConfigError, ModelError
 
 __all__ = [
     "AGREEMENT",

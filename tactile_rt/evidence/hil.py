@@ -28,8 +28,9 @@ from tactile_rt.classifier.classifier import Classification, Classifier
 from tactile_rt.drivers.codec import codec_class
 from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
 from tactile_rt.drivers.opening import make_codec
+from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, Source, SourceError, SourceStats
+from tactile_rt.stream import NS_PER_S, Chunk, Source, SourceStats
 
 if TYPE_CHECKING:
     from tactile_rt.drivers.emulation.faults import FaultSchedule

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.classifier.contact_point import ESTIMATES
+from tactile_rt.errors import ConfigError
 from tactile_rt.evidence.records import Record
 from tactile_rt.models.contact_regression import (
     FLOOR,
@@ -22,7 +23,6 @@ from tactile_rt.models.contact_regression import (
     tared,
 )
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.stream import ConfigError
 from tactile_rt.sweep_set import contacts_of
 
 __all__ = [

@@ -24,9 +24,9 @@ from tactile_rt.classifier.decision_rules import (
     UnknownRule,
     mass_above,
 )
+from tactile_rt.errors import RecordingError
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import Step, at_temperature, predict
-from tactile_rt.stream import RecordingError
 
 __all__ = ["COVERAGE", "fit_candidates", "fit_unknown", "fitted_rules"]
 

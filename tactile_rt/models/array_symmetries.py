@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import ArraySpec
 
 __all__ = ["Symmetry", "compose", "symmetries"]
 

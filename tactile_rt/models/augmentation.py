@@ -24,9 +24,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Generator, Tensor
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models import published_pictures
 from tactile_rt.models.array_symmetries import Symmetry, compose, symmetries
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "Augmentation",

@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tactile_rt.classifier.contact_point import WhiskerShapes
+from tactile_rt.errors import ConfigError, ModelError
 from tactile_rt.files import write_whole
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.sensor_spec import CHANNEL_FLOOR
-from tactile_rt.stream import ConfigError, ModelError
 from tactile_rt.sweep_set import SweepManifest, contacts_of
 
 __all__ = [

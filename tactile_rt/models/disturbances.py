@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.stream import ConfigError
 
 __all__ = ["CLEAN", "OFFSET", "RATED", "Disturbance"]
 

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models import attenders, decoders
 from tactile_rt.models.ead_config import (
     ATTENDERS,
@@ -29,7 +30,6 @@ from tactile_rt.models.ead_config import (
     encoder_class,
 )
 from tactile_rt.models.encoders.cells import Cell
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "ATTENDERS",

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from tactile_rt import extensions
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = [
     "ATTENDERS",

@@ -19,7 +19,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import ArraySpec
 
 PAPER_UNITS = {"N": 1e-3, "N m": 1e-6}  # mN and uN m
 PAPER_CLIP = 1000.0  # of these units

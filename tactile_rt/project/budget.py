@@ -13,6 +13,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.project.folder import Project
 from tactile_rt.sim_backend.arrays.files import load_animals
@@ -20,7 +21,6 @@ from tactile_rt.sim_backend.datasets.dataset import simulate_sweep
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.transducer import device_spec
-from tactile_rt.stream import ConfigError
 
 __all__ = ["Budget", "budget_sweeps", "described", "read_budget", "sized", "write_budget"]
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import msgspec
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.project.folder import Project
 from tactile_rt.sim_backend.measuring.findings import ArrayFinding
-from tactile_rt.stream import ConfigError
 
 __all__ = ["DeviceFit", "keep_fit", "read_fit"]
 

@@ -21,6 +21,7 @@ from urllib.parse import quote, urlencode
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.drivers.codec import codec_class
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.sensor_faults import LARGEST
 from tactile_rt.sensor_spec import channel_limits
@@ -35,7 +36,6 @@ from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, added_categorie
 from tactile_rt.sim_backend.sweep import Sweep, usual_distance, usual_size
 from tactile_rt.sim_backend.transducer import device_spec, sensor_of
 from tactile_rt.sim_backend.world import PROFILES
-from tactile_rt.stream import ConfigError
 
 __all__ = ["KINDS", "DeviceLine", "Project", "new_project"]
 

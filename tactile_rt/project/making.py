@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.evidence.classification import evaluate_model
 from tactile_rt.evidence.records import Record, write
 from tactile_rt.export.release import release
@@ -27,7 +28,6 @@ from tactile_rt.project.folder import Project
 from tactile_rt.project.report import write_report
 from tactile_rt.sim_backend.datasets.dataset import describe_set, finished_objects, make_sweeps
 from tactile_rt.sim_backend.datasets.inventory import write_sums
-from tactile_rt.stream import ConfigError
 from tactile_rt.sweep_set import read_skipped, write_skipped
 
 __all__ = ["MakeProgress", "make"]

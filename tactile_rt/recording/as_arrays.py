@@ -23,6 +23,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording.description import Description, seal
 from tactile_rt.recording.layout import (
     DECISIONS,
@@ -33,7 +34,7 @@ from tactile_rt.recording.layout import (
     decode_samples,
     encode_samples,
 )
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError, concatenate
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 
 __all__ = [
     "ABOUT",

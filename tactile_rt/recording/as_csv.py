@@ -21,11 +21,12 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.files import write_whole
 from tactile_rt.recording.as_arrays import ABOUT, COLUMNS, Told, about_of, about_text, raws_of
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.layout import Raw
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError, RecordingError, concatenate
+from tactile_rt.stream import ArraySpec, Chunk, concatenate
 
 __all__ = ["beside", "read_csv", "told_of", "told_text", "write_csv"]
 

@@ -11,6 +11,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
+from tactile_rt.errors import RecordingError, TactileError
 from tactile_rt.extras import lacking
 from tactile_rt.recording.as_arrays import (
     ABOUT,
@@ -24,7 +25,7 @@ from tactile_rt.recording.as_arrays import (
 )
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.layout import Raw
-from tactile_rt.stream import Chunk, RecordingError, TactileError, concatenate
+from tactile_rt.stream import Chunk, concatenate
 
 if TYPE_CHECKING:
     from _typeshed import ReadableBuffer

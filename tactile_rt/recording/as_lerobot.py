@@ -23,6 +23,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.files import whole_folder
 from tactile_rt.recording.as_arrays import COLUMNS, TEXTS, Told, raws_of
 from tactile_rt.recording.as_csv import told_of, told_text
@@ -39,14 +40,7 @@ from tactile_rt.recording.lerobot_meta import (
     write_meta,
 )
 from tactile_rt.recording.reader import Recording
-from tactile_rt.stream import (
-    NS_PER_S,
-    ArraySpec,
-    Chunk,
-    ConfigError,
-    RecordingError,
-    SpecMismatch,
-)
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
 __all__ = ["is_dataset", "read_dataset", "write_dataset"]
 

@@ -14,9 +14,10 @@ import numpy as np
 
 from tactile_rt.classifier.engines import DEFAULT
 from tactile_rt.classifier.model_file import hash_of, shipped_model
+from tactile_rt.errors import ConfigError
 from tactile_rt.recording.description import Description
 from tactile_rt.settings import parse_toml
-from tactile_rt.stream import NS_PER_S, Chunk, ConfigError
+from tactile_rt.stream import NS_PER_S, Chunk
 
 __all__ = [
     "FACTS",

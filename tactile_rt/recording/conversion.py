@@ -6,6 +6,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import BinaryIO
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.recording.as_arrays import TEXTS, read_npz, write_npz
 from tactile_rt.recording.as_csv import beside, read_csv, write_csv
@@ -16,7 +17,7 @@ from tactile_rt.recording.layout import SAMPLES, Raw, decode_samples, need_mcap,
 from tactile_rt.recording.lerobot_meta import need_pyarrow
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.writer import McapFile
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.stream import Chunk
 
 __all__ = ["chunks_of", "convert", "outputs_of"]
 

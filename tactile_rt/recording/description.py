@@ -10,7 +10,8 @@ import msgspec
 
 from tactile_rt.calibration import CalibratedSource, Calibration
 from tactile_rt.drivers.device_source import device_of
-from tactile_rt.stream import ArraySpec, ConfigError, RecordingError, Source
+from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.stream import ArraySpec, Source
 
 __all__ = [
     "METADATA",

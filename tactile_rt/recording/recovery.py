@@ -6,6 +6,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.files import open_regular, sync_folder, write_whole
 from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
 from tactile_rt.recording.layout import is_message, need_mcap
@@ -13,7 +14,6 @@ from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC, read_whole_records
 from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, is_in_file_form, name_of, plain
 from tactile_rt.recording.writer import McapFile, check_not_recorded
-from tactile_rt.stream import ConfigError, RecordingError
 
 if TYPE_CHECKING:
     from mcap.records import Message

@@ -22,8 +22,8 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings.tree import SettingNode, named
-from tactile_rt.stream import ConfigError
 
 __all__ = ["convert", "hint", "is_list", "is_text", "nearest", "no_such", "refusal", "types_of"]
 

@@ -11,6 +11,7 @@ import trimesh
 from mujoco import rollout
 from numpy.typing import NDArray
 
+from tactile_rt.errors import SourceError
 from tactile_rt.sim_backend.arrays.head import add_head
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
@@ -26,7 +27,6 @@ from tactile_rt.sim_backend.world import (
     read_base_loads,
     set_damping,
 )
-from tactile_rt.stream import SourceError
 
 __all__ = ["UNSTABLE", "MujocoWorld", "sweep_model"]
 

@@ -23,6 +23,7 @@ from typing import Final
 
 import numpy as np
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
@@ -36,7 +37,7 @@ from tactile_rt.sim_backend.sweep import Sweep, draw_sweep, usual_distance
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation, check_sweep, draw_simulation
 from tactile_rt.sim_backend.transducer import Transducer, device_spec, sensor_of
 from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStream, Source
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
 __all__ = ["CHUNK_SAMPLES", "PACES", "PacedSource", "Pass", "SimOptions", "SimSource", "check_pace"]
 

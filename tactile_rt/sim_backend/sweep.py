@@ -13,11 +13,11 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.approach import lateral_reach
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import rotation
-from tactile_rt.stream import ConfigError
 
 __all__ = ["NOTHING", "Sweep", "draw_sweep", "usual_distance", "usual_size"]
 

@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.approach import (
     centrelines,
     faces_right,
@@ -23,7 +24,6 @@ from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.remarks import strains
 from tactile_rt.sim_backend.sweep import Sweep, draw_sweep
 from tactile_rt.sim_backend.world import SAMPLE_MS, Profile, engine_of
-from tactile_rt.stream import ConfigError
 
 __all__ = ["SweepSimulation", "World", "check_sweep", "draw_simulation"]
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "ANGLES",

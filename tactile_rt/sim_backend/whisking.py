@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.sim_backend.arrays.whisker_array import Mount
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
 from tactile_rt.sim_backend.mujoco_world import UNSTABLE
@@ -27,7 +28,6 @@ from tactile_rt.sim_backend.world import (
     read_base_loads,
     set_damping,
 )
-from tactile_rt.stream import ConfigError, SourceError
 
 __all__ = ["ENDLESS", "HEAD", "WhiskSimulation"]
 

@@ -17,9 +17,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.trajectories import coupled
-from tactile_rt.stream import ConfigError
 
 __all__ = ["FASTEST_HZ", "LAG_S", "LARGEST_RAD", "MOST", "STEEPEST", "Drive", "Whisking"]
 

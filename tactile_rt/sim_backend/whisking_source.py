@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.objects.catalogue import load_object
@@ -20,7 +21,7 @@ from tactile_rt.sim_backend.source import CHUNK_SAMPLES, PacedSource, check_pace
 from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import Drive, Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError, EndOfStream
+from tactile_rt.stream import ArraySpec, Chunk, EndOfStream
 
 __all__ = ["WhiskingOptions", "WhiskingSource"]
 

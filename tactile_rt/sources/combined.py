@@ -30,18 +30,10 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.timebase import Resampler
 from tactile_rt.drivers.opening import Prepared
+from tactile_rt.errors import ConfigError, SourceError, TactileError
 from tactile_rt.settings import convert, read_toml, refusal
 from tactile_rt.sources.opening import check_source, open_source
-from tactile_rt.stream import (
-    NS_PER_S,
-    ArraySpec,
-    Chunk,
-    ConfigError,
-    EndOfStream,
-    Source,
-    SourceError,
-    TactileError,
-)
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
 __all__ = ["CombinedSource", "MemberArray", "combine_specs", "prepare_combined"]
 

@@ -18,9 +18,10 @@ from tactile_rt import extensions
 from tactile_rt.calibration import load_calibration
 from tactile_rt.classifier.array_file import read_array
 from tactile_rt.drivers.opening import Prepared
+from tactile_rt.errors import ConfigError, SpecMismatch
 from tactile_rt.extras import lacking
 from tactile_rt.settings import nearest, parse_options, split_url
-from tactile_rt.stream import ArraySpec, ConfigError, Source, SpecMismatch
+from tactile_rt.stream import ArraySpec, Source
 
 __all__ = ["SCHEMES", "check_model", "check_source", "open_source"]
 

@@ -19,8 +19,9 @@ from numpy.typing import ArrayLike
 
 from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
 from tactile_rt.drivers.opening import make_codec
+from tactile_rt.errors import ConfigError
 from tactile_rt.sources.synthetic import synthetic_spec
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, EndOfStream, Source
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
 __all__ = ["ArraySource", "FakeCan", "FakeSerial", "cut", "small_spec"]
 

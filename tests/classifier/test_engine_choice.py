@@ -12,7 +12,7 @@ from tactile_rt.classifier import engine_choice
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.engine_choice import choices_file, choose_engine, keep_engine
 from tactile_rt.classifier.engines import Engine
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.tiny_model import write_model
 from tests.helpers.touch_streams import SAME_RATE
 

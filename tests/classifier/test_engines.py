@@ -16,7 +16,7 @@ from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.engines import ENGINES, Engine, check_engine, open_network
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.classifier.stepper import Stepper
-from tactile_rt.stream import ConfigError, ModelError
+from tactile_rt.errors import ConfigError, ModelError
 from tests.helpers.tiny_model import CARD, STEPS, write_model
 from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, signal, stream
 

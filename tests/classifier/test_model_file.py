@@ -21,7 +21,7 @@ from tactile_rt.classifier.model_file import (
 )
 from tactile_rt.classifier.model_runs import probe_logits
 from tactile_rt.classifier.stepper import Stepper
-from tactile_rt.stream import ConfigError, ModelError, SpecMismatch
+from tactile_rt.errors import ConfigError, ModelError, SpecMismatch
 from tactile_rt.testing import small_spec
 from tests.helpers.old_models import write_old_model
 from tests.helpers.tiny_model import CARD, GRAPH, LABELS, WINDOW, write_model

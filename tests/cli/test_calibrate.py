@@ -11,8 +11,8 @@ from tactile_rt.calibration import (
     load_calibration,
     save_calibration,
 )
+from tactile_rt.errors import ConfigError
 from tactile_rt.sources import opening as sources
-from tactile_rt.stream import ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec
 
 SPEC = replace(small_spec(2), channels=("s0", "s1"), units=("1", "1"))

@@ -2,7 +2,7 @@
 
 import tomllib
 
-from tactile_rt.drivers.codec import CODECS
+from tactile_rt.drivers.catalogue import CODECS
 
 
 def test_every_codec_has_a_row(call):

@@ -16,13 +16,13 @@ pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
 from tactile_rt.models.evaluation import run_windows
 from tactile_rt.models.training.batches import TrainingBatches
 from tactile_rt.recording import Recording
 from tactile_rt.sensor_faults import SensorFaults
-from tactile_rt.stream import ConfigError
 from tactile_rt.sweep_set import SweepManifest
 from tests.helpers.labelled import ARRAY, record_touches, touched
 from tests.helpers.source_tree import ROOT

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tactile_rt.cli.tables import print_table
-from tactile_rt.drivers.codec import CODECS
+from tactile_rt.drivers.catalogue import CODECS
 
 CALL = "import sys; sys.argv[0] = 'tactile-rt'; from tactile_rt.cli import main; main()"
 

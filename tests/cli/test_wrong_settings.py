@@ -12,13 +12,14 @@ import pytest
 
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
-from tactile_rt.drivers.codec import CODECS, codec_class
+from tactile_rt.drivers.catalogue import CODECS
+from tactile_rt.drivers.codec import codec_class
 from tactile_rt.drivers.opening import CanOptions, SerialOptions
+from tactile_rt.errors import TactileError
 from tactile_rt.extras import install_extra
 from tactile_rt.recording.replay import ReplayOptions, SweepOptions
 from tactile_rt.sources.opening import open_source
 from tactile_rt.sources.synthetic import SyntheticOptions
-from tactile_rt.stream import TactileError
 from tactile_rt.testing import small_spec
 from tests.helpers.tiny_sweeps import write_tiny_set
 

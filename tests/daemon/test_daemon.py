@@ -33,9 +33,9 @@ from tactile_rt.daemon.items import (
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.metrics import exposition
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
+from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.locks import AlreadyRunning, Locks
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import ConfigError, SourceError
 from tactile_rt.testing import ArraySource, FakeSerial, cut, small_spec
 from tests.helpers.tiny_model import write_model
 from tests.helpers.waiting import PATIENCE_S, until

@@ -16,7 +16,7 @@ from tactile_rt.daemon.config import MetricsConfig
 from tactile_rt.daemon.health import SourceState
 from tactile_rt.daemon.messages import StateMessage
 from tactile_rt.daemon.metrics import Metrics, exposition
-from tactile_rt.stream import SourceError
+from tactile_rt.errors import SourceError
 from tests.helpers.published import View, busy_snapshot, part, running
 from tests.helpers.waiting import PATIENCE_S, until
 

@@ -22,7 +22,7 @@ from tactile_rt.daemon.page import feed as feed_module
 from tactile_rt.daemon.page.feed import Feed, array_line, map_axes
 from tactile_rt.daemon.page.guard import Guard
 from tactile_rt.daemon.page.routes import LIMITS, MAX_LINES, MAX_STREAMS, STATIC, PageClient
-from tactile_rt.stream import ConfigError, SourceError
+from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 

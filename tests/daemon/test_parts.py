@@ -34,8 +34,9 @@ from tactile_rt.daemon.mailbox import AROUND_BYTES, FRAME_BYTES, Hub, Mailbox
 from tactile_rt.daemon.messages import encode, message_of, topic_of
 from tactile_rt.daemon.part import Part, reason_of
 from tactile_rt.drivers.codec import CanFrame
+from tactile_rt.errors import ConfigError
 from tactile_rt.locks import AlreadyRunning, Locks, device_keys, lock_keys
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.stream import Chunk
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 

@@ -15,7 +15,7 @@ from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.service import install_script, unit_text
 from tactile_rt.daemon.service_folders import written_folders
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.overlay import changes
 
 SMALL = 'version = 1\n[[source]]\nname = "a"\nurl = "synthetic:2x2"\n'

@@ -9,8 +9,9 @@ import pytest
 
 from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule
 from tactile_rt.drivers.health import State
+from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import ConfigError, EndOfStream, SourceError
+from tactile_rt.stream import EndOfStream
 from tactile_rt.testing import FakeCan, FakeSerial
 from tests.helpers.waiting import PATIENCE_S, until
 

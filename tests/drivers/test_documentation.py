@@ -8,7 +8,8 @@ import msgspec
 import numpy as np
 import pytest
 
-from tactile_rt.drivers.codec import CODECS, Codec
+from tactile_rt.drivers.catalogue import CODECS
+from tactile_rt.drivers.codec import Codec
 from tactile_rt.drivers.device_source import DeviceOptions
 from tactile_rt.drivers.emulation.faults import KINDS, read_faults
 from tactile_rt.drivers.opening import CanOptions, SerialOptions

@@ -10,7 +10,7 @@ import pytest
 
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.logs import read_log
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 T0 = 1_700_000_000.5
 N = 60

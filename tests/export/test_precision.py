@@ -19,10 +19,10 @@ from onnx import numpy_helper
 from bench.inference.full_size import random_model
 from tactile_rt.classifier.model_file import load_model, read_model, shipped_model
 from tactile_rt.classifier.model_runs import file_outputs, verify_model
+from tactile_rt.errors import ConfigError
 from tactile_rt.export.onnx_step import PARITY_BAR, parity, step_graph, write_model
 from tactile_rt.export.precision import CONTRIB, PRECISIONS, in_precision
 from tactile_rt.models.ead import EADConfig
-from tactile_rt.stream import ConfigError
 
 CLASSES = 6
 # Largest difference of logits, of a spread of about 1, that a precision may make.

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tactile_rt.classifier.decision_rules import UNKNOWN, mass_above
+from tactile_rt.errors import RecordingError
 from tactile_rt.export.promises import fit_candidates, fit_unknown
-from tactile_rt.stream import RecordingError
 
 STEPS, CLASSES = 22, 10
 

@@ -9,9 +9,10 @@ pytest.importorskip("torch")
 
 import torch
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.checkpoints import TactileClassifier
 from tactile_rt.models.ead import EAD, ENCODERS, EADConfig
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.stream import ArraySpec
 from tactile_rt.timing import Timing
 from tests.helpers.small_networks import TOLERANCE, build, stream
 

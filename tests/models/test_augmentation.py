@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from tactile_rt.calibration.mirroring import Mirror
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.array_symmetries import compose, symmetries
 from tactile_rt.models.augmentation import (
     Tactile,
@@ -17,7 +18,6 @@ from tactile_rt.models.augmentation import (
     tactile_paper,
 )
 from tactile_rt.models.training.config import AUGMENTATIONS
-from tactile_rt.stream import ConfigError
 from tests.helpers.tiny_sweeps import plate, tiny_array
 
 SPEC = tiny_array()

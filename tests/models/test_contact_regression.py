@@ -13,6 +13,7 @@ import torch
 from sklearn.metrics import f1_score, roc_auc_score
 
 from tactile_rt.classifier.contact_point import WhiskerShapes
+from tactile_rt.errors import ConfigError
 from tactile_rt.evidence.locating import (
     contact_records,
     weighted_auroc,
@@ -29,7 +30,7 @@ from tactile_rt.models.contact_regression import (
     train_contacts,
 )
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SPLITS, SweepManifest, write_object
 
 SHAPES = WhiskerShapes(*(np.array(v) for v in (

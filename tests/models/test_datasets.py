@@ -10,11 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_rt.classifier.contact import ContactDetector
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, windows
 from tactile_rt.models.evaluation import cut_windows
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.models.training.batches import TrainingBatches, partners
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest, Sweeps
 from tactile_rt.timing import MOUSE
 

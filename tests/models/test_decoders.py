@@ -7,8 +7,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models import decoders
-from tactile_rt.stream import ConfigError
 
 
 def count(module: nn.Module) -> int:

@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch.nn import functional as F
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.ead import ATTENDERS, DECODERS, EAD, ENCODERS, READOUTS, EADConfig
-from tactile_rt.stream import ConfigError
 from tests.helpers.small_networks import STEPS, TOLERANCE, build, frames, stream
 
 NAMES = tuple(name for name in ENCODERS if name != "graph")  # which has its own tests

@@ -10,6 +10,7 @@ pytest.importorskip("torch")
 from sklearn.metrics import roc_auc_score
 
 from tactile_rt.classifier.contact import ContactDetector
+from tactile_rt.errors import ConfigError
 from tactile_rt.models import evaluation, onsets
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.disturbances import OFFSET, Disturbance
@@ -22,7 +23,7 @@ from tactile_rt.models.evaluation import (
 )
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.sensor_spec import channel_limits
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest, Sweeps
 from tactile_rt.timing import MOUSE
 

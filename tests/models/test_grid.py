@@ -16,6 +16,7 @@ pytest.importorskip("torch")
 pytest.importorskip("lightning")
 pytest.importorskip("matplotlib")
 
+from tactile_rt.errors import ConfigError, ModelError, RecordingError
 from tactile_rt.models.grid import pool, results
 from tactile_rt.models.grid.outcomes import (
     Outcome,
@@ -33,7 +34,7 @@ from tactile_rt.models.grid.pool import run_grid
 from tactile_rt.models.grid.results import gather, put_into, table, write_results
 from tactile_rt.models.grid.work import Workbench
 from tactile_rt.models.training.config import DivergedError, Progress
-from tactile_rt.stream import ArraySpec, ConfigError, ModelError, RecordingError
+from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest, write_object
 from tests.helpers.source_tree import ROOT
 

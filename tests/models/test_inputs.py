@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.inputs import InputStage, paper_units
-from tactile_rt.stream import ConfigError
 from tests.helpers.tiny_sweeps import plate, tiny_array
 
 EMPTY = {(0, 5), (0, 6), (1, 5), (1, 6), (4, 6)}

@@ -6,9 +6,9 @@ from shlex import split
 
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.training import TrainingConfig, read_recipe, shipped_recipes
 from tactile_rt.models.training.recipes import load_recipe, training_command
-from tactile_rt.stream import ConfigError
 
 E4 = [0.1, 0.01, 0.001, 0.0001]
 GATED = {"zhuang-ugrnn", "zhuang-intersection", "zhuang-gru", "zhuang-lstm"}

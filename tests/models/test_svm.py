@@ -7,9 +7,9 @@ import pytest
 
 pytest.importorskip("sklearn")
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.svm import fit, fit_margins, fit_svm
-from tactile_rt.stream import ConfigError
 from tests.helpers.tiny_sweeps import write_tiny_set
 
 

@@ -14,6 +14,7 @@ import pytest
 import torch
 from torch import nn
 
+from tactile_rt.errors import ConfigError, ModelError
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import hits, predict
 from tactile_rt.models.training import (
@@ -37,7 +38,6 @@ from tactile_rt.models.training.optimizers import (
 from tactile_rt.models.training.probing import linear_probe
 from tactile_rt.models.training.recipes import read_recipe
 from tactile_rt.models.training.replay import replayed
-from tactile_rt.stream import ConfigError, ModelError
 from tactile_rt.sweep_set import SweepManifest, write_object
 from tests.helpers.tiny_sweeps import SAMPLES, write_tiny_set
 

@@ -13,6 +13,7 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("lightning")
 
+from tactile_rt.errors import ConfigError, ModelError  # noqa: E402
 from tactile_rt.files import replaced  # noqa: E402
 from tactile_rt.models.checkpoint_files import describe_checkpoint, network_of  # noqa: E402
 from tactile_rt.models.ead_config import CELLS  # noqa: E402
@@ -29,7 +30,6 @@ from tactile_rt.models.training import (  # noqa: E402
 )
 from tactile_rt.models.training.config import DivergedError  # noqa: E402
 from tactile_rt.models.training.validation import Validation  # noqa: E402
-from tactile_rt.stream import ConfigError, ModelError  # noqa: E402
 from tests.helpers.holding import held_elsewhere  # noqa: E402
 from tests.helpers.tiny_sweeps import write_tiny_set  # noqa: E402
 

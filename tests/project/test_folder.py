@@ -16,6 +16,7 @@ pytest.importorskip("matplotlib")
 import trimesh
 
 from tactile_rt.daemon.loading import load_config
+from tactile_rt.errors import ConfigError
 from tactile_rt.project import folder as folder_module
 from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized, write_budget
 from tactile_rt.project.folder import KINDS, Project, new_project
@@ -26,7 +27,6 @@ from tactile_rt.sim_backend.arrays.robots import ROBOTS, robot_text
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.sources.opening import check_source, open_source
-from tactile_rt.stream import ConfigError
 from tests.helpers.source_tree import ROOT
 
 MAGNETS = ROOT / "docs" / "arrays" / "magnets.toml"

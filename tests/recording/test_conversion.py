@@ -16,13 +16,14 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays_of
 
 from tactile_rt.calibration import Calibration
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.extras import install_extra
 from tactile_rt.recording import Description, Recording, recover
 from tactile_rt.recording.conversion import convert, outputs_of
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.writer import McapFile
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk, ConfigError, RecordingError, concatenate
+from tactile_rt.stream import Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
 
 pytest.importorskip("mcap")

@@ -2,8 +2,8 @@
 
 import pytest
 
+from tactile_rt.errors import RecordingError
 from tactile_rt.recording import Recording
-from tactile_rt.stream import RecordingError
 from tests.helpers.hostile_files import MCAPS
 from tests.helpers.measured import measured
 

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.recording.labels import LabelledInterval, append_label, label_of_file, read_labels
-from tactile_rt.stream import ConfigError
 
 HEADER = "recording,start_s,end_s,label,object\n"
 

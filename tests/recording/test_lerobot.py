@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.as_lerobot import is_dataset, read_dataset, write_dataset
 from tactile_rt.recording.conversion import chunks_of, convert
@@ -18,7 +19,7 @@ from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.lerobot_film import film_of
 from tactile_rt.recording.lerobot_meta import Statistics
 from tactile_rt.recording.writer import McapFile
-from tactile_rt.stream import Chunk, ConfigError, RecordingError, SpecMismatch, concatenate
+from tactile_rt.stream import Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.recordings import all_parts, noise
 

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording import Recording, recover
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import ConfigError, RecordingError, concatenate
+from tactile_rt.stream import concatenate
 from tactile_rt.testing import cut
 from tests.helpers.recordings import SPEC, all_parts, noise, odd_chunks, write
 

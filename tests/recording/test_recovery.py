@@ -8,12 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording import Description, Recording, recover
 from tactile_rt.recording.description import RECOVERED
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.recording.recovery import MOST_NONE
 from tactile_rt.recording.writer import McapFile
-from tactile_rt.stream import ConfigError, RecordingError
 from tactile_rt.testing import cut
 from tests.helpers.recordings import SPEC, all_parts, noise, parts, write
 

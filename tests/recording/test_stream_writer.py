@@ -11,10 +11,10 @@ import time
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.extras import install_extra
 from tactile_rt.recording import Recording, StreamWriter, recover, writer
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import ConfigError, RecordingError
 from tactile_rt.testing import ArraySource, FakeSerial, cut
 from tests.helpers.recordings import (
     SPEC,

@@ -13,6 +13,7 @@ import mujoco
 
 from bench.sim.beams import flat
 from bench.sim.pegs import SLIDE_MM_S, _steps, press, presses
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.sim_backend.arrays.cells import link_nodes
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.contacts import ContactProbe, contact_distances
@@ -29,7 +30,6 @@ from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES
-from tactile_rt.stream import ConfigError, RecordingError
 from tactile_rt.sweep_set import SweepManifest, contacts_of, read_object, read_sweeps
 
 PLAIN = SweepRecipe(

@@ -7,13 +7,14 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend import source as source_module
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
 from tactile_rt.sim_backend.source import CHUNK_SAMPLES, REST_SAMPLES, SimOptions, SimSource
 from tactile_rt.sim_backend.world import CHANNELS, array_spec
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream, SourceStats, concatenate
+from tactile_rt.stream import Chunk, EndOfStream, SourceStats, concatenate
 
 
 def fast(**options: str | float) -> SimSource:

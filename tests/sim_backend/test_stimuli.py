@@ -10,6 +10,7 @@ pytest.importorskip("mujoco")
 
 import mujoco
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.stimuli import (
     PERIOD_NS,
@@ -23,7 +24,6 @@ from tactile_rt.sim_backend.stimuli import (
 from tactile_rt.sim_backend.trajectories import Whisk
 from tactile_rt.sim_backend.whisking import WhiskSimulation
 from tactile_rt.sim_backend.world import OBJECT_BIT, PROFILES, array_spec
-from tactile_rt.stream import ConfigError
 
 MOUSE = {w.name: w for w in mouse_whiskers()}
 

@@ -15,6 +15,7 @@ import mujoco
 from matplotlib.figure import Figure
 from PIL import Image
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.objects.catalogue import make_object
@@ -29,7 +30,7 @@ from tactile_rt.sim_backend.views.stage import Stage
 from tactile_rt.sim_backend.views.window import _Player, check_display
 from tactile_rt.sim_backend.views.writing import check_suffix, write_image, write_video
 from tactile_rt.sim_backend.world import OBJECT_BIT, PROFILES, WHISKER_BIT, array_spec
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.stream import ArraySpec
 
 SCALE = ForceScale(1.0, 10.0)
 SIDE = 200  # pixels of a test picture

@@ -9,6 +9,7 @@ pytest.importorskip("mujoco")
 
 import mujoco
 
+from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.sim_backend import whisking
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.arrays.whisker_array import Mount, mirrored
@@ -21,7 +22,6 @@ from tactile_rt.sim_backend.world import (
     empty_world,
     set_damping,
 )
-from tactile_rt.stream import ConfigError, SourceError
 
 MOUSE = {w.name: w for w in mouse_whiskers()}
 FEW = tuple(MOUSE[n] for n in ("A1", "B0", "C2", "D3", "E5"))

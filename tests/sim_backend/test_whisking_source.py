@@ -15,6 +15,7 @@ from scipy.integrate import solve_ivp
 
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_common import IMPOSSIBLE, MessageType
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.trajectories import ELEVATION_SLOPES, Whisk
 from tactile_rt.sim_backend.whisking import ENDLESS, WhiskSimulation
@@ -22,7 +23,7 @@ from tactile_rt.sim_backend.whisking_drive import LAG_S, LARGEST_RAD, MOST, Driv
 from tactile_rt.sim_backend.whisking_source import WhiskingOptions, WhiskingSource
 from tactile_rt.sim_backend.world import PROFILES, array_spec
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, concatenate
+from tactile_rt.stream import Chunk, EndOfStream, Source, concatenate
 from tactile_rt.testing import FakeCan, FakeSerial
 from tests.helpers.waiting import until
 

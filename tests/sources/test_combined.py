@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sources.combined import CombinedSource, MemberArray, combine_specs
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec
 
 LEFT, RIGHT = small_spec(3), small_spec(2, rate_hz=500.0)

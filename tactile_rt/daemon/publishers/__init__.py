@@ -4,9 +4,9 @@ from importlib import import_module
 from typing import Any
 
 from tactile_rt import extensions
+from tactile_rt.errors import ConfigError
 from tactile_rt.extras import lacking
 from tactile_rt.settings import no_such
-from tactile_rt.stream import ConfigError
 
 __all__ = ["PUBLISHERS", "load_class", "publisher_class"]
 

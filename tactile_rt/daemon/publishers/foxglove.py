@@ -39,7 +39,8 @@ from tactile_rt.daemon.messages import (
 from tactile_rt.daemon.publishers.connections import ConnectionLimit
 from tactile_rt.daemon.publishers.scene import Scene
 from tactile_rt.daemon.publishers.sending import Connections, Prefix, Repeated, tell_exposed
-from tactile_rt.stream import ArraySpec, SourceError
+from tactile_rt.errors import SourceError
+from tactile_rt.stream import ArraySpec
 
 __all__ = ["FoxgloveOptions", "FoxglovePublisher", "schema_of"]
 

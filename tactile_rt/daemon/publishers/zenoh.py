@@ -18,7 +18,7 @@ from tactile_rt.daemon.publishers.sending import (
     is_port,
     tell_exposed,
 )
-from tactile_rt.stream import ConfigError, SourceError
+from tactile_rt.errors import ConfigError, SourceError
 
 __all__ = ["ZenohOptions", "ZenohPublisher"]
 

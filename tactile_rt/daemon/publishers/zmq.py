@@ -16,7 +16,7 @@ from tactile_rt.daemon.publishers.sending import (
     is_port,
     tell_exposed,
 )
-from tactile_rt.stream import SourceError
+from tactile_rt.errors import SourceError
 
 __all__ = ["ZmqOptions", "ZmqPublisher"]
 

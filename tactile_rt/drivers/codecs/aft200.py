@@ -17,7 +17,8 @@ from tactile_rt.drivers.codec import (
     six_axis,
 )
 from tactile_rt.drivers.codecs.framing import Rounds
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import Chunk
 
 __all__ = ["Aft200", "Aft200Options"]
 

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from tactile_rt.drivers.codecs.ascii_mapping import Element
 from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, shipped_frame
 from tactile_rt.drivers.codecs.frame_mapping import UNHEARD
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import Chunk
 
 __all__ = ["AnySkin", "AnySkinOptions"]
 

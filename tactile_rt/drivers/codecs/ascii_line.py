@@ -24,7 +24,8 @@ from tactile_rt.drivers.codecs.ascii_mapping import (
     read_mapping,
 )
 from tactile_rt.drivers.codecs.ascii_text import Names, fields, number, quoted
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import Chunk
 
 __all__ = ["AsciiLine", "AsciiLineOptions"]
 

@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import crc16_modbus
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["Ati485", "Ati485Options"]
 

@@ -18,7 +18,8 @@ from tactile_rt.drivers.codec import (
     Step,
     six_axis,
 )
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import Chunk
 
 __all__ = ["AtiCan", "AtiCanOptions"]
 

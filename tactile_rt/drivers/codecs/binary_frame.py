@@ -3,19 +3,20 @@
 import textwrap
 from dataclasses import dataclass
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.drivers.catalogue import FRAMES
 from tactile_rt.drivers.codec import Command, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.endings import EndFinder, Found, StrideFinder
 from tactile_rt.drivers.codecs.frame_layout import FrameLayout, as_bytes
 from tactile_rt.drivers.codecs.frame_mapping import FrameMapping, read_frame_mapping
 from tactile_rt.drivers.codecs.framing import FrameFinder
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import Chunk
 
 __all__ = [
     "BinaryFrame",
@@ -27,7 +28,6 @@ __all__ = [
 ]
 
 DISTINCT = 4  # bytes of an ending that no measurement has
-FRAMES = Path(__file__).with_name("frames")  # the devices whose frames are described
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,8 @@ import numpy as np
 from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
 from tactile_rt.drivers.codecs.dbc_mapping import FramePart, Signal, read_mapping
 from tactile_rt.drivers.codecs.framing import Rounds
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import Chunk
 
 __all__ = ["CanDbc", "CanDbcOptions"]
 

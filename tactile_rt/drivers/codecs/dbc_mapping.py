@@ -13,16 +13,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
-import cantools
 import msgspec
 import numpy as np
-from cantools.database.errors import Error as DatabaseError
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.dbc_limits import DEEPEST, MOST_BYTES, check_dbc
+from tactile_rt.errors import ConfigError
+from tactile_rt.extras import lacking
 from tactile_rt.settings import convert, read_toml
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.stream import ArraySpec
 
 __all__ = ["DbcMapping", "FramePart", "Signal", "read_mapping"]
 
@@ -200,6 +200,11 @@ def _near(name: str, known: Iterable[str]) -> str:
 
 class _Reader:
     def __init__(self, path: Path, file: _File) -> None:
+        try:
+            import cantools
+            from cantools.database.errors import Error as DatabaseError
+        except ModuleNotFoundError as error:
+            raise lacking("codec can-dbc needs", "dbc", error) from None
         self.path, self.file = path, file
         self.dbc = path.parent / file.dbc
         try:

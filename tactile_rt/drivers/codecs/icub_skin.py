@@ -8,7 +8,8 @@ import numpy as np
 
 from tactile_rt.drivers.codec import CanCodec, CanFrame, Command, SampleBatch, Samples, Step
 from tactile_rt.drivers.codecs.framing import Rounds
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["IcubSkin", "IcubSkinOptions"]
 

@@ -35,7 +35,8 @@ from tactile_rt.drivers.codecs.native_common import (
     pack_valid,
     quantise,
 )
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import Chunk
 
 __all__ = ["NativeOptions", "NativeSerial", "frame"]
 

@@ -7,7 +7,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "FORMATS",

@@ -28,7 +28,8 @@ from tactile_rt.drivers.codec import (
     WireStats,
 )
 from tactile_rt.drivers.codecs.framing import FrameFinder
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["OptoForceCan", "OptoForceCanOptions", "OptoForceOptions", "OptoForceSerial"]
 

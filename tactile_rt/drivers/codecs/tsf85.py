@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Command, SampleBatch, Samples, SerialCodec, Step
 from tactile_rt.drivers.codecs.framing import ByteBuffer
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["Tsf85", "Tsf85Options"]
 

@@ -20,7 +20,8 @@ from tactile_rt.drivers.emulation.endpoints import (
 )
 from tactile_rt.drivers.emulation.faults import FaultSchedule
 from tactile_rt.drivers.opening import make_codec
-from tactile_rt.stream import ConfigError, Source
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import Source
 
 SPEEDS = ("baud", "bitrate")  # of a line; 0 for none
 

@@ -21,7 +21,8 @@ from tactile_rt.drivers.emulation.transmitter import (
     Transmitter,
     fit,
 )
-from tactile_rt.stream import NS_PER_S, Chunk, ConfigError, EndOfStream, Source
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import NS_PER_S, Chunk, EndOfStream, Source
 
 __all__ = ["PACES", "Emulator"]
 

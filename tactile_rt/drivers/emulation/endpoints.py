@@ -14,7 +14,7 @@ from tactile_rt.drivers.codec import CanFrame, Packet
 from tactile_rt.drivers.emulation.pseudo_terminal import Pty
 from tactile_rt.drivers.emulation.wire import Wire, bytes_s, frames_s
 from tactile_rt.drivers.slcan import SlcanAdapter
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = ["BusEndpoint", "Endpoint", "SerialEndpoint", "SlcanEndpoint"]
 

@@ -33,8 +33,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import Packet
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings import convert, no_such, read_toml
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "KINDS",

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 from tactile_rt.drivers.emulation.wire import Wire, misheard
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 __all__ = ["Pty"]
 

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.models.alignment.benchmark import (
     PROTOCOLS,
@@ -21,7 +22,6 @@ from tactile_rt.models.alignment.benchmark import (
     Target,
 )
 from tactile_rt.models.alignment.rdm import PAIRS, STIMULI
-from tactile_rt.stream import ConfigError
 
 __all__ = ["benchmark_sha256", "load_benchmark", "load_strict", "save_benchmark"]
 

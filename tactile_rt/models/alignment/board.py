@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.models.alignment.datasets import NeuralDataset
 from tactile_rt.models.alignment.layers import Layers
@@ -21,7 +22,6 @@ from tactile_rt.models.alignment.neural import Animal
 from tactile_rt.models.alignment.statistics import held_out, standard_error
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.models.alignment.targets import part_of
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "ANOTHER",

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.benchmark import PROTOCOLS, Benchmark
 from tactile_rt.models.alignment.clock import CLOCKS, WARNING, ContactResponse, said_of
 from tactile_rt.models.alignment.copies import refuse_copies
@@ -15,7 +16,6 @@ from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.reliability import BOOTSTRAPS, SEED
 from tactile_rt.models.alignment.selection import Selection
 from tactile_rt.models.alignment.strict import freeze_strict
-from tactile_rt.stream import ConfigError
 
 __all__ = ["build", "checked_sessions"]
 

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.neural import NeuralSession
-from tactile_rt.stream import ConfigError
 
 __all__ = ["refuse_copies"]
 

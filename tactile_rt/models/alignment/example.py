@@ -17,9 +17,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
 from tactile_rt.models.alignment.rdm import DISTANCES, SHAPES, STIMULI
-from tactile_rt.stream import ConfigError
 
 __all__ = ["MODELS", "Brain", "example_models"]
 

@@ -6,11 +6,11 @@ from itertools import count
 from pathlib import Path
 
 from tactile_rt.classifier.model_file import read_model
+from tactile_rt.errors import ConfigError, ModelError
 from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.responses_file import RESPONSES, responses_layers
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.models.checkpoint_files import describe_checkpoint
-from tactile_rt.stream import ConfigError, ModelError
 
 __all__ = ["check_models", "load_layers", "load_untrained", "told_apart"]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.rdm import STIMULI
-from tactile_rt.stream import ConfigError
 
 __all__ = ["Animal", "NeuralSession", "by_animal", "pad", "published_layout", "rates_sha256"]
 

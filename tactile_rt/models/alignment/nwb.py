@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.extras import lacking
 from tactile_rt.models.alignment.clock import CLOCKS, ContactResponse, contact_response
 from tactile_rt.models.alignment.neural import NeuralSession
@@ -41,7 +42,6 @@ from tactile_rt.models.alignment.nwb_parts import (
 )
 from tactile_rt.models.alignment.rdm import DISTANCES, SHAPES, stimulus_index
 from tactile_rt.models.alignment.selection import Selection
-from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     import h5py

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.selection import TASKS
-from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     import h5py

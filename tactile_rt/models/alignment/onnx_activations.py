@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.model_file import ModelCard, load_model
 from tactile_rt.classifier.runtime import FlushDenormals
+from tactile_rt.errors import ModelError, TactileError
 from tactile_rt.models.alignment.layers import Layers, first_difference, table
 from tactile_rt.models.alignment.onnx_taps import (
     GRU_LAYERS,
@@ -28,7 +29,6 @@ from tactile_rt.models.alignment.onnx_taps import (
     step_graph,
 )
 from tactile_rt.models.alignment.stimuli_input import STEPS, StimuliInput
-from tactile_rt.stream import ModelError, TactileError
 
 __all__ = ["nearest_taps", "onnx_layers", "with_outputs"]
 

@@ -24,6 +24,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.models.alignment.neural import pad, rates_sha256
 from tactile_rt.models.alignment.rdm import STIMULI, pearson, rdm
@@ -37,7 +38,6 @@ from tactile_rt.models.alignment.reliability import (
     split_half,
     trial_mean,
 )
-from tactile_rt.stream import ConfigError
 
 __all__ = ["POOLED", "freeze_paper_code"]
 

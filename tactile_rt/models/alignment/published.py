@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.rdm import STIMULI
-from tactile_rt.stream import ConfigError
 
 __all__ = ["read_published", "write_published"]
 

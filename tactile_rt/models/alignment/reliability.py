@@ -11,8 +11,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.rdm import pearson, rdm
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "BOOTSTRAPS",

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.layers import PARTS, Layers
 from tactile_rt.models.alignment.rdm import STIMULI
-from tactile_rt.stream import ConfigError
 
 __all__ = ["RESPONSES", "responses_layers"]
 

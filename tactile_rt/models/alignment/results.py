@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.models.alignment.benchmark import Benchmark
 from tactile_rt.models.alignment.benchmark_file import benchmark_sha256
@@ -17,7 +18,6 @@ from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, normalised, rdm
 from tactile_rt.models.alignment.scoring import Score, score
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "AlignmentControl",

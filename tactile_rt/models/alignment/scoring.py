@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.benchmark import Benchmark
 from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, pearson, rdm
 from tactile_rt.models.alignment.statistics import (
@@ -15,7 +16,6 @@ from tactile_rt.models.alignment.statistics import (
     mean_held_out,
     standard_error,
 )
-from tactile_rt.stream import ConfigError
 
 __all__ = ["Score", "layer_rdms", "score", "score_rdms"]
 

@@ -19,13 +19,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.models.alignment.canonical import canonical
 from tactile_rt.models.alignment.neural import Animal, NeuralSession, rates_sha256
 from tactile_rt.models.alignment.pooling import Moments, moments_of
 from tactile_rt.models.alignment.rdm import CONSTANT, STIMULI, normalised, pearson
 from tactile_rt.models.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "MINIMUM_RELIABILITY",

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
 from tactile_rt.models.alignment.selection import CELLS, LAYERS_UM
 from tactile_rt.settings import no_such
-from tactile_rt.stream import ConfigError
 
 __all__ = ["TARGET_PARTS", "part_of"]
 

@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from tactile_rt import extensions
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.encoders.convolution import Convolution, convolve
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "CELLS",

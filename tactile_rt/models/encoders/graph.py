@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.ead_config import CELLS, added_cells
-from tactile_rt.stream import ConfigError
 
 __all__ = ["FUSIONS", "KINDS", "Edge", "Graph", "Input", "Node"]
 

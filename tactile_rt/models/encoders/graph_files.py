@@ -20,9 +20,9 @@ from pathlib import Path
 
 import msgspec
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
 from tactile_rt.settings import SettingNode, convert, parse_toml, read_toml
-from tactile_rt.stream import ConfigError
 
 __all__ = ["parse_graph", "read_graph"]
 

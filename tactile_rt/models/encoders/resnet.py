@@ -12,8 +12,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.ead_config import MOUSE_FRAME
-from tactile_rt.stream import ConfigError
 
 __all__ = ["FoldedResNet18", "ResNet18Encoder"]
 

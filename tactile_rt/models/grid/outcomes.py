@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.models.grid.plan import OF_UNTRAINED, SUPERVISED, Grid, Task
 from tactile_rt.models.training.config import TrainingConfig
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "POINT",

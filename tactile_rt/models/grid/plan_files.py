@@ -3,10 +3,10 @@
 from importlib import resources
 from pathlib import Path
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.grid.plan import Candidate, Grid, Task
 from tactile_rt.models.training.config import ProbeConfig
 from tactile_rt.settings import convert, make_node, parse_toml, read_toml
-from tactile_rt.stream import ConfigError
 
 __all__ = ["read_grid", "shipped_grids"]
 

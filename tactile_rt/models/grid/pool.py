@@ -13,12 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from tactile_rt.errors import TactileError
 from tactile_rt.locks import alone_in
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.grid.outcomes import SUBSET, TESTED, Outcome, waiting_tasks, write_tested
 from tactile_rt.models.grid.plan import Grid, SweepCounts, Task
 from tactile_rt.models.grid.work import Workbench
-from tactile_rt.stream import TactileError
 from tactile_rt.sweep_set import (
     SET_VERSION,
     SPLITS,

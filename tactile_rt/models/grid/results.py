@@ -9,11 +9,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.models.evaluation import Interval, accuracy
 from tactile_rt.models.grid.outcomes import Outcome, Training, read_outcome, read_tested
 from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid, Growth
-from tactile_rt.stream import ConfigError
 
 __all__ = ["Answer", "GridResults", "Row", "gather", "put_into", "table", "write_results"]
 

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.datasets import NOISE_LEVELS, SweepSet, windows
 from tactile_rt.models.implausible import IMPLAUSIBLE
-from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     from torch import Tensor

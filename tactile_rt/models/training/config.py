@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
 
+from tactile_rt.errors import ConfigError, ModelError
 from tactile_rt.models.data_checks import check_labelled, check_split
 from tactile_rt.models.datasets import frame_of
 from tactile_rt.models.ead_config import MOUSE_FRAME, READOUTS, EADConfig
 from tactile_rt.sensor_faults import SensorFaults
-from tactile_rt.stream import ConfigError, ModelError
 from tactile_rt.sweep_set import SweepManifest, join_manifests
 
 __all__ = [

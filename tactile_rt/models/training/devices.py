@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.training.config import TrainingConfig
-from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     from lightning.fabric import Fabric

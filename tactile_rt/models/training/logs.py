@@ -10,9 +10,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from tactile_rt.errors import ConfigError, ModelError
 from tactile_rt.extras import install_line
 from tactile_rt.files import replaced
-from tactile_rt.stream import ConfigError, ModelError
 
 __all__ = ["Board", "log_epoch", "logged_epochs"]
 

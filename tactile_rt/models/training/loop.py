@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 import torch
 
+from tactile_rt.errors import RecordingError
 from tactile_rt.locks import alone_in
 from tactile_rt.models.augmentation import build
 from tactile_rt.models.checkpoint_files import describe_checkpoint
@@ -49,7 +50,6 @@ from tactile_rt.models.training.optimizers import build_optimizer
 from tactile_rt.models.training.replay import batch_loss
 from tactile_rt.models.training.resuming import RunState, as_json, begin_run
 from tactile_rt.models.training.validation import Validation
-from tactile_rt.stream import RecordingError
 from tactile_rt.sweep_set import OUTLIERS
 
 if TYPE_CHECKING:

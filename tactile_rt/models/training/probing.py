@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.locks import alone_in
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on, save_whole
 from tactile_rt.models.data_checks import (
@@ -28,7 +29,6 @@ from tactile_rt.models.training.batches import JITTER, TrainingBatches
 from tactile_rt.models.training.config import ProbeConfig, Progress
 from tactile_rt.models.training.logs import log_epoch
 from tactile_rt.models.training.recipes import as_options, training_command
-from tactile_rt.stream import ConfigError
 
 __all__ = ["linear_probe", "probe"]
 

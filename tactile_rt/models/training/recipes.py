@@ -21,6 +21,7 @@ from typing import Any
 
 import msgspec
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.checkpoint_files import NETWORK
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.sensor_faults import SensorFaults
@@ -34,7 +35,6 @@ from tactile_rt.settings import (
     read_toml,
     set_keys,
 )
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "Recipe",

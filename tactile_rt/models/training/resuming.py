@@ -13,13 +13,13 @@ import msgspec
 import torch
 from torch.optim.lr_scheduler import LRScheduler
 
+from tactile_rt.errors import ConfigError, ModelError
 from tactile_rt.files import write_whole
 from tactile_rt.models.checkpoint_files import describe_checkpoint, reason
 from tactile_rt.models.objectives import Objective
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.logs import logged_epochs
 from tactile_rt.models.training.optimizers import build_schedule
-from tactile_rt.stream import ConfigError, ModelError
 
 __all__ = ["RunState", "as_json", "begin_run"]
 

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.augmentation import Augmentation, Loads
 from tactile_rt.models.checkpoints import run_on
 from tactile_rt.models.datasets import SweepSet, windows
@@ -16,7 +17,6 @@ from tactile_rt.models.objectives import Objective
 from tactile_rt.models.training.batches import partners
 from tactile_rt.models.training.config import TWO_SWEEPS, TrainingConfig
 from tactile_rt.models.training.feeding import Share, generator_of
-from tactile_rt.stream import ConfigError
 
 __all__ = ["Validation"]
 

@@ -18,6 +18,7 @@ import numpy as np
 from tactile_rt.classifier.array_file import read_array
 from tactile_rt.drivers.codecs.column_guess import guess_columns
 from tactile_rt.drivers.codecs.column_words import compress_columns
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.files import open_regular
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.account import Import, clock_of, write_chunks
@@ -29,7 +30,7 @@ from tactile_rt.recording.records import MAGIC
 from tactile_rt.recording.ros2_form import ARRAY
 from tactile_rt.ros2 import messages
 from tactile_rt.settings import nearest
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError, RecordingError, concatenate
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 
 __all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag", "proposed_columns"]
 

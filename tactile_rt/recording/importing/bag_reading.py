@@ -19,10 +19,11 @@ from typing import Any, BinaryIO, Final
 
 import msgspec
 
+from tactile_rt.errors import RecordingError
 from tactile_rt.extras import lacking
 from tactile_rt.files import open_regular
 from tactile_rt.recording.records import MAGIC
-from tactile_rt.stream import NS_PER_S, RecordingError
+from tactile_rt.stream import NS_PER_S
 
 __all__ = ["ROS1", "OpenBag", "open_bag"]
 

@@ -19,8 +19,8 @@ from typing import Any, Final
 
 from tactile_rt.drivers.codecs.ascii_text import fields, in_seconds, number
 from tactile_rt.drivers.logs import open_log_file
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording.importing.table import Table
-from tactile_rt.stream import ConfigError, RecordingError
 
 __all__ = ["CsvForm", "csv_form", "read_table"]
 

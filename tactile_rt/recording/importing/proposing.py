@@ -8,8 +8,8 @@ from tactile_rt.drivers.codecs.ascii_text import in_seconds, number
 from tactile_rt.drivers.codecs.column_guess import LOOKED_AT, guess_columns, guess_line_columns
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.drivers.opening import make_codec
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording.importing.csv import CsvForm, csv_form, read_table
-from tactile_rt.stream import ConfigError, RecordingError
 
 __all__ = ["ProposedColumns", "line_columns", "propose_columns", "propose_line_columns"]
 

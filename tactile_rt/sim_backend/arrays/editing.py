@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings import find_lines, parse_toml
-from tactile_rt.stream import ConfigError
 
 __all__ = ["Edit", "edited", "rounded"]
 

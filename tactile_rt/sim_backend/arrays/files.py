@@ -33,6 +33,7 @@ from typing import Any
 import msgspec
 
 from tactile_rt import extensions
+from tactile_rt.errors import ConfigError
 from tactile_rt.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec
 from tactile_rt.settings import (
     SettingNode,
@@ -56,7 +57,6 @@ from tactile_rt.sim_backend.arrays.whisker_array import (
     place,
 )
 from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, REQUIRED, TURN, Whisker
-from tactile_rt.stream import ConfigError
 
 __all__ = ["load_animals", "load_array", "read_animals"]
 

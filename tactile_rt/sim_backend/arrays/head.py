@@ -6,8 +6,8 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.whisker_array import HEAD_FILES
-from tactile_rt.stream import ConfigError
 
 __all__ = ["HEAD_BIT", "add_head"]
 

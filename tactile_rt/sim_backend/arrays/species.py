@@ -12,6 +12,7 @@ from importlib import resources
 import numpy as np
 
 from tactile_rt import extensions
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.robots import ROBOTS
 from tactile_rt.sim_backend.arrays.whisker_array import (
     MOUNT,
@@ -22,7 +23,6 @@ from tactile_rt.sim_backend.arrays.whisker_array import (
     mirrored,
 )
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
-from tactile_rt.stream import ConfigError
 
 __all__ = ["SIDES", "SPECIES", "mouse_whiskers", "rat_whiskers", "species_array"]
 

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "MOUNT",

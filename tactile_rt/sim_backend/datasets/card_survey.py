@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import RecordingError
 from tactile_rt.sim_backend.datasets.separability import (
     Features,
     Fit,
@@ -18,7 +19,6 @@ from tactile_rt.sim_backend.datasets.separability import (
     check_separability,
     window_features,
 )
-from tactile_rt.stream import RecordingError
 from tactile_rt.sweep_set import SweepManifest, has_object, read_object, read_skipped
 
 __all__ = ["Card", "survey"]

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from tactile_rt.errors import RecordingError
 from tactile_rt.files import write_whole
-from tactile_rt.stream import RecordingError
 from tactile_rt.sweep_set import (
     MANIFEST,
     SKIPPED,

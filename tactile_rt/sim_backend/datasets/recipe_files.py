@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import msgspec
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.settings import (
     SettingNode,
@@ -37,7 +38,6 @@ from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import usual_distance
 from tactile_rt.sim_backend.transducer import device_spec
-from tactile_rt.stream import ConfigError
 from tactile_rt.timing import STEP_MS, Timing
 
 __all__ = [

@@ -33,6 +33,7 @@ from typing import Any
 
 import numpy as np
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.settings import no_such
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
@@ -40,7 +41,6 @@ from tactile_rt.sim_backend.randomisation import Randomisation
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "GENERATED",

@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.environments.whisking_head import Stretch, WhiskingHead, place_beside
@@ -18,7 +19,7 @@ from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import usual_distance, usual_size
 from tactile_rt.sim_backend.whisking_drive import Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
-from tactile_rt.stream import Chunk, ConfigError, SourceError
+from tactile_rt.stream import Chunk
 
 __all__ = ["KINDS", "LOGITS", "MOTION", "ActiveWhisking"]
 

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tactile_rt.errors import ConfigError, SpecMismatch
 from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.settings import parse_toml, read_text, read_toml
 from tactile_rt.sim_backend.arrays.editing import edited
@@ -17,7 +18,7 @@ from tactile_rt.sim_backend.measuring.gains import KnownLoad, compare_gain, read
 from tactile_rt.sim_backend.measuring.measured import measure
 from tactile_rt.sim_backend.measuring.mechanics import compare_whiskers
 from tactile_rt.sim_backend.transducer import device_spec
-from tactile_rt.stream import ArraySpec, Chunk, ConfigError, SpecMismatch
+from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = ["Fitted", "fit_array", "read_described"]
 

@@ -13,13 +13,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.sim_backend.arrays.editing import Edit, rounded
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.measuring.findings import SIGMAS, ArrayFinding, Figure, about, pooled
 from tactile_rt.sim_backend.measuring.resting import Rest
 from tactile_rt.sim_backend.transducer import Transducer
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.stream import Chunk
 
 __all__ = ["KnownLoad", "compare_gain", "readings"]
 

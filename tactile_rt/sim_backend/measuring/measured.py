@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.measuring.findings import SIGMAS, Figure
 from tactile_rt.sim_backend.measuring.resting import Rest, find_rest
 from tactile_rt.sim_backend.measuring.ringing import Ring, find_swings, fit_ring
-from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, ConfigError
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
 __all__ = ["Measured", "measure"]
 

@@ -16,6 +16,7 @@ import numpy as np
 import trimesh
 
 from tactile_rt import extensions
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh
@@ -29,7 +30,6 @@ from tactile_rt.sim_backend.objects.shapes import (
 )
 from tactile_rt.sim_backend.objects.shapes import varied as varied_shapes
 from tactile_rt.sim_backend.objects.solids import TactileObject, normalised, stretched
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "CATEGORIES",

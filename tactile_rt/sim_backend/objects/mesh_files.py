@@ -10,8 +10,8 @@ from urllib.parse import unquote
 import numpy as np
 import trimesh
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.objects.mesh_limits import check_mesh_content
-from tactile_rt.stream import ConfigError
 
 __all__ = ["MESH_SUFFIXES", "check_mesh_file", "mesh_content", "read_parts", "read_triangles"]
 

@@ -35,12 +35,12 @@ from urllib.parse import quote
 import msgspec
 from trimesh.exchange.ply import export_ply
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.settings import check_columns, convert, no_such, read_csv
 from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
 from tactile_rt.sim_backend.objects.mesh_files import read_parts
 from tactile_rt.sim_backend.objects.object_sets import FOLDER_TABLE, Origin
-from tactile_rt.stream import ConfigError
 
 __all__ = [
     "ListedFile",

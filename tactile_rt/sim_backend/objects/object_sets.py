@@ -22,12 +22,12 @@ from pathlib import Path
 
 import msgspec
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.settings import check_columns, convert, read_csv
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.solids import TactileObject
-from tactile_rt.stream import ConfigError
 
 __all__ = ["FOLDER_TABLE", "ObjectSet", "Origin", "SetReport", "open_objects"]
 

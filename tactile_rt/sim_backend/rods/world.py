@@ -9,13 +9,13 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from tactile_rt.errors import SourceError
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.rods.chains import Chain
 from tactile_rt.sim_backend.rods.rod import make_rod
 from tactile_rt.sim_backend.rods.stepping import RodState, RowBounds, advance
 from tactile_rt.sim_backend.rods.touching import Object, Segments, unseen
 from tactile_rt.sim_backend.world import JAMMED, SAMPLE_MS
-from tactile_rt.stream import SourceError
 
 __all__ = ["Piece", "RodWorld"]
 

@@ -14,11 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.views.camera import Camera
 from tactile_rt.sim_backend.views.footage import Footage
 from tactile_rt.sim_backend.views.scale import ForceScale
 from tactile_rt.sim_backend.world import OBJECT_BIT
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.stream import ArraySpec
 
 __all__ = ["Dressed", "Stage", "add_forces", "add_paper", "has_display"]
 

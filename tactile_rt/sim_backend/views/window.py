@@ -5,11 +5,11 @@ import warnings
 
 import mujoco
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.views.camera import Camera
 from tactile_rt.sim_backend.views.footage import Footage
 from tactile_rt.sim_backend.views.scale import ForceScale
 from tactile_rt.sim_backend.views.stage import Dressed, add_forces, add_paper, has_display
-from tactile_rt.stream import ConfigError
 
 __all__ = ["check_display", "show"]
 

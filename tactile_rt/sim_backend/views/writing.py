@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
-from tactile_rt.stream import ConfigError
 
 __all__ = ["IMAGES", "VIDEOS", "check_suffix", "write_image", "write_video"]
 

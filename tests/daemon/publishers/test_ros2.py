@@ -16,7 +16,7 @@ from bench.daemon.ros2 import BAR_MS, free_domain, measure
 from tactile_rt.daemon.items import SourceChunk
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.publishers.ros2 import Ros2Options, Ros2Publisher
-from tactile_rt.stream import ConfigError, SourceError
+from tactile_rt.errors import ConfigError, SourceError
 from tests.helpers.published import (
     FORCES,
     UTC,

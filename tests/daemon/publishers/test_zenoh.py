@@ -10,7 +10,7 @@ import zenoh
 
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions, ZenohPublisher
-from tactile_rt.stream import ConfigError, SourceError
+from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.testing import small_spec
 from tests.helpers.published import (
     View,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.drivers.codecs.anyskin import AnySkin, AnySkinOptions
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import (
     T0,
     CodecCase,

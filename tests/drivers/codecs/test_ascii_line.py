@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.ascii_line import AsciiLine, AsciiLineOptions
 from tactile_rt.drivers.codecs.ascii_mapping import UNITS
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import (
     T0,
     CodecCase,

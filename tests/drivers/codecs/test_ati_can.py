@@ -7,7 +7,7 @@ import pytest
 
 from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.ati_can import AtiCan, AtiCanOptions
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 RESOLUTION = [290 / 32767 / 2] * 3 + [10 / 32767 / 2] * 3

@@ -10,8 +10,8 @@ from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.binary_frame import BinaryFrame, BinaryFrameOptions
 from tactile_rt.drivers.codecs.optoforce import OptoForceOptions, OptoForceSerial
 from tactile_rt.drivers.emulation.device import EmulatedSerial
+from tactile_rt.errors import ConfigError
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import ConfigError
 from tactile_rt.testing import ArraySource, cut
 from tests.helpers.codec_contract import (
     T0,

@@ -7,7 +7,8 @@ import pytest
 
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.bota import Bota, BotaOptions
-from tactile_rt.stream import Chunk, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import Chunk
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 # By hand from the format: AA, status 0, the loads 1, -2, 0.5, -0.25, 0.125 and 4, 305419896 us,

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from tactile_rt.drivers.codecs.ascii_line import AsciiLine, AsciiLineOptions
 from tactile_rt.drivers.codecs.column_words import compress_columns, expand_columns
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 
 @pytest.mark.parametrize(

@@ -5,8 +5,9 @@ import struct
 import numpy as np
 import pytest
 
-from tactile_rt.drivers.codec import CODECS, Command
-from tactile_rt.drivers.codecs.binary_frame import FRAMES, DescribedFrame, FrameOptions, frame_codec
+from tactile_rt.drivers.catalogue import CODECS, FRAMES
+from tactile_rt.drivers.codec import Command
+from tactile_rt.drivers.codecs.binary_frame import DescribedFrame, FrameOptions, frame_codec
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of
 
 DRAW = np.random.default_rng(4)

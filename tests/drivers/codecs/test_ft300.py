@@ -5,7 +5,7 @@ import pytest
 
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.ft300 import Ft300, Ft300Options
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 

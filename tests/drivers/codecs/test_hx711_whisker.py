@@ -8,7 +8,7 @@ import pytest
 
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.hx711_whisker import Hx711Whisker, Hx711WhiskerOptions
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import (
     T0,
     CodecCase,

@@ -5,7 +5,7 @@ import pytest
 
 from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.icub_skin import IcubSkin, IcubSkinOptions
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 

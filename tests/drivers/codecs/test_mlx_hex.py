@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.drivers.codecs.mlx_hex import MlxHex, MlxHexOptions
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import (
     T0,
     CodecCase,

@@ -9,7 +9,7 @@ import pytest
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_common import MessageType
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tactile_rt.testing import small_spec
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of
 

@@ -10,7 +10,8 @@ import pytest
 from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.native_can import NativeCan, NativeCanOptions
 from tactile_rt.drivers.codecs.native_common import DeviceDescription
-from tactile_rt.stream import ArraySpec, ConfigError
+from tactile_rt.errors import ConfigError
+from tactile_rt.stream import ArraySpec
 from tactile_rt.testing import small_spec
 from tests.helpers.codec_contract import (
     T0,

@@ -10,7 +10,7 @@ from tactile_rt.drivers.codecs.optoforce import (
     OptoForceOptions,
     OptoForceSerial,
 )
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import (
     T0,
     CodecCase,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.drivers.codecs.ascii_line import AsciiLine, AsciiLineOptions
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract
 
 nan = np.nan

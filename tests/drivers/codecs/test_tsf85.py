@@ -7,7 +7,7 @@ import pytest
 
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.tsf85 import Tsf85, Tsf85Options
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 # By hand from the format: taxel k of finger 0 counts k, of finger 1 256 + k; then one packet with

@@ -22,7 +22,8 @@ from tactile_rt.drivers.emulation.endpoints import BusEndpoint, SerialEndpoint, 
 from tactile_rt.drivers.emulation.faults import Fate, Fault, FaultSchedule
 from tactile_rt.drivers.emulation.transmitter import fit
 from tactile_rt.drivers.slcan import SlcanDecoder, encode, opening
-from tactile_rt.stream import Chunk, ConfigError, EndOfStream, Source, SourceError
+from tactile_rt.errors import ConfigError, SourceError
+from tactile_rt.stream import Chunk, EndOfStream, Source
 from tactile_rt.testing import ArraySource, FakeCan, FakeSerial, cut, small_spec
 from tactile_rt.testing.fixtures import fake_can, fake_serial  # noqa: F401
 from tests.helpers.waiting import PATIENCE_S, until

@@ -15,7 +15,7 @@ from tactile_rt.drivers.emulation.faults import (
     damaged,
     read_faults,
 )
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 RATE = 1000
 

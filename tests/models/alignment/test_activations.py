@@ -8,6 +8,7 @@ torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
 from tactile_rt.classifier.model_file import load_model, read_model, shipped_model  # noqa: E402
+from tactile_rt.errors import ConfigError, ModelError  # noqa: E402
 from tactile_rt.models.alignment.activations import (  # noqa: E402
     network_layers,
     reach,
@@ -24,7 +25,6 @@ from tactile_rt.models.checkpoints import TactileClassifier  # noqa: E402
 from tactile_rt.models.ead import EADConfig  # noqa: E402
 from tactile_rt.models.encoders.graph_encoder import draw_as_published  # noqa: E402
 from tactile_rt.models.encoders.zhuang import zhuang_graph  # noqa: E402
-from tactile_rt.stream import ConfigError, ModelError  # noqa: E402
 from tests.helpers.source_tree import ROOT  # noqa: E402
 
 FELT = read_stimuli()

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment import benchmark_sha256, load_benchmark, save_benchmark, score
 from tactile_rt.models.alignment.benchmark import Consistency, Frozen
 from tactile_rt.models.alignment.strict import freeze_strict
-from tactile_rt.stream import ConfigError
 from tests.helpers.brains import animals
 
 SHORT = Frozen(np.ones(3), 1.0, 1.0, 9)

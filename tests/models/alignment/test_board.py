@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment import board as boards
 from tactile_rt.models.alignment.board import (
     ANOTHER,
@@ -25,7 +26,6 @@ from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.metrics import find_metric
 from tactile_rt.models.alignment.metrics.geometry import NOTHING
 from tactile_rt.models.alignment.stimuli_input import read_stimuli
-from tactile_rt.stream import ConfigError
 from tests.helpers import brains
 
 METRICS = ("rsa", "cka")

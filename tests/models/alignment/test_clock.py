@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment import build
 from tactile_rt.models.alignment.clock import contact_response
 from tactile_rt.models.alignment.neural import by_animal
 from tactile_rt.models.alignment.nwb import find_nwb, read_nwb
 from tactile_rt.models.alignment.strict import freeze_strict
-from tactile_rt.stream import ConfigError
 from tests.helpers.nwb_sessions import ORIGIN_S, write_animals
 
 pytest.importorskip("h5py", reason="h5py reads the files")

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.example import MODELS, Brain, example_models
 from tactile_rt.models.alignment.example_files import BEGIN_S, write_example
 from tactile_rt.models.alignment.loading import check_models, load_layers
 from tactile_rt.models.alignment.rdm import rsa
-from tactile_rt.stream import ConfigError
 
 h5py = pytest.importorskip("h5py")
 SMALL = Brain(mice=2, sessions=1, units=6, trials=5)

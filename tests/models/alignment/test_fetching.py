@@ -6,12 +6,12 @@ import re
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.datasets import fetching, ranges
 from tactile_rt.models.alignment.datasets.fetching import PublishedFile, fetch, published_files
 from tactile_rt.models.alignment.example import Brain
 from tactile_rt.models.alignment.example_files import write_example
 from tactile_rt.models.alignment.nwb import CLOCKS, WINDOWS, read_session
-from tactile_rt.stream import ConfigError
 from tests.helpers.archive import Archive
 
 h5py = pytest.importorskip("h5py", reason="h5py reads the files")

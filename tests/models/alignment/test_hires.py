@@ -5,10 +5,10 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.datasets import find_dataset
 from tactile_rt.models.alignment.metrics import find_metric
 from tactile_rt.models.alignment.stimuli_input import read_stimuli
-from tactile_rt.stream import ConfigError
 
 pytest.importorskip("pynwb")
 pytest.importorskip("h5py")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bench.align import oracles
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.metrics import (
     METRICS,
     MINIMUM_CEILING,
@@ -17,7 +18,6 @@ from tactile_rt.models.alignment.metrics.linear import predicted
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
 from tactile_rt.models.alignment.selection import LAYERS_UM
 from tactile_rt.models.alignment.targets import part_of
-from tactile_rt.stream import ConfigError
 from tests.helpers import brains
 
 NAMES = tuple(METRICS)

@@ -6,10 +6,10 @@ from datetime import UTC, datetime
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment import build, nwb
 from tactile_rt.models.alignment.clock import CLOCKS
 from tactile_rt.models.alignment.rdm import STIMULI
-from tactile_rt.stream import ConfigError
 
 h5py = pytest.importorskip("h5py", reason="h5py reads the files")
 pynwb = pytest.importorskip("pynwb", reason="pynwb writes the files and is the oracle")

@@ -7,6 +7,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment import load_benchmark
 from tactile_rt.models.alignment.board import read_board
 from tactile_rt.models.alignment.layers import Layers
@@ -19,7 +20,6 @@ from tactile_rt.models.alignment.results import (
 )
 from tactile_rt.models.alignment.stimuli_input import SHIPPED, read_stimuli
 from tactile_rt.models.alignment.strict import freeze_strict
-from tactile_rt.stream import ConfigError
 from tests.helpers import brains
 
 FELT = read_stimuli()

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.benchmark_file import load_benchmark, save_benchmark
 from tactile_rt.models.alignment.canonical import canonical
 from tactile_rt.models.alignment.example import Brain
@@ -16,7 +17,6 @@ from tactile_rt.models.alignment.paper_code import freeze_paper_code
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.scoring import score, score_rdms
 from tactile_rt.models.alignment.strict import divided, freeze_strict
-from tactile_rt.stream import ConfigError
 from tests.helpers.brains import animals, geometry, loop, padded, responses, session
 
 BOOTSTRAPS = 200

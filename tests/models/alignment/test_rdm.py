@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.rdm import (
     STIMULI,
     pearson,
@@ -12,7 +13,6 @@ from tactile_rt.models.alignment.rdm import (
     square,
     stimulus_index,
 )
-from tactile_rt.stream import ConfigError
 
 
 def test_an_rdm_is_one_minus_the_correlations_above_the_diagonal():

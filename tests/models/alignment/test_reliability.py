@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.benchmark import Consistency
 from tactile_rt.models.alignment.rdm import pearson, rdm
 from tactile_rt.models.alignment.reliability import (
@@ -16,7 +17,6 @@ from tactile_rt.models.alignment.reliability import (
     split_half,
     trial_mean,
 )
-from tactile_rt.stream import ConfigError
 from tests.helpers.brains import geometry, loop, padded
 
 PUBLISHED = Path(__file__).parent / "data" / "published_model_input.npz"

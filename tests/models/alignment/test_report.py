@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.gate import neural_checks
 from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.pictures import (
@@ -31,7 +32,6 @@ from tactile_rt.models.alignment.results import (
 )
 from tactile_rt.models.alignment.stimuli_input import read_stimuli
 from tactile_rt.models.alignment.strict import freeze_strict
-from tactile_rt.stream import ConfigError
 from tests.helpers import brains
 
 ALONE = {"meta", "line", "rect", "circle", "polyline", "br"}

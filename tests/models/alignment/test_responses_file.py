@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.responses_file import responses_layers
-from tactile_rt.stream import ConfigError
 
 RNG = np.random.default_rng(0)
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment import build
 from tactile_rt.models.alignment.copies import refuse_copies
 from tactile_rt.models.alignment.neural import NeuralSession
 from tactile_rt.models.alignment.nwb import read_nwb, read_session
 from tactile_rt.models.alignment.selection import Selection
-from tactile_rt.stream import ConfigError
 from tests.helpers import brains
 from tests.helpers.nwb_sessions import write_animals, write_session
 

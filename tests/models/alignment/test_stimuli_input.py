@@ -9,13 +9,13 @@ pytest.importorskip("onnx")
 import onnx
 
 from tactile_rt.classifier.model_file import METADATA_KEY, read_model, shipped_model
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.activations import (
     checkpoint_layers,
     untrained_card_layers,
 )
 from tactile_rt.models.alignment.onnx_activations import onnx_layers
 from tactile_rt.models.alignment.stimuli_input import read_stimuli
-from tactile_rt.stream import ConfigError
 from tests.helpers.source_tree import ROOT
 
 FELT = read_stimuli()

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 from tactile_rt.models.encoders.graph_files import parse_graph, read_graph
 from tactile_rt.models.encoders.zhuang import GRAPH
-from tactile_rt.stream import ConfigError
 from tests.helpers.small_networks import TOLERANCE, frames, stir, stream
 
 TEXT = """

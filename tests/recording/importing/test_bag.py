@@ -8,12 +8,13 @@ import sys
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError, RecordingError, TactileError
 from tactile_rt.recording import Recording
 from tactile_rt.recording.importing.bag import bag_topics, import_bag, is_bag, proposed_columns
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.ros2 import messages
 from tactile_rt.ros2.definitions import schema_text
-from tactile_rt.stream import ConfigError, RecordingError, TactileError, concatenate
+from tactile_rt.stream import concatenate
 from tactile_rt.testing import cut, small_spec
 
 rosbags = pytest.importorskip("rosbags")

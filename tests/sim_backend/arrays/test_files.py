@@ -17,6 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays import head as head_module
 from tactile_rt.sim_backend.arrays.files import load_animals, load_array, read_animals
 from tactile_rt.sim_backend.arrays.head import HEAD_BIT, add_head
@@ -42,7 +43,6 @@ from tactile_rt.sim_backend.world import (
     set_damping,
 )
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import ConfigError
 from tests.helpers.source_tree import ROOT
 
 Floats = NDArray[np.float64]

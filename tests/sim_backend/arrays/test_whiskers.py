@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers, rat_whiskers
 from tactile_rt.sim_backend.arrays.whiskers import (
     OPTIONAL,
@@ -17,7 +18,6 @@ from tactile_rt.sim_backend.arrays.whiskers import (
     keratin_radii,
     rotation,
 )
-from tactile_rt.stream import ConfigError
 
 WHISKERS = {w.name: w for w in mouse_whiskers()}
 every = pytest.mark.parametrize("whisker", WHISKERS.values(), ids=WHISKERS)

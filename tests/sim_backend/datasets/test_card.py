@@ -11,6 +11,7 @@ pytest.importorskip("sklearn")
 
 from matplotlib.image import imread
 
+from tactile_rt.errors import RecordingError
 from tactile_rt.models.svm import fit
 from tactile_rt.sensor_spec import channel_limits
 from tactile_rt.sim_backend.datasets import separability
@@ -21,7 +22,6 @@ from tactile_rt.sim_backend.datasets.separability import (
     check_separability,
     window_features,
 )
-from tactile_rt.stream import RecordingError
 from tactile_rt.sweep_set import SweepManifest, write_object, write_skipped
 from tactile_rt.testing import small_spec
 

@@ -17,6 +17,7 @@ pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
 from tactile_rt.classifier.timebase import Resampler
+from tactile_rt.errors import ConfigError, RecordingError, SourceError, TactileError
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.datasets import dataset
 from tactile_rt.sim_backend.datasets.dataset import (
@@ -41,7 +42,6 @@ from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, UNITS
-from tactile_rt.stream import ConfigError, RecordingError, SourceError, TactileError
 from tactile_rt.sweep_set import (
     SPLITS,
     SweepManifest,

@@ -7,8 +7,8 @@ import pytest
 
 pytest.importorskip("mujoco")
 
+from tactile_rt.errors import RecordingError
 from tactile_rt.sim_backend.datasets.inventory import Tally, tally
-from tactile_rt.stream import RecordingError
 from tactile_rt.sweep_set import object_path, write_object, write_skipped
 
 

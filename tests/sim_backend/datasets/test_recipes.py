@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import (
@@ -33,7 +34,6 @@ from tactile_rt.sim_backend.datasets.recipes import (
 )
 from tactile_rt.sim_backend.objects import catalogue as objects
 from tactile_rt.sim_backend.sweep import Sweep
-from tactile_rt.stream import ConfigError
 from tactile_rt.sweep_set import WITHHELD
 
 

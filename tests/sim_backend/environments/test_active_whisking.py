@@ -12,12 +12,12 @@ pytest.importorskip("gymnasium")
 import gymnasium
 from gymnasium.utils.env_checker import check_env
 
+from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.sim_backend.environments import ENVIRONMENT, WHISKERS
 from tactile_rt.sim_backend.environments.active_whisking import KINDS, LOGITS, ActiveWhisking
 from tactile_rt.sim_backend.environments.whisking_head import WhiskingHead, place_beside
 from tactile_rt.sim_backend.whisking_drive import LAG_S, Whisking
 from tactile_rt.sim_backend.world import PROFILES
-from tactile_rt.stream import ConfigError, SourceError
 
 
 def few(**how: object) -> ActiveWhisking:

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("trimesh")
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.objects.catalogue import (
     CATEGORIES,
     OUTLIERS,
@@ -19,7 +20,6 @@ from tactile_rt.sim_backend.objects.catalogue import (
     make_object,
 )
 from tactile_rt.sim_backend.objects.solids import bar, box, normalised, rod, wall
-from tactile_rt.stream import ConfigError
 from tests.helpers.source_tree import ROOT
 
 KINDS = CATEGORIES + WITHHELD

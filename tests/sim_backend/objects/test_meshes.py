@@ -9,13 +9,13 @@ pytest.importorskip("trimesh")
 
 import trimesh
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.objects import mesh_files
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object, make_object
 from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh
 from tactile_rt.sim_backend.objects.solids import box
-from tactile_rt.stream import ConfigError
 from tests.helpers import mesh_truth
 
 Z_UP_TO_Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, -1.0, 0, 0], [0, 0, 0, 1.0]])

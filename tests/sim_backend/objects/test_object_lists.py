@@ -15,6 +15,7 @@ pytest.importorskip("manifold3d")
 
 import trimesh
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.objects import object_lists
@@ -26,7 +27,6 @@ from tactile_rt.sim_backend.objects.object_lists import (
 )
 from tactile_rt.sim_backend.objects.object_sets import open_objects
 from tactile_rt.sim_backend.objects.solids import box
-from tactile_rt.stream import ConfigError
 
 COLUMNS = ListedFile.__struct_fields__
 COMMIT = "0123456789abcdef0123456789abcdef01234567"

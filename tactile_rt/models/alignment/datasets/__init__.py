@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from importlib import import_module, metadata
 from pathlib import Path
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.neural import Animal
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.settings import no_such
-from tactile_rt.stream import ConfigError
 
 __all__ = ["DATASETS", "DatasetContents", "NeuralDataset", "dataset_names", "find_dataset"]
 

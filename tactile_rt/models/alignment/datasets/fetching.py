@@ -16,6 +16,7 @@ from importlib import resources
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.models.alignment.datasets.ranges import RangeFile, connections
 from tactile_rt.models.alignment.nwb import read_nwb
@@ -29,7 +30,6 @@ from tactile_rt.models.alignment.nwb_parts import (
     WHISKER,
     last_time,
 )
-from tactile_rt.stream import ConfigError
 
 __all__ = ["Fetched", "PublishedFile", "counted", "fetch", "published_files"]
 

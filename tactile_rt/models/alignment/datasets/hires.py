@@ -30,11 +30,11 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.extras import lacking
 from tactile_rt.models.alignment.datasets import DatasetContents, NeuralDataset
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
 from tactile_rt.models.alignment.stimuli_input import PERIOD_MS, StimuliInput
-from tactile_rt.stream import ConfigError
 
 if TYPE_CHECKING:
     import h5py

@@ -8,7 +8,7 @@ import io
 from typing import TYPE_CHECKING
 from urllib.request import getproxies
 
-from tactile_rt.stream import ConfigError
+from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
     import urllib3

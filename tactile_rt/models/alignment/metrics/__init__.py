@@ -18,9 +18,9 @@ from importlib import import_module, metadata
 import numpy as np
 from numpy.typing import NDArray
 
+from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.neural import Animal
 from tactile_rt.settings import no_such
-from tactile_rt.stream import ConfigError
 
 __all__ = ["METRICS", "MINIMUM_CEILING", "Measure", "Metric", "find_metric", "metric_names"]
 
