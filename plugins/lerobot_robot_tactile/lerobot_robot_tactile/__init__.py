@@ -1,6 +1,6 @@
 """Tactile arrays for LeRobot: a robot that has another robot's joints and cameras, and sensors.
 
-    lerobot-record --robot.type=tactile --robot.robot.type=so101_follower ... \\
+    lerobot-record --robot.type=tactile --robot.robot='{type: so101_follower, ...}' \\
         --robot.sensors='{finger: "serial:///dev/ttyACM0?codec=native"}'
 """
 

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import draccus
 from lerobot.robots.config import RobotConfig
 
 __all__ = ["TactileConfig"]
@@ -15,15 +16,24 @@ class TactileConfig(RobotConfig):
 
     Attributes:
         sensors: The URL of each sensor by its name, as `tactile_rt.open_source` takes it.
-        robot: The robot that carries them; none: sensors alone.
+        robot: The configuration of the robot that carries them, with its ``type``, as in
+            ``{type: so101_follower, port: /dev/ttyACM0}``; none: sensors alone.
         history: The number of newest samples of each sensor in an observation.
+        max_age_s: The age from which on a reading is stale, s; 0: three sample periods of the
+            sensor, and at least 0.1.
+        on_stale: ``error`` ends the recording or policy when a sensor is stale; ``nan`` goes on
+            with NaN for what it does not measure.
         record: The folder in which every sample is recorded at the sensor's own rate, in
             NAME-TIME.mcap; empty: none is.
     """
 
     sensors: dict[str, str] = field(default_factory=dict)
-    robot: RobotConfig | None = None
+    # A RobotConfig once it is read. Not declared as one: the parser offers every type of robot for
+    # it, this one included, with all of their options and so on without end.
+    robot: dict[str, Any] | None = None
     history: int = 1
+    max_age_s: float = 0.0
+    on_stale: str = "error"
     record: str = ""
 
     def __post_init__(self) -> None:
@@ -32,8 +42,31 @@ class TactileConfig(RobotConfig):
             raise ValueError("--robot.sensors names no sensor: '{finger: \"serial:...\"}'")
         if self.history < 1:
             raise ValueError(f"--robot.history must be 1 or more, not {self.history}")
+        if not 0 <= self.max_age_s < float("inf"):
+            raise ValueError(f"--robot.max_age_s must be 0 or more, not {self.max_age_s:g}")
+        if self.on_stale not in ("error", "nan"):
+            raise ValueError(f"--robot.on_stale must be error or nan, not {self.on_stale!r}")
+        self.robot = _read_carrier(self.robot)
 
     @property
     def cameras(self) -> dict[str, Any]:
-        """The robot's own."""
+        """The cameras of the robot that carries the sensors."""
         return getattr(self.robot, "cameras", {})
+
+
+def _read_carrier(robot: dict[str, Any] | RobotConfig | None) -> RobotConfig | None:
+    """Read the configuration of the robot that carries the sensors.
+
+    Raises:
+        ValueError: it names no type, or one that LeRobot does not know.
+    """
+    if robot is None or isinstance(robot, RobotConfig):
+        return robot
+    if "type" not in robot:
+        raise ValueError("--robot.robot names no type: '{type: so101_follower, port: ...}'")
+    known = sorted(set(RobotConfig.get_known_choices()) - {"tactile"})
+    if robot["type"] not in known:
+        raise ValueError(
+            f"--robot.robot: {robot['type']!r} is no type of robot: {', '.join(known)}"
+        )
+    return draccus.decode(RobotConfig, robot)

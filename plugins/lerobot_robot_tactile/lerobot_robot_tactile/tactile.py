@@ -1,6 +1,7 @@
 """The robot: its observations are those of the robot that it wraps, and the newest samples."""
 
 import threading
+import time
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,8 @@ __all__ = ["Sensor", "Tactile"]
 
 POLL_S = 0.05
 FIRST_S = 10.0  # until a sensor's first sample
+PERIODS, LEAST_AGE_S = 3, 0.1  # the age limit where none is given
+NEVER = -(2**62)  # ns
 
 
 class Sensor:
@@ -28,16 +31,29 @@ class Sensor:
         name: The name of the sensor.
         url: What to open.
         history: The number of newest samples to keep.
+        max_age_s: The age from which on a value is stale, s; 0: three sample periods, and at least
+            0.1 s.
         record: The folder to record every sample in; empty: none is recorded.
+
+    Attributes:
+        max_age_s: The age from which on a value is stale, s.
     """
 
-    def __init__(self, name: str, url: str, history: int, record: str) -> None:
+    def __init__(
+        self, name: str, url: str, history: int = 1, max_age_s: float = 0.0, record: str = ""
+    ) -> None:
         self.name = name
         self._source = open_source(url)
         self.spec = self._source.spec
-        self._newest = np.full((history, *self.spec.shape), np.nan, np.float32)
+        self.max_age_s = max_age_s or max(PERIODS / self.spec.rate_hz, LEAST_AGE_S)
+        # Of the newest samples, replaced as a whole: host time, ns (history,); the last valid
+        # values (history, element, channel); and when those were taken, ns (history, element).
+        self._newest = (
+            np.zeros(history, np.int64),
+            np.full((history, *self.spec.shape), np.nan, np.float32),
+            np.full((history, len(self.spec.elements)), NEVER, np.int64),
+        )
         self._error: Exception | None = None
-        self._lock = threading.Lock()
         self._came, self._stop = threading.Event(), threading.Event()
         self._writer = None
         if record:
@@ -52,24 +68,47 @@ class Sensor:
     def names(self) -> list[str]:
         """The name of each number of `read`, in its order."""
         flat = [f"{self.name}.{e}.{c}" for e in self.spec.elements for c in self.spec.channels]
-        if len(self._newest) == 1:
-            return flat
-        ago = range(len(self._newest) - 1, -1, -1)
-        return [f"{name}.{k}" for k in ago for name in flat]
+        ago = range(len(self._newest[0]) - 1, -1, -1)
+        values = flat if len(ago) == 1 else [f"{name}.{k}" for k in ago for name in flat]
+        return [*values, f"{self.name}.age_ms", f"{self.name}.valid"]
 
-    def read(self) -> np.ndarray:
-        """(history, element, channel) The newest samples, the oldest first, SI; where an element
-        has no trustworthy value, its last one, and before any, 0.
+    def wait(self) -> None:
+        """Wait for the first sample.
 
         Raises:
-            DeviceNotConnectedError: The sensor has failed, or is over.
+            DeviceNotConnectedError: None came within 10 s, or the sensor has failed.
         """
-        if not self._came.wait(FIRST_S) and self._error is None:
+        if not self._came.wait(FIRST_S):
             raise DeviceNotConnectedError(f"{self.name} gave no sample within {FIRST_S:g} s")
         if self._error is not None:
             raise DeviceNotConnectedError(f"{self.name}: {self._error}")
-        with self._lock:
-            return np.nan_to_num(self._newest)
+
+    def trouble(self) -> str:
+        """Say why the sensor cannot be relied on now; empty if it can."""
+        if self._error is not None:
+            return f"{self.name}: {self._error}"
+        age_s = self.read()[-2] / 1e3
+        if age_s <= self.max_age_s:
+            return ""
+        since = f"for {age_s:.2g} s" if age_s > 0 else "yet"
+        return f"{self.name} has given no valid sample {since}: is it plugged in and running?"
+
+    def read(self) -> list[float]:
+        """Return the newest samples, their age and how much of them is valid, as `names` says.
+
+        Values are in SI units, the oldest sample first. An element keeps its last valid value for
+        `max_age_s`; then, and before its first, it is NaN. The age is that of the newest valid
+        value of any element, ms; NaN before the first. Valid is the share of elements that have a
+        value now, 0 to 1.
+        """
+        now = time.monotonic_ns()
+        t_ns, values, valid_ns = self._newest
+        held = np.append(t_ns[:-1], now)[:, None] - valid_ns <= 1e9 * self.max_age_s
+        held &= held[-1].any()  # when nothing comes, what came before tells nothing of now
+        newest = int(valid_ns[-1].max())
+        age_ms = (now - newest) / 1e6 if newest > NEVER else float("nan")
+        shown = np.where(held[..., None], values, np.nan)
+        return [*shown.ravel().tolist(), age_ms, float(held[-1].mean())]
 
     def close(self) -> None:
         """Stop reading, and end the recording."""
@@ -94,13 +133,16 @@ class Sensor:
         self._came.set()
 
     def _take(self, chunk: Chunk) -> None:
-        n = len(self._newest)
-        values, valid = chunk.values[-n:], chunk.valid[-n:]
-        with self._lock:
-            last = self._newest[-1]
-            for row, ok in zip(values, valid, strict=True):
-                last = np.where(ok[:, None], row, last)
-                self._newest = np.concatenate([self._newest[1:], last[None]])
+        now, n = chunk.t_ns, len(self._newest[0])
+        if not self._source.live:  # a recording's times are those of another day
+            now = now - now[-1] + time.monotonic_ns()
+        t_ns, values, valid_ns = self._newest
+        for t, row, ok in zip(now[-n:], chunk.values[-n:], chunk.valid[-n:], strict=True):
+            t_ns = np.append(t_ns[1:], t)
+            last = np.where(ok[:, None], row, values[-1])
+            values = np.concatenate([values[1:], last[None]])
+            valid_ns = np.concatenate([valid_ns[1:], np.where(ok, t, valid_ns[-1])[None]])
+        self._newest = t_ns, values, valid_ns
         self._came.set()
 
 
@@ -113,7 +155,9 @@ class Tactile(Robot):
     def __init__(self, config: TactileConfig) -> None:
         super().__init__(config)
         self.config = config
-        self.robot = None if config.robot is None else make_robot_from_config(config.robot)
+        self.robot: Any = None
+        if config.robot is not None:
+            self.robot = make_robot_from_config(config.robot)
         self.sensors: list[Sensor] = []
 
     @property
@@ -123,7 +167,7 @@ class Tactile(Robot):
 
     @cached_property
     def _names(self) -> list[str]:
-        """Of the sensors' numbers; a sensor must be opened to be known."""
+        """The sensors' features; a sensor must be opened to be known."""
         opened = self.sensors or self._open("")
         names = [name for sensor in opened for name in sensor.names]
         if opened is not self.sensors:
@@ -141,14 +185,32 @@ class Tactile(Robot):
 
     @property
     def is_connected(self) -> bool:
-        return bool(self.sensors) and (self.robot is None or self.robot.is_connected)
+        """True while the robot is connected and every sensor measures.
+
+        With ``on_stale=nan`` a sensor that measures nothing counts as connected.
+        """
+        if not self.sensors or self._troubles():
+            return False
+        return self.robot is None or self.robot.is_connected
 
     def connect(self, calibrate: bool = True) -> None:
-        if self.is_connected:
+        """Open the sensors, wait for a sample of each, and connect the robot.
+
+        Raises:
+            DeviceAlreadyConnectedError: It is connected.
+            DeviceNotConnectedError: A sensor gives no sample within 10 s.
+        """
+        if self.sensors:
             raise DeviceAlreadyConnectedError(f"{self} is connected already")
-        if self.robot is not None:
-            self.robot.connect(calibrate)
         self.sensors = self._open(self.config.record)
+        try:
+            for sensor in self.sensors:
+                sensor.wait()
+            if self.robot is not None:
+                self.robot.connect(calibrate)
+        except BaseException:
+            self.disconnect()
+            raise
 
     @property
     def is_calibrated(self) -> bool:
@@ -163,21 +225,44 @@ class Tactile(Robot):
             self.robot.configure()
 
     def get_observation(self) -> dict[str, Any]:
-        if not self.is_connected:
+        """Return the robot's observation, and the newest samples of every sensor.
+
+        Raises:
+            DeviceNotConnectedError: It is not connected; or a sensor is stale or has failed, with
+                ``on_stale=error``: then all has been disconnected.
+        """
+        if not self.sensors:
             raise DeviceNotConnectedError(f"{self} is not connected")
+        if troubles := self._troubles():
+            self.disconnect()  # as LeRobot does after an error, but only of what is connected
+            raise DeviceNotConnectedError("; ".join(troubles))
         found = self.robot.get_observation() if self.robot else {}
         for sensor in self.sensors:
-            found.update(zip(sensor.names, sensor.read().ravel().tolist(), strict=True))
+            found.update(zip(sensor.names, sensor.read(), strict=True))
         return found
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         return action if self.robot is None else self.robot.send_action(action)
 
     def disconnect(self) -> None:
+        """Disconnect the robot, and close the sensors and their recordings."""
         opened, self.sensors = self.sensors, []
-        _close(opened)
-        if self.robot is not None and self.robot.is_connected:
-            self.robot.disconnect()
+        try:
+            if self.robot is not None and self.robot.is_connected:
+                self.robot.disconnect()
+        finally:
+            _close(opened)
+
+    def __del__(self) -> None:
+        # LeRobot's own asks `is_connected`, and a silent sensor must not leave an arm powered.
+        if getattr(self, "sensors", None):
+            self.disconnect()
+
+    def _troubles(self) -> list[str]:
+        """Say of each sensor that cannot be relied on why; none with ``on_stale=nan``."""
+        if self.config.on_stale == "nan":
+            return []
+        return [trouble for sensor in self.sensors if (trouble := sensor.trouble())]
 
     def _open(self, record: str) -> list[Sensor]:
         if record:
@@ -185,7 +270,8 @@ class Tactile(Robot):
         opened: list[Sensor] = []
         try:
             for name, url in self.config.sensors.items():
-                opened.append(Sensor(name, url, self.config.history, record))
+                config = self.config
+                opened.append(Sensor(name, url, config.history, config.max_age_s, record))
         except BaseException:
             _close(opened)
             raise

@@ -1,0 +1,289 @@
+"""The plug-in under LeRobot's own parser: every command starts, and touch that is dead is no touch.
+
+draccus is LeRobot's parser. LeRobot itself is gigabytes: it stands here as the four names that the
+plug-in takes of it; `bench/roads/lerobot.py` goes through its own command line.
+"""
+
+import queue
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tactile_rt.recording import Recording
+from tactile_rt.stream import Chunk, EndOfStream, Source
+from tactile_rt.testing import FakeSerial, small_spec
+from tests.helpers.waiting import until
+
+draccus = pytest.importorskip("draccus")
+PLUGIN = Path(__file__).parents[2] / "plugins" / "lerobot_robot_tactile"
+SPEC = small_spec()  # 3 elements at 1 kHz
+FX = [f"finger.{element}.{SPEC.channels[0]}" for element in SPEC.elements]
+
+
+@pytest.fixture
+def lerobot(monkeypatch):
+    """LeRobot's base classes, with one type of robot, and the plug-in installed."""
+    names = ("", ".robots", ".robots.config", ".utils", ".utils.errors")
+    package = {name: ModuleType(f"lerobot{name}") for name in names}
+
+    @dataclass(kw_only=True)
+    class RobotConfig(draccus.ChoiceRegistry):
+        id: str | None = None
+
+        def __post_init__(self) -> None: ...
+
+    class Robot:
+        def __init__(self, config: RobotConfig) -> None:
+            self.id = config.id
+
+    @RobotConfig.register_subclass("made_up_arm")
+    @dataclass(kw_only=True)
+    class ArmConfig(RobotConfig):
+        port: str = "/dev/null"
+        cameras: dict[str, str] = field(default_factory=dict)
+
+    class Arm(Robot):
+        is_connected = False
+        action_features = observation_features = {"elbow.pos": float}  # noqa: RUF012
+
+        def connect(self, calibrate: bool) -> None:
+            self.is_connected = True
+
+        def disconnect(self) -> None:
+            self.is_connected = False
+
+        def get_observation(self) -> dict[str, Any]:
+            return {"elbow.pos": 0.25}
+
+    package[".robots"].Robot, package[".robots.config"].RobotConfig = Robot, RobotConfig
+    package[".robots"].make_robot_from_config = Arm
+    for name in ("DeviceAlreadyConnectedError", "DeviceNotConnectedError"):
+        setattr(package[".utils.errors"], name, type(name, (ConnectionError,), {}))
+    for name, module in package.items():
+        monkeypatch.setitem(sys.modules, f"lerobot{name}", module)
+    monkeypatch.syspath_prepend(PLUGIN)
+    for name in ("", ".config_tactile", ".tactile"):
+        monkeypatch.delitem(sys.modules, f"lerobot_robot_tactile{name}", raising=False)
+    import lerobot_robot_tactile
+
+    return lerobot_robot_tactile
+
+
+@pytest.fixture
+def read_arguments(lerobot):
+    """What a LeRobot command makes of its arguments: the robot's configuration."""
+    from lerobot.robots.config import RobotConfig
+
+    @dataclass
+    class RecordConfig:
+        robot: RobotConfig
+        fps: int = 30
+
+    return lambda *arguments: draccus.parse(RecordConfig, args=list(arguments)).robot
+
+
+class Plugged(Source):
+    """A sensor of which a test says when it gives a sample."""
+
+    def __init__(self) -> None:
+        super().__init__(SPEC)
+        self.chunks: queue.Queue[Chunk | Exception] = queue.Queue()
+        self.sent = 0
+
+    def give(self, value: float, valid: tuple[bool, ...] = (True,) * 3) -> None:
+        values = np.full((1, *SPEC.shape), value, np.float32)
+        now = np.array([time.monotonic_ns()])
+        self.chunks.put(Chunk(np.array([self.sent]), now, values, np.array([valid])))
+        self.sent += 1
+
+    def read(self, timeout: float | None = None) -> Chunk | None:
+        try:
+            found = self.chunks.get(timeout=timeout)
+        except queue.Empty:
+            return None
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def close(self) -> None: ...
+
+
+@pytest.fixture
+def touch(lerobot, monkeypatch, read_arguments):
+    """Make a robot of some arguments and its sensor, connected; disconnected at the end."""
+    made = []
+
+    def make(*arguments):
+        sensor = Plugged()
+        monkeypatch.setattr(lerobot.tactile, "open_source", lambda url: sensor)
+        robot = lerobot.Tactile(
+            read_arguments("--robot.type=tactile", "--robot.sensors={finger: 'any:'}", *arguments)
+        )
+        made.append(robot)
+        sensor.give(1.0)
+        robot.connect()
+        return robot, sensor
+
+    yield make
+    for robot in made:
+        robot.disconnect()
+
+
+def seen(robot, name):
+    return robot.get_observation()[name]
+
+
+def error_of(robot):
+    """The message with which an observation is refused; empty if it is given."""
+    from lerobot.utils.errors import DeviceNotConnectedError
+
+    try:
+        robot.get_observation()
+    except DeviceNotConnectedError as error:
+        return str(error)
+    return ""
+
+
+def test_a_command_of_another_robot_starts_with_the_plug_in_installed(read_arguments):
+    robot = read_arguments("--robot.type=made_up_arm", "--robot.port=/dev/ttyACM0")
+    assert robot.port == "/dev/ttyACM0"
+
+
+def test_the_help_of_a_command_ends(read_arguments, capsys):
+    with pytest.raises(SystemExit) as left:
+        read_arguments("--help")
+    assert left.value.code == 0
+    assert "--robot.sensors" in capsys.readouterr().out
+
+
+def test_the_robot_that_carries_the_sensors_is_read_from_its_braces(read_arguments):
+    robot = read_arguments(
+        "--robot.type=tactile",
+        "--robot.robot={type: made_up_arm, port: /dev/ttyACM1, cameras: {a: b}}",
+        "--robot.sensors={finger: 'serial:///dev/ttyACM0?codec=native'}",
+        "--robot.history=2",
+    )
+    assert robot.sensors == {"finger": "serial:///dev/ttyACM0?codec=native"}
+    assert (robot.robot.port, robot.cameras, robot.history) == ("/dev/ttyACM1", {"a": "b"}, 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "names no sensor"),
+        (["--robot.sensors={f: 'x:'}", "--robot.robot={port: /dev/null}"], "names no type"),
+        (["--robot.sensors={f: 'x:'}", "--robot.robot={type: made_up}"], "'made_up' is no type"),
+        (["--robot.sensors={f: 'x:'}", "--robot.robot={type: tactile}"], "'tactile' is no type"),
+        (["--robot.sensors={f: 'x:'}", "--robot.on_stale=wait"], "must be error or nan"),
+        (["--robot.sensors={f: 'x:'}", "--robot.max_age_s=-1"], "must be 0 or more"),
+    ],
+)
+def test_a_mistake_is_said(read_arguments, arguments, said):
+    with pytest.raises(draccus.utils.ParsingError) as raised:
+        read_arguments("--robot.type=tactile", *arguments)
+    assert said in str(raised.value.__cause__)
+
+
+def test_an_observation_is_the_robot_s_and_the_newest_samples(touch):
+    robot, sensor = touch("--robot.robot={type: made_up_arm}", "--robot.max_age_s=60")
+    sensor.give(2.0)
+    until(lambda: seen(robot, FX[0]) == 2.0)
+    found = robot.get_observation()
+    assert found["elbow.pos"] == 0.25 and found["finger.valid"] == 1.0
+    assert 0 <= found["finger.age_ms"] < 60_000
+    assert list(found) == list(robot.observation_features)
+
+
+def test_the_age_limit_is_three_periods_and_at_least_a_tenth_of_a_second(lerobot, monkeypatch):
+    for rate_hz, limit in ((1000.0, 0.1), (10.0, 0.3)):
+        source = Plugged()
+        source.spec = small_spec(rate_hz=rate_hz)
+        monkeypatch.setattr(lerobot.tactile, "open_source", lambda url, source=source: source)
+        sensor = lerobot.tactile.Sensor("finger", "any:")
+        sensor.close()
+        assert sensor.max_age_s == pytest.approx(limit)
+
+
+def test_a_sensor_that_stands_still_is_an_error_and_the_arm_is_released(touch):
+    robot, _ = touch("--robot.robot={type: made_up_arm}")
+    arm = robot.robot
+    until(lambda: not robot.is_connected)
+    assert arm.is_connected
+    assert "finger has given no valid sample for" in error_of(robot)
+    assert not arm.is_connected
+    assert "is not connected" in error_of(robot)
+
+
+def test_a_stream_that_is_over_is_an_error_at_once(touch):
+    robot, sensor = touch("--robot.max_age_s=3600")
+    sensor.chunks.put(EndOfStream())
+    until(lambda: not robot.is_connected)
+    assert error_of(robot) == "finger: its stream is over"
+
+
+def test_by_choice_what_a_silent_sensor_measures_is_nan_until_it_comes_back(touch):
+    robot, sensor = touch("--robot.on_stale=nan", "--robot.max_age_s=0.5")
+    until(lambda: np.isnan(seen(robot, FX[0])))
+    assert robot.is_connected
+    assert seen(robot, "finger.valid") == 0.0 and seen(robot, "finger.age_ms") > 500
+    back = {FX[0]: 3.0, "finger.valid": 1.0}
+    until(
+        lambda: back.items() <= robot.get_observation().items(), meanwhile=lambda: sensor.give(3.0)
+    )
+
+
+def test_an_element_that_goes_away_is_nan_and_the_others_go_on(touch):
+    robot, sensor = touch("--robot.on_stale=nan", "--robot.max_age_s=0.5")
+
+    def gone():
+        found = robot.get_observation()
+        there = found[FX[0]] == found[FX[2]] == 4.0 and found["finger.valid"] == pytest.approx(
+            2 / 3
+        )
+        return there and np.isnan(found[FX[1]])
+
+    until(gone, meanwhile=lambda: sensor.give(4.0, (True, False, True)))
+
+
+def test_history_keeps_the_samples_in_their_order(touch):
+    robot, sensor = touch("--robot.history=3", "--robot.max_age_s=60")
+    for value in (2.0, 3.0, 4.0):
+        sensor.give(value)
+    until(lambda: seen(robot, f"{FX[0]}.0") == 4.0)
+    assert [seen(robot, f"{FX[0]}.{ago}") for ago in (2, 1, 0)] == [2.0, 3.0, 4.0]
+
+
+def test_a_sensor_that_never_speaks_does_not_connect(lerobot, touch, monkeypatch):
+    from lerobot.utils.errors import DeviceNotConnectedError
+
+    monkeypatch.setattr(lerobot.tactile, "FIRST_S", 0.01)
+    monkeypatch.setattr(Plugged, "give", lambda self, value: None)
+    with pytest.raises(DeviceNotConnectedError, match="finger gave no sample within"):
+        touch()
+
+
+def test_of_a_sensor_that_dies_the_recording_is_whole(touch, tmp_path):
+    robot, _ = touch(f"--robot.record={tmp_path}")
+    until(lambda: error_of(robot))
+    (path,) = tmp_path.glob("finger-*.mcap")
+    assert sum(map(len, Recording(path))) == 1
+
+
+def test_a_device_that_is_pulled_out_is_no_touch(lerobot, read_arguments):
+    with FakeSerial(np.ones((1, *SPEC.shape)), spec=SPEC) as device:
+        url = device.url
+        robot = lerobot.Tactile(
+            read_arguments("--robot.type=tactile", f"--robot.sensors={{finger: '{url}'}}")
+        )
+        robot.connect()
+        try:
+            device.unplug()
+            until(lambda: error_of(robot))
+        finally:
+            robot.disconnect()
