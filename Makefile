@@ -70,5 +70,5 @@ $(VENV)/.sim: pyproject.toml $(PINS)
 
 $(VENV)/.dev: pyproject.toml $(PINS)
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) --editable '.[sim,gym,train,view,dbc,record,import,publish,ros2,lerobot,ui,test,docs,dev]'
+	$(INSTALL) --editable '.[sim,gym,train,view,dbc,import,publish,ros2,lerobot,test,docs,dev]'
 	touch $@ $(VENV)/.sim

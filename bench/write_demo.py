@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 from tactile_rt.classifier.model_file import load_model, shipped_model
-from tactile_rt.cli.demonstration import RECORDING
 from tactile_rt.recording import StreamWriter
+from tactile_rt.recording.replay import DEMO
 from tactile_rt.sim_backend.source import SimOptions, SimSource
 
 SEED, OBJECTS = 2026, 6
@@ -38,4 +38,4 @@ def main(output: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else RECORDING)
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else DEMO)

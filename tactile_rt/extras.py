@@ -7,6 +7,7 @@ checkout by its folder; otherwise to what is installed, which pip then need not 
 import shlex
 import shutil
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from tactile_rt.errors import ConfigError
@@ -26,11 +27,17 @@ def install_extra(extra: str) -> str:
 def install_line(requirement: str, option: str = "") -> str:
     """The command that installs a package for the Python that is running.
 
+    In an environment that uv made there is no pip: there it is uv that installs.
+
     Args:
         requirement: What pip calls it.
         option: Of pip, before it, with a space behind.
     """
     python = Path(sys.executable)
+    if find_spec("pip") is None:
+        return (
+            f"uv pip install --python {shlex.quote(str(python))} {option}{shlex.quote(requirement)}"
+        )
     # Where the environment is not activated, `pip` is another's.
     ours = shutil.which("pip") == str(python.with_name("pip"))
     pip = "pip" if ours else f"{shlex.quote(str(python))} -m pip"

@@ -43,13 +43,20 @@ def test_this_is_a_checkout():
 
 
 def test_otherwise_it_is_what_is_installed(environment, installed):
-    words = shlex.split(extras.install_extra("record"))
-    assert words == [str(environment / "python"), "-m", "pip", "install", "tactile-rt[record]"]
+    words = shlex.split(extras.install_extra("sim"))
+    assert words == [str(environment / "python"), "-m", "pip", "install", "tactile-rt[sim]"]
+
+
+def test_where_there_is_no_pip_uv_installs(environment, installed, monkeypatch):
+    monkeypatch.setattr(extras, "find_spec", lambda name: None)
+    words = shlex.split(extras.install_extra("sim,view"))
+    python = str(environment / "python")
+    assert words == ["uv", "pip", "install", "--python", python, "tactile-rt[sim,view]"]
 
 
 def test_in_an_activated_environment_pip_is_enough(environment, installed, monkeypatch):
     monkeypatch.setenv("PATH", f"{environment}:/usr/bin")
-    assert extras.install_extra("record") == "pip install 'tactile-rt[record]'"
+    assert extras.install_extra("sim") == "pip install 'tactile-rt[sim]'"
     assert extras.install_line("tensorboard") == "pip install tensorboard"
 
 
@@ -63,11 +70,9 @@ def test_pip_of_another_environment_is_not_taken(environment, installed, tmp_pat
 
 def test_it_names_the_package_that_is_missing(environment, installed, monkeypatch):
     monkeypatch.setenv("PATH", str(environment))
-    error = ModuleNotFoundError("No module named 'mcap.writer'", name="mcap.writer")
-    said = str(extras.lacking("recordings need", "record", error))
-    assert said == (
-        "recordings need mcap, which is not installed: pip install 'tactile-rt[record]'"
-    )
+    error = ModuleNotFoundError("No module named 'av.video'", name="av.video")
+    said = str(extras.lacking("films need", "view", error))
+    assert said == "films need av, which is not installed: pip install 'tactile-rt[view]'"
 
 
 def test_what_no_extra_brings_is_no_lack_of_an_extra():

@@ -46,6 +46,7 @@ def check(file: File, sets: Settings = None) -> None:
     from tactile_rt.daemon.admission import model_path
     from tactile_rt.daemon.checks import check_config
     from tactile_rt.daemon.loading import load_config
+    from tactile_rt.sources.opening import is_made_up
 
     loaded = load_config(file, sets or [])
     check_config(loaded)
@@ -62,6 +63,9 @@ def check(file: File, sets: Settings = None) -> None:
         )
     ]
     typer.echo(f"{file}: {', '.join([*counts, *tables])}: all right")
+    for source in found.source:
+        if found.model and is_made_up(source.url):
+            typer.echo(f"source {source.name} is made up: what is decided on it means nothing")
 
 
 @config.command()

@@ -96,7 +96,7 @@ def demo(
         with starting(), console.status("building the array and the objects"):
             demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)
     except ModuleNotFoundError as error:
-        raise needs("record" if recorded else "sim", error) from None
+        raise needs("sim", error) from None
     with leaving(seconds), demonstration:
         narrow = console.width < WIDTH
         if plain or narrow or not console.is_terminal or console.is_dumb_terminal:

@@ -25,9 +25,8 @@ if TYPE_CHECKING:
     from tactile_rt.sim_backend.source import Pass
     from tactile_rt.stream import Source
 
-__all__ = ["RECORDING", "Demonstration", "SweepOutcome"]
+__all__ = ["Demonstration", "SweepOutcome"]
 
-RECORDING = Path(__file__).parents[1] / "assets" / "demo.mcap"  # see bench/write_demo.py
 END_NS = 50_000_000  # before the end of the recording: the last samples may be lost
 LATENCIES_KEPT = 10_000  # steps that the latency percentiles look back on: a demo may run for days
 
@@ -140,9 +139,10 @@ class Demonstration:
         """The recording, from an emulated device on a serial port."""
         from tactile_rt.drivers.emulation.device import EmulatedSerial
         from tactile_rt.recording import Recording
+        from tactile_rt.recording.replay import DEMO
         from tactile_rt.sources.opening import open_source
 
-        recording = Recording(RECORDING)
+        recording = Recording(DEMO)
         notes = recording.description.session
         told = [notes[f"pass_{i}"].split() for i in range(len(notes))]
         passes = [RecordedPass(int(start), name, category) for start, name, category in told]
@@ -151,7 +151,7 @@ class Demonstration:
         ends = [p.start_ns for p in passes[1:]] + [last - END_NS]
         count = min(sweeps or len(passes), len(passes))
         self.passes, self._ends_ns = passes[:count], ends[count - 1]
-        played = self._device.enter_context(open_source(f"replay:{RECORDING}?speed=0"))
+        played = self._device.enter_context(open_source(f"replay:{DEMO}?speed=0"))
         device = self._device.enter_context(EmulatedSerial(played, "native", log=False))
         return open_source(device.url)
 

@@ -53,9 +53,7 @@ def import_file(
     extra "import") wrenches, arrays and our own messages need nothing
     more. gzip is unpacked.
     """
-    from tactile_rt.recording.layout import need_mcap
 
-    need_mcap()
     if not log.exists():
         raise ConfigError(f"no file {log}")
     if log.is_file() and not log.stat().st_size:

@@ -59,10 +59,8 @@ def record(
     makes a whole file, too.
     """
     from tactile_rt.recording import StreamWriter
-    from tactile_rt.recording.layout import need_mcap
     from tactile_rt.sources.opening import open_source
 
-    need_mcap()
     for file in (output, json):
         check_output(file)
     check_is_mcap(output)

@@ -57,7 +57,7 @@ def run(
     from tactile_rt.classifier.classifier import Classifier
     from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.classifier.session import Session
-    from tactile_rt.sources.opening import check_model, open_source
+    from tactile_rt.sources.opening import check_model, is_made_up, open_source
 
     file = model or shipped_model()
     samples = printed = 0
@@ -71,6 +71,8 @@ def run(
             raise SpecMismatch(f"{source}: {error}") from None
         if classifier.remark:
             typer.echo(classifier.remark, err=True)
+        if is_made_up(source):
+            typer.echo(f"{source} is made up: what is decided on it means nothing", err=True)
         session = Session(opened, classifier)
         with leaving(seconds), session:
             for chunk, decisions in session:

@@ -64,12 +64,10 @@ def teach(
     from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.locks import alone_in
     from tactile_rt.recording.labels import LABELS
-    from tactile_rt.recording.layout import need_mcap
     from tactile_rt.sources.opening import open_source
     from tactile_rt.teaching.lesson import FEATURES, MODEL, Lesson
     from tactile_rt.teaching.teacher import Teacher
 
-    need_mcap()
     check_output(json)
     wanted = [name.strip() for name in classes.split(",") if name.strip()]
     at = _address(page) if page else None

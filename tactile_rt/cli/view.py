@@ -77,7 +77,7 @@ def view(
             )
             from tactile_rt.sim_backend.world import PROFILES, world_spec
     except ModuleNotFoundError as error:
-        raise needs("sim,view", error) from None
+        raise needs("view", error) from None
     except (AttributeError, RuntimeError) as error:  # as mujoco does where it finds no such driver
         if "MUJOCO_GL" not in os.environ:
             raise

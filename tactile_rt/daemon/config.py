@@ -275,13 +275,14 @@ version = 1
 
 [[source]]
 name = "whiskers"
-url = "synthetic:mouse"        # a device: serial:///dev/ttyACM0?codec=native
+url = "replay:demo?loop=true"  # six recorded objects; a device: serial:///dev/ttyACM0?codec=native
+                               # "synthetic:mouse" is made up: what is decided on it means nothing
 # calibration = "cell-3"       # file, or id of a device: tactile-rt calibrate
 # frozen_s = 0                 # no change for so long: the device hangs; 0: if its noise is known
 # array = "array.json"         # what the device is, if its codec cannot know; or a model's .onnx
 
-# [[model]]                    # none: nothing is classified
-# source = "whiskers"          # needed if there are several
+[[model]]                      # none: nothing is classified
+source = "whiskers"            # needed if there are several
 # file = "model.onnx"          # default: the one that comes with the package
 # decisions = "every_step"     # or "final": one per contact
 # deadline_ms = 0              # older, or longer to make, is late; 0: one step
@@ -303,9 +304,9 @@ options = { samples = false }  # file: default standard output; state_s: how oft
 # before_s = 10
 # after_s = 5
 
-# [page]
-# host = "127.0.0.1"           # beyond loopback a token is needed
-# port = 8765
+[page]
+host = "127.0.0.1"             # beyond loopback a token is needed
+port = 8765                    # http://127.0.0.1:8765
 # token = ""
 # control = false              # true: the page may start and stop the recorder
 

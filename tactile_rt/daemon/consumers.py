@@ -19,7 +19,7 @@ _HERE = "tactile_rt.daemon"
 
 # table: (where the class is, extra that it needs); imported when used
 TABLES = {
-    "recorder": (f"{_HERE}.recorder:Recorder", "record"),
+    "recorder": (f"{_HERE}.recorder:Recorder", ""),
     "page": (f"{_HERE}.page:Page", ""),
     "metrics": (f"{_HERE}.metrics:Metrics", ""),
 }

@@ -42,7 +42,6 @@ from tactile_rt.recording.layout import (
     Raw,
     encode_packet,
     encode_samples,
-    need_mcap,
     samples_in,
 )
 from tactile_rt.recording.rotation import Rotation
@@ -108,9 +107,6 @@ class Recorder(Consumer):
     Args:
         name: for the log.
         config: the table ``[recorder]``.
-
-    Raises:
-        ConfigError: the extra is not installed.
     """
 
     wants = frozenset(
@@ -120,7 +116,6 @@ class Recorder(Consumer):
     tick_s = 0.2
 
     def __init__(self, name: str, config: RecorderConfig) -> None:
-        need_mcap()
         self._name, self._config = name, config
         self._folder = RecordingsFolder(
             Path(config.folder), config.min_free_mb, lambda job: self._syncer.add(job),

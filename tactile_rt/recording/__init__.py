@@ -9,7 +9,7 @@
     health    how source and recorder are doing, at every change
     decisions, events    what the daemon decided and told meanwhile
 
-The layout is described in docs/reference/recording.md. It needs the extra ``record``.
+The layout is described in docs/reference/recording.md.
 """
 
 from tactile_rt.recording.description import Description

@@ -13,7 +13,7 @@ from tactile_rt.recording.as_csv import beside, read_csv, write_csv
 from tactile_rt.recording.as_hdf5 import need_h5py, read_hdf5, write_hdf5
 from tactile_rt.recording.as_lerobot import is_dataset, read_dataset
 from tactile_rt.recording.description import RECOVERED, Description
-from tactile_rt.recording.layout import SAMPLES, Raw, decode_samples, need_mcap, samples_in
+from tactile_rt.recording.layout import SAMPLES, Raw, decode_samples, samples_in
 from tactile_rt.recording.lerobot_meta import need_pyarrow
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.writer import McapFile
@@ -89,8 +89,6 @@ def _check_output(path: Path) -> None:
         raise ConfigError(f"{path} is neither .mcap nor {', '.join(READERS)}")
     if path.suffix in HDF5:
         need_h5py()
-    if path.suffix == MCAP:
-        need_mcap()
 
 
 def _read(path: Path, episode: int = 0) -> tuple[Description, Generator[Raw, None, None]]:

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from tactile_rt.drivers.codec import CanFrame
-from tactile_rt.extras import lacking
 from tactile_rt.stream import Chunk
 
 __all__ = [
@@ -29,7 +28,6 @@ __all__ = [
     "encode_samples",
     "is_message",
     "last_ns",
-    "need_mcap",
     "samples_in",
 ]
 
@@ -55,18 +53,6 @@ class Raw:
     topic: str
     t_ns: int
     data: bytes
-
-
-def need_mcap() -> None:
-    """Make sure that MCAP files can be written and read.
-
-    Raises:
-        ConfigError: the extra is not installed.
-    """
-    try:
-        import mcap.writer  # noqa: F401
-    except ModuleNotFoundError as error:
-        raise lacking("recordings need", "record", error) from None
 
 
 def encode_samples(chunk: Chunk) -> bytes:

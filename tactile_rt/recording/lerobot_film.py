@@ -146,5 +146,5 @@ def _need_av() -> Any:
     try:
         import av
     except ModuleNotFoundError as error:
-        raise lacking("films need", "view", error) from None
+        raise lacking("films need", "lerobot", error) from None
     return av

@@ -21,7 +21,6 @@ from tactile_rt.recording.layout import (
     decode_packet,
     decode_samples,
     is_message,
-    need_mcap,
 )
 from tactile_rt.recording.records import MAGIC, read_records
 from tactile_rt.recording.ros2_form import is_in_file_form, name_of, plain
@@ -168,7 +167,6 @@ def _described(path: Path, records: "Iterator[Record]") -> "tuple[Description, R
 @contextmanager
 def _opened(path: Path) -> Iterator[BinaryIO]:
     """A recording that has been written to its end."""
-    need_mcap()
     try:
         file = open_regular(path)
     except FileNotFoundError:

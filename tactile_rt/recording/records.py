@@ -75,7 +75,7 @@ class _TooMuch(ValueError):
 
 class _Reader:
     def __init__(self, file: BinaryIO) -> None:
-        from mcap.records import Message  # the extra may not be installed
+        from mcap.records import Message
 
         self._file, self._new_message = file, Message
         self._size = file.seek(0, 2)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, BinaryIO
 from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.files import open_regular, sync_folder, write_whole
 from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
-from tactile_rt.recording.layout import is_message, need_mcap
+from tactile_rt.recording.layout import is_message
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC, read_whole_records
 from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, is_in_file_form, name_of, plain
@@ -38,10 +38,9 @@ def recover(path: str | Path, output: str | Path | None = None, force: bool = Fa
 
     Raises:
         ConfigError: there is no such file, the output is there already or is being recorded right
-            now, or the extra is not installed.
+            now.
         RecordingError: it is no recording, or nothing in it is whole.
     """
-    need_mcap()
     path = Path(path)
     whole = _is_whole(path)
     if whole and output is None:

@@ -2,9 +2,11 @@
 
 replay:run.mcap                                   the recorded chunks, as fast as they came
 replay:run.mcap?speed=10                          ten times as fast; 0: as fast as they are read
+replay:run.mcap?loop=true                         over and over
 replay:run.mcap?from=wire                         raw packets, decoded again
 replay:run.mcap?from=wire&codec=native            by another codec than the recorded one
 replay:data/default24/mug-1.npz?sweep=3&rest_s=1    one object's sweeps out of a sweep set
+replay:demo?loop=true                             the recording that comes with the package
 """
 
 import math
@@ -31,8 +33,10 @@ from tactile_rt.settings import take_options
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
 from tactile_rt.sweep_set import SweepManifest, read_object
 
-__all__ = ["ReplayOptions", "ReplaySource", "SweepOptions", "open_replay", "prepare_replay"]
+__all__ = ["DEMO", "ReplayOptions", "ReplaySource", "SweepOptions", "open_replay", "prepare_replay"]
 
+# Six objects sweep past simulated whiskers, see bench/write_demo.py: `replay:demo`.
+DEMO = Path(__file__).parents[1] / "assets" / "demo.mcap"
 NPZ = b"PK"  # how it begins
 SWEEP_CHUNK_NS = 9_000_000  # a chunk's length, as other sources have it
 SLICE_S = 0.1  # how soon a waiting read notices that the source was closed
@@ -48,10 +52,12 @@ class ReplayOptions:
     Attributes:
         speed: Pace of the stream, as a multiple of the recorded one; 0 for as fast as it is read.
         codec: Name of the codec that decodes raw packets; empty for the recorded one.
+        loop: Whether it begins again at its end; numbers and times of the samples go on.
     """
 
     speed: float = 1.0
     codec: str = ""
+    loop: bool = False
 
 
 def open_replay(target: str, fields: dict[str, str]) -> Source:
@@ -73,6 +79,8 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
     path, what = Path(target), f"replay:{target}"
     if not target:
         raise ConfigError("replay: needs a file, e.g. replay:run.mcap, replay:data/SET/mug-1.npz")
+    if target == "demo" and not path.exists():
+        path = DEMO
     _check_file(path)
     if path.suffix == ".npz":
         (sweeps,) = take_options(what, fields, SweepOptions)
@@ -81,7 +89,11 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
         return Prepared(
             spec,
             partial(
-                ReplaySource, spec, lambda _: _sweep_chunks(path, manifest, sweeps), sweeps.speed
+                ReplaySource,
+                spec,
+                lambda _: _sweep_chunks(path, manifest, sweeps),
+                sweeps.speed,
+                loop=sweeps.loop,
             ),
         )
     fields = dict(fields)
@@ -97,7 +109,7 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
             about.spec,
             partial(
                 ReplaySource, about.spec, lambda stats: _recorded(recording, stats), options.speed,
-                about.calibration is not None,
+                about.calibration is not None, options.loop,
             ),
         )  # fmt: skip
     if channel != WIRE:
@@ -114,14 +126,23 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
     if same:
         own = {**about.codec_options, **own}
     array = _array_of(own.pop("array", ""))
-    codec = make_codec(about.wire, options.codec or about.codec, own)
-    codec.spec = codec.spec or array
+
+    def new_codec() -> Codec[Any]:
+        codec = make_codec(about.wire, options.codec or about.codec, own)
+        codec.spec = codec.spec or array
+        return codec
+
+    def decode() -> _Decoding:
+        return _Decoding(str(path), new_codec(), recording.packets(), about.clock)
 
     def opened() -> Source:
-        decoding = _Decoding(str(path), codec, recording.packets(), about.clock)
-        return ReplaySource(decoding.spec, decoding.chunks, options.speed)
+        first = [decode()]  # which knows the array; each further pass is decoded anew
+        return ReplaySource(
+            first[0].spec, lambda stats: (first.pop() if first else decode()).chunks(stats),
+            options.speed, loop=options.loop,
+        )  # fmt: skip
 
-    prepared = Prepared(codec.spec, opened)
+    prepared = Prepared(new_codec().spec, opened)
     if about.calibration is not None:
         prepared = prepared.calibrated(about.calibration)
     # What a device said of itself is among the packets.
@@ -165,6 +186,7 @@ class ReplaySource(Source):
         timed: makes the chunks and when they are due, ns; what is lost is counted in its argument.
         speed: times the recorded pace; 0: at once.
         calibrated: whether the samples were calibrated before they were recorded.
+        loop: whether to begin again at the end, with numbers and times that go on.
 
     Attributes:
         calibrated: Whether the samples were calibrated before they were recorded.
@@ -178,11 +200,12 @@ class ReplaySource(Source):
         timed: Callable[[SourceStats], Timed],
         speed: float = 1.0,
         calibrated: bool = False,
+        loop: bool = False,
     ) -> None:
         super().__init__(spec)
         self.calibrated = calibrated
         self._speed = speed
-        self._timed = timed(self.stats)
+        self._timed = self._again_and_again(timed) if loop else timed(self.stats)
         self._next: tuple[int, Chunk] | None = None
         self._begin: tuple[int, int] | None = None  # due time and host time of the first chunk
         self._closed = False
@@ -213,6 +236,22 @@ class ReplaySource(Source):
             self._timed.close()  # type: ignore[attr-defined]  # which closes the file
         except ValueError:
             pass  # being read in another thread, whose next read ends
+
+    def _again_and_again(self, timed: Callable[[SourceStats], Timed]) -> Timed:
+        """Pass after pass, each beginning a sample's period after the end of the one before."""
+        period = round(NS_PER_S / self.spec.rate_hz)
+        end: tuple[int, int] | None = None  # number and time that the next sample is to have
+        while True:
+            shift: tuple[int, int] | None = None  # of numbers and times in this pass
+            for due, chunk in timed(self.stats):
+                if shift is None:
+                    begins = int(chunk.seq[0]), int(chunk.t_ns[0])
+                    shift = (end[0] - begins[0], end[1] - begins[1]) if end else (0, 0)
+                chunk = replace(chunk, seq=chunk.seq + shift[0], t_ns=chunk.t_ns + shift[1])
+                end = int(chunk.seq[-1]) + 1, int(chunk.t_ns[-1]) + period
+                yield due + shift[1], chunk
+            if shift is None:
+                return  # there is nothing in it
 
     def _wait_s(self, due: int) -> float:
         if not self._speed:
@@ -300,9 +339,11 @@ class SweepOptions:
         sweep: The number of the only sweep to stream, from 0; None: all, one after another.
         rest_s: The rest before each sweep, s, besides the lead that is stored with it: so that a
             contact ends, and a tare is taken, before the next.
+        loop: Whether it begins again at its end; numbers and times of the samples go on.
     """
 
     speed: float = 1.0
+    loop: bool = False
     sweep: int | None = None
     rest_s: float = 0.5
 

@@ -24,7 +24,6 @@ from tactile_rt.recording.layout import (
     Packet,
     encode_packet,
     encode_samples,
-    need_mcap,
 )
 from tactile_rt.recording.rotation import Rotation
 from tactile_rt.recording.syncing import Syncer
@@ -87,7 +86,6 @@ class StreamWriter:
         rotate_mb: float = 0.0,
         rotate_s: float = 0.0,
     ) -> None:
-        need_mcap()
         self.path, self.files = Path(path), 0
         self._source, self._device = source, device_of(source)
         self._url, self._session = url, dict(session or {})

@@ -23,7 +23,7 @@ from tactile_rt.extras import lacking
 from tactile_rt.settings import nearest, parse_options, split_url
 from tactile_rt.stream import ArraySpec, Source
 
-__all__ = ["SCHEMES", "check_model", "check_source", "open_source"]
+__all__ = ["SCHEMES", "check_model", "check_source", "is_made_up", "open_source"]
 
 # scheme: (module, name, extra that it needs). The name is of a class of the target and an `Options`
 # dataclass that it names, which may have a `check` of both for what can be told without opening,
@@ -35,7 +35,7 @@ SCHEMES = {
     "serial": ("tactile_rt.drivers.opening", "prepare_serial", ""),
     "can": ("tactile_rt.drivers.opening", "prepare_can", ""),
     "synthetic": ("tactile_rt.sources.synthetic", "SyntheticSource", ""),
-    "replay": ("tactile_rt.recording.replay", "prepare_replay", "record"),
+    "replay": ("tactile_rt.recording.replay", "prepare_replay", ""),
     "combined": ("tactile_rt.sources.combined", "prepare_combined", ""),
 }
 ASKED = ("serial", "can")  # where a device may be asked what array it is, and so must be told
@@ -68,6 +68,11 @@ def check_source(url: str, *, calibration: str = "", array: str = "") -> ArraySp
         ConfigError, RecordingError, SpecMismatch: as `open_source`, in the same words.
     """
     return _prepared(url, calibration, array, check=True).spec
+
+
+def is_made_up(url: str) -> bool:
+    """Return whether nothing makes a URL's touches, so that decisions on them mean nothing."""
+    return url.startswith("synthetic:")
 
 
 def check_model(model: Path, url: str) -> None:

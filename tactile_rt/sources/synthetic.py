@@ -1,5 +1,7 @@
 """A made-up array that feels bumps go by: a source that needs neither device nor simulator.
 
+The bumps are of no object, so what a model decides on them means nothing; `replay:demo` is of some.
+
 synthetic:                                    5 whiskers x 6 channels at 1 kHz, without end
 synthetic:35x6?rate_hz=1000&seconds=10&pace=fast&seed=3
 synthetic:mouse                               the array that the package's own model knows

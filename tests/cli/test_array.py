@@ -8,7 +8,6 @@ import pytest
 
 pytest.importorskip("mujoco")
 pytest.importorskip("numba")
-pytest.importorskip("mcap")
 
 from tactile_rt.project.device import read_fit
 from tactile_rt.project.folder import Project, new_project

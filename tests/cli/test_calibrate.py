@@ -203,7 +203,6 @@ def test_times_in_a_recording_do_as_well(call, device, tmp_path):
 
 
 def test_samples_that_were_calibrated_as_they_were_recorded_are_no_readings(refused, tmp_path):
-    pytest.importorskip("mcap")
     from tactile_rt.recording.description import Description
     from tactile_rt.recording.importing.account import Import, write_chunks
 

@@ -14,8 +14,9 @@ from tactile_rt.classifier.classifier import Classification
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.cli import demo as demo_module
 from tactile_rt.cli.demo import draw, watch
-from tactile_rt.cli.demonstration import RECORDING, Demonstration
+from tactile_rt.cli.demonstration import Demonstration
 from tactile_rt.extras import install_extra
+from tactile_rt.recording.replay import DEMO
 from tactile_rt.stream import Chunk
 
 simulated = pytest.mark.skipif(not find_spec("mujoco"), reason="MuJoCo is not installed")
@@ -106,7 +107,6 @@ def test_only_the_first_episode_of_each_pass_is_scored():
 
 
 def test_without_mujoco_a_recording_is_played_over_a_serial_port(call, monkeypatch) -> None:
-    pytest.importorskip("mcap")
     monkeypatch.setattr(demo_module, "find_spec", lambda name: None)
     code, out, err = call("demo", "--sweeps", "2")
     first, second, summary = out.splitlines()
@@ -123,7 +123,6 @@ def test_a_recording_that_is_asked_for_is_as_fast_as_it_was(refused) -> None:
 
 
 def test_the_view_of_a_recording_says_that_it_is_one() -> None:
-    pytest.importorskip("mcap")
     screen = Console(file=io.StringIO(), width=80, height=24, force_terminal=True, record=True)
     with Demonstration(shipped_model(), 1, 0, fast=False, recorded=True) as demo:
         watch(demo, screen)
@@ -132,4 +131,4 @@ def test_the_view_of_a_recording_says_that_it_is_one() -> None:
     text = screen.export_text()
     assert "30 recorded whiskers felt objects that the model has never met" in text
     assert "s of a recording, 0 samples dropped" in text
-    assert RECORDING.stat().st_size < 1_000_000
+    assert DEMO.stat().st_size < 1_000_000

@@ -10,7 +10,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("mcap")
 pytest.importorskip("torch")
 pytest.importorskip("onnx")
 

@@ -10,8 +10,6 @@ import pytest
 from tactile_rt.recording import Recording
 from tactile_rt.testing import FakeSerial
 
-pytest.importorskip("mcap")
-
 SOURCE = "synthetic:2x3?pace=fast&seconds=0.3"
 PROGRAM = "import sys; from tactile_rt.cli import main; sys.argv[0] = 'tactile-rt'; main()"
 

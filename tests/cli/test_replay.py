@@ -14,7 +14,6 @@ from tactile_rt.recording import Recording
 from tactile_rt.recording.writer import McapFile
 from tactile_rt.testing import FakeSerial, small_spec
 
-pytest.importorskip("mcap")
 tiny_model = pytest.importorskip("tests.helpers.tiny_model")
 
 SPEC = small_spec()

@@ -30,7 +30,6 @@ def shell(words: str, streams: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_without_any_stream_it_does_its_work(tmp_path):
-    pytest.importorskip("mcap")
     path = tmp_path / "a.mcap"
     # Nothing that is opened meanwhile is taken for the output.
     assert shell(f"record '{SOURCE}' {path}", "<&- >&- 2>&-").returncode == 0
@@ -59,7 +58,6 @@ def test_a_full_disk_under_its_output_is_one_line():
     ],
 )
 def test_what_finds_no_room_is_named_and_not_left(call, tmp_path, monkeypatch, words, made, needs):
-    pytest.importorskip("mcap")
     pytest.importorskip(needs)
     monkeypatch.chdir(tmp_path)
     call("record", SOURCE, "a.mcap")
@@ -94,7 +92,6 @@ def heard():
 def test_who_is_told_to_leave_leaves_nothing_half_written(
     call, heard, tmp_path, monkeypatch, number, made_of_it
 ):
-    pytest.importorskip("mcap")
     from tactile_rt.recording import conversion
 
     call("record", SOURCE, tmp_path / "a.mcap")
@@ -120,7 +117,6 @@ def test_who_is_told_to_leave_where_python_drops_what_is_raised_leaves(
     call, heard, tmp_path, monkeypatch, number, busy
 ):
     """As while h5py takes an object away, in a callback of a weak reference."""
-    pytest.importorskip("mcap")
     from tactile_rt.recording import conversion
 
     call("record", SOURCE, tmp_path / "a.mcap")
@@ -153,7 +149,6 @@ def test_who_is_told_to_leave_where_python_drops_what_is_raised_leaves(
 
 
 def test_a_recording_is_whole_when_the_terminal_closes(call, heard, tmp_path, monkeypatch):
-    pytest.importorskip("mcap")
     push = StreamWriter.push
 
     def push_and_close(writer, chunk):
@@ -178,7 +173,6 @@ def test_what_ignores_hangups_goes_on_ignoring_them():
 
 
 def test_a_folder_of_others_is_refused_before_the_work(refused, tmp_path, monkeypatch):
-    pytest.importorskip("mcap")
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != tmp_path)
     said = refused("record", "serial:///dev/none?codec=native", tmp_path / "a.mcap")
     assert f"{tmp_path} may not be written into" in said

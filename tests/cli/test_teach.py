@@ -17,8 +17,6 @@ import msgspec
 import numpy as np
 import pytest
 
-pytest.importorskip("mcap")
-
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.locks import alone_in

@@ -211,7 +211,6 @@ def test_so_is_what_is_wrong_with_a_file_that_it_names(alike, tmp_path):
     garbage, text = tmp_path / "garbage.bin", tmp_path / "text.mcap"
     garbage.write_bytes(b"\xff\xfe\x00")
     text.write_text("no recording")
-    pytest.importorskip("mcap")
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(b"\x89MCAP0\r\n" + bytes(40))
     sweeps = tmp_path / "set" / f"{write_tiny_set(tmp_path / 'set').names()[0]}.npz"
@@ -251,7 +250,6 @@ def test_so_is_what_is_wrong_with_a_file_that_it_names(alike, tmp_path):
 
 
 def test_so_is_a_recording_with_wrong_options(alike, call, tmp_path):
-    pytest.importorskip("mcap")
     path = tmp_path / "run.mcap"
     assert call("record", "synthetic:2x2?seconds=0.05&pace=fast", path)[0] == 0
     for url in (

@@ -5,7 +5,6 @@ import time
 
 import pytest
 
-pytest.importorskip("mcap")
 pytest.importorskip("onnx")
 
 from bench.daemon.process import DaemonProcess, free_port, messages_of

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("mcap")
 pytest.importorskip("onnx")
 
 from bench.daemon.process import DaemonProcess, free_port, messages_of

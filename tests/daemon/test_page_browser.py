@@ -264,3 +264,21 @@ def test_a_wrong_token_opens_nothing_and_the_right_one_lasts(tab, port):
         # Nothing is wider than a phone.
         assert one.page.evaluate("document.documentElement.scrollWidth") <= 390
         assert one.faults() == []
+
+
+@pytest.mark.parametrize(("url", "shown"), [("synthetic:mouse", True), ("replay:demo", False)])
+def test_beside_decisions_on_made_up_touches_it_says_so(tab, port, tmp_path, url, shown):
+    file = tmp_path / "robot.toml"
+    file.write_text(
+        f'version = 1\n[[source]]\nname = "a"\nurl = "{url}"\n[[model]]\n'
+        f'[page]\nport = {port}\n[log]\nfile = "log"\n'
+    )
+    daemon = Daemon(load_config(file))
+    daemon.start()
+    try:
+        one = tab()
+        one.page.goto(f"http://127.0.0.1:{port}/")
+        one.has("!document.getElementById('by-model').hidden && document.title.includes('mouse')")
+        assert one.page.locator("#made-up").is_visible() == shown
+    finally:
+        daemon.stop()

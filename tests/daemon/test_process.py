@@ -1,6 +1,7 @@
 """`tactile-rt run robot.toml` as a process: signals and exit codes; `tactile-rt config`."""
 
 import contextlib
+import itertools
 import json
 import os
 import shlex
@@ -13,7 +14,7 @@ import time
 
 import pytest
 
-from bench.daemon.process import messages_of
+from bench.daemon.process import free_port, messages_of
 from tactile_rt.cli import main
 from tactile_rt.daemon.config import EXAMPLE
 from tactile_rt.daemon.process import SIGNALS
@@ -236,24 +237,34 @@ def takes(process, number):
     return bool(mask >> (number - 1) & 1)
 
 
-def test_the_example_decides_once_its_model_is_uncommented(folder):
-    """What `config example` prints, with one `# ` less."""
-    printed = subprocess.run(
-        [*RUN, "config", "example"], capture_output=True, text=True, check=True
-    ).stdout
-    (folder / "example.toml").write_text(printed.replace("# [[model]]", "[[model]]"))
+def test_the_example_decides_what_was_touched(tmp_path):
+    subprocess.run([*RUN, "config", "example", "robot.toml"], cwd=tmp_path, check=True)
+    port = f"page.port={free_port()}"
     with subprocess.Popen(
-        [*RUN, "run", str(folder / "example.toml")], stdout=subprocess.PIPE, text=True
+        [*RUN, "run", "robot.toml", "--set", port], cwd=tmp_path, stdout=subprocess.PIPE, text=True
     ) as process:
         try:
             published = map(json.loads, process.stdout)
-            found = [next(m for m in published if m["type"] == "decision") for _ in range(3)]
+            finals = (m["label"] for m in published if m["type"] == "decision" and m["final"])
+            # Of what passed before the model was ready it may have felt a part.
+            assert "grapes" in itertools.islice(finals, 3)
+            assert next(finals) == "table"
         finally:
             process.send_signal(signal.SIGTERM)
             process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 0
-    assert [d["step"] for d in found] == [1, 2, 3]
-    assert found[0]["source"] == "whiskers" and found[0]["label"] in found[0]["probabilities"]
+
+
+def test_what_is_made_up_is_said_to_be(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    (folder / "robot.toml").write_text(EXAMPLE)
+    url = "source.whiskers.url=synthetic:mouse"
+    _, said, _ = call(monkeypatch, capsys, "config", "check", "robot.toml", "--set", url)
+    assert said.endswith("source whiskers is made up: what is decided on it means nothing\n")
+    _, said, _ = call(monkeypatch, capsys, "config", "check", "robot.toml")
+    assert "made up" not in said
+    _, _, err = call(monkeypatch, capsys, "run", "--source", "synthetic:mouse?seconds=0.1")
+    assert err.startswith("synthetic:mouse?seconds=0.1 is made up: what is decided on it means")
 
 
 def test_a_stream_that_is_over_and_a_time_that_is_up_end_it(folder, monkeypatch, capfd):

@@ -32,8 +32,6 @@ from tests.helpers.recorder_by_hand import (
     samples,
 )
 
-pytest.importorskip("mcap")
-
 VALUES = np.random.default_rng(0).normal(size=(90, *SPEC.shape)).astype(np.float32)
 
 

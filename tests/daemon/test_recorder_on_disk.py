@@ -28,8 +28,6 @@ from tests.helpers.recorder_by_hand import (
 )
 from tests.helpers.waiting import PATIENCE_S, until
 
-pytest.importorskip("mcap")
-
 VALUES = np.random.default_rng(0).normal(size=(400, *SPEC.shape)).astype(np.float32)
 CHUNKS = cut(VALUES, 1000.0, samples=10)
 NOBODY = 65534

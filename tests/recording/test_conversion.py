@@ -26,7 +26,6 @@ from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
 
-pytest.importorskip("mcap")
 h5py = pytest.importorskip("h5py")
 
 SPEC = small_spec()

@@ -7,8 +7,6 @@ from tactile_rt.recording import Recording
 from tests.helpers.hostile_files import MCAPS
 from tests.helpers.measured import measured
 
-pytest.importorskip("mcap")
-
 
 @pytest.mark.parametrize("name", MCAPS)
 def test_a_hostile_recording_is_refused(name, tmp_path):

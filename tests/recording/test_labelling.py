@@ -26,8 +26,6 @@ from tests.helpers.labelled import ARRAY, KINDS, chunks_of_touches, record_touch
 from tests.helpers.recordings import write
 from tests.helpers.tiny_sweeps import plate, write_tiny_set
 
-pytest.importorskip("mcap")
-
 HEADER = "recording,start_s,end_s,label,object\n"
 
 

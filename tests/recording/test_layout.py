@@ -20,8 +20,6 @@ from tactile_rt.stream import Chunk
 from tactile_rt.testing import FakeCan, FakeSerial, cut
 from tests.helpers.recordings import SPEC, noise, odd_chunks, parts, record_device, write
 
-pytest.importorskip("mcap")
-
 
 def test_samples_are_cdr_as_written_by_hand():
     chunk = Chunk(

@@ -23,7 +23,6 @@ from tactile_rt.stream import Chunk, concatenate
 from tactile_rt.testing import cut, small_spec
 from tests.helpers.recordings import all_parts, noise
 
-pytest.importorskip("mcap")
 pytest.importorskip("pyarrow")
 import pyarrow.parquet as pq
 

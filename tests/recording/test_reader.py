@@ -15,8 +15,6 @@ from tactile_rt.stream import concatenate
 from tactile_rt.testing import cut
 from tests.helpers.recordings import SPEC, all_parts, noise, odd_chunks, write
 
-pytest.importorskip("mcap")
-
 
 def test_chunks_come_back_bit_for_bit(path, no_thread_left):
     chunks = odd_chunks()

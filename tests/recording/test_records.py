@@ -4,9 +4,6 @@ from io import BytesIO
 
 import numpy as np
 import pytest
-
-pytest.importorskip("mcap")
-
 from mcap.reader import NonSeekingReader
 from mcap.records import (
     Channel,

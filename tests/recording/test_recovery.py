@@ -7,6 +7,7 @@ from contextlib import suppress
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import NonSeekingReader
 
 from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording import Description, Recording, recover
@@ -16,10 +17,6 @@ from tactile_rt.recording.recovery import MOST_NONE
 from tactile_rt.recording.writer import McapFile
 from tactile_rt.testing import cut
 from tests.helpers.recordings import SPEC, all_parts, noise, parts, write
-
-pytest.importorskip("mcap")
-
-from mcap.reader import NonSeekingReader
 
 
 @pytest.fixture(scope="module")

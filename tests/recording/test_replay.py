@@ -11,13 +11,12 @@ from tactile_rt.calibration import Calibration, save_calibration
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
 from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording import Recording
+from tactile_rt.recording.replay import DEMO
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import EndOfStream, concatenate
 from tactile_rt.sweep_set import SweepManifest, write_object
 from tactile_rt.testing import FakeCan, FakeSerial, cut
 from tests.helpers.recordings import SPEC, all_parts, noise, parts, record_device, write
-
-pytest.importorskip("mcap")
 
 
 def replayed(path, options="from=wire&speed=0"):
@@ -229,3 +228,64 @@ def test_sweeps_without_their_set_are_refused(sweep_set):
     (sweep_set[0].parent / "manifest.json").unlink()
     with pytest.raises(RecordingError, match="not a sweep set"):
         open_source(f"replay:{sweep_set[0]}")
+
+
+def passes(url, samples, count):
+    """The chunks of so many passes over what has so many samples, and the account of them."""
+    taken, chunks = 0, []
+    with open_source(url) as source:
+        while taken < count * samples:
+            chunks.append(source.read())
+            taken += len(chunks[-1])
+        assert taken == count * samples, "a pass ends with a chunk"
+        return concatenate(chunks), source.stats
+
+
+def check_three(whole, n, rate_hz):
+    assert (whole.seq == whole.seq[0] + np.arange(3 * n)).all()
+    assert (np.diff(whole.t_ns) > 0).all()
+    seams = np.diff(whole.t_ns)[[n - 1, 2 * n - 1]]
+    assert seams.tolist() == [round(1e9 / rate_hz)] * 2
+    for again in (whole.values[n : 2 * n], whole.values[2 * n :]):
+        np.testing.assert_array_equal(again, whole.values[:n])
+
+
+def test_a_loop_begins_again_and_its_numbers_and_times_go_on(path):
+    write(path, cut(noise(100), SPEC.rate_hz))
+    whole, stats = passes(f"replay:{path}?loop=true&speed=0", 100, 3)
+    check_three(whole, 100, SPEC.rate_hz)
+    assert (stats.delivered, stats.missing) == (300, 0)
+
+
+def test_packets_are_decoded_anew_in_every_pass_of_a_loop(path):
+    chunks, _ = record_device(FakeSerial(noise(90, (4, 6)), log=False), path, 90)
+    n = sum(map(len, chunks))
+    whole, stats = passes(f"replay:{path}?loop=true&from=wire&speed=0", n, 3)
+    check_three(whole, n, 1000.0)
+    assert stats.missing == 0
+
+
+def test_a_sweep_set_loops(sweep_set):
+    file, values = sweep_set
+    n = values.shape[1]
+    url = f"replay:{file}?speed=0&rest_s=0&sweep=1&loop=true"
+    with open_source(url) as source:
+        rate_hz = source.spec.rate_hz
+    check_three(passes(url, n, 3)[0], n, rate_hz)
+
+
+def test_a_loop_of_nothing_ends(path):
+    write(path, [])
+    with open_source(f"replay:{path}?loop=true&speed=0") as source:
+        assert list(source) == []
+
+
+def test_the_recording_that_ships_has_a_name_unless_a_file_has_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with open_source("replay:demo?speed=0") as source:
+        assert sum(map(len, source)) == sum(map(len, Recording(DEMO)))
+    write(tmp_path / "demo", cut(noise(7), SPEC.rate_hz))
+    with open_source("replay:demo?speed=0") as source:
+        assert sum(map(len, source)) == 7
+    with pytest.raises(ConfigError, match="no file"):
+        open_source(f"replay:{tmp_path}/none/demo")

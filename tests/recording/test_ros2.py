@@ -9,15 +9,14 @@ import numpy as np
 import pytest
 
 from tactile_rt.calibration import Calibration
-from tactile_rt.cli.demonstration import RECORDING
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.as_ros2 import write_bag
 from tactile_rt.recording.layout import encode_samples
+from tactile_rt.recording.replay import DEMO
 from tactile_rt.recording.writer import McapFile
 from tactile_rt.testing import FakeCan, FakeSerial, cut, small_spec
 from tests.helpers.recordings import SPEC, all_parts, noise, record_device
 
-pytest.importorskip("mcap")
 pytest.importorskip("rosbags")
 pytest.importorskip("mcap_ros2")
 from mcap.reader import make_reader
@@ -103,10 +102,10 @@ def test_each_channel_of_a_daemon_s_recording_is_read_by_both(path):
 
 
 def test_the_recording_that_is_shipped_is_read_by_both():
-    one, other = by_rosbags(RECORDING), by_mcap_ros2(RECORDING)
+    one, other = by_rosbags(DEMO), by_mcap_ros2(DEMO)
     assert {t: len(m) for t, m in one.items() if m} == {t: len(m) for t, m in other.items()}
     values = np.concatenate([m.values for m in one["/tactile/mouse_right/samples"]])
-    assert len(values) == 30 * 6 * sum(map(len, Recording(RECORDING)))
+    assert len(values) == 30 * 6 * sum(map(len, Recording(DEMO)))
 
 
 @pytest.mark.parametrize("name", ["device", "daemon"])

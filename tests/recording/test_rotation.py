@@ -12,8 +12,6 @@ from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, FakeSerial, cut
 from tests.helpers.recordings import SPEC, all_parts, noise, record_device
 
-pytest.importorskip("mcap")
-
 
 def test_files_of_one_second_are_numbered_and_none_is_written_over(tmp_path):
     source, rotation = ArraySource(SPEC, []), Rotation(tmp_path, "left")

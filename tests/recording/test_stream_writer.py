@@ -26,8 +26,6 @@ from tests.helpers.recordings import (
 )
 from tests.helpers.waiting import PATIENCE_S, until
 
-pytest.importorskip("mcap")
-
 
 def test_health_is_told_when_it_changes(path, tmp_path):
     fake = FakeSerial(noise(9000, (4, 6)), link=str(tmp_path / "whisker"))

@@ -14,8 +14,6 @@ from tactile_rt.recording.writer import RecordingWriter
 from tactile_rt.testing import ArraySource, cut
 from tests.helpers.recordings import SPEC, all_parts, noise
 
-pytest.importorskip("mcap")
-
 # Begins a file, killed at each line of the writer in turn.
 PROGRAM = """
 import itertools, os, sys

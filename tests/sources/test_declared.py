@@ -99,7 +99,6 @@ def test_a_device_is_the_array_that_it_is_said_to_be(codec: str, tmp_path: Path)
 
 
 def test_it_is_recorded_as_that_array_and_decoded_again_as_that(tmp_path: Path) -> None:
-    pytest.importorskip("mcap")
     array, path = array_of(1, "fz fx", "N,N"), tmp_path / "run.mcap"
     file = write(tmp_path / "robot.json", array)
     chunks, _ = record_device(
@@ -132,7 +131,6 @@ class Mute(NativeSerial):
 
 
 def test_a_native_device_that_says_nothing_is_told(tmp_path: Path, monkeypatch) -> None:
-    pytest.importorskip("mcap")
     array = array_of(3, "fy mz", "N,N m")
     file, path = write(tmp_path / "robot.json", array), tmp_path / "run.mcap"
     monkeypatch.setattr("tactile_rt.drivers.codecs.native.NativeSerial", Mute)

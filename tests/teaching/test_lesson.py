@@ -45,7 +45,6 @@ def teach(lesson: Lesson, labels: list[str], seed: int) -> None:
 
 @pytest.fixture(scope="module")
 def taught(tmp_path_factory):
-    pytest.importorskip("mcap")
     lesson = Lesson.begun(tmp_path_factory.mktemp("lesson") / "a", wrench_spec(), FLOOR)
     teach(lesson, TAUGHT, seed=1)
     lesson.learn()

@@ -6,7 +6,6 @@ import time
 import numpy as np
 import pytest
 
-pytest.importorskip("mcap")
 pytest.importorskip(
     "playwright.sync_api", reason="needs playwright (165 MB): pip install playwright"
 )

@@ -2,7 +2,6 @@
 
 import pytest
 
-pytest.importorskip("mcap")
 pytest.importorskip("zmq")
 pytest.importorskip("onnx")
 faults = pytest.importorskip("bench.daemon.faults")

@@ -4,7 +4,6 @@ import pytest
 
 from tests.helpers.waiting import until
 
-pytest.importorskip("mcap")
 kills = pytest.importorskip("bench.daemon.kills")
 
 

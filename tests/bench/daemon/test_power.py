@@ -7,7 +7,6 @@ import pytest
 
 from tests.helpers.waiting import until
 
-pytest.importorskip("mcap")
 power = pytest.importorskip("bench.daemon.power")
 kills = pytest.importorskip("bench.daemon.kills")
 

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 pytest.importorskip("onnx", reason="needs onnx: pip install '.[train]'")
-pytest.importorskip("mcap", reason="needs mcap: pip install '.[record]'")
 pytest.importorskip("zenoh", reason="needs zenoh: pip install '.[publish]'")
 
 from bench.daemon import chaos

@@ -274,6 +274,8 @@ function states() {
   }
   options($("model"), models, model);
   $("model-label").hidden = models.length < 2;
+  const here = s.sources.find((p) => p.part.name === "source." + source);
+  $("made-up").hidden = !models.length || !here || !here.url.startsWith("synthetic:");
   $("no-model").hidden = models.length > 0;
   $("by-model").hidden = models.length === 0;
   $("daemon").textContent = "daemon " + s.state;
