@@ -12,7 +12,6 @@ takes: the sources need no ONNX Runtime, and reading a recording needs no serial
 """
 
 import os
-import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -92,7 +91,3 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
-
-
-if "gymnasium" in sys.modules:  # which looks for "tactile_rt:tactile_rt/ActiveWhisking-v0" here
-    import_module("tactile_rt.sim_backend.environments")

@@ -1,8 +1,9 @@
 """Hooks of the documentation's site, see mkdocs.yml.
 
 Pages are read in two places. In the repository a link may lead to any file of the tree; on the site
-it leads there, too, by the repository's address in pyproject.toml. And the decisions are listed by
-their titles as they are in their folder, so that a new one needs no line anywhere.
+it leads there, too, by the repository's address in pyproject.toml. The decisions are listed by
+their titles as they are in their folder, so that a new one needs no line anywhere. And a table
+without a heading has no band where it would be.
 """
 
 import os
@@ -11,15 +12,17 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-__all__ = ["on_config", "on_page_markdown"]
+__all__ = ["on_config", "on_page_content", "on_page_markdown"]
 
 ROOT = Path(__file__).parents[2]
+NO_HEADING = re.compile(r"<thead>\s*<tr>(\s*<th[^>]*></th>)+\s*</tr>\s*</thead>")
 LINK = re.compile(r"(!?)\[((?:[^][]|\[[^][]*\])*)\]\(([^)\s]+)\)")
 
 
 def on_config(config: Any) -> Any:
     """Add the decisions to the navigation, and the address of the repository."""
     config.repo_url = repository()
+    config.repo_name = "/".join(config.repo_url.split("/")[-2:])
     docs = Path(config.docs_dir)
     pages = sorted(docs.glob("decisions/*.md"))
     listed = [{title(page): page.relative_to(docs).as_posix()} for page in pages]
@@ -45,6 +48,11 @@ def on_page_markdown(markdown: str, page: Any, config: Any, **_: Any) -> str:
         return f"[{words}]({config.repo_url}/{kind}/main/{there.relative_to(ROOT).as_posix()})"
 
     return LINK.sub(led, markdown)
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """Take away the headings of tables that have none."""
+    return NO_HEADING.sub("", html)
 
 
 def repository() -> str:

@@ -27,6 +27,7 @@ from tactile_rt.cli.app import (
     needs,
     starting,
 )
+from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import STDOUT, Json, told_as_json
 from tactile_rt.errors import ConfigError
 from tactile_rt.extras import install_extra
@@ -93,7 +94,7 @@ def demo(
         raise ConfigError(f"--fast and --seed are for a simulation: {do}")
     recorded |= not simulated
     try:
-        with starting(), console.status("building the array and the objects"):
+        with starting(), working(Console(stderr=True), "building the array and the objects"):
             demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None

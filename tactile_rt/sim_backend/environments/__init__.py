@@ -2,11 +2,9 @@
 
     import gymnasium
 
-    env = gymnasium.make("tactile_rt:tactile_rt/ActiveWhisking-v0", task="locate")
+    env = gymnasium.make("tactile_rt.sim_backend.environments:tactile_rt/ActiveWhisking-v0")
 
-Gymnasium imports what stands before the colon, and `tactile_rt` makes its environments known where
-Gymnasium is in use. A program that imports `tactile_rt` before Gymnasium names this package there,
-"tactile_rt.sim_backend.environments:tactile_rt/ActiveWhisking-v0".
+Gymnasium imports the module that stands before the colon, and this one registers the environment.
 """
 
 from typing import Final

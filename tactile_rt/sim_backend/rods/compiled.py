@@ -1,11 +1,13 @@
 """Compilation of the inner loops to machine code, which is kept for the next process.
 
 Where nothing can be kept (a folder that belongs to another, no home, a full disk), or what is kept
-is damaged, a process compiles for itself: that takes it half a minute, and no more.
+is damaged, a process compiles for itself: that takes it half a minute, and no more. Work that
+takes so long says so after ten seconds, as a warning of this module's logger.
 """
 
 import contextlib
 import logging
+import threading
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -39,21 +41,44 @@ class _Kept(_caching.FunctionCache):  # type: ignore[misc]
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = None
         try:
-            return super().load_overload(sig, target_context)
+            found = super().load_overload(sig, target_context)
         except Exception:  # damage shows itself in a dozen ways
             with contextlib.suppress(OSError):
                 self.flush()
-            return None
+        if found is None:
+            _compiling.add(self)
+            _watch_once()
+        return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
+        _compiling.discard(self)
         with contextlib.suppress(OSError):
             super().save_overload(sig, data)
 
 
+_LOG = logging.getLogger(__name__)
+PATIENCE_S = 10.0
+_compiling: set[_Kept] = set()  # the functions that are being compiled now
+
+
+@cache
+def _watch_once() -> None:
+    """Warn if compilation still goes on after `PATIENCE_S`."""
+    timer = threading.Timer(PATIENCE_S, _warn_of_compilation)
+    timer.daemon = True
+    timer.start()
+
+
+def _warn_of_compilation() -> None:
+    if _compiling:
+        _LOG.warning("compiling the simulator, once on this machine: half a minute more or less")
+
+
 @cache
 def _tell_once() -> None:
-    logging.getLogger(__name__).warning(
+    _LOG.warning(
         "the simulator is compiled anew, which takes half a minute: there is no folder to keep it "
         "in; NUMBA_CACHE_DIR can name one"
     )

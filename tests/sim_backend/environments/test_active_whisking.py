@@ -42,10 +42,12 @@ def test_the_checker_finds_nothing(task: str) -> None:
     check_env(made.unwrapped)
 
 
-def test_it_is_made_by_its_name_in_a_program_that_imports_nothing() -> None:
+@pytest.mark.parametrize("imports", ["gymnasium", "tactile_rt, gymnasium", "gymnasium, tactile_rt"])
+def test_it_is_made_by_its_name_whatever_is_imported_first(imports: str) -> None:
+    name = "tactile_rt.sim_backend.environments:tactile_rt/ActiveWhisking-v0"
     code = (
-        "import gymnasium\n"
-        "env = gymnasium.make('tactile_rt:tactile_rt/ActiveWhisking-v0', task='locate')\n"
+        f"import {imports}\n"
+        f"env = gymnasium.make({name!r}, task='locate')\n"
         "print(env.spec.max_episode_steps, *env.unwrapped.array_spec.elements)"
     )
     done = subprocess.run([sys.executable, "-W", "error", "-c", code], capture_output=True)

@@ -80,6 +80,27 @@ def test_a_full_disk_keeps_nothing(doubled, tmp_path, monkeypatch):
     assert kept(tmp_path, ".nbi") == []
 
 
+def test_compilation_that_lasts_is_said_and_what_was_kept_is_not(doubled, monkeypatch, caplog):
+    class Due:
+        """A timer that is over at once."""
+
+        def __init__(self, seconds, function):
+            self.start = function
+
+    monkeypatch.setattr(module.threading, "Timer", Due)
+    said = []
+    for _ in range(2):
+        module._watch_once.cache_clear()
+        caplog.clear()
+        with caplog.at_level(logging.WARNING):
+            assert doubled()(2.0) == 4.0
+        said.append("compiling the simulator" in caplog.text)
+    assert said == [True, False]
+    caplog.clear()
+    module._warn_of_compilation()  # what was compiled is compiled no more
+    assert not caplog.records
+
+
 def test_without_a_folder_it_is_said_once(doubled, monkeypatch, caplog):
     def no_place(self, function):
         raise RuntimeError("cannot cache function: no locator available")
