@@ -10,6 +10,8 @@
 They are apart from `stream`, which needs numpy, so that a command starts quickly.
 """
 
+from collections.abc import Iterable
+
 __all__ = [
     "ConfigError",
     "ModelError",
@@ -17,7 +19,34 @@ __all__ = [
     "SourceError",
     "SpecMismatch",
     "TactileError",
+    "length",
+    "name_some",
+    "shorten",
 ]
+
+LONGEST, WORD = 200, 80  # characters of a message, and of a word of it that is no path
+
+
+def name_some(items: Iterable[str], most: int = 3, between: str = ", ") -> str:
+    """Join the first items for a message, and count the rest: ``a, b, c and 17 more``."""
+    names = list(items)
+    more = f" and {len(names) - most} more" if len(names) > most else ""
+    return between.join(names[:most]) + more
+
+
+def length(message: str) -> int:
+    """Count the characters of a message; of a URL or the like 40 at most, of a path none."""
+    return sum(min(len(word), WORD // 2) + 1 for word in message.split(" ") if "/" not in word)
+
+
+def shorten(message: str) -> str:
+    """Cut what is too long out of a message: of a word that is no path, then of the whole."""
+    words = [
+        word if len(word) <= WORD or "/" in word else f"{word[:30]}...{word[-20:]}"
+        for word in message.split(" ")
+    ]
+    message = " ".join(words)
+    return message if length(message) <= LONGEST else f"{message[:130]} ... {message[-65:]}"
 
 
 class TactileError(Exception):

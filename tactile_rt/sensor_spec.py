@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.stream import NS_PER_S, ArraySpec
 
 __all__ = [
@@ -281,7 +281,7 @@ def channel_limits(
         return ChannelLimits(*(a.astype(np.float32) for a in (noise, floor, clip, 2 * noise)))
     if unknown := sorted(set(spec.units) - set(RATED_NOISE)):
         raise ConfigError(
-            f"channels in {', '.join(unknown)} cannot be learnt from without a [sensor] in the "
+            f"channels in {name_some(unknown)} cannot be learnt from without a [sensor] in the "
             "array's file, which says how noisy they are"
         )
 

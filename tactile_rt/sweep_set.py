@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.errors import ConfigError, RecordingError, name_some
 from tactile_rt.files import write_whole
 from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.sensor_spec import ChannelLimits, SensorSpec, channel_limits
@@ -136,7 +136,7 @@ class SweepManifest:
         """
         for split in splits:
             if split not in self.split:
-                raise ConfigError(f"no split {split!r}: there are {', '.join(self.split)}")
+                raise ConfigError(f"no split {split!r}: there are {name_some(self.split)}")
         return [name for split in dict.fromkeys(splits or self.split) for name in self.split[split]]
 
     def category(self, name: str) -> str:
@@ -187,7 +187,7 @@ class SweepManifest:
             differing = _differing(here, there)
             if differing:
                 raise ConfigError(
-                    f"{folder} holds another sweep set (other {', '.join(differing)}): "
+                    f"{folder} holds another sweep set (other {name_some(differing)}): "
                     "choose another folder, or repeat the options that began it"
                 )
             return
@@ -406,7 +406,7 @@ def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str,
 
 def _names_of(folder: Path, manifest: SweepManifest, split: str) -> list[str]:
     if split not in manifest.split:
-        raise ConfigError(f"no split {split!r} in {folder}: it has {', '.join(manifest.split)}")
+        raise ConfigError(f"no split {split!r} in {folder}: it has {name_some(manifest.split)}")
     skipped = read_skipped(folder)
     names = [name for name in manifest.split[split] if name not in skipped]
     if not names:

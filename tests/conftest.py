@@ -68,8 +68,18 @@ def _threads() -> set[threading.Thread]:
 
 @pytest.fixture
 def call(capsys, monkeypatch):
-    """Call `tactile-rt` in this process with these arguments: (exit code, stdout, stderr)."""
+    """Call `tactile-rt` in this process with these arguments: (exit code, stdout, stderr).
+
+    A message that must be cut to its longest fails the test: it is to be written shorter.
+    """
+    from tactile_rt import errors
     from tactile_rt.cli import main, progress
+
+    def check_length(message, shorten=errors.shorten):
+        assert errors.length(message) <= errors.LONGEST, f"{errors.length(message)}: {message}"
+        return shorten(message)
+
+    monkeypatch.setattr(errors, "shorten", check_length)
 
     # A slow machine must not add lines of progress to what a test expects on stderr.
     monkeypatch.setattr(progress, "LINE_S", threading.TIMEOUT_MAX)

@@ -86,7 +86,7 @@ def with_item(items: tuple, at: int, item: object) -> tuple:
         ),
         (
             {"channels": (*SPEC.channels, "fx"), "units": (*SPEC.units, "N")},
-            "channels are (fy, mz, fx), not (fy, mz); units are (N, N m, N), not (N, N m)",
+            "channels are (fy, mz, fx), not (fy, mz)",
         ),
         ({"name": "other", "frame": "base"}, "name is 'other', not 'small'; frame is"),
     ],

@@ -23,7 +23,7 @@ from tactile_rt.classifier.decision_rules import (
     named,
 )
 from tactile_rt.classifier.onnx_check import MAX_ELEMENTS
-from tactile_rt.errors import ConfigError, ModelError, SpecMismatch
+from tactile_rt.errors import ConfigError, ModelError, SpecMismatch, name_some
 from tactile_rt.sensor_spec import SensorSpec, channel_limits
 from tactile_rt.stream import ArraySpec
 
@@ -205,12 +205,12 @@ def element_order(card_spec: ArraySpec, source_spec: ArraySpec) -> NDArray[np.in
     else:
         lacking = [e for e in mine if e not in theirs]
         foreign = [e for e in theirs if e not in mine]
-        differences = [f"elements: lacks {', '.join(lacking)}"] if lacking else []
-        differences += [f"elements: {', '.join(foreign)} unknown to the model"] if foreign else []
+        differences = [f"lacks {name_some(lacking)}"] if lacking else []
+        differences += [f"{name_some(foreign)} unknown to the model"] if foreign else []
         rest = ("name", "rate_hz", "elements", "grid", "positions", "orientations")
         differences += card_spec.differences(source_spec, ignore=rest)
     if differences:
-        raise SpecMismatch("; ".join(differences))
+        raise SpecMismatch(name_some(differences, 2, "; "))
     return order
 
 
@@ -229,10 +229,10 @@ def fit_source(model: Path, card: ModelCard, spec: ArraySpec) -> NDArray[np.intp
     try:
         return element_order(card.array, spec)
     except SpecMismatch as error:
-        do = "name a model of this array"
+        do = "name a model of it"
         with suppress(SpecMismatch):
             declared(spec, card.array)
-            do += f"; or, if the sensor is the model's array, declare it: array={model}"
+            do += f", or declare it as the model's: array={model}"
         raise SpecMismatch(
             f"{model} was made for another array than {spec.name!r}: {error}; {do}"
         ) from None

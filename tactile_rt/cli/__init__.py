@@ -188,9 +188,25 @@ def _misused(error: Any) -> NoReturn:
     if type(error).__name__ == "NoArgsIsHelpError":  # nothing was said at all
         error.show()
         sys.exit(error.exit_code)
-    command = error.ctx.command_path if error.ctx else "tactile-rt"
+    command = error.ctx.command_path if error.ctx else _command_path(sys.argv[1:])
     said = " ".join(error.format_message().split()).rstrip(".")
     _give_up(f"{said}; see {command} --help", error.exit_code)
+
+
+def _command_path(words: list[str]) -> str:
+    """Return the command that the words of the command line name, as its help calls it."""
+    from typer.main import get_command
+
+    from tactile_rt.cli.app import app
+
+    path = "tactile-rt"
+    command: Any = get_command(app)
+    for word in words:
+        command = getattr(command, "commands", {}).get(word)
+        if command is None:
+            break
+        path += f" {word}"
+    return path
 
 
 def _empty_stdout() -> None:
@@ -205,7 +221,8 @@ def _give_up(why: str, code: int = 0) -> NoReturn:
     import typer
 
     from tactile_rt.cli.app import USER_ERROR
+    from tactile_rt.errors import shorten
 
-    line = " ".join(why.splitlines())  # what a user wrote may have several
+    line = shorten(" ".join(why.splitlines()))  # what a user wrote may have several
     typer.secho(f"tactile-rt: {line}", err=True, fg="red")
     sys.exit(code or USER_ERROR)

@@ -86,7 +86,13 @@ def fit(
         raise ConfigError("--out and --in-place: choose one of the two")
     for file in (out, json):
         check_output(file)
+    from tactile_rt.sources.opening import check_source, open_source
+
     loads = [_known(text) for text in known or ()]
+    if not described.is_file():
+        raise ConfigError(f"{described}: no such file")
+    url = f"replay:{recording}?speed=0" if Path(recording).is_file() else recording
+    check_source(url)
     try:
         with starting():
             from tactile_rt.project.device import keep_fit
@@ -95,10 +101,8 @@ def fit(
         raise needs("sim", error) from None
     from tactile_rt.calibration.taring import record
     from tactile_rt.files import write_whole
-    from tactile_rt.sources.opening import open_source
     from tactile_rt.stream import concatenate
 
-    url = f"replay:{recording}?speed=0" if Path(recording).is_file() else recording
     with starting():
         source = open_source(url)
     with source:

@@ -14,7 +14,7 @@ from rich.console import Console
 from tactile_rt.cli.app import app, check_output, needs
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import Json, show_records
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 
 CHECKOUT = Path(__file__).parents[2]
 # Each area, and the extra that its `run(quick) -> list[Record]` needs.
@@ -51,7 +51,7 @@ def bench(
     """
     known = (*AREAS, FAULTS)
     if area is not None and area not in known:
-        raise ConfigError(f"no benchmark area {area!r}: there are {', '.join(known)}")
+        raise ConfigError(f"no benchmark area {area!r}: there are {name_some(known, 8)}")
     if resume is not None and area != FAULTS:
         raise ConfigError("--resume goes with faults: tactile-rt bench faults --resume FILE")
     check_output(json)

@@ -13,7 +13,7 @@ from rich.table import Table
 from tactile_rt.cli.app import app, check_output, starting
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import STDOUT, Json, print_table, told_as_json
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 
 if TYPE_CHECKING:
     import numpy as np
@@ -148,7 +148,7 @@ def calibrate(
         )
     target = known or fresh
     if not element and len(target.elements) > 1:
-        raise ConfigError(f"--element: name the loaded one of {', '.join(target.elements)}")
+        raise ConfigError(f"--element: name the loaded one of {name_some(target.elements)}")
     element = element or target.elements[0]
     try:
         if len(loads.times):
@@ -245,7 +245,7 @@ def _with_fit(
 ) -> "Calibration":
     if element not in known.elements:
         raise ConfigError(
-            f"--element: {known.device} has no {element!r}; there are {', '.join(known.elements)}"
+            f"--element: {known.device} has no {element!r}; there are {name_some(known.elements)}"
         )
     if known.matrices.keys() - {element} and known.output != (loads.axes, loads.units):
         raise ConfigError(

@@ -78,16 +78,17 @@ def codecs(
     """Show what devices can speak: a line a codec; of one, its options and what it cannot show."""
     from tactile_rt.drivers.catalogue import CODECS, FRAMES
     from tactile_rt.errors import ConfigError
+    from tactile_rt.settings import no_such
 
     if frame:
         described = {path.stem: path for path in sorted(FRAMES.glob("*.toml"))}
         if frame not in described:
-            raise ConfigError(f"--frame {frame}: described are {', '.join(described)}")
+            raise ConfigError(no_such("described frame", frame, described))
         typer.echo(described[frame].read_text("utf-8"), nl=False)
         return
     names = sorted({name for _, name in CODECS})
     if codec and codec not in names:
-        raise ConfigError(f"no codec {codec!r}: there are {', '.join(names)}")
+        raise ConfigError(no_such("codec", codec, names))
     found: list[dict[str, Any]] = [
         {"codec": name, "wire": wire, "device": CODECS[wire, name].device}
         for wire, name in sorted(CODECS, key=lambda key: key[::-1])

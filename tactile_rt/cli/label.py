@@ -15,8 +15,13 @@ from tactile_rt.errors import ConfigError, RecordingError
 
 @app.command()
 def label(
-    recordings: Annotated[list[Path], typer.Argument(help="Recordings: .mcap, .npz, .csv, .h5.")],
-    folder: Annotated[Path, typer.Argument(help="Where the sweep set goes.", metavar="OUT")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RECORDING... OUT",
+            help="Recordings: .mcap, .npz, .csv, .h5; then the folder of the sweep set.",
+        ),
+    ],
     labels: Annotated[
         Path | None, typer.Option(help="What was touched when; default: labels.csv beside them.")
     ] = None,
@@ -54,6 +59,9 @@ def label(
     from tactile_rt.sim_backend.datasets.inventory import write_sums
     from tactile_rt.sweep_set import SPLITS
 
+    *recordings, folder = files
+    if not recordings:
+        raise ConfigError(f"no OUT: name the folder of the sweep set after {folder}")
     if (labels is not None) + by_name + unlabelled > 1:
         raise ConfigError("--labels, --by-name and --unlabelled exclude one another: give one")
     check_output(json)

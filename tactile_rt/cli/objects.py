@@ -10,6 +10,7 @@ from rich.markup import escape
 from tactile_rt.cli.app import app, check_output, needs, starting
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, show_table, told_as_json
+from tactile_rt.errors import ConfigError
 
 objects = typer.Typer(help="Objects that others made.", no_args_is_help=True)
 app.add_typer(objects, name="objects")
@@ -34,16 +35,16 @@ def get(
 
     Called again it goes on with what is missing. Exit code 1 if anything is.
     """
-    try:
-        with starting():
-            from tactile_rt.sim_backend.objects.object_lists import get_objects, read_list
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
+    from tactile_rt.sim_backend.objects.object_lists import get_objects, read_list
+
     check_output(json)
     listed = read_list(wanted)
     console = Console(stderr=True)
-    with progress_bar(console, "getting", total=len(listed), counted=True) as update:
-        missing = get_objects(listed, folder, clones, lambda name: update(advance=1))
+    try:
+        with starting(), progress_bar(console, "getting", len(listed), counted=True) as update:
+            missing = get_objects(listed, folder, clones, lambda name: update(advance=1))
+    except ModuleNotFoundError as error:
+        raise needs("sim", error) from None
     for name, why in missing.items():
         console.print(f"[red]{escape(name)}[/]: {escape(why)}", soft_wrap=True, highlight=False)
     licences = sorted({thing.files[0].licence for thing in listed})
@@ -70,6 +71,8 @@ def check(
 
     Exit code 1 if some cannot.
     """
+    if not folder.is_dir():
+        raise ConfigError(f"no folder {folder}")
     try:
         with starting():
             from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM

@@ -8,7 +8,7 @@ from urllib.parse import parse_qsl
 import typer
 
 from tactile_rt.cli.app import app, check_new, leaving
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.errors import ConfigError, RecordingError, name_some
 
 if TYPE_CHECKING:
     from tactile_rt.classifier.classifier import Classification, Classifier
@@ -223,7 +223,7 @@ def _in_order(files: list[Path]) -> "list[Recording]":
     names = dict.fromkeys(map(_source_of, found))
     if len(names) > 1:
         raise ConfigError(
-            f"recordings of several sources: {', '.join(names)}; replay one at a time"
+            f"recordings of several sources: {name_some(names)}; replay one at a time"
         )
     if len(found) == 1:
         return found

@@ -8,7 +8,6 @@ raises: what fails a check is counted in `stats`.
 """
 
 import abc
-import difflib
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -21,6 +20,7 @@ from numpy.typing import NDArray
 from tactile_rt import extensions
 from tactile_rt.drivers.catalogue import CODECS
 from tactile_rt.errors import ConfigError
+from tactile_rt.settings import no_such
 from tactile_rt.stream import ArraySpec, Chunk
 
 __all__ = [
@@ -333,8 +333,4 @@ def codec_class(wire: str, name: str) -> type[Codec[Any]]:
     if name in other:
         elsewhere = "can" if wire == "serial" else "serial"
         raise ConfigError(f"codec {name} speaks over {elsewhere}:, not over {wire}:")
-    near = difflib.get_close_matches(name, sorted(known), 1)
-    raise ConfigError(
-        f"no {wire} codec {name!r}: there are {', '.join(sorted(known))}"
-        + (f" (did you mean {near[0]}?)" if near else "")
-    )
+    raise ConfigError(no_such(f"{wire} codec", name, sorted(known)))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.decision_rules import UNKNOWN
 from tactile_rt.classifier.model_card import ModelCard
 from tactile_rt.classifier.model_file import load_model
-from tactile_rt.errors import ConfigError, SpecMismatch
+from tactile_rt.errors import ConfigError, SpecMismatch, name_some
 from tactile_rt.evidence.model_windows import stepped
 from tactile_rt.evidence.promises import familiarity, named_faults, promises
 from tactile_rt.evidence.records import Record
@@ -185,7 +185,7 @@ def _tested_on(data: Path, card: ModelCard, model: Path, quick: bool) -> SweepSe
     strange = [name for name in test.manifest.categories if name not in known]
     if strange:
         raise ConfigError(
-            f"{model} does not know {', '.join(strange)} of {data}: leave them out of "
+            f"{model} does not know {name_some(strange)} of {data}: leave them out of "
             "objects.categories, or name them in objects.withheld"
         )
     number = np.array([known.index(name) for name in test.manifest.categories])

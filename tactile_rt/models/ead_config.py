@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from tactile_rt import extensions
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 
 __all__ = [
     "ATTENDERS",
@@ -95,7 +95,7 @@ class EADConfig:
             ("preprocessing", PREPROCESSINGS),
         ):
             if (value := getattr(self, field)) not in known:
-                raise ConfigError(f"{field} is {value!r}, not one of {', '.join(known)}")
+                raise ConfigError(f"{field} is {value!r}, not one of {name_some(known, 8)}")
         if self.classes < 1:
             raise ConfigError(f"classes is {self.classes}, must be at least 1")
         if not 0 < self.width <= WIDEST or self.width * WIDTH_UNIT % 1:

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.stream import ArraySpec
 
 PAPER_UNITS = {"N": 1e-3, "N m": 1e-6}  # mN and uN m
@@ -118,7 +118,7 @@ def paper_units(spec: ArraySpec) -> tuple[list[float], list[float]]:
     """
     if unknown := sorted(set(spec.units) - set(PAPER_UNITS)):
         raise ConfigError(
-            f"preprocessing paper is of forces and moments: this array has {', '.join(unknown)}; "
+            f"preprocessing paper is of forces and moments: this array has {name_some(unknown)}; "
             "take log"
         )
     units = [PAPER_UNITS[unit] for unit in spec.units]

@@ -23,7 +23,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.errors import ConfigError, RecordingError, name_some
 from tactile_rt.recording.description import Description, seal
 from tactile_rt.recording.layout import (
     DECISIONS,
@@ -155,7 +155,7 @@ def raws_of(
 def _check(what: str, arrays: Mapping[str, Any], shape: tuple[int, int]) -> None:
     missing = [name for name in COLUMNS if name not in arrays]
     if missing:
-        raise RecordingError(f"{what} holds no {', '.join(missing)}")
+        raise RecordingError(f"{what} holds no {name_some(missing)}")
     n = len(arrays["seq"])
     for name, kind in zip(COLUMNS, KINDS, strict=True):
         expected = {"values": (n, *shape), "valid": (n, shape[0])}.get(name, (n,))

@@ -12,6 +12,7 @@ of any name and checks of the structs' own included, whose path msgspec does not
 
 import dataclasses
 import difflib
+import itertools
 import math
 import re
 import types
@@ -22,7 +23,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.settings.tree import SettingNode, named
 
 __all__ = ["convert", "hint", "is_list", "is_text", "nearest", "no_such", "refusal", "types_of"]
@@ -37,7 +38,7 @@ WORDS = {  # of msgspec, in a user's words
     "object": "a table", "array": "a list", "null": "nothing",
 }  # fmt: skip
 SEVERAL = {float: "numbers", int: "whole numbers", str: "texts", bool: "true or false"}
-LISTED = 40  # names that a message lists
+LISTED = 66  # characters of the names that a message lists
 _REFUSED = (ConfigError, ValueError, OverflowError, RecursionError)  # msgspec's are ValueErrors
 
 
@@ -89,9 +90,10 @@ def nearest(name: str, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(name.casefold(), plain, 1, 0.6)
     if near:
         return f"did you mean {plain[near[0]]}?"
-    more = f" ... ({len(names)})" if len(names) > LISTED else ""
     verb = "is" if len(names) == 1 else "are"
-    return f"there {verb} {', '.join(names[:LISTED]) or 'none'}{more}"
+    ends = itertools.accumulate(len(name) + 2 for name in names)
+    fitting = sum(end <= LISTED for end in ends)
+    return f"there {verb} {name_some(names, max(3, fitting)) or 'none'}"
 
 
 def no_such(what: str, name: str, known: Iterable[str]) -> str:

@@ -15,7 +15,7 @@ A lesson is a folder, so that it can be gone on with, looked at and corrected:
 
 import shutil
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -247,13 +247,19 @@ class Lesson:
         return tuple(name for name in self.labels if self.count(name) >= FEWEST)
 
     def left_out(self) -> "LessonProgress":
-        """How well touches are told apart by the others, at their last step."""
+        """How well touches are told apart by the others, at their last step.
+
+        Of one class alone no touch can be wrong, and none is counted as right.
+        """
         used = [k for k, t in enumerate(self.touches) if t.label in self.taught_enough]
         if not used:
             return LessonProgress((), (), ())
         names = [self.touches[k].label for k in used]
         found = self.taught.left_out(self._features(used), names)
-        return _progress(used, names, found)
+        progress = _progress(used, names, found)
+        if isinstance(self.taught, Taught) and len(set(names)) < 2:
+            return replace(progress, classes=())
+        return progress
 
     def learn(self) -> ModelCard:
         """Write the model of all classes with enough touches.

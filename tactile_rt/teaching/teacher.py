@@ -160,6 +160,9 @@ class Teacher:
             for name, count, good in self.progress.classes
         ]
         lines += [f"{a} is taken for {b}" for a, b in self.progress.confused[:3]]
+        learnt = self.lesson.taught_enough
+        if learnt and not lines:
+            lines = [f"{learnt[0]} is the only class: teach another, to see if they are told apart"]
         few = [name for name in self.lesson.labels if name not in self.lesson.taught_enough]
         return [*lines, *(f"{name}: one touch is too few, and was not learnt" for name in few)]
 

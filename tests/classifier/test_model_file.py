@@ -369,9 +369,9 @@ def test_anything_else_that_differs_is_said_exactly() -> None:
     source = reordered(spec, (2, 0, 3, 1))
     moved = replace(source, positions=((9.0, 9.0, 9.0), *source.positions[1:]))
     for other, said in [
-        (small_spec(elements=3), f"elements: lacks {spec.elements[3]}"),
+        (small_spec(elements=3), f"lacks {spec.elements[3]}"),
         (replace(source, elements=("new", *source.elements[1:])),
-         f"elements: lacks {source.elements[0]}; elements: new unknown to the model"),
+         f"lacks {source.elements[0]}; new unknown to the model"),
         (moved, r"positions\[2\] is \(9.0, 9.0, 9.0\), not"),
         (replace(source, channels=source.channels[::-1]), r"channels\[0\] is"),
         (replace(source, frame="elsewhere"), "frame is 'elsewhere', not"),

@@ -90,7 +90,7 @@ def test_mistakes_are_one_line(call, brain, tmp_path):
         (("--data", f"example={tmp_path / 'none'}"), "none"),
         ((*data, "--metric", "rsaa"), "did you mean rsa"),
         ((*data, "--part", "L7"), "no part of cortex"),
-        ((*data, "--seed", "-1", MODEL), "greater than or equal to 0"),
+        ((*data, "--seed", "-1", MODEL), "is not in the range"),
         ((*data, tmp_path / "odd.npz"), "is no layer"),
         ((*data, "--json", tmp_path / "x" / "b.json"), "no folder"),
     ):

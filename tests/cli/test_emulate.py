@@ -68,7 +68,7 @@ def test_ctrl_c_leaves(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nativ"], "no serial codec 'nativ': there are"),
+        (["nativ"], "no serial codec 'nativ'; did you mean native?"),
         (["bota", "--wire", "can", "--bus", "virtual:x"], "codec bota speaks over serial:"),
         (["native", "--wire", "usb"], "--wire must be serial, slcan or can, not 'usb'"),
         (["native", "--wire", "can"], "--wire can needs --bus INTERFACE:CHANNEL"),

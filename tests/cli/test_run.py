@@ -146,7 +146,7 @@ def test_a_model_that_cannot_be_used_is_one_line(call, bad_models, wrong, said, 
 def test_a_model_of_another_array_is_refused_before_a_device_is_looked_for(refused, source):
     said = refused("run", "--source", source)
     assert said.startswith(f"tactile-rt: {source}: {shipped_model()} was made for another array")
-    assert "; name a model of this array" in said
+    assert "; name a model of it" in said
 
 
 def test_a_source_is_run_as_the_array_that_it_is_said_to_be(call, refused, tmp_path):
@@ -180,8 +180,8 @@ def test_a_source_that_cannot_be_opened_is_one_line(call, source, said):
 
 @pytest.mark.parametrize(
     ("command", "missing", "extra"),
-    [(("run", "--source", ONE_MUG), ("mujoco",), "sim"), (("demo",), ("mujoco", "mcap"), "record")],
-    ids=["run", "demo"],
+    [(("run", "--source", ONE_MUG), ("mujoco",), "sim"), (("view", "mug-50"), ("mujoco",), "view")],
+    ids=["run", "view"],
 )
 def test_without_the_extra_the_way_to_install_it_is_named(command, missing, extra):
     without = "; ".join(f"sys.modules[{name!r}] = None" for name in missing)

@@ -13,8 +13,6 @@ from pathlib import Path
 import pytest
 
 from tactile_rt.cli import app as cli_app
-from tactile_rt.cli.devices import _about
-from tactile_rt.drivers.codec import SerialCodec
 from tactile_rt.recording import Recording, StreamWriter
 
 CLI = "import sys; sys.argv[0] = 'tactile-rt'; from tactile_rt.cli import main; main()"
@@ -190,11 +188,3 @@ def test_a_configuration_is_written_whole_or_not(refused, tmp_path, monkeypatch)
         f"tactile-rt: cannot use {path}: No space left on device\n"
     )
     assert os.listdir(tmp_path) == []
-
-
-def test_a_codec_without_docstrings_has_not_those_of_its_base():
-    """As all have under `python -OO`, where the bases of the standard library keep theirs."""
-    assert _about(type("Bare", (SerialCodec,), {})) == ""
-    assert _about(type("Told", (SerialCodec,), {"__doc__": "\n    Reads ``x``.\n\n    More."})) == (
-        "Reads x."
-    )

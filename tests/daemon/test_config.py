@@ -218,7 +218,7 @@ def test_a_model_that_cannot_fit_its_source_is_refused_beforehand(tmp_path, monk
     found = refusal_of(tmp_path, SMALL.replace("synthetic:5x6", url) + "[[model]]\n")
     assert found.startswith("robot.toml:5: model[0].file: source whiskers: ")
     assert "mouse44.onnx was made for another array than" in found
-    assert "; name a model of this array" in found
+    assert "; name a model of it" in found
 
 
 def test_so_is_one_of_another_array_than_a_recording(tmp_path):
@@ -239,9 +239,7 @@ def test_a_model_is_held_against_what_its_source_is_said_to_be(tmp_path):
     declaration = 'array = "mouse.onnx"\n'
     check_config(load(tmp_path, line.format(declaration)))
     found = refusal_of(tmp_path, line.format(""))
-    assert found.endswith(
-        f"if the sensor is the model's array, declare it: array={shipped_model()}"
-    )
+    assert found.endswith(f"or declare it as the model's: array={shipped_model()}")
     for unknown in ("serial:/dev/none?codec=native", "can:virtual:none?codec=native"):
         check_config(load(tmp_path, line.replace("synthetic:30x6", unknown).format("")))
     # of a device that only itself can tell, what it is said to be counts

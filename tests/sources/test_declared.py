@@ -239,14 +239,14 @@ def test_a_model_s_file_says_what_array_it_is(tmp_path: Path) -> None:
         check_model(model, line)
     said = str(caught.value)
     assert said.startswith(f"{line}: {model} was made for another array than 'ascii_line': ")
-    assert "elements: lacks whisker0, whisker1, whisker2" in said
-    assert said.endswith(f"if the sensor is the model's array, declare it: array={model}")
+    assert "lacks whisker0, whisker1, whisker2" in said
+    assert said.endswith(f"or declare it as the model's: array={model}")
     check_model(model, f"{line}&array={model}")  # as it says
     for url in ("serial:x?codec=native", f"serial:x?codec=native&array={model}"):
         check_model(model, url)  # the device will tell
     with pytest.raises(SpecMismatch) as caught:
         check_model(model, "serial:x?codec=bota")
-    assert str(caught.value).endswith("; name a model of this array")  # declared it cannot be
+    assert str(caught.value).endswith("; name a model of it")  # declared it cannot be
 
 
 def test_a_declared_array_costs_nothing_where_it_is_so_already(tmp_path: Path) -> None:

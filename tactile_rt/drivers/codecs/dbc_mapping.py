@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.dbc_limits import DEEPEST, MOST_BYTES, check_dbc
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.extras import lacking
 from tactile_rt.settings import convert, read_toml
 from tactile_rt.stream import ArraySpec
@@ -195,7 +195,7 @@ def read_mapping(path: Path) -> DbcMapping:
 
 def _near(name: str, known: Iterable[str]) -> str:
     near = difflib.get_close_matches(name, list(known), 1)
-    return f" (did you mean {near[0][:100]}?)" if near else ""
+    return f" (did you mean {near[0][:40]}?)" if near else ""
 
 
 class _Reader:
@@ -294,7 +294,7 @@ class _Reader:
     def _message(self, where: str, name: str) -> Any:
         if name not in self.messages:
             hint = _near(name, self.messages)
-            raise ConfigError(f"{where}: no message {name!r} in {self.dbc}{hint}")
+            raise ConfigError(f"{where}: no message {name[:40]!r} in {self.dbc}{hint}")
         return self.messages[name]
 
     def _find(self, where: str, name: str) -> tuple[Any, Signal]:
@@ -307,9 +307,12 @@ class _Reader:
         message = self._message(where, of)
         known = {s.name: s for s in message.signals}
         if signal_name not in known:
-            hint = _near(signal_name, known) or f"; it has {', '.join(known)[:500] or 'none'}"
+            hint = (
+                _near(signal_name, known)
+                or f"; it has {name_some([n[:40] for n in known]) or 'none'}"
+            )
             raise ConfigError(
-                f"{where}: no signal {signal_name!r} in message {of} of {self.dbc}{hint}"
+                f"{where}: no signal {signal_name!r} in message {of[:40]} of {self.dbc}{hint}"
             )
         signal = known[signal_name]
         chain: list[tuple[str, frozenset[int]]] = []

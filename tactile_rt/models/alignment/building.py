@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.alignment.benchmark import PROTOCOLS, Benchmark
 from tactile_rt.models.alignment.clock import CLOCKS, WARNING, ContactResponse, said_of
 from tactile_rt.models.alignment.copies import refuse_copies
@@ -187,17 +187,14 @@ def _complete(sessions: Sequence[NeuralSession], notes: list[str]) -> list[Neura
         else:
             kept.append(session)
     if not kept:
-        raise ConfigError("no session can be used: " + "; ".join(notes))
+        raise ConfigError(f"no session can be used: {name_some(notes, 1)}")
     return kept
 
 
 def _check_reliable(made: Benchmark) -> None:
     if not made.reliable:
-        found = ", ".join(
+        found = name_some(
             f"{t.name} {t.chosen.reliability:.2f} ({t.chosen.units} of {t.unfiltered.units} units)"
             for t in made.targets
         )
-        raise ConfigError(
-            f"no animal is reliable enough to score on; reliabilities: {found}; "
-            + "; ".join(made.notes)
-        )
+        raise ConfigError(f"no animal is reliable enough to score on; reliabilities: {found}")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.alignment.rdm import STIMULI
 
 __all__ = ["Animal", "NeuralSession", "by_animal", "pad", "published_layout", "rates_sha256"]
@@ -105,7 +105,7 @@ def published_layout(animal: Animal) -> Floats:
         missing = [name for name, n in zip(STIMULI, session.trials, strict=True) if not n]
         if missing:
             raise ConfigError(
-                f"session {session.name} has no correct trial of {', '.join(missing)}: paper-code "
+                f"session {session.name} has no correct trial of {name_some(missing)}: paper-code "
                 "cannot place it; leave the session out or build with protocol strict"
             )
         _, first = np.unique(session.stimulus, return_index=True)

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.extras import lacking
 from tactile_rt.models.alignment.clock import CLOCKS, ContactResponse, contact_response
 from tactile_rt.models.alignment.neural import NeuralSession
@@ -139,7 +139,7 @@ def read_nwb(
                 readings.append(reading)
         read(1.0)
     if not readings:
-        raise ConfigError("; ".join(spoilt) or f"no session of {len(named)} is of {wanted}")
+        raise ConfigError(name_some(spoilt, 1) or f"no session of {len(named)} is of {wanted}")
     notes = [*spoilt, *(note for reading in readings for note in reading.notes)]
     if str(wanted):
         units = sum(r.session.rates.shape[1] for r in readings)
@@ -163,7 +163,7 @@ def read_session(
     """
     for what, value, known in (("window", window, WINDOWS), ("clock", clock, CLOCKS)):
         if value not in known:
-            raise ConfigError(f"no {what} {value!r}: there are {', '.join(known)}")
+            raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
     h5py = _h5py()
     try:
         with h5py.File(path, "r") as file:
@@ -235,8 +235,8 @@ def _session(
             drop(~np.isfinite(start), "no contact before the choice")
     rows = np.flatnonzero(kept)
     if not rows.size:
-        raise ConfigError("; ".join([f"no trial is left in {TRIALS}: correct, not ignored, convex "
-                                     "or concave", *notes]))  # fmt: skip
+        left = f"no trial is left in {TRIALS}: correct, not ignored, convex or concave"
+        raise ConfigError(name_some([left, *notes], 2, "; "))
     depth = unit_column(file, "depth", len(units), notes)
     inhibitory = inhibitory_units(file, len(units), notes)
     chosen = selection.units(depth, inhibitory, len(units))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.alignment.selection import TASKS
 
 if TYPE_CHECKING:
@@ -76,7 +76,7 @@ def trial_columns(file: "h5py.File") -> dict[str, NDArray[Any]]:
     if missing:
         there = ", ".join(sorted(table))
         raise ConfigError(
-            f"{TRIALS} lacks the column{'s' * (len(missing) > 1)} {', '.join(missing)} "
+            f"{TRIALS} lacks the column{'s' * (len(missing) > 1)} {name_some(missing)} "
             f"(it has {there})"
         )
     columns = {name: stored(table, name) for name in COLUMNS}

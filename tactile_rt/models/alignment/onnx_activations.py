@@ -34,7 +34,7 @@ __all__ = ["nearest_taps", "onnx_layers", "with_outputs"]
 
 Floats = NDArray[np.float32]
 TOKENS = 2  # of a GPT attender's step, the action token last
-REASON = 300  # characters of what onnxruntime says
+REASON = 120  # characters of what onnxruntime says
 TAP = "tap:"  # prefix of the outputs that are added
 
 

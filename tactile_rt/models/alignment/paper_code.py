@@ -24,7 +24,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.models.alignment.neural import pad, rates_sha256
 from tactile_rt.models.alignment.rdm import STIMULI, pearson, rdm
@@ -74,7 +74,7 @@ def freeze_paper_code(
             notes.append(f"{error}: left out")
         progress((done := done + 1) / steps)
     if not targets:
-        raise ConfigError("; ".join(notes) or "there is no animal")
+        raise ConfigError(name_some(notes, 1) or "there is no animal")
     names = tuple(target.name for target in targets)
     rates = {name: rates[name] for name in names}
     pooled = None

@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 
 __all__ = ["CELLS", "LAYERS_UM", "TASKS", "Selection"]
 
@@ -57,7 +57,7 @@ class Selection:
         """
         for what, value, known in (("task", task, TASKS), ("cell type", cells, CELLS)):
             if value is not None and value not in known:
-                raise ConfigError(f"no {what} {value!r}: there are {', '.join(known)}")
+                raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
         return cls(task, tuple(sessions), _depths(depth) if depth else None, cells)
 
     def takes(self, session: str) -> bool:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.sensor_spec import CHANNEL_FLOOR
 from tactile_rt.stream import ArraySpec
@@ -106,7 +106,7 @@ def read_stimuli(path: Path | None = None) -> StimuliInput:
     except FileNotFoundError:
         raise ConfigError(f"no file {path}: make one with `tactile-rt whisk`") from None
     except Exception as error:  # numpy and zipfile raise many unrelated types for a damaged file
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = " ".join(str(error).split())[:80] or type(error).__name__
         raise ConfigError(f"{path} is no model input of `tactile-rt whisk`: {reason}") from None
     for what in ("stimuli", "elements", "channels", "units"):
         text = arrays[what]
@@ -117,7 +117,7 @@ def read_stimuli(path: Path | None = None) -> StimuliInput:
     names = [str(n) for n in arrays["stimuli"]]
     missing = [n for n in STIMULI if n not in names]
     if missing:
-        raise ConfigError(f"{path} lacks the stimuli {', '.join(missing)}")
+        raise ConfigError(f"{path} lacks the stimuli {name_some(missing)}")
     elements, channels, units = (
         tuple(str(n) for n in arrays[k]) for k in ("elements", "channels", "units")
     )
@@ -132,7 +132,7 @@ def read_stimuli(path: Path | None = None) -> StimuliInput:
     if not (np.abs(values) <= np.finfo(np.float32).max).all():
         raise ConfigError(f"{path} has samples that are not finite")
     if unknown := sorted(set(units) - set(CHANNEL_FLOOR)):
-        raise ConfigError(f"{path}: channels in {', '.join(unknown)} cannot be scored")
+        raise ConfigError(f"{path}: channels in {name_some(unknown)} cannot be scored")
     samples = values[[names.index(n) for n in STIMULI]].astype(np.float32)
     floor = np.array([CHANNEL_FLOOR[u] for u in units], dtype=np.float32)
     return StimuliInput(

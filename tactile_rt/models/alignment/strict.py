@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.models.alignment.canonical import canonical
 from tactile_rt.models.alignment.neural import Animal, NeuralSession, rates_sha256
@@ -139,7 +139,7 @@ def freeze_strict(
         )
         progress(done / len(animals))
     if not targets:
-        raise ConfigError("no animal can be used: " + "; ".join(notes))
+        raise ConfigError(f"no animal can be used: {name_some(notes, 1)}")
     return Benchmark(
         protocol="strict",
         targets=tuple(targets),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.ead_config import CELLS, added_cells
 
 __all__ = ["FUSIONS", "KINDS", "Edge", "Graph", "Input", "Node"]
@@ -93,7 +93,7 @@ class Graph:
         self.sizes  # noqa: B018  maps must fit each other
         idle = sorted(n.name for n in self.nodes if n.name not in self.remaining)
         if idle:
-            raise ConfigError(f"{', '.join(idle)} cannot reach the readout {self.readout}")
+            raise ConfigError(f"{name_some(idle)} cannot reach the readout {self.readout}")
         if self.frame.name not in self.remaining:
             raise ConfigError(f"no path from {self.frame.name} to the readout {self.readout}")
 
@@ -171,7 +171,7 @@ def _check_node(node: Node, names: list[str]) -> None:
         *(("fusion", edge.fusion, FUSIONS) for edge in node.reads),
     ):
         if value not in known:
-            raise ConfigError(f"{node.name}: {what} is {value!r}, not one of {', '.join(known)}")
+            raise ConfigError(f"{node.name}: {what} is {value!r}, not one of {name_some(known, 8)}")
     sources = [edge.source for edge in node.reads]
     if not sources or node.reads[0].fusion != "concatenate":
         raise ConfigError(f"{node.name}: the first edge that it reads must be concatenated")

@@ -3,7 +3,7 @@
 from importlib import resources
 from pathlib import Path
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.grid.plan import Candidate, Grid, Task
 from tactile_rt.models.training.config import ProbeConfig
 from tactile_rt.settings import convert, make_node, parse_toml, read_toml
@@ -61,7 +61,7 @@ def _check(grid: Grid) -> None:
     tables |= {f"options of cell {cell.name!r}": cell.options for cell in grid.cells}
     for table, fields in tables.items():
         if taken := [key for key in fields if key in OWN]:
-            raise ConfigError(f"{table}: {', '.join(taken)} is what the grid itself decides")
+            raise ConfigError(f"{table}: {name_some(taken)} is what the grid itself decides")
     if "data" in grid.probe:
         raise ConfigError("probe: data is what the grid itself decides")
     before: dict[str, Candidate] = {}

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from math import isfinite
 from pathlib import Path
 
-from tactile_rt.errors import ConfigError, ModelError
+from tactile_rt.errors import ConfigError, ModelError, name_some
 from tactile_rt.models.data_checks import check_labelled, check_split
 from tactile_rt.models.datasets import frame_of
 from tactile_rt.models.ead_config import MOUSE_FRAME, READOUTS, EADConfig
@@ -160,7 +160,7 @@ class TrainingConfig:
             ("precision", PRECISIONS),
         ):
             if (value := getattr(self, name)) not in known:
-                raise ConfigError(f"{name} is {value!r}, not one of {', '.join(known)}")
+                raise ConfigError(f"{name} is {value!r}, not one of {name_some(known, 8)}")
         for name in ("epochs", "batch", "learning_rate", "drop_every", "temperature"):
             _check_positive(name, getattr(self, name))
         for name in ("updates", "clip_norm", "weight_decay", "jitter"):

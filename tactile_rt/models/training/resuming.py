@@ -13,7 +13,7 @@ import msgspec
 import torch
 from torch.optim.lr_scheduler import LRScheduler
 
-from tactile_rt.errors import ConfigError, ModelError
+from tactile_rt.errors import ConfigError, ModelError, name_some
 from tactile_rt.files import write_whole
 from tactile_rt.models.checkpoint_files import describe_checkpoint, reason
 from tactile_rt.models.objectives import Objective
@@ -83,7 +83,7 @@ class RunState:
             self.epoch, self.done, self.best = saved["epoch"], saved["done"], saved["best"]
         except Exception as error:  # torch raises many unrelated types for a damaged file
             raise ModelError(
-                f"{last} is damaged ({reason(error)}): delete it to begin the run anew"
+                f"{last} is damaged ({reason(error)[:60]}): delete it to begin the run anew"
             ) from None
         try:
             describe_checkpoint(folder / "best.pt")
@@ -129,7 +129,7 @@ def begin_run(config: TrainingConfig, folder: Path) -> None:
     ]
     if differing:
         raise ConfigError(
-            f"{folder} holds a run of another configuration (other {', '.join(differing)}): choose "
+            f"{folder} holds a run of another configuration (other {name_some(differing)}): choose "
             "another folder, or repeat the options that began it"
         )
 

@@ -12,7 +12,7 @@ from importlib import resources
 import numpy as np
 
 from tactile_rt import extensions
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.sim_backend.arrays.robots import ROBOTS
 from tactile_rt.sim_backend.arrays.whisker_array import (
     MOUNT,
@@ -69,7 +69,7 @@ def species_array(name: str) -> WhiskerArray:
         near = difflib.get_close_matches(name, known, 1)
         raise ConfigError(
             f"no simulated array {name!r}: "
-            + (f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}")
+            + (f"did you mean {near[0]}?" if near else f"there are {name_some(known, 8)}")
             + " (or give a .csv or .toml file)"
         )
     side = side or "right"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tactile_rt.errors import RecordingError
+from tactile_rt.errors import RecordingError, name_some
 from tactile_rt.files import write_whole
 from tactile_rt.sweep_set import (
     MANIFEST,
@@ -117,7 +117,7 @@ def check_sums(folder: Path) -> int:
     if bad:
         raise RecordingError(
             f"{folder}: {len(bad)} of {len(sums)} files are missing or damaged: "
-            f"{', '.join(bad)}; delete them and sweep again"
+            f"{name_some(bad)}; delete them and sweep again"
         )
     return len(sums)
 

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError, SourceError
+from tactile_rt.errors import ConfigError, SourceError, name_some
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.environments.whisking_head import Stretch, WhiskingHead, place_beside
@@ -191,7 +191,7 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
             raise ConfigError(f"no whisker meets {named or 'any object'}: take another array")
         category = placed.name.rpartition("-")[0]
         if category not in self._kinds:
-            raise ConfigError(f"{placed.name} is of none of the kinds {', '.join(self._kinds)}")
+            raise ConfigError(f"{placed.name} is of none of the kinds {name_some(self._kinds)}")
         self._object, self._label = placed.name, self._kinds.index(category)
         self._head = WhiskingHead(
             self._array, placed, self._profile, Whisking(FREQUENCY_HZ, 0.0, 0.0)
@@ -283,5 +283,5 @@ def _some(array: WhiskerArray, names: Sequence[str]) -> WhiskerArray:
         return array
     known = {w.name: w for w in array.whiskers}
     if unknown := [name for name in names if name not in known]:
-        raise ConfigError(f"array {array.name} has no whisker {unknown[0]}: {', '.join(known)}")
+        raise ConfigError(f"array {array.name} has no whisker {unknown[0]}: {name_some(known, 8)}")
     return replace(array, whiskers=tuple(w for w in array.whiskers if w.name in names))

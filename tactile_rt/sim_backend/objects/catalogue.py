@@ -16,7 +16,7 @@ import numpy as np
 import trimesh
 
 from tactile_rt import extensions
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh
@@ -150,13 +150,10 @@ def _check(category: str, index: int) -> str:
     if kind not in _BUILDERS and kind not in (added := added_categories()):
         near = difflib.get_close_matches(kind, (*_BUILDERS, *added), n=1, cutoff=0.3)
         prefix = VARIED if category.startswith(VARIED) else ""
-        hint = f" (did you mean {prefix + near[0]!r}?)" if near else ""
+        known = name_some([*CATEGORIES, *WITHHELD, *OUTLIERS, *added], 8)
+        hint = f"did you mean {prefix + near[0]!r}?" if near else f"there are {known}"
         raise ConfigError(
-            f"no object called {category!r}{hint}; there are {', '.join(CATEGORIES)}; "
-            f"{', '.join(WITHHELD)} (withheld from training); {', '.join(OUTLIERS)} (of no kind); "
-            f"{', '.join(added)}{' (of other packages); ' if added else ''}"
-            f"each also with {VARIED!r} before it; "
-            f"and mesh files ending in {', '.join(MESH_SUFFIXES)}"
+            f"no object called {category!r}; {hint} (or a mesh file: {', '.join(MESH_SUFFIXES)})"
         )
     if index < 0:
         raise ConfigError(f"object {category}-{index}: the index must be 0 or more")

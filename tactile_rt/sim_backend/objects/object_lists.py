@@ -33,14 +33,11 @@ from typing import Annotated
 from urllib.parse import quote
 
 import msgspec
-from trimesh.exchange.ply import export_ply
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.settings import check_columns, convert, no_such, read_csv
 from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
-from tactile_rt.sim_backend.objects.mesh_files import read_parts
-from tactile_rt.sim_backend.objects.object_sets import FOLDER_TABLE, Origin
 
 __all__ = [
     "ListedFile",
@@ -146,7 +143,10 @@ def get_objects(
 
     Raises:
         ConfigError: the folder of clones is not there.
+        ModuleNotFoundError: trimesh is not installed, with which meshes are read.
     """
+    from tactile_rt.sim_backend.objects import mesh_files  # noqa: F401
+
     if clones is not None and not clones.is_dir():
         raise ConfigError(f"{clones}: no such folder of clones")
     folder.mkdir(parents=True, exist_ok=True)
@@ -168,6 +168,10 @@ def get_objects(
 
 
 def _get(thing: ListedObject, path: Path, clones: Path | None) -> None:
+    from trimesh.exchange.ply import export_ply
+
+    from tactile_rt.sim_backend.objects.mesh_files import read_parts
+
     first = thing.files[0]
     with tempfile.TemporaryDirectory() as place:
         parts = []
@@ -217,6 +221,8 @@ def _cloned(file: ListedFile, clones: Path) -> bytes:
 
 
 def _write_table(objects: Sequence[ListedObject], folder: Path) -> None:
+    from tactile_rt.sim_backend.objects.object_sets import FOLDER_TABLE, Origin
+
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(("category", "name", *Origin.__struct_fields__))

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.extras import lacking
 from tactile_rt.models.alignment.datasets import DatasetContents, NeuralDataset
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
@@ -81,7 +81,7 @@ def _read(
             notes.append(f"{path.name} left out: it cannot be read as one of these ({reason})")
         progress(done / len(files))
     if not cells:
-        raise ConfigError("no cell can be used: " + "; ".join(notes))
+        raise ConfigError(f"no cell can be used: {name_some(notes, 1)}")
     mice = sorted({cell.session.animal for cell in cells})
     groups = tuple(
         Animal(
