@@ -46,7 +46,7 @@ def shorten(message: str) -> str:
         for word in message.split(" ")
     ]
     message = " ".join(words)
-    return message if length(message) <= LONGEST else f"{message[:130]} ... {message[-65:]}"
+    return message if length(message) <= LONGEST else f"{message[:129]} ... {message[-65:]}"
 
 
 class TactileError(Exception):
