@@ -13,7 +13,7 @@ PARALLEL := -n logical --maxprocesses 8 --max-worker-restart 0 --dist loadfile -
 # What `make quick` looks at: a package under tactile_rt, as P=drivers.
 P ?= stream
 
-.PHONY: demo test quick lint check docs check-export bench fuzz captures format clean
+.PHONY: demo test quick lint check docs roads check-export bench fuzz captures format clean
 
 demo: $(VENV)/.sim
 	$(BIN)/tactile-rt demo --sweeps 12
@@ -43,6 +43,9 @@ check: lint
 	$(PYTEST) $(PARALLEL)
 	$(PYTEST) -m slow
 	$(BIN)/python -m bench.checks.wheel
+
+roads: $(VENV)/.dev
+	$(BIN)/python -m bench.roads base page extras lerobot
 
 check-export: $(VENV)/.dev
 	$(BIN)/python -m bench.checks.export

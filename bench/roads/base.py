@@ -13,7 +13,7 @@ PASSED = ["birdcage", "grapes", "table", "bottle", "plane", "castle"]  # in the 
 TABLE = "time,left,right\n" + "".join(f"{k / 100},{k % 7},{k % 5}\n" for k in range(300))
 # Two samples of an Aidin AFT200: forces and torques in two frames each.
 LOG = "".join(
-    f"({k / 100:.6f}) can0 {name}#{'7530' * 3}\n" for k in range(100) for name in ("1A1", "1B1")
+    f"({k / 100:.6f}) can0 {name}#{'7530' * 3}\n" for k in range(100) for name in ("001", "002")
 )
 
 
@@ -63,11 +63,6 @@ def walk_base(road: Road, wheel: Path) -> None:
     )
     model = ["--source", "replay:demo?speed=0", "--model", "lesson/model.onnx", "--final-only"]
     road.step("decide by the lesson", "tactile-rt", "run", *model, says=['"label":"'])
-    advice = road.step(
-        "an extra that is lacking", "tactile-rt", "describe", "can:virtual:x?codec=can-dbc&mapping="
-        "docs.toml", code=2, says=["tactile-rt: "],
-    )  # fmt: skip
-    del advice
     said = road.step(
         "a source that needs an extra", "tactile-rt", "run", "--source", "sim:mouse", code=2,
         says=["not installed: "],

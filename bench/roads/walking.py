@@ -1,7 +1,6 @@
 """What a road is walked with: a wheel, an empty environment, steps that must say what they do."""
 
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -24,7 +23,7 @@ class Failed(Exception):
 def build_wheel(folder: Path) -> Path:
     """Build the wheel of this checkout into a folder; returns its path."""
     build = [sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(ROOT)]
-    subprocess.run(build, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(build, check=True, capture_output=True)
     (wheel,) = folder.glob("*.whl")
     return wheel
 
@@ -33,13 +32,15 @@ def find_python(version: str) -> str:
     """Return the path of a Python such as ``3.12``; empty if there is none here."""
     if sys.version_info[:2] == tuple(map(int, version.split("."))):
         return str(Path(sys.base_prefix) / "bin" / f"python{version}")
-    found = shutil.which(f"python{version}")
-    if found and not subprocess.run([found, "-c", ""], capture_output=True, check=False).returncode:
-        return found
-    if not shutil.which("uv"):
-        return ""
-    asked = ["uv", "python", "find", "--no-python-downloads", version]
-    return subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
+    for folder in os.environ["PATH"].split(":"):
+        found = Path(folder) / f"python{version}"
+        # A launcher may be there without the Python that it launches.
+        if (
+            found.is_file()
+            and not subprocess.run([found, "-c", ""], capture_output=True).returncode
+        ):
+            return str(found)
+    return ""
 
 
 @dataclass(frozen=True)

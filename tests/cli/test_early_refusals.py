@@ -123,3 +123,21 @@ def test_a_refusal_takes_little_time(command):
     ((code, _, _),), used = children([command])
     assert code == 2
     assert used < MOST_S
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("objects", "get", "raal", "out"), "no list 'raal'; did you mean real?"),
+        (("objects", "check", "none"), "no folder none"),
+        (("array", "fit", "plucks.mcap", "--array", "none.toml"), "none.toml: no such file"),
+    ],
+)
+def test_a_wrong_word_is_told_before_an_extra_is_asked_for(words, said):
+    without = "import sys; sys.modules.update(trimesh=None, mujoco=None)\n"
+    done = subprocess.run(
+        [sys.executable, "-c", without + CHILD], input=json.dumps(words), capture_output=True,
+        text=True, check=True,
+    )  # fmt: skip
+    code, told, _ = json.loads(done.stdout)
+    assert code == 2 and said in told and told.count("\n") == 1

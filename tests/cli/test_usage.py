@@ -148,3 +148,19 @@ def test_no_word_of_a_table_is_lost_at_any_width(width, capsys):
         out = capsys.readouterr().out
         assert all(word in out for word in words)
         assert "…" not in out
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        (["tare", "synthetic:", "--json"], "tactile-rt tare"),
+        (["config", "show", "x.toml", "--set"], "tactile-rt config show"),
+        (["align", "score", "x.pt", "--json"], "tactile-rt align score"),
+    ],
+)
+def test_an_option_without_its_value_leads_to_its_command_s_help(refused, words, command):
+    assert refused(*words).endswith(f"requires an argument; see {command} --help\n")
+
+
+def test_the_folder_is_what_a_lone_recording_lacks(refused):
+    assert "no OUT: name the folder of the sweep set after a.mcap" in refused("label", "a.mcap")

@@ -312,6 +312,19 @@ def test_who_teaches_is_led_and_obeyed(tmp_path):
     assert quiet.obey("undo") == "there is no touch to take back"
 
 
+def test_of_one_class_alone_no_touch_is_called_right(tmp_path):
+    lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
+    teacher = Teacher(lesson, ["press"], 4)
+    rng = np.random.default_rng(0)
+    for k in range(4):
+        features = rng.normal(size=(22, lesson.taught.network.size)).astype(np.float32)
+        teacher.take("press", features, "session-1.mcap", (k, k + 1))
+    assert teacher.done and teacher.progress.right == (0, 0)
+    assert teacher.summary() == [
+        "press is the only class: teach another, to see if they are told apart"
+    ]
+
+
 def test_a_class_may_be_a_number_and_none_is_made_of_one(tmp_path):
     lesson = Lesson.begun(tmp_path / "b", wrench_spec(), FLOOR)
     teacher = Teacher(lesson, ["press", "2", "1"], 2)
