@@ -54,7 +54,7 @@ def _train(road: Road) -> None:
         road.step("record", "tactile-rt", "record", "replay:demo?speed=0", name)
     road.step("label", "tactile-rt", "label", *names, "set", "--by-name")
     network = ["--encoder", "gru", "--attender", "none", "--decoder", "linear"]
-    few = ["--batch", "8", "--set", "updates=20"]
+    few = ["--batch", "2", "--set", "updates=20"]
     road.step("train", "tactile-rt", "train", "set", "run", *network, *few)
     road.step("export", "tactile-rt", "export", "run/best.pt", "model.onnx")
     road.step("evaluate", "tactile-rt", "eval", "model.onnx", "set")
@@ -113,8 +113,10 @@ def _align(road: Road) -> None:
 
 
 def _cluster(road: Road) -> None:
-    few = ["--recipe", "mouse12", "--split", "test", "--set", "sweeps=1"]
-    road.step("sweep", "tactile-rt", "sweep", "set", *few, "--ray", "auto")
+    settings = ("per_category=3", "validation=1", "test=1")
+    few = [word for one in settings for word in ("--set", f"objects.{one}")]
+    recipe = ["--recipe", "mouse12", *few, "--set", "sweeps.draws=1", "--split", "test"]
+    road.step("sweep", "tactile-rt", "sweep", "set", *recipe, "--ray", "auto")
 
 
 EXTRAS: dict[str, Callable[[Road], None]] = {
