@@ -52,7 +52,7 @@ class ReplayOptions:
     Attributes:
         speed: Pace of the stream, as a multiple of the recorded one; 0 for as fast as it is read.
         codec: Name of the codec that decodes raw packets; empty for the recorded one.
-        loop: Whether it begins again at its end; numbers and times of the samples go on.
+        loop: Whether the recording begins again at its end; numbers and times of samples go on.
     """
 
     speed: float = 1.0
@@ -339,7 +339,7 @@ class SweepOptions:
         sweep: The number of the only sweep to stream, from 0; None: all, one after another.
         rest_s: The rest before each sweep, s, besides the lead that is stored with it: so that a
             contact ends, and a tare is taken, before the next.
-        loop: Whether it begins again at its end; numbers and times of the samples go on.
+        loop: Whether the recording begins again at its end; numbers and times of samples go on.
     """
 
     speed: float = 1.0

@@ -49,7 +49,7 @@ def test_width_scales_every_channel_count():
     ("wrong", "match"),
     [
         ({"classes": 0}, "classes"),
-        ({"encoder": "zhuang"}, "encoder is 'zhuang'.*zhuang-intersection-ln"),
+        ({"encoder": "zhuang"}, "encoder is 'zhuang', not one of zhuang-timedecay, .* and 12 more"),
         ({"attender": "lstm"}, "attender"),
         ({"decoder": ""}, "decoder"),
         ({"readout": "first"}, "readout"),

@@ -2,7 +2,6 @@
 
 import errno
 import os
-import re
 import subprocess
 import sys
 import threading
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 
 from tactile_rt.errors import ConfigError, RecordingError
-from tactile_rt.extras import install_extra
 from tactile_rt.recording import Recording, StreamWriter, recover, writer
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import ArraySource, FakeSerial, cut
@@ -251,21 +249,3 @@ def test_a_file_that_is_there_is_not_written_over(path):
     assert len(list(Recording(path))) == 2
     with pytest.raises(ConfigError, match="no folder"):
         StreamWriter(path.parent / "none" / "x.mcap", ArraySource(SPEC, []))
-
-
-def test_without_the_extra_it_says_what_to_install(path, monkeypatch):
-    write(path, cut(noise(10), 1000.0))
-    for name in [n for n in sys.modules if n.partition(".")[0] == "mcap"]:
-        monkeypatch.setitem(sys.modules, name, None)
-    monkeypatch.setitem(sys.modules, "mcap", None)
-    for use in (
-        lambda: StreamWriter(path, ArraySource(SPEC, [])),
-        lambda: Recording(path).description,
-        lambda: list(Recording(path)),
-        lambda: recover(path),
-        lambda: open_source(f"replay:{path}"),
-    ):
-        with pytest.raises(
-            ConfigError, match=f"need mcap, .*: {re.escape(install_extra('record'))}"
-        ):
-            use()
