@@ -166,6 +166,7 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
         spec = opened.spec
         shape = f"{spec.shape[0]} elements x {spec.shape[1]} channels"
         typer.echo(f"{spec.name}: {shape}, nominally {spec.rate_hz:g} Hz", err=json == STDOUT)
+        np.quantile([0.0], 0.5)  # the first takes a while, in which samples would wait
         ends, ended = time.monotonic() + (seconds or math.inf), False
         while not ended and (began := time.monotonic()) < ends:
             until, n, late = min(began + WINDOW_S, ends), 0, []

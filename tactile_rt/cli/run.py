@@ -45,7 +45,8 @@ def run(
     if file is not None:
         if source is not None or model is not None or not every_step:
             raise ConfigError(
-                f"{file} says what to run: give --set source.NAME.url=... or the like beside it"
+                f"{file} says source, model and decisions: change them there or by --set, as "
+                "--set source.NAME.url=..."
             )
         serve(file, sets or [], seconds)
         return

@@ -255,7 +255,8 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
         if not fits:
             _show_identifiers(frames, told)
             told.nothing(
-                f"no codec fits {path}", "with a DBC file of it: --as codec=can-dbc&mapping="
+                f"no codec fits {path}",
+                "with a DBC file of it: --as 'codec=can-dbc&mapping=FILE.toml'",
             )
         _show(fits, told)
         _import(path, fits[0], told)

@@ -119,7 +119,7 @@ def _absolute(nodes: SettingNode) -> None:
         elif top == ("source", "url"):
             scheme, colon, rest = node.value.partition(":")
             target, question, options = rest.partition("?")
-            shipped = scheme == "replay" and target == "demo" and not _is_file(_from(node, target))
+            shipped = (scheme, target) == ("replay", "demo")
             if colon and scheme in FILES_IN and target and not shipped:
                 node.value = f"{scheme}:{_from(node, target)}{question}{options}"
 

@@ -79,7 +79,7 @@ def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
     path, what = Path(target), f"replay:{target}"
     if not target:
         raise ConfigError("replay: needs a file, e.g. replay:run.mcap, replay:data/SET/mug-1.npz")
-    if target == "demo" and not path.exists():
+    if target == "demo":  # a file of that name is ./demo
         path = DEMO
     _check_file(path)
     if path.suffix == ".npz":

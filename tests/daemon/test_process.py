@@ -344,7 +344,10 @@ def test_what_hangs_at_the_end_is_left_behind(folder, started):
     [
         (["run"], "run needs a configuration (robot.toml, --set with it) or --source URL"),
         (["run", "--source", "synthetic:", "--set", "a=1"], "run needs a configuration"),
-        (["run", "robot.toml", "--source", "synthetic:"], "robot.toml says what to run"),
+        (
+            ["run", "robot.toml", "--source", "synthetic:"],
+            "robot.toml says source, model and decisions",
+        ),
         (["run", "gone.toml"], "gone.toml: no such file"),
         (["run", "robot.toml", "--set", "page.port=0"], "page.port: expected a whole number >= 1"),
         (["config", "check", "robot.toml", "--set", "sorce=1"], "did you mean source?"),

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording import Recording
 from tactile_rt.stream import Chunk, EndOfStream, Source
 from tactile_rt.testing import FakeSerial, small_spec
@@ -35,6 +36,7 @@ def lerobot(monkeypatch):
     @dataclass(kw_only=True)
     class RobotConfig(draccus.ChoiceRegistry):
         id: str | None = None
+        calibration_dir: Path | None = None
 
         def __post_init__(self) -> None: ...
 
@@ -182,12 +184,24 @@ def test_the_robot_that_carries_the_sensors_is_read_from_its_braces(read_argumen
         (["--robot.sensors={f: 'x:'}", "--robot.robot={type: tactile}"], "'tactile' is no type"),
         (["--robot.sensors={f: 'x:'}", "--robot.on_stale=wait"], "must be error or nan"),
         (["--robot.sensors={f: 'x:'}", "--robot.max_age_s=-1"], "must be 0 or more"),
+        (["--robot.sensors={f: 'x:'}", "--robot.history=101"], "must be 1 to 100, not 101"),
+        (["--robot.sensors={../f: 'x:'}"], "'../f' is no name"),
+        (["--robot.sensors={f:replay:demo}"], "'f:replay:demo' is no name"),
+        (["--robot.sensors={f: demo}"], "f: 'demo' is no URL"),
     ],
 )
 def test_a_mistake_is_said(read_arguments, arguments, said):
     with pytest.raises(draccus.utils.ParsingError) as raised:
         read_arguments("--robot.type=tactile", *arguments)
     assert said in str(raised.value.__cause__)
+
+
+def test_the_robot_is_named_by_its_type_and_has_the_name_that_is_given(read_arguments):
+    sensors = "--robot.sensors={finger: 'any:'}"
+    arm = "--robot.robot={type: made_up_arm, id: right}"
+    for robot, name in (("--robot.robot=made_up_arm", "left"), (arm, "right")):
+        read = read_arguments("--robot.type=tactile", "--robot.id=left", sensors, robot)
+        assert (read.id, read.robot.id, read.robot.port) == ("left", name, "/dev/null")
 
 
 def test_an_observation_is_the_robot_s_and_the_newest_samples(touch):
@@ -273,6 +287,60 @@ def test_of_a_sensor_that_dies_the_recording_is_whole(touch, tmp_path):
     until(lambda: error_of(robot))
     (path,) = tmp_path.glob("finger-*.mcap")
     assert sum(map(len, Recording(path))) == 1
+
+
+@pytest.mark.parametrize("stale", ["error", "nan"])
+def test_a_recording_that_fails_is_said_and_hides_no_touch(touch, tmp_path, caplog, stale):
+    robot, sensor = touch(f"--robot.record={tmp_path}", f"--robot.on_stale={stale}",
+                          "--robot.max_age_s=60")  # fmt: skip
+
+    def full(chunk):
+        raise RecordingError("no space left")
+
+    robot.sensors[0]._writer.push = full
+    sensor.give(5.0)
+    if stale == "error":
+        until(lambda: "finger is not recorded: no space left" in error_of(robot))
+        return
+    until(lambda: seen(robot, FX[0]) == 5.0)
+    until(lambda: seen(robot, FX[0]) == 5.0 and caplog.messages)
+    assert caplog.messages == ["finger is not recorded: no space left"]
+
+
+def test_every_sensor_is_closed_whatever_the_recording_of_one_says(lerobot, monkeypatch):
+    closed = []
+
+    class Failing(Plugged):
+        def close(self) -> None:
+            closed.append(self)
+            raise RecordingError("no space left")
+
+    sensors = [Failing() for _ in range(3)]
+    left = iter(sensors)
+    monkeypatch.setattr(lerobot.tactile, "open_source", lambda url: next(left))
+    names = dict.fromkeys(("a", "b", "c"), "any:")
+    robot = lerobot.Tactile(lerobot.TactileConfig(sensors=names))
+    for sensor in sensors:
+        sensor.give(1.0)
+    robot.connect()
+    with pytest.raises(RecordingError):
+        robot.disconnect()
+    assert set(closed) == set(sensors)
+
+
+def test_a_wrong_url_is_told_with_its_sensor(lerobot):
+    robot = lerobot.Tactile(lerobot.TactileConfig(sensors={"right": "replay:nope.mcap"}))
+    with pytest.raises(ConfigError, match=r"--robot.sensors: right: no file nope.mcap"):
+        robot.connect()
+
+
+def test_what_goes_on_with_nan_is_logged_once_each_way(touch, caplog):
+    robot, sensor = touch("--robot.on_stale=nan", "--robot.max_age_s=0.3")
+    until(lambda: np.isnan(seen(robot, FX[0])))
+    until(lambda: seen(robot, FX[0]) == 3.0, meanwhile=lambda: sensor.give(3.0))
+    until(lambda: seen(robot, FX[0]) and len(caplog.messages) > 1, meanwhile=lambda: sensor.give(3))
+    assert "finger has given no valid sample" in caplog.messages[0]
+    assert caplog.messages[1] == "finger measures again"
 
 
 def test_a_device_that_is_pulled_out_is_no_touch(lerobot, read_arguments):

@@ -280,12 +280,11 @@ def test_a_loop_of_nothing_ends(path):
         assert list(source) == []
 
 
-def test_the_recording_that_ships_has_a_name_unless_a_file_has_it(tmp_path, monkeypatch):
+def test_the_recording_that_ships_has_a_name_and_a_file_of_that_name_a_path(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with open_source("replay:demo?speed=0") as source:
-        assert sum(map(len, source)) == sum(map(len, Recording(DEMO)))
     write(tmp_path / "demo", cut(noise(7), SPEC.rate_hz))
-    with open_source("replay:demo?speed=0") as source:
-        assert sum(map(len, source)) == 7
+    for url, samples in (("demo", sum(map(len, Recording(DEMO)))), ("./demo", 7)):
+        with open_source(f"replay:{url}?speed=0") as source:
+            assert sum(map(len, source)) == samples
     with pytest.raises(ConfigError, match="no file"):
         open_source(f"replay:{tmp_path}/none/demo")

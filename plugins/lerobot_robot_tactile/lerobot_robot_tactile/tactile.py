@@ -1,7 +1,9 @@
 """The robot: its observations are those of the robot that it wraps, and the newest samples."""
 
+import logging
 import threading
 import time
+from contextlib import ExitStack
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -11,7 +13,7 @@ from lerobot.robots import Robot, make_robot_from_config
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from lerobot_robot_tactile.config_tactile import TactileConfig
-from tactile_rt.errors import SourceError
+from tactile_rt.errors import ConfigError, SourceError, TactileError
 from tactile_rt.recording import StreamWriter
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, EndOfStream
@@ -54,6 +56,7 @@ class Sensor:
             np.full((history, len(self.spec.elements)), NEVER, np.int64),
         )
         self._error: Exception | None = None
+        self._unrecorded = ""  # why the recording has ended
         self._came, self._stop = threading.Event(), threading.Event()
         self._writer = None
         if record:
@@ -87,6 +90,8 @@ class Sensor:
         """Say why the sensor cannot be relied on now; empty if it can."""
         if self._error is not None:
             return f"{self.name}: {self._error}"
+        if self._unrecorded:
+            return f"{self.name} is not recorded: {self._unrecorded}"
         age_s = self.read()[-2] / 1e3
         if age_s <= self.max_age_s:
             return ""
@@ -114,23 +119,32 @@ class Sensor:
         """Stop reading, and end the recording."""
         self._stop.set()
         self._thread.join()
-        if self._writer is not None:
-            self._writer.close()
-        self._source.close()
+        try:
+            if self._writer is not None:
+                self._writer.close()
+        finally:
+            self._source.close()
 
     def _run(self) -> None:
         try:
             while not self._stop.is_set():
                 chunk = self._source.read(POLL_S)
                 if chunk is not None:
-                    if self._writer is not None:
-                        self._writer.push(chunk)
                     self._take(chunk)
+                    self._record(chunk)
         except EndOfStream:
             self._error = SourceError("its stream is over")
         except Exception as error:  # told to whoever reads next
             self._error = error
         self._came.set()
+
+    def _record(self, chunk: Chunk) -> None:
+        if self._writer is None or self._unrecorded:
+            return
+        try:
+            self._writer.push(chunk)
+        except Exception as error:  # as of a full disk: touch itself goes on
+            self._unrecorded = str(error) or type(error).__name__
 
     def _take(self, chunk: Chunk) -> None:
         now, n = chunk.t_ns, len(self._newest[0])
@@ -159,6 +173,7 @@ class Tactile(Robot):
         if config.robot is not None:
             self.robot = make_robot_from_config(config.robot)
         self.sensors: list[Sensor] = []
+        self._troubled: set[str] = set()  # sensors of which that has been logged
 
     @property
     def cameras(self) -> dict[str, Any]:
@@ -189,7 +204,7 @@ class Tactile(Robot):
 
         With ``on_stale=nan`` a sensor that measures nothing counts as connected.
         """
-        if not self.sensors or self._troubles():
+        if not self.sensors or (self.config.on_stale == "error" and self._troubles()):
             return False
         return self.robot is None or self.robot.is_connected
 
@@ -233,9 +248,17 @@ class Tactile(Robot):
         """
         if not self.sensors:
             raise DeviceNotConnectedError(f"{self} is not connected")
-        if troubles := self._troubles():
-            self.disconnect()  # as LeRobot does after an error, but only of what is connected
-            raise DeviceNotConnectedError("; ".join(troubles))
+        troubles = self._troubles()
+        if troubles and self.config.on_stale == "error":
+            said = DeviceNotConnectedError("; ".join(troubles.values()))
+            try:
+                self.disconnect()  # as LeRobot does after an error, but only of what is connected
+            except Exception as error:
+                raise said from error
+            raise said
+        for name in troubles.keys() ^ self._troubled:
+            logging.warning(troubles.get(name, f"{name} measures again"))
+        self._troubled = set(troubles)
         found = self.robot.get_observation() if self.robot else {}
         for sensor in self.sensors:
             found.update(zip(sensor.names, sensor.read(), strict=True))
@@ -258,20 +281,24 @@ class Tactile(Robot):
         if getattr(self, "sensors", None):
             self.disconnect()
 
-    def _troubles(self) -> list[str]:
-        """Say of each sensor that cannot be relied on why; none with ``on_stale=nan``."""
-        if self.config.on_stale == "nan":
-            return []
-        return [trouble for sensor in self.sensors if (trouble := sensor.trouble())]
+    def _troubles(self) -> dict[str, str]:
+        """Say why, of each sensor that cannot be relied on."""
+        return {s.name: trouble for s in self.sensors if (trouble := s.trouble())}
 
     def _open(self, record: str) -> list[Sensor]:
         if record:
-            Path(record).mkdir(parents=True, exist_ok=True)
+            try:
+                Path(record).mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                raise ConfigError(f"--robot.record: no folder {record}: {error.strerror}") from None
         opened: list[Sensor] = []
         try:
             for name, url in self.config.sensors.items():
                 config = self.config
-                opened.append(Sensor(name, url, config.history, config.max_age_s, record))
+                try:
+                    opened.append(Sensor(name, url, config.history, config.max_age_s, record))
+                except TactileError as error:
+                    raise type(error)(f"--robot.sensors: {name}: {error}") from None
         except BaseException:
             _close(opened)
             raise
@@ -279,5 +306,6 @@ class Tactile(Robot):
 
 
 def _close(sensors: list[Sensor]) -> None:
-    for sensor in sensors:
-        sensor.close()
+    with ExitStack() as stack:  # each is closed, whatever another's recording says
+        for sensor in sensors:
+            stack.callback(sensor.close)
