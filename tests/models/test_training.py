@@ -313,9 +313,14 @@ def test_a_run_of_every_objective_can_be_repeated(tiny, tmp_path, objective, aug
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.filterwarnings("default:The AccumulateGrad node's stream does not match:UserWarning")
 @pytest.mark.parametrize("encoder", ["zhuang-intersection-ln", "gru", "mamba", "resnet18"])
 @pytest.mark.parametrize("objective", ["supervised", "simclr", "simsiam", "autoencoder"])
-def test_an_update_is_replayed_on_a_gpu_with_the_gradients_of_its_kernels(tiny, encoder, objective):
+def test_an_update_is_replayed_on_a_gpu_with_the_gradients_of_its_kernels(
+    tiny, encoder, objective, monkeypatch
+):
+    for backend in (torch.backends.cuda.matmul, torch.backends.cudnn):
+        monkeypatch.setattr(backend, "allow_tf32", False)
     config = TrainingConfig(
         tiny, encoder=encoder, width=1 / 32, objective=objective, augmentation="tactile",
         dropout=0.0, precision="fp32",
