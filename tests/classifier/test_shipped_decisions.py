@@ -1,0 +1,48 @@
+"""What the shipped model decides on the shipped recording, number by number.
+
+`python -m tests.classifier.test_shipped_decisions` writes the file anew, where a model or the
+recording has changed on purpose.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from tactile_rt import Classifier, shipped_model
+from tactile_rt.recording.replay import DEMO
+from tactile_rt.sources.opening import open_source
+
+FILE = Path(__file__).parent / "data" / "shipped_decisions.npz"
+ROUNDING = 2e-6  # of probabilities: processors multiply in other orders
+
+
+def decide() -> dict[str, np.ndarray]:
+    """Every decision on the recording, as arrays."""
+    with open_source(f"replay:{DEMO}?speed=0") as source:
+        classifier = Classifier(shipped_model(), source.spec)
+        made = [one for chunk in source for one in classifier.push(chunk)]
+    return {
+        "label": np.array([one.label for one in made]),
+        "onset_ns": np.array([one.onset_ns for one in made]),
+        "t_ns": np.array([one.t_ns for one in made]),
+        "step": np.array([one.step for one in made]),
+        "probabilities": np.array([one.probabilities for one in made], np.float32),
+        "candidates": np.array([",".join(one.candidates) for one in made]),
+    }
+
+
+def test_every_decision_is_the_one_that_it_was() -> None:
+    found = decide()
+    with np.load(FILE) as file:
+        was = dict(file)
+    assert found.keys() == was.keys()
+    np.testing.assert_allclose(
+        found.pop("probabilities"), was.pop("probabilities"), rtol=0, atol=ROUNDING
+    )
+    for name, values in was.items():
+        assert (found[name] == values).all(), name
+    assert len(was["label"]) == 132
+
+
+if __name__ == "__main__":
+    np.savez_compressed(FILE, **decide())
