@@ -5,21 +5,23 @@ BIN := $(VENV)/bin
 # The exact releases that the tests run with.
 PINS := requirements/constraints.txt
 INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint $(PINS)
-# As many processes as cores, each taking the next file: what a file's tests share is made once.
-# `pytest` alone runs the same tests in one process.
+# One process more than cores, as tests often wait; each takes the next file, so that what a file's
+# tests share is made once. `pytest` alone runs all but the slow ones in one process.
 PYTEST := $(BIN)/python -m pytest
-PARALLEL := -n logical --maxprocesses 8 --max-worker-restart 0 --dist loadfile --no-loadscope-reorder
+WORKERS := $(shell expr $$(getconf _NPROCESSORS_ONLN) + 1)
+PARALLEL := -n $(WORKERS) --maxprocesses 9 --max-worker-restart 0 --dist loadfile --no-loadscope-reorder
+QUICK := -m "not slow and not hardware and not lengthy"
 
 # What `make quick` looks at: a package under tactile_rt, as P=drivers.
 P ?= stream
 
-.PHONY: demo test quick lint check docs roads check-export bench fuzz captures format clean
+.PHONY: demo test quick lint check wheel docs roads check-export bench fuzz captures format clean
 
 demo: $(VENV)/.sim
 	$(BIN)/tactile-rt demo --sweeps 12
 
 test: $(VENV)/.dev
-	$(PYTEST) $(PARALLEL)
+	$(PYTEST) $(PARALLEL) $(QUICK)
 
 quick: $(VENV)/.dev
 	@test -e tactile_rt/$(P) -o -e tactile_rt/$(P).py || { echo "no package tactile_rt/$(P)"; exit 2; }
@@ -27,7 +29,7 @@ quick: $(VENV)/.dev
 	$(BIN)/ruff check tactile_rt tests
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(PYTEST) $(PARALLEL) -m "not slow and not hardware and not lengthy" $(wildcard tests/$(P) tests/test_$(P).py)
+	$(PYTEST) $(PARALLEL) $(QUICK) $(wildcard tests/$(P) tests/test_$(P).py)
 
 docs: $(VENV)/.dev
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
@@ -40,8 +42,10 @@ lint: $(VENV)/.dev
 	$(BIN)/lint-imports
 
 check: lint
-	$(PYTEST) $(PARALLEL)
-	$(PYTEST) -m slow
+	$(PYTEST) $(PARALLEL) -m "not hardware"
+	$(MAKE) wheel
+
+wheel: $(VENV)/.dev
 	$(BIN)/python -m bench.checks.wheel
 
 roads: $(VENV)/.dev

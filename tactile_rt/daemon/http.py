@@ -31,6 +31,7 @@ __all__ = ["HttpLimits", "HttpServer", "Refused", "Request", "Response", "listen
 
 BACKLOG = 64
 END_S = 0.5  # what streams have for their end when the server closes
+TURNS = 5  # of the loop, however late: from an accepted connection to `_meet` it is three
 JOIN_S = 2.0
 TOKEN = re.compile(r"[!#$%&'*+.^_`|~0-9A-Za-z-]+")
 CONTROL = re.compile(r"[\x00-\x08\x0a-\x1f\x7f]")
@@ -221,7 +222,8 @@ class HttpServer:
         )
         await self._over.wait()
         server.close()
-        await asyncio.sleep(0.01)  # who has been accepted is met, and turned away
+        for _ in range(TURNS):  # who has been accepted is met, and turned away
+            await asyncio.sleep(0.002)
         for task in self._asking:
             task.cancel()
         if self._tasks:

@@ -139,7 +139,7 @@ class SourceContract:
             for now, then in zip(_parts(chunk), copy, strict=True):
                 assert np.array_equal(now, then)
 
-    def test_a_read_without_patience_returns_at_once(self, case: Case) -> None:
+    def test_a_read_without_patience_returns_at_once_and_closing_ends_it(self, case: Case) -> None:
         with case.open() as source:
             took = []
             for _ in range(20):
@@ -148,9 +148,6 @@ class SourceContract:
                 took.append(time.monotonic() - began)
                 assert chunk is None or isinstance(chunk, Chunk)
             assert sorted(took)[10] < AT_ONCE_S  # a busy machine may hold up some of them
-
-    def test_closing_ends_it_and_may_be_repeated(self, case: Case) -> None:
-        with case.open() as source:
             assert source.read(PATIENCE_S) is not None
             source.close()
             source.close()
@@ -158,18 +155,6 @@ class SourceContract:
                 with pytest.raises(EndOfStream):
                     source.read(0)
             assert list(source) == []
-
-    def test_it_may_be_closed_before_it_is_read(self, case: Case) -> None:
-        with case.open() as source:
-            source.close()
-            with pytest.raises(EndOfStream):
-                source.read(0)
-
-    def test_leaving_the_context_closes_it(self, case: Case) -> None:
-        with case.open() as source:
-            pass
-        with pytest.raises(EndOfStream):
-            source.read(0)
 
     def test_iteration_goes_from_the_first_chunk_to_the_last(self, run: Run, case: Case) -> None:
         with case.open() as source:
@@ -180,7 +165,12 @@ class SourceContract:
                     break
         assert n == source.stats.delivered == run.stats.delivered
 
-    def test_two_sources_are_two_things(self, case: Case) -> None:
+    def test_two_are_two_things_and_end_when_closed_or_left_unread(self, case: Case) -> None:
         with case.open() as one, case.open() as other:
             assert one != other
             assert len({one, other}) == 2
+            one.close()
+            with pytest.raises(EndOfStream):
+                one.read(0)
+        with pytest.raises(EndOfStream):
+            other.read(0)

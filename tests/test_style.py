@@ -1,0 +1,69 @@
+"""Names and first lines read as NumPy's and ROS's do: see CONTRIBUTING, "Names and sentences".
+
+What was written before the rules stands in style.txt, which only gets shorter:
+`python -m tests.test_style` strikes out what has been mended and adds nothing.
+"""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from tests.helpers.source_tree import FUNCTIONS, modules
+
+FILE = Path(__file__).with_name("style.txt")
+WORDS = 15  # of a docstring's first sentence
+# A function does something: its name is a verb. A true conversion may be a participle.
+PARTICIPLE = re.compile(
+    r"_*(?:[a-z]+ed|said|told|kept|heard|found|made|drawn|taken|given|sent|left|seen|felt|cut|put"
+    r"|built|shown|known|written|held|met|lost|meant|begun|of_[a-z_]+)"
+)
+# Its first line is an imperative: not a riddle about what comes out.
+RIDDLE = re.compile(
+    r"(?:Whether|What|Who|Whoever|Whose|Of|How|Which|Where|When|As|By|That|Those)\b"
+)
+UNCLEAR = re.compile(
+    r"\b(?:is|are|was|were) (?:told|said|heard of|kept apart)\b|\bwhoever\b|\bwhat is wanted\b",
+    re.I,
+)
+
+
+def offences() -> Iterator[str]:
+    """What is wrong with which function or class, as `KIND MODULE.NAME`."""
+    for module in modules().values():
+        if not module.name.startswith("tactile_rt"):
+            continue
+        for node, owner in module.nodes:
+            if not isinstance(node, (*FUNCTIONS, ast.ClassDef)):
+                continue
+            name = ".".join(filter(None, (module.name, owner and owner.name, node.name)))
+            gives = {ast.unparse(one) for one in node.decorator_list} & {
+                "property",
+                "cached_property",
+            }
+            verb = isinstance(node, FUNCTIONS) and not gives
+            if verb and PARTICIPLE.fullmatch(node.name):
+                yield f"participle {name}"
+            first = re.split(r"\.\s|\n\n", ast.get_docstring(node) or "")[0]
+            if verb and RIDDLE.match(first):
+                yield f"riddle {name}"
+            if len(first.split()) > WORDS:
+                yield f"long {name}"
+            if UNCLEAR.search(first):
+                yield f"unclear {name}"
+
+
+def test_new_names_and_first_lines_are_plain() -> None:
+    known = set(FILE.read_text("utf-8").split("\n"))
+    new = sorted(set(offences()) - known)
+    assert new == [], "see CONTRIBUTING, Names and sentences"
+
+
+def test_what_has_been_mended_is_struck_out() -> None:
+    known = {line for line in FILE.read_text("utf-8").split("\n") if line}
+    assert sorted(known - set(offences())) == [], "python -m tests.test_style strikes it out"
+
+
+if __name__ == "__main__":
+    known = FILE.read_text("utf-8").split("\n") if FILE.exists() else list(offences())
+    FILE.write_text("\n".join(sorted(set(known) & set(offences()))) + "\n", "utf-8")
