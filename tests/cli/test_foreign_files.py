@@ -9,6 +9,10 @@ from base64 import b64encode
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_typestore
 
 from tactile_rt.recording import Recording
 from tactile_rt.stream import concatenate
@@ -166,3 +170,55 @@ def test_a_log_of_a_bus_is_read(call, tmp_path, name):
     assert (steps[:, 0] > 0).all() and (steps[:, 4] < 0).all() and not steps[:, [1, 2, 3, 5]].any()
     if name not in ("candump", "slcan"):  # which have no times
         assert np.diff(whole.t_ns) == pytest.approx(1e7, abs=2e4)
+
+
+def wrench_bag(folder, form, count=N):
+    """A bag of so many wrenches, at 100 Hz by their headers' times."""
+    store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
+    if form == "ros1":
+        path, writer, seq = folder / "a.bag", Ros1Writer(folder / "a.bag"), {"seq": 0}
+    else:
+        path, seq = folder / "a", {}
+        writer = Ros2Writer(path, version=9, storage_plugin=StoragePlugin[form.upper()])
+    serialize = store.serialize_ros1 if form == "ros1" else store.serialize_cdr
+    kind = store.types["geometry_msgs/msg/WrenchStamped"]
+    wrench, vector = (
+        store.types["geometry_msgs/msg/Wrench"],
+        store.types["geometry_msgs/msg/Vector3"],
+    )
+    header, time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
+    with writer:
+        topic = writer.add_connection("/ft/wrench", kind.__msgtype__, typestore=store)
+        for k in range(count):
+            head = header(
+                **seq,
+                stamp=time(sec=UTC + k // 100, nanosec=k % 100 * 10_000_000),
+                frame_id="tool0",
+            )
+            load = wrench(force=vector(x=0.5 * k - 3, y=-0.25 * k, z=1.0), torque=vector(0, 0, -k))
+            message = serialize(kind(header=head, wrench=load), kind.__msgtype__)
+            writer.write(topic, UTC * 10**9 + k * 10_000_000 + 777, message)
+    return path
+
+
+@pytest.mark.parametrize("form", ["ros1", "sqlite3", "mcap"])
+def test_a_bag_is_read(call, tmp_path, form):
+    out = tmp_path / "out.mcap"
+    code, said, err = call("import", wrench_bag(tmp_path, form), out)
+    assert code == 0, err
+    whole = concatenate(list(Recording(out)))
+    assert whole.values[:, 0].tolist() == [[0.5 * k - 3, -0.25 * k, 1, 0, 0, -k] for k in range(N)]
+    assert np.diff(whole.t_ns).tolist() == [10_000_000] * (N - 1)
+    assert f"{N} intact, 0 corrupt, 0 missing" in said
+
+
+@pytest.mark.parametrize("part", [0.8, 0.5])
+def test_what_is_left_of_a_bag_that_was_cut_is_read(call, tmp_path, part):
+    path = wrench_bag(tmp_path, "mcap", 4000) / "a.mcap"
+    path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
+    out = tmp_path / "out.mcap"
+    code, _, err = call("import", path, out)
+    assert code == 0, err
+    whole = concatenate(list(Recording(out)))
+    assert 1000 < len(whole) < 4000 and "its end is missing or damaged" in err
+    assert np.array_equal(whole.values[:, 0, 0], [0.5 * k - 3 for k in range(len(whole))])
