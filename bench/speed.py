@@ -1,6 +1,6 @@
 """Is this checkout as fast as another one? The same work in both, in turn, in CPU time.
 
-python -m bench.speed OTHER_CHECKOUT [--pairs 10] [--only NAME]
+python -m bench.speed OTHER_CHECKOUT [--pairs 10] [--most 60] [--only NAME]
 
 Each measurement is a process of its own that does a fixed amount of work with what its checkout
 has, and prints the CPU seconds of each figure. The two checkouts take turns, so that whatever else
@@ -23,7 +23,8 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parents[1]
-PAIRS, RESAMPLES, SLOWER = 10, 10_000, 1.05
+PAIRS, MOST, RESAMPLES, SLOWER = 10, 60, 10_000, 1.05
+WIDTH = 0.04  # of the interval of a ratio
 ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 Work = tuple[Callable[[], object], int]  # what is timed, and how often it is done
 
@@ -174,6 +175,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("other", type=Path, help="the checkout to compare with")
     parser.add_argument("--pairs", type=int, default=PAIRS, help="of processes, for each figure")
+    parser.add_argument("--most", type=int, default=MOST, help="pairs, while it is too wide")
     parser.add_argument("--only", action="append", choices=WORKS)
     parser.add_argument("--measure", help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -184,19 +186,28 @@ def main() -> int:
     import numpy as np
 
     other, rng, slower = args.other.resolve(), np.random.default_rng(0), 0
+
+    def interval(found: list[float]) -> tuple[float, float]:
+        draws = np.median(rng.choice(found, (RESAMPLES, len(found))), axis=1)
+        low, high = np.percentile(draws, (2.5, 97.5))
+        return float(low), float(high)
+
     for name in args.only or WORKS:
         pairs: dict[str, list[float]] = {}
-        for k in range(args.pairs + 1):
+        for k in range(args.most + 1):
             order = (HERE, other) if k % 2 else (other, HERE)
             taken = {checkout: ask(checkout, name) for checkout in order}
             for figure in taken[HERE].keys() & taken[other].keys() if k else ():  # 0 warms up
                 pairs.setdefault(figure, []).append(taken[HERE][figure] / taken[other][figure])
+            if k >= args.pairs and all(
+                high - low <= WIDTH for low, high in map(interval, pairs.values())
+            ):
+                break
         for figure, found in sorted(pairs.items()):
-            draws = np.median(rng.choice(found, (RESAMPLES, len(found))), axis=1)
-            low, high = np.percentile(draws, (2.5, 97.5))
-            slower += low > SLOWER
-            line = f"{figure:<28}{np.median(found):7.3f} [{low:.3f}, {high:.3f}]"
-            print(line + (" SLOWER" if low > SLOWER else ""), flush=True)  # noqa: T201
+            low, high = interval(found)
+            slower += high > SLOWER
+            line = f"{figure:<28}{np.median(found):7.3f} [{low:.3f}, {high:.3f}] {len(found)} pairs"
+            print(line + (" SLOWER" if high > SLOWER else ""), flush=True)  # noqa: T201
     return 1 if slower else 0
 
 
