@@ -1,4 +1,5 @@
 import faulthandler
+import gc
 import os
 import signal
 import sys
@@ -31,6 +32,9 @@ settings.register_profile("tactile_rt", deadline=None, derandomize=True)
 settings.load_profile("tactile_rt")
 
 
+# Until all tests are collected; see `pytest_collection_finish`.
+gc.disable()
+
 LENGTHY = Path(__file__).with_name("lengthy.txt")
 
 
@@ -41,6 +45,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if item.nodeid.removeprefix("tests/").startswith(names):
             item.add_marker(pytest.mark.lengthy)
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage from now on, but never look at the thousands of tests again."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.hookimpl(tryfirst=True)
