@@ -149,8 +149,7 @@ def install_service(
     """
     from tactile_rt.daemon.checks import check_config
     from tactile_rt.daemon.loading import load_config
-    from tactile_rt.daemon.service import install_script, unit_text
-    from tactile_rt.daemon.service_folders import check_folders
+    from tactile_rt.daemon.service import check_folders, install_script, unit_text
     from tactile_rt.drivers.discovery import serial_ports, udev_rules
 
     loaded = load_config(file.absolute())
@@ -163,7 +162,7 @@ def install_service(
     program, path = _program(), str(file.absolute())
     unit = unit_text([*program, "run", path], loaded.config, user)
     again = [*program, "install-service", path, "--user", user]
-    script = install_script(UNIT, again, loaded.config, user)
+    script = install_script(UNIT, again, user)
     out.mkdir(parents=True, exist_ok=True)
     _write(out / UNIT, unit)
     _write(out / "99-tactile.rules", udev_rules(serial_ports()))

@@ -16,7 +16,7 @@ from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.daemon.config import Config, ModelConfig, SourceConfig, is_loopback
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
 from tactile_rt.daemon.loading import Loaded
-from tactile_rt.daemon.service_folders import MADE
+from tactile_rt.daemon.service import MADE
 from tactile_rt.errors import SpecMismatch, TactileError
 from tactile_rt.locks import device_keys
 from tactile_rt.settings import no_such

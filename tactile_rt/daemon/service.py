@@ -1,14 +1,28 @@
-"""The daemon as a service of systemd: the unit, and the script that installs it."""
+"""The daemon as a service of systemd: the unit, and the script that installs it.
 
+What installs the service is root, so it must not be able to hurt: the service writes into folders
+that systemd makes for it, and nowhere else.
+"""
+
+import os
+import pwd
 import shlex
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from tactile_rt.daemon.config import Config
-from tactile_rt.daemon.service_folders import MADE, made_by_systemd, written_folders
+from tactile_rt.daemon.loading import Loaded
 from tactile_rt.errors import ConfigError
 
-__all__ = ["install_script", "unit_text"]
+__all__ = ["MADE", "check_folders", "install_script", "unit_text"]
 
+# Where systemd makes a folder for the service.
+MADE = {
+    "StateDirectory": Path("/var/lib/tactile-rt"),
+    "LogsDirectory": Path("/var/log/tactile-rt"),
+    "RuntimeDirectory": Path("/run/tactile-rt"),
+}
 WATCHDOG_S = 15
 # Kinds of device that a sensor may be: see /proc/devices.
 DEVICES = ("char-ttyACM", "char-ttyUSB", "char-ttyS", "char-ttyAMA", "char-ttyTHS", "char-pts")
@@ -104,7 +118,7 @@ if ! id {user} >/dev/null 2>&1; then
     useradd --system --no-create-home --shell /usr/sbin/nologin --user-group {user}
 fi
 usermod --append --groups dialout {user}
-{folders}install -m 0644 -- "$here/{unit}" /etc/systemd/system/{unit}
+install -m 0644 -- "$here/{unit}" /etc/systemd/system/{unit}
 install -m 0644 -- "$here/99-tactile.rules" /etc/udev/rules.d/99-tactile.rules
 udevadm control --reload && udevadm trigger
 systemctl daemon-reload
@@ -112,61 +126,102 @@ systemctl enable {unit}
 systemctl restart {unit}
 systemctl --no-pager status {unit}
 """
-# A folder of the service's own, never one that is there; `chown USER:` adds the user's group.
-NEW_FOLDER = """\
-[ -d {folder} ] || {{ mkdir -m 0750 -- {folder} && chown -- {user}: {folder}; }}
-"""
 
 
 def unit_text(
     command: Sequence[str], config: Config, user: str, watchdog_s: float = WATCHDOG_S
 ) -> str:
-    """The unit file.
+    """Return the unit file of a service that runs a command.
 
     Args:
-        command: what to start, absolute paths.
-        config: what it will run: folders that it writes into are made writable, nothing else is.
-        user: whose name it runs under.
-        watchdog_s: silent for so long, it is started anew, s.
+        command: The program with absolute paths, and its arguments.
+        config: The configuration that it will run; see `check_folders`.
+        user: The name of the service's user.
+        watchdog_s: The time of silence after which it is started anew, s.
 
     Raises:
-        ConfigError: a path has a character that a unit file cannot hold.
+        ConfigError: The command has a character that a unit file cannot hold.
     """
-    folders = written_folders(config)
-    for text in (*command, *map(str, folders)):
+    for text in command:
         if any(ord(c) < 32 for c in text):
             raise ConfigError(f"{text!r} cannot stand in a unit file")
-    home = any(
-        p.startswith(("/home/", "/root/", "/run/user/")) for p in (*command, *map(str, folders))
-    )
+    home = any(p.startswith(("/home/", "/root/", "/run/user/")) for p in command)
+    folders = [folder for _, folder in _list_outputs(config)]
     made = [
         f"{key}={base.name}"
         for key, base in MADE.items()
         if key == "StateDirectory" or any(f.is_relative_to(base) for f in folders)
     ]
-    writes = [f"ReadWritePaths={_path(str(f))}" for f in folders if not made_by_systemd(f)]
     return UNIT.format(
         command=" ".join(map(_quoted, command)), user=user, watchdog=f"{watchdog_s:g}",
-        home="read-only" if home else "yes", made="\n".join([*made, *writes]),
+        home="read-only" if home else "yes", made="\n".join(made),
         devices="\n".join(f"DeviceAllow={d} rw" for d in DEVICES),
     )  # fmt: skip
 
 
-def install_script(unit: str, again: Sequence[str], config: Config, user: str) -> str:
-    """The script that installs the unit as root; it can be read before it is run.
+def install_script(unit: str, again: Sequence[str], user: str) -> str:
+    """Return the shell script that installs the unit as root.
 
     Args:
-        unit: name of its file.
-        again: command that writes the unit once more, into the folder that is added as ``--out``.
-        config: folders that it writes into, and that are not there, are made.
-        user: whose name it runs under; made if there is none.
+        unit: The name of the unit's file.
+        again: The command that writes the unit once more, into the folder added as ``--out``.
+        user: The name of the service's user, made if there is none.
     """
-    folders = "".join(
-        NEW_FOLDER.format(user=user, folder=shlex.quote(str(f)))
-        for f in written_folders(config)
-        if not made_by_systemd(f)
-    )
-    return SCRIPT.format(unit=unit, again=shlex.join(again), user=user, folders=folders)
+    return SCRIPT.format(unit=unit, again=shlex.join(again), user=user)
+
+
+def check_folders(loaded: Loaded, user: str) -> None:
+    """Refuse a folder that systemd does not make for the service, or that is another's.
+
+    Args:
+        loaded: The configuration.
+        user: The name of the service's user, who need not be there yet.
+
+    Raises:
+        ConfigError: The folder, whose it is, and what to do; one line.
+    """
+    names = " or ".join(map(str, MADE.values()))
+    read = _list_inputs(loaded)
+    for key, folder in _list_outputs(loaded.config):
+        if not any(Path(os.path.realpath(folder)).is_relative_to(b) for b in MADE.values()):
+            loaded.refuse(key, f"folder {folder}: a service writes into {names} alone")
+    for base in MADE.values():
+        inside = next((file for file in read if file.is_relative_to(base)), None)
+        if inside is not None:
+            raise ConfigError(f"the service would own {inside}, which it reads: not in {base}")
+        if os.path.lexists(base) and base.lstat().st_uid != _uid(user):
+            raise ConfigError(f"folder {base}: user {user} must own it: give it to {user}")
+
+
+def _list_outputs(config: Config) -> Iterator[tuple[list[str | int], Path]]:
+    """Yield each key whose value names an output, with the output's folder."""
+    if config.recorder is not None:
+        yield ["recorder", "folder"], Path(config.recorder.folder)
+    if config.log.file:
+        yield ["log", "file"], Path(config.log.file).parent
+    for i, publisher in enumerate(config.publisher):
+        file = publisher.options.get("file")
+        if publisher.kind == "jsonl" and isinstance(file, str) and file:
+            yield ["publisher", i, "options", "file"], Path(file).parent
+
+
+def _list_inputs(loaded: Loaded) -> list[Path]:
+    """Return what decides what the service does, and which it therefore may not write."""
+    config = loaded.config
+    names = [
+        *(node.file for _, node in loaded.nodes.walk()),
+        *(m.file for m in config.model),
+        *(file for s in config.source for file in (s.array, s.calibration)),
+        str(loaded.path), sys.prefix, sys.executable, __file__,
+    ]  # fmt: skip
+    return [Path(os.path.realpath(n)) for n in dict.fromkeys(names) if os.path.isabs(n)]
+
+
+def _uid(user: str) -> int | None:
+    try:
+        return pwd.getpwnam(user).pw_uid
+    except KeyError:
+        return None
 
 
 def _quoted(word: str) -> str:
@@ -175,10 +230,3 @@ def _quoted(word: str) -> str:
     if word and all(c.isalnum() or c in "-_./=:@+,%$" for c in word):
         return word
     return '"' + word.replace("\\", "\\\\").replace('"', '\\"') + '"'
-
-
-def _path(path: str) -> str:
-    text = path.replace("%", "%%")
-    if any(c in text for c in " '\"\\"):
-        return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    return text

@@ -13,8 +13,7 @@ from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.cli import main
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
-from tactile_rt.daemon.service import install_script, unit_text
-from tactile_rt.daemon.service_folders import written_folders
+from tactile_rt.daemon.service import unit_text
 from tactile_rt.errors import ConfigError
 from tests.helpers.overlay import changes
 
@@ -27,61 +26,33 @@ def configured(tmp_path, text=""):
     return file, load_config(file).config
 
 
-def test_the_unit_opens_what_the_configuration_writes_and_nothing_else(tmp_path):
+def test_the_unit_opens_folders_of_the_services_own_and_nothing_else(tmp_path):
     file, config = configured(
-        tmp_path,
-        '[recorder]\nfolder = "my recordings"\n[log]\nfile = "logs/d.log"\n'
-        '[[publisher]]\nkind = "jsonl"\noptions = { file = "out/a.jsonl" }\n',
+        tmp_path, recorder("/var/lib/tactile-rt/rec") + log("/var/log/tactile-rt/d.log")
     )
-    folders = [tmp_path / "logs", tmp_path / "my recordings", tmp_path / "out"]
-    assert written_folders(config) == folders
-    unit = unit_text([sys.executable, "run", str(file)], config, "tactile")
-    lines = unit.splitlines()
-    assert f'ReadWritePaths="{tmp_path}/my recordings"' in lines
-    assert [x for x in lines if x.startswith("ReadWritePaths")] == [
-        f"ReadWritePaths={tmp_path}/logs", f'ReadWritePaths="{tmp_path}/my recordings"',
-        f"ReadWritePaths={tmp_path}/out",
-    ]  # fmt: skip
+    check_config(load_config(file))  # a folder that systemd will make need not be there
+    lines = unit_text([sys.executable, "run", str(file)], config, "tactile").splitlines()
     for line in (
         "Type=notify", "NoNewPrivileges=yes", "ProtectSystem=strict", "DevicePolicy=closed",
         "DeviceAllow=char-ttyACM rw", "WatchdogSec=15", "RestartPreventExitStatus=2 3",
-        "User=tactile", "CapabilityBoundingSet=",
+        "User=tactile", "CapabilityBoundingSet=", "StateDirectory=tactile-rt",
+        "LogsDirectory=tactile-rt",
     ):  # fmt: skip
         assert line in lines
-
-
-def test_systemd_makes_the_folders_that_are_the_services_own(tmp_path):
-    """And only what such a folder does not cover is opened besides."""
-    file, config = configured(
-        tmp_path,
-        recorder("/var/lib/tactile-rt/rec")
-        + log("/var/log/tactile-rt/d.log")
-        + '[[publisher]]\nkind = "jsonl"\noptions = { file = "out/a" }\n',
-    )
-    (tmp_path / "out").mkdir()
-    check_config(load_config(file))  # a folder that systemd will make need not be there
-    unit = unit_text(["/opt/x", "run", str(file)], config, "tactile").splitlines()
-    assert "StateDirectory=tactile-rt" in unit and "LogsDirectory=tactile-rt" in unit
-    assert [x for x in unit if x.startswith("ReadWritePaths")] == [f"ReadWritePaths={tmp_path}/out"]
-    assert not any(x.startswith("RuntimeDirectory") for x in unit)
-    script = install_script("u.service", ["/opt/x"], config, "tactile")
-    assert f"mkdir -m 0750 -- {tmp_path}/out" in script and "/rec" not in script
+    assert not any(x.startswith(("ReadWritePaths", "RuntimeDirectory")) for x in lines)
 
 
 def test_what_means_something_in_a_unit_is_kept_from_it(tmp_path):
     _, config = configured(tmp_path)
     unit = unit_text(["/bin/a b", "100%", "$HOME", 'q"'], config, "u")
     assert r'ExecStart="/bin/a b" 100%% $$HOME "q\""' in unit.splitlines()
-    _, config = configured(tmp_path, '[recorder]\nfolder = "/srv/it\'s 100% \\"x\\""\n')
-    unit = unit_text(["/bin/a"], config, "u")
-    assert r'''ReadWritePaths="/srv/it's 100%% \"x\""''' in unit.splitlines()
     with pytest.raises(ConfigError, match="unit file"):
         unit_text(["/bin/a\nExecStart=/bin/evil"], config, "u")
 
 
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="no systemd here")
 def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path):
-    file, config = configured(tmp_path, '[recorder]\nfolder = "my recordings"\n')
+    file, config = configured(tmp_path, recorder("/var/lib/tactile-rt/rec"))
     unit = tmp_path / "tactile-rt.service"
     unit.write_text(unit_text([sys.executable, "run", str(file)], config, "root"))
     command = ["systemd-analyze", "verify", "--man=no"]
@@ -170,10 +141,9 @@ def prepared(config="", before="", after=""):
     return f"{PREPARE}\n{before}\n{write}{WRITE} /root/service\n{after}"
 
 
-def check_installed(changed, made=()):
+def check_installed(changed):
     assert changed.code == 0, changed.said
-    expected = INSTALLED | set(made)
-    assert expected <= set(changed.after) <= expected | ACCOUNTS
+    assert INSTALLED <= set(changed.after) <= INSTALLED | ACCOUNTS
     for path in ACCOUNTS & set(changed.after):
         (was, now) = changed.before[path], changed.after[path]
         if was is None or now is None or path == "/etc/.pwd.lock":
@@ -194,101 +164,42 @@ def test_installing_changes_accounts_unit_and_rules_and_nothing_else(on_a_copy):
 
 
 def test_installing_again_changes_nothing(on_a_copy):
-    keeps = recorder("/srv/recordings")
+    keeps = recorder("/var/lib/tactile-rt/recordings")
     changed = on_a_copy(prepared(keeps, after=RUN), RUN)
     assert (changed.code, changed.after) == (0, {}), changed.said
 
 
-@pytest.mark.parametrize(
-    ("folder", "before"),
-    [
-        ("/srv/recordings", ""),
-        ("""/srv/it's my "rec" 100% $HOME `id`""", ""),
-        ("/srv/deep/er/recordings", "mkdir -p /srv/deep/er"),
-    ],
-)
-def test_a_new_folder_is_made_and_none_above_it(on_a_copy, folder, before):
-    changed = on_a_copy(prepared(recorder(folder), before), RUN)
-    check_installed(changed, {folder})
-    (entry,) = [x for x in changed.after["/etc/passwd"][3].splitlines() if x.startswith("tactile:")]
-    owner, group = map(int, entry.split(":")[2:4])
-    assert changed.before[folder] is None and changed.after[folder] == [
-        "drwxr-x---",
-        owner,
-        group,
-        "",
-    ]
-
-
-@pytest.mark.parametrize(
-    ("folder", "before"),
-    [
-        ("/srv/rec", "mkdir -m 0777 /srv/rec; chown tactile: /srv/rec; echo x > /srv/rec/file"),
-        ("/var/lib/tactile-rt/rec", "install -d -m 0700 -o tactile /var/lib/tactile-rt"),
-        (
-            "/home/bob/rec",
-            "install -d -m 0711 -o bob /home/bob; install -d -o tactile /home/bob/rec",
-        ),
-    ],
-)
-def test_a_folder_of_the_services_own_is_left_as_it_is(on_a_copy, folder, before):
-    users = f"{USER}useradd bob\n"
-    changed = on_a_copy(prepared(recorder(folder), users + before), RUN)
-    check_installed(changed)
+def test_a_folder_of_the_services_own_is_left_as_it_is(on_a_copy):
+    before = f"{USER}install -d -m 0700 -o tactile /var/lib/tactile-rt"
+    check_installed(on_a_copy(prepared(recorder("/var/lib/tactile-rt/rec"), before), RUN))
 
 
 OTHERS = "useradd bob; mkdir -m 0750 /srv/bobs; chown bob: /srv/bobs\n"
+ALONE = "a service writes into /var/lib/tactile-rt or /var/log/tactile-rt or /run/tactile-rt alone"
 REFUSED = [
-    (log("/tmp/d.log"), "", "log.file: folder /tmp: the service has a /tmp of its own"),
-    (log("/var/log/d.log"), "", "log.file: folder /var/log: it is not for one service"),
-    (log("d.log"), "", f"log.file: folder /etc/tactile: the service would own {CONFIG}"),
-    (log("/d.log"), "", "log.file: folder /: the service would own"),
-    (recorder("/home/bob"), "", "folder /home/bob: it is not for one service"),
-    (recorder("/etc"), "", f"folder /etc: the service would own {CONFIG}"),
-    (recorder("/run/rec"), "", "folder /run/rec: /run is empty after each boot"),
-    (recorder("/srv/no/rec"), "", "there is no folder /srv/no to make it in"),
-    (recorder("/srv/../srv/rec"), "", "it is /srv/rec in truth: name that"),
+    (log("/tmp/d.log"), "", f"log.file: folder /tmp: {ALONE}"),
+    (log("d.log"), "", f"log.file: folder /etc/tactile: {ALONE}"),
+    (recorder("/var/lib/tactile-rt/../../etc"), "", ALONE),
     (
-        recorder(sys.prefix), "", f"folder {sys.prefix}: the service ",  # wherever it lies
-    ),
-    (
-        '[[source]]\nname = "b"\nurl = "synthetic:mouse"\n'
-        '[[model]]\nsource = "b"\nfile = "/srv/models/m.onnx"\n' + recorder("/srv/models"),
-        f"mkdir /srv/models; cp {shlex.quote(str(shipped_model()))} /srv/models/m.onnx",
-        "folder /srv/models: the service would own /srv/models/m.onnx, which it reads",
-    ),
-    (
-        recorder("/srv/bobs"), OTHERS,
-        "/srv/bobs belongs to bob (drwxr-x---), and tactile must own it",
-    ),
-    (
-        recorder("/srv/bobs/rec"), OTHERS,
-        "others than root can write in /srv/bobs: make it yourself: sudo useradd --system",
-    ),
-    (
-        recorder("/srv/open/rec"), "mkdir -m 1777 /srv/open",
-        "others than root can write in /srv/open",
-    ),
-    (
-        recorder("/srv/link"), f"{OTHERS}ln -s bobs /srv/link",
-        "folder /srv/link: it is /srv/bobs in truth: name that",
-    ),
-    (
-        recorder("/srv/ro"), f"{USER}mkdir -m 0500 /srv/ro; chown tactile: /srv/ro",
-        "/srv/ro belongs to tactile (dr-x------), and tactile must own it and write in it",
+        recorder("/var/lib/tactile-rt/rec"),
+        f"{OTHERS}install -d /var/lib/tactile-rt; ln -s /srv/bobs /var/lib/tactile-rt/rec", ALONE,
     ),
     (
         '[[publisher]]\nkind = "jsonl"\noptions = { file = "/srv/bobs/out" }\n', OTHERS,
-        "publisher[0].options.file: folder /srv/bobs: /srv/bobs belongs to bob",
+        f"publisher[0].options.file: folder /srv/bobs: {ALONE}",
     ),
     (
-        recorder("/var/lib/tactile-rt/rec"), f"{OTHERS}mv /srv/bobs /var/lib/tactile-rt",
-        "/var/lib/tactile-rt belongs to bob",
+        '[[source]]\nname = "b"\nurl = "synthetic:mouse"\n'
+        '[[model]]\nsource = "b"\nfile = "/var/lib/tactile-rt/m.onnx"\n',
+        "mkdir /var/lib/tactile-rt; "
+        f"cp {shlex.quote(str(shipped_model()))} /var/lib/tactile-rt/m.onnx",
+        "the service would own /var/lib/tactile-rt/m.onnx, which it reads",
     ),
     (
         "", f"{OTHERS}mv /srv/bobs /var/lib/tactile-rt",
-        "folder /var/lib/tactile-rt: /var/lib/tactile-rt belongs to bob",
+        "folder /var/lib/tactile-rt: user tactile must own it",
     ),
+    ("", f"{OTHERS}ln -s /srv/bobs /run/tactile-rt", "folder /run/tactile-rt: user tactile must"),
 ]  # fmt: skip
 
 
@@ -304,10 +215,11 @@ def test_a_folder_that_is_not_the_services_is_refused_before_anything_is_written
 @pytest.mark.parametrize(
     ("meanwhile", "said"),
     [
-        (f"{OTHERS}mv /srv/bobs /srv/rec", "/srv/rec belongs to bob"),
-        (f"{OTHERS}ln -s bobs /srv/rec", "/srv/rec: it is /srv/bobs in truth"),
-        ("chmod 1777 /srv", "others than root can write in /srv"),
-        (f"sed -i s:/srv/rec:/srv/rec2: {CONFIG}", "now gives another tactile-rt.service"),
+        (f"{OTHERS}mv /srv/bobs /var/lib/tactile-rt", "user tactile must own it"),
+        (
+            f"echo {shlex.quote(log('/var/log/tactile-rt/d'))} >> {CONFIG}",
+            "now gives another tactile-rt.service",
+        ),
         (f"echo nonsense >> {CONFIG}", "the configuration cannot be installed"),
         ("groupdel dialout", "there is no group dialout"),
         ("rm -r /etc/udev/rules.d", "there is no folder /etc/udev/rules.d"),
@@ -318,7 +230,7 @@ def test_a_folder_that_is_not_the_services_is_refused_before_anything_is_written
     ],
 )
 def test_what_has_changed_since_is_seen_before_anything_is_changed(on_a_copy, meanwhile, said):
-    changed = on_a_copy(prepared(recorder("/srv/rec"), after=meanwhile), RUN)
+    changed = on_a_copy(prepared(recorder("/var/lib/tactile-rt/rec"), after=meanwhile), RUN)
     assert (changed.code, changed.after) == (1, {}), changed.said
     assert said in changed.said and "nothing has been changed\n" in changed.said
 
