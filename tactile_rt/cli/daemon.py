@@ -70,7 +70,7 @@ def check(file: File, sets: Settings = None) -> None:
 
 @config.command()
 def show(file: File, sets: Settings = None) -> None:
-    """Print the configuration in force: with what it extends, overrides and defaults."""
+    """Print the configuration in force: with what --set overrides, and defaults."""
     from tactile_rt.daemon.config import config_text
     from tactile_rt.daemon.loading import load_config
 

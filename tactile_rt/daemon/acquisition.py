@@ -42,13 +42,9 @@ class Acquisition:
         """Read a source until its line is lost, or it is not wanted any more; returns then.
 
         Args:
-            source: what to read; nobody else may meanwhile.
-            take: is given what comes, in the thread that reads; None, several times a second, if
-                nothing does.
-            wanted: whether to go on.
-
-        Raises:
-            Exception: whatever reading it, or `take`, raises.
+            take: Called in the thread that reads with what comes; several times a second with
+                None, if nothing does.
+            wanted: Tells whether to go on.
         """
         lent = _Lent(source, take, wanted)
         with self._lock:

@@ -25,15 +25,11 @@ class Admission:
     """Begins at once.
 
     Args:
-        config: table of the model.
-        limits: how much memory and time its trial may take.
         opened: the stream that it will classify; None: it is only tried.
         age: of the stream, see `Classifier`; used if it is live.
         trial: of the same file, if there was one.
 
     Attributes:
-        config: The table of the model.
-        file: The path of the model's file.
         stamp: What the file was when it was tried, see `file_stamp`.
         finished: Set when the model is there, or refused.
         error: The reason for which the model is refused; None: it is not.

@@ -2,7 +2,8 @@
 
 Version 1 of the keys is promised: a file that is right for it stays right for later releases, or
 is refused by its ``version``, never misread. Relative paths are meant from the file's folder.
-`loading` reads such a file, `checks` says whether it can work.
+`loading` reads such a file, `checks` says whether it can work; `EXAMPLE` explains its keys, the
+docstrings what it leaves out.
 """
 
 import ipaddress
@@ -46,10 +47,6 @@ class SourceConfig(_Table, frozen=True, kw_only=True):
     """``[[source]]``: an array.
 
     Attributes:
-        name: The name by which models, messages and recordings refer to the array.
-        url: The URL of the source, as `tactile-rt run --source` takes it.
-        calibration: A calibration file, or the id of a device calibrated before; empty if the
-            samples are used as they come.
         array: A file of the array that the source is, as `tactile-rt describe` writes it, or an
             ``.onnx`` model, whose array it then is; empty if it is what the URL says.
         frozen_s: Time without any change of any value from which the device is taken to hang, s; 0
@@ -68,11 +65,6 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
     """``[[model]]``: a classifier on a source.
 
     Attributes:
-        file: The ``.onnx`` file; empty for the model that comes with the package.
-        source: The name of the source whose samples are classified; needed if there are several.
-        name: The name of the model in messages; empty to name it like its source.
-        decisions: Choice of the decisions that are published: ``every_step``, or ``final`` ones
-            alone.
         mode: ``episode`` decides from the onset on, better with every step; ``sliding`` decides as
             long as contact lasts, each time about the newest steps, as many as an episode has.
         every: Number of steps from one sliding decision to the next, at most those of an episode;
@@ -80,14 +72,6 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
         sure: Probability that ends an episode early when one class reaches it `in_a_row` steps
             running; 0 for never.
         in_a_row: Number of steps running for `sure`, at most those of an episode.
-        deadline_ms: Longest time that a step may take, and greatest age of its newest sample when
-            its decision is published, ms; 0 for the duration of the step itself.
-        late: What becomes of a step beyond `deadline_ms`: ``count``, ``report`` in the log, or
-            ``skip``, so that the decision is not published.
-        catch_up: What the model does when its decisions would be older than `behind_ms`: it skips
-            to the ``newest`` sample, ending the episode, or takes ``all`` steps, marked as late.
-        behind_ms: Greatest age of a decision's newest sample with `catch_up` ``newest``, ms; 0 for
-            three steps, at least 150 ms.
         providers: Execution providers of onnxruntime, best first: ``cpu``, ``cuda``, ``tensorrt``.
         engine: What runs the model: ``onnxruntime``, ``openvino`` or ``openvino-bf16``; empty for
             what `tactile-rt model bench --engines` kept for this machine, else ``onnxruntime``.
@@ -113,8 +97,7 @@ class PublisherConfig(_Table, frozen=True, kw_only=True):
     """``[[publisher]]``: where messages go.
 
     Attributes:
-        kind: Kind of publisher: ``jsonl``, ``zmq``, ``zenoh``, ``foxglove``, ``ros2``, or one that
-            another package adds.
+        kind: One of `publishers.PUBLISHERS`, or one that another package adds.
         name: The name of the publisher in the log and on the page; empty to name it like its kind.
         options: The table of options that this kind of publisher takes.
     """
@@ -125,19 +108,7 @@ class PublisherConfig(_Table, frozen=True, kw_only=True):
 
 
 class RecorderConfig(_Table, frozen=True, kw_only=True):
-    """``[recorder]``: MCAP files.
-
-    Attributes:
-        folder: The folder that recordings are written into; made if it is missing.
-        rotate_mb: Size at which a new file begins, MB; 0 for never.
-        rotate_s: Age at which a new file begins, s; 0 for never.
-        min_free_mb: Free space below which nothing is recorded, MB.
-        sync_s: Time between two syncs of a file, which put it on the medium so that it outlives a
-            power cut, s; 0 to sync it only at its end.
-        mode: ``always`` records all samples; ``trigger`` only those around contacts and faults.
-        before_s: Time before a trigger that is kept, s.
-        after_s: Time after a trigger that is kept, s.
-    """
+    """``[recorder]``: MCAP files."""
 
     folder: Text
     rotate_mb: Megabytes = 512.0
@@ -150,14 +121,7 @@ class RecorderConfig(_Table, frozen=True, kw_only=True):
 
 
 class PageConfig(_Table, frozen=True, kw_only=True):
-    """``[page]``: the web page.
-
-    Attributes:
-        host: The address that the page listens on; beyond loopback a token is needed.
-        port: The TCP port that the page listens on, 1 to 65535.
-        token: The secret that a browser must know, at least 16 characters; empty for none.
-        control: Whether the page may start and stop the recorder, besides showing things.
-    """
+    """``[page]``: the web page."""
 
     host: Text = "127.0.0.1"
     port: Port = 8765
@@ -173,15 +137,7 @@ class MetricsConfig(_Table, frozen=True, kw_only=True):
 
 
 class LogConfig(_Table, frozen=True, kw_only=True):
-    """``[log]``: one line per event.
-
-    Attributes:
-        level: The least severe level that is written: ``info``, ``warning`` or ``error``.
-        format: Format of the lines, ``text`` or ``json``.
-        file: The file that lines are appended to; empty for stderr, which systemd keeps.
-        repeat_s: Time within which an event that comes again is counted instead of written, s;
-            the count is told once: "repeated n times".
-    """
+    """``[log]``: one line per event."""
 
     level: Literal["info", "warning", "error"] = "info"
     format: Literal["text", "json"] = "text"
@@ -190,29 +146,7 @@ class LogConfig(_Table, frozen=True, kw_only=True):
 
 
 class LimitsConfig(_Table, frozen=True, kw_only=True):
-    """``[limits]``: how much may wait, and how long things may take.
-
-    Attributes:
-        queue_items: Number of items that may wait for one consumer before the oldest goes.
-        queue_mb: Size of the items that may wait for one consumer before the oldest goes, MB.
-        model_queue_items: Number of chunks that may wait for one model.
-        gather_ms: Time that a model waits for more samples before it looks at those that came, ms;
-            less is sooner, more takes less of the processor.
-        model_mb: Memory that a model may need to load and run, beside four times its file's size,
-            MB.
-        model_s: Time that a model may need to load and warm up, s.
-        stop_s: Longest time that closing may take, s.
-        stall_s: Duration from which a call is told as stalled, s.
-        sample_age_s: Age of a live source's newest sample from which the daemon is degraded, s;
-            three periods of a slow sensor, if that is more.
-        behind_s: Time that items may wait for a model or a consumer before the daemon is degraded,
-            s.
-        record_age_s: Age that the newest sample of a recording may have, less that of its source,
-            before the daemon is degraded, s.
-        retry_first_s: Pause before a part that broke is tried again for the first time, s.
-        retry_last_s: Longest pause before a part that broke is tried again, s; from the first on
-            pauses double up to this.
-    """
+    """``[limits]``: how much may wait, and how long things may take; `EXAMPLE` says of what."""
 
     queue_items: Annotated[int, msgspec.Meta(ge=16, le=1_000_000)] = 4096
     queue_mb: Annotated[float, msgspec.Meta(ge=1, le=4096)] = 32.0
@@ -230,23 +164,9 @@ class LimitsConfig(_Table, frozen=True, kw_only=True):
 
 
 class Config(_Table, frozen=True, kw_only=True):
-    """The file.
-
-    Attributes:
-        version: The version of the keys, always 1.
-        extends: The file that this one adds to and overrides; empty once it has been read.
-        source: The arrays, one table ``[[source]]`` each.
-        model: The classifiers, one table ``[[model]]`` each.
-        publisher: The publishers, one table ``[[publisher]]`` each.
-        recorder: The table ``[recorder]``; None if nothing is recorded.
-        page: The table ``[page]``; None without a web page.
-        metrics: The table ``[metrics]``; None without metrics.
-        log: The table ``[log]``, which may be left out.
-        limits: The table ``[limits]``, which may be left out.
-    """
+    """The file: one table, or one of a list of tables, for each part."""
 
     version: Literal[1]
-    extends: str = ""
     source: tuple[SourceConfig, ...] = ()
     model: tuple[ModelConfig, ...] = ()
     publisher: tuple[PublisherConfig, ...] = ()
@@ -271,7 +191,6 @@ EXAMPLE = """\
 # To use what is commented out, remove the first # of the line.
 # Run it: tactile-rt run robot.toml     Paths are meant from this file's folder.
 version = 1
-# extends = "base.toml"        # what is here adds to that file and overrides it
 
 [[source]]
 name = "whiskers"

@@ -107,15 +107,7 @@ class Consumer(abc.ABC):
 
 
 class ConsumerPart(Part):
-    """Runs a consumer.
-
-    Args:
-        name: The name of the part: ``publisher.NAME``, ``recorder`` ...
-        kind: The kind of consumer, for the snapshot.
-        consumer: The consumer itself.
-        view: The daemon as the consumer sees it.
-        report, limits: As of every `Part`.
-    """
+    """Runs a consumer in a thread of its own, fed from a mailbox."""
 
     def __init__(
         self,

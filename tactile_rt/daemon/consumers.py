@@ -31,10 +31,8 @@ class Wanted:
 
     Attributes:
         name: The name of the part that runs the consumer, e.g. ``publisher.zmq``.
-        kind: The kind of consumer, e.g. ``zmq`` or ``recorder``.
-        key: A value that is equal for two consumers that are configured alike, of which the
-            running one need not be restarted.
-        make: A function that makes the consumer; may raise `ConfigError`.
+        key: Equal for two consumers that are configured alike: the running one need not restart.
+        make: Makes the consumer; may raise `ConfigError`.
         options: The table of the configuration; of a publisher that of its ``options``.
     """
 

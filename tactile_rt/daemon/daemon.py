@@ -38,7 +38,6 @@ class Daemon:
 
     Args:
         loaded: the configuration, checked.
-        clock: of the host.
         locks: that keep a second daemon away; None: none.
         on_over: called once, from another thread, when all streams are over.
         freeze: whether to keep what is there after the start out of the garbage collector, which

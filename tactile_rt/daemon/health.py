@@ -39,34 +39,20 @@ BREAKS = ("fails", "has failed", "stalls")  # what a part does, not what is the 
 
 @dataclass(frozen=True)
 class Latency:
-    """Of a repeated thing.
-
-    Attributes:
-        count: The number of measurements since the start.
-        sum_s: The sum of all measurements since the start, s.
-        p50_ms, p99_ms, max_ms: The median, the 99th percentile and the maximum of the newest 1000
-            measurements, ms; 0 where there is none.
-        edges_s: (b,) The upper edges of the histogram's buckets, s.
-        buckets: (b + 1,) The counts since the start, the last beyond all edges; not cumulative.
-    """
+    """Of a repeated thing: since the start, and of the newest 1000 measurements (`p50_ms` ...)."""
 
     count: int = 0
     sum_s: float = 0.0
     p50_ms: float = 0.0
     p99_ms: float = 0.0
     max_ms: float = 0.0
-    edges_s: tuple[float, ...] = ()
-    buckets: tuple[int, ...] = ()
+    edges_s: tuple[float, ...] = ()  # (b,) upper edges of the histogram's buckets
+    buckets: tuple[int, ...] = ()  # (b + 1,) the last beyond all edges; not cumulative
 
 
 @dataclass(frozen=True)
 class Losses:
-    """How much was lost lately of what is counted beside.
-
-    Attributes:
-        second: The number that was lost within the newest second.
-        minute: The number that was lost within the newest minute.
-    """
+    """How much was lost within the newest second and minute of what is counted beside."""
 
     second: int = 0
     minute: int = 0
@@ -79,13 +65,11 @@ class PartState:
     Attributes:
         name: The name of the part, as in `Event.part`.
         state: ``starting``; ``running``; ``stalled``: in a call that does not return, also while it
-            starts; ``waiting``:
-            it broke and is tried again after a pause; ``failed``: it cannot work as it is
-            configured, and is not tried again; ``ended``: its stream is over; ``stopped``.
+            starts; ``waiting``: it broke and is tried again after a pause; ``failed``: it cannot
+            work as it is configured, and is not tried again; ``ended``: its stream is over;
+            ``stopped``.
         reason: The reason why the part is not running, in words.
         since_ns: The time at which the part came into this state, host CLOCK_MONOTONIC, ns.
-        starts: The number of times that the part was started.
-        failures: The number of times that the part broke.
     """
 
     name: str
@@ -100,27 +84,8 @@ class PartState:
 class SourceState:
     """A source: `part`, where it is, its array, and what came of it.
 
-    Attributes:
-        part: The state of the source as a part of the daemon.
-        url: The URL of the source as configured.
-        array, frame, rate_hz, elements, channels, units: The name of the sensor array, its mount
-            frame, nominal rate (Hz), elements, channels and their units; empty before the source
-            was first opened.
-        device: The health of the device; None: there is no device, or it is not open.
-        stats: The samples delivered and lost, summed over all times that the source was opened.
-        samples: The number of samples read.
-        newest_ns: The time at which the newest sample was taken, host CLOCK_MONOTONIC, ns; of a
-            device whose own clock is kept that at which it came; 0: there is none yet.
-        read_ns: The time at which the newest sample was read, host CLOCK_MONOTONIC, ns.
-        flowing_ns: The time since which samples have come without a pause, host CLOCK_MONOTONIC,
-            ns.
-        live: Whether samples come whether or not anyone reads them, so that they can be too old.
-        losses: The number of samples that were corrupt, missing or dropped lately.
-        bad_samples: The number of samples of one element that held no number, or an absurd one,
-            though the element was not marked as invalid.
-        bad: The number of these lately.
-        frozen_s: The time for which no value has changed though the sensor's noise should change
-            some, s; 0: they change, or nothing is known of the noise.
+    Times are host CLOCK_MONOTONIC, ns; 0: not yet. What is of the array is empty before the source
+    was first opened.
     """
 
     part: PartState
@@ -131,137 +96,79 @@ class SourceState:
     elements: tuple[str, ...] = ()
     channels: tuple[str, ...] = ()
     units: tuple[str, ...] = ()
-    device: Health | None = None
-    stats: SourceStats = field(default_factory=SourceStats)
+    device: Health | None = None  # None: there is none, or it is not open
+    stats: SourceStats = field(default_factory=SourceStats)  # over all times that it was opened
     samples: int = 0
-    newest_ns: int = 0
-    read_ns: int = 0
-    flowing_ns: int = 0
-    live: bool = False
-    losses: Losses = field(default_factory=Losses)
-    bad_samples: int = 0
+    newest_ns: int = 0  # of the newest sample; of a device whose own clock is kept: when it came
+    read_ns: int = 0  # when the newest sample was read
+    flowing_ns: int = 0  # since when samples have come without a pause
+    live: bool = False  # samples come whether or not anyone reads them, so that they can be too old
+    losses: Losses = field(default_factory=Losses)  # corrupt, missing or dropped
+    bad_samples: int = 0  # of one element, no number or an absurd one, though not marked invalid
     bad: Losses = field(default_factory=Losses)
-    frozen_s: float = 0.0
+    frozen_s: float = (
+        0.0  # no value has changed, though the sensor's noise should change some; or 0
+    )
 
 
 @dataclass(frozen=True)
 class ModelState:
-    """A model: its source and file, and what it decided.
-
-    Attributes:
-        part: The state of the model as a part of the daemon.
-        source: The name of the source that is classified.
-        file: The path of the model file.
-        sha256: The hash of the model file, hexadecimal; empty if the file cannot be read.
-        labels: The classes that the model tells apart.
-        queue: The mailbox of samples for the model.
-        decisions, final: The number of decisions so far, and of those that were the last ones of
-            their episode.
-        touching: Whether there is contact now.
-        label, probability: The most probable class of the newest decision, and how probable; empty
-            and 0 before the first one.
-        latency: The time from the sample that completed a step to the decision.
-        step: The time that the network alone took for a step.
-        decision_age_ms: The age of the newest sample of the newest decision when that decision was
-            there, ms.
-        behind_s: The time that the oldest samples that are not yet classified have waited, s.
-        late: The number of steps that took longer than they may, or whose samples were too old.
-        skipped: The number of times that it skipped to the newest sample.
-        skips: The number of times that it did so lately.
-        lost: The number of samples that were dropped from its mailbox lately.
-        refused: The reason for which the model that was to take the place of this one does not;
-            empty if none was refused since this one was admitted.
-        bad_samples: The number of samples that held what is no number, and were left out.
-        engine: The name of the engine that runs it; empty if that is not known yet.
-    """
+    """A model: its source and file, and what it decided."""
 
     part: PartState
     source: str
     file: str
-    sha256: str = ""
+    sha256: str = ""  # empty if the file cannot be read
     labels: tuple[str, ...] = ()
     queue: QueueState = field(default_factory=QueueState)
     decisions: int = 0
-    final: int = 0
+    final: int = 0  # decisions that were the last ones of their episode
     touching: bool = False
-    label: str = ""
+    label: str = ""  # most probable class of the newest decision; empty before the first one
     probability: float = 0.0
-    latency: Latency = field(default_factory=Latency)
-    step: Latency = field(default_factory=Latency)
-    late: int = 0
-    bad_samples: int = 0
-    decision_age_ms: float = 0.0
-    behind_s: float = 0.0
-    skipped: int = 0
+    latency: Latency = field(default_factory=Latency)  # from the sample that completed a step
+    step: Latency = field(default_factory=Latency)  # of the network alone
+    late: int = 0  # steps that took longer than they may, or whose samples were too old
+    bad_samples: int = 0  # no numbers, and left out
+    decision_age_ms: float = 0.0  # of the newest decision's newest sample when that was there
+    behind_s: float = 0.0  # how long the oldest samples wait to be classified
+    skipped: int = 0  # times that it skipped to the newest sample
     skips: Losses = field(default_factory=Losses)
-    lost: Losses = field(default_factory=Losses)
-    refused: str = ""
-    engine: str = ""
+    lost: Losses = field(default_factory=Losses)  # samples that were dropped from its mailbox
+    refused: str = ""  # why the model that was to take the place of this one does not
+    engine: str = ""  # empty if not known yet
 
 
 @dataclass(frozen=True)
 class OnDisk:
-    """What of a source is on the disk.
+    """What of a source is on the disk. Times are host CLOCK_MONOTONIC, ns; 0: none."""
 
-    Attributes:
-        written_ns: The host monotonic time of the newest sample that the operating system has, so
-            that it outlives the process, ns; 0 if there is none.
-        synced_ns: The host monotonic time of the newest sample that is on the medium, so that it
-            outlives a power cut, ns; 0 if there is none.
-        samples: The number of samples that are recorded.
-        lost_samples: The number of samples that should have been recorded and are not; those that
-            did not reach the recorder are counted in its queue.
-        lost_ns: The host monotonic time at which samples were lost last, ns; 0 if none were.
-        lost_why: The reason for which samples were lost last; empty if none were.
-        open: Whether a file of the source is open.
-        meant_ns: The host monotonic time since which the source is to be recorded, ns; 0: it is not
-            now, as it is closed, somebody has stopped the recorder, or it waits for a trigger.
-        waits_ns: The host monotonic time since which something that the operating system has waits
-            for the medium, ns; 0: nothing does.
-        slow_s: The time for which that may wait, s; 0: for ever.
-    """
-
-    written_ns: int = 0
-    synced_ns: int = 0
+    written_ns: int = 0  # of the newest sample that outlives the process: the system has it
+    synced_ns: int = 0  # of the newest sample that outlives a power cut: the medium has it
     samples: int = 0
-    lost_samples: int = 0
-    lost_ns: int = 0
+    lost_samples: int = 0  # beside those that did not reach the recorder: see its queue
+    lost_ns: int = 0  # when samples were lost last
     lost_why: str = ""
     open: bool = False
-    meant_ns: int = 0
-    waits_ns: int = 0
-    slow_s: float = 0.0
+    meant_ns: int = 0  # since when it is to be recorded; 0: closed, stopped, or without a trigger
+    waits_ns: int = 0  # since when something that the system has waits for the medium
+    slow_s: float = 0.0  # for how long that may wait; 0: for ever
 
 
 @dataclass(frozen=True)
 class ConsumerState:
-    """A consumer.
-
-    Attributes:
-        part: The state of the consumer as a part of the daemon.
-        kind: The kind of consumer, such as ``jsonl`` or ``recorder``.
-        queue: The mailbox of items for the consumer.
-        latency: The time from the sample that completed a step to the decision having been
-            published.
-        details: Whatever the consumer tells of itself, by name.
-        decision_age_ms: The age of the newest sample of the newest decision when that decision had
-            been published, ms.
-        behind_s: The time that the oldest item that is not yet handled has waited, s.
-        losses: The number of items that were dropped from its mailbox, or by itself, lately.
-        trouble: What keeps the consumer from its work now, in words; empty if nothing does.
-        on_disk: What is known of each source's recording, of the recorder alone, by source.
-    """
+    """A consumer: its queue, what it tells of itself, and how late it is."""
 
     part: PartState
-    kind: str
+    kind: str  # such as jsonl or recorder
     queue: QueueState = field(default_factory=QueueState)
-    latency: Latency = field(default_factory=Latency)
+    latency: Latency = field(default_factory=Latency)  # to the decision having been published
     details: dict[str, str | int | float] = field(default_factory=dict)
-    decision_age_ms: float = 0.0
-    behind_s: float = 0.0
-    losses: Losses = field(default_factory=Losses)
-    trouble: str = ""
-    on_disk: dict[str, OnDisk] = field(default_factory=dict)
+    decision_age_ms: float = 0.0  # of the newest decision's newest sample when it was published
+    behind_s: float = 0.0  # how long the oldest item waits to be handled
+    losses: Losses = field(default_factory=Losses)  # items dropped from its mailbox, or by itself
+    trouble: str = ""  # what keeps it from its work now, in words
+    on_disk: dict[str, OnDisk] = field(default_factory=dict)  # of the recorder alone, by source
 
 
 @dataclass(frozen=True)
@@ -290,22 +197,7 @@ class Trouble:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The daemon.
-
-    Attributes:
-        version: The version of this package.
-        pid: The process id of the daemon.
-        config: The path of the configuration.
-        t_ns, utc_ns: The time at which all this is true, host CLOCK_MONOTONIC and UTC, ns.
-        started_ns: The time at which the daemon started, host CLOCK_MONOTONIC, ns.
-        reloads: The number of times that the configuration was reloaded.
-        state: ``starting``, ``running``, ``degraded`` or ``stopping``.
-        degraded: The lines, one for each thing that does not work, with what
-            goes on all the same.
-        clock_steps: The number of times that the wall clock jumped.
-        troubles: The same things as `degraded`, in their pieces.
-        sources, models, consumers: The states of all sources, models and consumers.
-    """
+    """The daemon at `t_ns`, host CLOCK_MONOTONIC, which is `utc_ns` in UTC."""
 
     version: str
     pid: int
@@ -314,9 +206,9 @@ class Snapshot:
     utc_ns: int
     started_ns: int
     reloads: int
-    state: str
-    degraded: tuple[str, ...] = ()
-    clock_steps: int = 0
+    state: str  # starting, running, degraded or stopping
+    degraded: tuple[str, ...] = ()  # the lines of `troubles`
+    clock_steps: int = 0  # times that the wall clock jumped
     sources: tuple[SourceState, ...] = ()
     models: tuple[ModelState, ...] = ()
     consumers: tuple[ConsumerState, ...] = ()

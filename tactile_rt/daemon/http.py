@@ -60,9 +60,7 @@ class Refused(Exception):
     """A request that is not served.
 
     Args:
-        status: The status of HTTP.
         reason: One line, shown to who asked.
-        headers: More headers of the answer.
     """
 
     def __init__(self, status: int, reason: str, headers: Mapping[str, str] | None = None) -> None:
@@ -75,12 +73,10 @@ class Request:
     """What somebody asks.
 
     Attributes:
-        method: The method as it was sent, such as GET.
         path: The path as it was sent, not decoded, beginning with a slash.
-        query: What follows the first question mark of the target; empty where there is none.
-        version: The version of HTTP as it was sent, HTTP/1.0 or HTTP/1.1.
+        query: What follows the first question mark of the target.
+        version: HTTP/1.0 or HTTP/1.1.
         headers: The values by name in lower case; those given several times are joined.
-        peer: The IP address of who asks.
         begun: The part of the body that came with the head.
         reader: The connection, from which the rest of the body is read.
     """
@@ -95,11 +91,7 @@ class Request:
     reader: asyncio.StreamReader | None = None
 
     async def body(self, most: int, seconds: float) -> bytes:
-        """The whole body.
-
-        Args:
-            most: The largest one that is read, in bytes.
-            seconds: The time that it may take, s.
+        """Read the whole body of at most so many bytes.
 
         Raises:
             Refused: It is too large or too slow, breaks off, or does not tell its length.
@@ -128,11 +120,10 @@ class Response:
     """What is sent back.
 
     Attributes:
-        status: The status of HTTP.
         body: The body; or a generator of its pieces, which is closed when the peer goes or the
             server ends. What it raises before the first piece becomes the answer instead.
         kind: The media type of the body.
-        headers: More headers, beside those that all answers of the server carry.
+        headers: Beside those that all answers of the server carry.
     """
 
     status: int = 200
@@ -145,10 +136,8 @@ class HttpServer:
     """Answers from now on until it is closed.
 
     Args:
-        name: The name of its thread.
         listening: The socket, see `listen`; closed with the server.
         answer: The application, called in the thread of the server.
-        limits: What those who ask may cost.
         headers: Headers that every answer carries.
         failed: Told why when a request could not be answered for a fault of our own.
 

@@ -1,4 +1,8 @@
-"""What moves between the parts of the daemon: few, frozen, in the order in which it happened."""
+"""What moves between the parts of the daemon: few, frozen, in the order in which it happened.
+
+Each names its source and model as the configuration does, and `frame`, the array's mount frame.
+Times are host CLOCK_MONOTONIC, ns, where nothing else stands; `utc_offset_ns` is UTC less that.
+"""
 
 from dataclasses import dataclass
 from typing import Any
@@ -25,12 +29,7 @@ class Opened:
     """A source has been opened, or opened again; samples and packets of it follow.
 
     Attributes:
-        source: The name of the source in the configuration.
-        spec: The sensor array of the source.
-        url: The URL of the source as configured.
         stream: The opened source, for `health`, `stats` and what it is; never read or close it.
-        t_ns: The time at which the source was opened, host CLOCK_MONOTONIC, ns.
-        utc_offset_ns: UTC less monotonic time then, ns.
         prelude: The (packet, arrival in ns) pairs that came of a device while it was started, in
             which it describes itself. The same packets also come as `Packet` items.
     """
@@ -49,21 +48,12 @@ class Closed:
     """A source has been closed: it broke, is over, or is no longer configured."""
 
     source: str
-    reason: str
     t_ns: int
 
 
 @dataclass(frozen=True)
 class SourceChunk:
-    """A chunk of a source as it came, calibrated.
-
-    Attributes:
-        source: The name of the source in the configuration.
-        spec: The sensor array of the source.
-        chunk: The samples as they came, calibrated.
-        arrived_ns: The time at which the chunk was read, host CLOCK_MONOTONIC, ns.
-        utc_offset_ns: UTC less monotonic time then, ns.
-    """
+    """A chunk of a source as it came, calibrated, and when it was read."""
 
     source: str
     spec: ArraySpec
@@ -86,12 +76,9 @@ class Decision:
     """A model's decision.
 
     Attributes:
-        source, model: The names of the source and of the model in the configuration.
-        frame: The mount frame of the array.
         decision: The label, probabilities and step; its times are the stream's.
-        sample_ns: The host time of the sample that completed the step, CLOCK_MONOTONIC, ns.
-        made_ns: The host time at which the decision was there, CLOCK_MONOTONIC, ns.
-        utc_offset_ns: UTC less monotonic time then, ns.
+        sample_ns: The host time of the sample that completed the step.
+        made_ns: The host time at which the decision was there.
         deadline_ns: The age of that sample from which the decision is late, ns; 0: there is none.
     """
 
@@ -122,14 +109,10 @@ class Skipped:
     """A model skipped a stretch of its stream: it was behind, and goes on at the newest sample.
 
     Attributes:
-        source, model: The names of the source and of the model in the configuration.
-        frame: The mount frame of the array.
         from_ns, until_ns: The stream times of the first sample that was skipped, and of the first
             one that was not, ns.
         lost: The number of samples of the stretch that did not even reach the model's contact
             detector: they were dropped from its mailbox.
-        t_ns: The host time at which this was decided, CLOCK_MONOTONIC, ns.
-        utc_offset_ns: UTC less monotonic time then, ns.
     """
 
     source: str
@@ -151,10 +134,7 @@ class Event:
             ``metrics``, ``systemd``, or ``daemon``.
         state: The new state, as in `PartState.state`; a device's state is ``device:streaming`` and
             so on.
-        reason: The reason for the change, in words.
         level: ``info``, ``warning`` or ``error``.
-        t_ns: The time of the change, host CLOCK_MONOTONIC, ns.
-        utc_offset_ns: UTC less monotonic time then, ns.
     """
 
     part: str
@@ -173,7 +153,6 @@ class Control:
     """
 
     action: str
-    argument: str = ""
 
 
 Item = Opened | Closed | SourceChunk | Packet | Decision | Contact | Skipped | Event | Control

@@ -1,11 +1,9 @@
-"""Read a configuration: one file, what it extends, and what the command line sets.
+"""Read a configuration: one file, and what the command line sets.
 
 Every mistake is one line that names file and line (or the ``--set``), the key, and the nearest
 valid name.
 """
 
-import hashlib
-import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,11 +14,10 @@ import msgspec
 
 from tactile_rt.daemon.config import CONFIG_VERSION, Config
 from tactile_rt.errors import ConfigError
-from tactile_rt.settings import SettingNode, convert, merge, read_toml, refusal, set_key
+from tactile_rt.settings import SettingNode, convert, read_toml, refusal, set_key
 
 __all__ = ["Loaded", "load_config"]
 
-DEEPEST = 8  # files that extend files
 LARGEST = 1 << 20  # bytes of a configuration
 FILES_IN = ("replay", "combined")  # schemes of URLs whose target is a file
 
@@ -33,71 +30,34 @@ class Loaded:
         config: The configuration, with all names filled in and all paths absolute.
         nodes: The tree that the configuration was made of, which knows the lines.
         path: The path of the file, as the user named it.
-        sets: The settings of the command line, ``KEY=VALUE`` each.
     """
 
     config: Config
     nodes: SettingNode
     path: Path
-    sets: tuple[str, ...] = ()
 
     def refuse(self, path: list[str | int], why: str) -> NoReturn:
         """Raise the `ConfigError` of a value."""
         raise refusal(self.nodes, path, why)
 
-    @property
-    def sha256(self) -> str:
-        """Hash of what it says, however it is written."""
-        return hashlib.sha256(msgspec.json.encode(self.config)).hexdigest()
-
 
 def load_config(path: Path, sets: Sequence[str] = ()) -> Loaded:
-    """Read a file; whatever is wrong with it, or with one that it extends, is a `ConfigError`.
+    """Read a file; whatever is wrong with it is a `ConfigError`.
 
     Args:
-        path: of the TOML file.
         sets: ``a.b=value``, of which ``source.NAME.url=...`` names an item of a list.
 
     Raises:
         ConfigError: one line with file and line.
     """
-    nodes = _with_bases(path, [])
+    nodes = read_toml(path, LARGEST)
     for text in sets:
         nodes = set_key(nodes, text, Config)
     _check_version(nodes)
     _absolute(nodes)
     config = convert(nodes, Config)
-    loaded = Loaded(config, nodes, path, tuple(sets))
-    return Loaded(_filled(loaded), nodes, path, tuple(sets))
-
-
-# reading
-
-
-def _with_bases(path: Path, above: list[Path]) -> SettingNode:
-    nodes = read_toml(path, LARGEST)
-    if "version" in nodes.value:
-        _check_version(nodes)  # of a base, too: its keys may mean something else
-    base = nodes.value.get("extends")
-    if base is None:
-        return nodes
-    if not isinstance(base.value, str) or not base.value:
-        raise ConfigError(f'{base.where}: extends names a file: extends = "base.toml"')
-    here = Path(os.path.realpath(path))
-    file = nodes.folder / base.value
-    if "\0" in base.value:
-        raise ConfigError(f"{base.where}: extends: no file's name has a zero byte")
-    if Path(os.path.realpath(file)) in [*above, here]:
-        raise ConfigError(f"{base.where}: extends: {base.value} extends this file in turn")
-    if len(above) >= DEEPEST:
-        raise ConfigError(f"{base.where}: extends: more than {DEEPEST} files, one in another")
-    if not file.is_file():
-        found = f"{file} is a folder" if file.is_dir() else f"no file {file}"
-        raise ConfigError(f"{base.where}: extends: {found}")
-    shown = file if path.is_absolute() else Path(os.path.relpath(file))
-    under = _with_bases(shown, [*above, here])
-    del nodes.value["extends"]
-    return merge(under, nodes)
+    loaded = Loaded(config, nodes, path)
+    return Loaded(_filled(loaded), nodes, path)
 
 
 def _absolute(nodes: SettingNode) -> None:
@@ -162,9 +122,7 @@ def _filled(loaded: Loaded) -> Config:
         base = publisher.name or re.sub(r"[^A-Za-z0-9_-]", "-", publisher.kind)
         name = _free(base, taken, bool(publisher.name), loaded, ["publisher", i])
         publishers.append(msgspec.structs.replace(publisher, name=name))
-    return msgspec.structs.replace(
-        config, model=tuple(models), publisher=tuple(publishers), extends=""
-    )
+    return msgspec.structs.replace(config, model=tuple(models), publisher=tuple(publishers))
 
 
 def _free(name: str, taken: set[str], given: bool, loaded: Loaded, path: list[str | int]) -> str:

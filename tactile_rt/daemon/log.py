@@ -29,12 +29,7 @@ class _Seen:
 
 class Log(Consumer):
     """Writes events. Of those that say the same of the same part, the first is written at once,
-    the others are counted and told together when `repeat_s` is over.
-
-    Args:
-        name: of the part.
-        config: level, format, file.
-    """
+    the others are counted and told together when `repeat_s` is over."""
 
     wants = frozenset({Event})
     tick_s = 1.0

@@ -74,14 +74,11 @@ class DecisionMessage(_FromSource, frozen=True, tag="decision", kw_only=True):
 
     Attributes:
         t_ns: The stream time of the last sample used, ns.
-        model: The name of the model in the configuration.
         onset_ns: The stream time at which contact began, ns: with `source` and `model` it names
             the episode.
-        step: The number of the step since onset, from 1.
-        final: Whether the step is the last one of its episode.
-        label: The decision: the most probable class, or a refusal to name one, such as "unknown".
+        step: The number of the step since onset, from 1; `final` is the last one of its episode.
+        label: The most probable class, or a refusal to name one, such as "unknown".
         probabilities: The probability of each class, and of each refusal, by its label.
-        model_ms: The time that the network took, ms.
         latency_ms: The time from the sample that completed the step until the decision was there,
             ms.
         age_ms: The age of that sample when the message was written, ms: what reads the message may
@@ -144,10 +141,8 @@ class SamplesMessage(_FromSource, frozen=True, tag="samples", kw_only=True):
     """A chunk of n samples; `t_ns` and `utc_ns` are those of its last one.
 
     Attributes:
-        elements, channels, units: The axes of `values`: names of elements, names of channels, and
-            the SI unit of each channel.
-        seq: (n,) The sequence numbers of the samples.
-        times_ns: (n,) The stream time of each sample, ns.
+        elements, channels, units: The axes of `values`, and the SI unit of each channel.
+        seq, times_ns: (n,) The sequence numbers and stream times of the samples.
         values: (n, element, channel) The numbers, each written as the shortest one that reads back
             as the same float32; null where the element has no trustworthy value.
     """

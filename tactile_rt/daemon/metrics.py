@@ -7,7 +7,7 @@ at a time.
 
 import os
 import resource
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -16,7 +16,7 @@ import msgspec
 
 from tactile_rt.daemon.config import MetricsConfig, is_loopback
 from tactile_rt.daemon.consumer import TAKEN, Consumer, View
-from tactile_rt.daemon.health import Latency, PartState, QueueState, Snapshot
+from tactile_rt.daemon.health import Latency, ModelState, Snapshot, SourceState
 from tactile_rt.daemon.http import HttpLimits, HttpServer, Refused, Request, Response, listen
 from tactile_rt.daemon.items import Item
 from tactile_rt.daemon.messages import encode, state_message
@@ -34,16 +34,11 @@ STATES = ("starting", "running", "degraded", "stopping")
 PART_STATES = ("starting", "running", "stalled", "waiting", "failed", "ended", "stopped")
 
 Labels = Mapping[str, str]
-Rows = Iterable[tuple[Labels, float]]
+Row = tuple[str, str, str, Callable[[Any, int], Any]]
 
 
 class Metrics(Consumer):
-    """Answers those who ask.
-
-    Args:
-        name: The name of the part.
-        config: The table ``[metrics]``: where to listen.
-    """
+    """Answers those who ask at the address of the table ``[metrics]``."""
 
     wants = frozenset()
     tick_s = 1.0
@@ -122,258 +117,173 @@ def _local(host: str) -> bool:
 
 
 def exposition(snapshot: Snapshot) -> bytes:
-    """All metrics of the daemon."""
-    out = _Text()
-    _daemon(out, snapshot)
-    parts = [s.part for s in snapshot.sources] + [m.part for m in snapshot.models]
-    _parts(out, parts + [c.part for c in snapshot.consumers])
-    _sources(out, snapshot)
-    _models(out, snapshot)
-    _consumers(out, snapshot)
-    return "".join(out.lines).encode()
+    """Return all metrics of the daemon as Prometheus' text."""
+    lines = []
+    for rows, labelled in _list_things(snapshot):
+        for name, label, about, value in rows:
+            found: list[str] = []
+            for labels, thing in labelled:
+                given = value(thing, snapshot.t_ns)
+                if isinstance(given, Latency):
+                    found += _write_histogram(name, labels, given)
+                elif label:
+                    each = (given or {}).items()
+                    found += [_write_sample(name, {**labels, label: k}, v) for k, v in each]
+                elif given is not None:
+                    found.append(_write_sample(name, labels, given))
+            if found:
+                kind = "histogram" if "_bucket{" in found[0] else "gauge"
+                kind = "counter" if name.endswith("_total") else kind
+                lines += [f"# HELP tactile_{name} {about}\n# TYPE tactile_{name} {kind}\n", *found]
+    return "".join(lines).encode()
 
 
-class _Text:
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-
-    def add(self, name: str, kind: str, about: str, rows: Rows) -> None:
-        """A metric, unless it has no rows."""
-        found = [f"tactile_{name}{_labels(labels)} {_number(value)}\n" for labels, value in rows]
-        if found:
-            self.lines += [
-                f"# HELP tactile_{name} {about}\n# TYPE tactile_{name} {kind}\n", *found
-            ]  # fmt: skip
-
-    def histogram(self, name: str, about: str, rows: Iterable[tuple[Labels, Latency]]) -> None:
-        """Latencies; their buckets are not cumulative, those of Prometheus are."""
-        found = []
-        for labels, latency in rows:
-            below = 0
-            edges = [*(f"{e:g}" for e in latency.edges_s), "+Inf"]
-            counts = latency.buckets or (0,)
-            for edge, count in zip(edges, counts, strict=True):
-                below += count
-                found.append(
-                    f"tactile_{name}_bucket{_labels({**labels, 'le': edge})} {below}\n"
-                )  # fmt: skip
-            found.append(f"tactile_{name}_sum{_labels(labels)} {_number(latency.sum_s)}\n")
-            found.append(f"tactile_{name}_count{_labels(labels)} {below}\n")
-        if found:
-            self.lines += [
-                f"# HELP tactile_{name} {about}\n# TYPE tactile_{name} histogram\n", *found
-            ]  # fmt: skip
+def _list_things(s: Snapshot) -> Iterator[tuple[tuple[Row, ...], list[tuple[Labels, Any]]]]:
+    """Yield each table of metrics, with the things that it is about and their labels."""
+    things: tuple[Any, ...] = (*s.sources, *s.models, *s.consumers)
+    yield DAEMON, [({}, s)]
+    yield TROUBLE, [({"part": t.part, "what": t.what}, t) for t in s.troubles]
+    yield PART, [({"part": x.part.name}, x.part) for x in things]
+    yield SOURCE, [({"source": _short(x)}, x) for x in s.sources]
+    yield MODEL, [({"model": _short(x), "source": x.source}, x) for x in s.models]
+    yield CONSUMER, [({"consumer": x.part.name, "kind": x.kind}, x) for x in s.consumers]
+    yield DISK, [({"source": n}, d) for c in s.consumers for n, d in c.on_disk.items()]
 
 
-def _daemon(out: _Text, s: Snapshot) -> None:
-    out.add("build_info", "gauge", "Version of tactile_rt.", [({"version": s.version}, 1)])
-    started = (s.utc_ns - s.t_ns + s.started_ns) / 1e9
-    out.add("start_time_seconds", "gauge", "When the daemon started, Unix time.", [({}, started)])
-    out.add(
-        "state", "gauge", "1 for the state the daemon is in.",
-        [({"state": x}, x == s.state) for x in STATES],
-    )  # fmt: skip
-    out.add("degraded_parts", "gauge", "Things that do not work.", [({}, len(s.degraded))])
-    out.add(
-        "trouble", "gauge", "1 for each thing that does not work.",
-        [({"part": t.part, "what": t.what}, 1) for t in s.troubles],
-    )  # fmt: skip
-    out.add("config_reloads_total", "counter", "Times it was reloaded.", [({}, s.reloads)])
-    out.add("clock_steps_total", "counter", "Jumps of the wall clock.", [({}, s.clock_steps)])
+def _short(thing: SourceState | ModelState) -> str:
+    return thing.part.name.partition(".")[2]
+
+
+def _since(t_ns: int, now_ns: int) -> float | None:
+    """Return the time since a moment, s; None for 0, which is none."""
+    return (now_ns - t_ns) / 1e9 if t_ns else None
+
+
+def _read_cpu_s() -> float:
     used = resource.getrusage(resource.RUSAGE_SELF)
-    cpu = used.ru_utime + used.ru_stime
-    out.add("cpu_seconds_total", "counter", "Processor time of the daemon.", [({}, cpu)])
+    return used.ru_utime + used.ru_stime
+
+
+def _read_resident_bytes() -> int | None:
     try:
-        with open("/proc/self/statm") as file:
-            resident = int(file.read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-        out.add("resident_memory_bytes", "gauge", "Memory of the daemon.", [({}, resident)])
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, ValueError, IndexError):
-        pass  # not Linux
+        return None  # not Linux
 
 
-def _parts(out: _Text, parts: list[PartState]) -> None:
-    out.add(
-        "part_state", "gauge", "1 for the state a part is in.",
-        [({"part": p.name, "state": x}, x == p.state) for p in parts for x in PART_STATES],
-    )  # fmt: skip
-    out.add(
-        "part_starts_total", "counter", "Times a part was started.",
-        [({"part": p.name}, p.starts) for p in parts],
-    )  # fmt: skip
-    out.add(
-        "part_failures_total", "counter", "Times a part broke.",
-        [({"part": p.name}, p.failures) for p in parts],
+def _list_queue_rows(name: str) -> tuple[Row, ...]:
+    return (
+        (f"{name}_put_total", "class", "Items for it.", lambda x, _: x.queue.put),
+        (f"{name}_taken_total", "class", "Items it took.", lambda x, _: x.queue.taken),
+        (f"{name}_dropped_total", "class", "Items it was too slow for.",
+         lambda x, _: x.queue.dropped),
+        (f"{name}_waiting", "class", "Items that wait for it.", lambda x, _: x.queue.waiting),
+        (f"{name}_waiting_bytes", "", "Size of what waits.", lambda x, _: x.queue.waiting_bytes),
     )  # fmt: skip
 
 
-def _sources(out: _Text, s: Snapshot) -> None:
-    named = [(x.part.name.partition(".")[2], x) for x in s.sources]
-    out.add(
-        "source_samples_total", "counter", "Samples read.",
-        [({"source": n}, x.samples) for n, x in named],
-    )  # fmt: skip
-    out.add(
-        "source_lost_samples_total", "counter", "Samples lost, by where they were lost.",
-        [
-            ({"source": n, "reason": why}, getattr(x.stats, why))
-            for n, x in named
-            for why in ("corrupt", "missing", "dropped")
-        ],
-    )  # fmt: skip
-    out.add(
-        "source_duplicate_samples_total", "counter", "Samples that came twice, taken once.",
-        [({"source": n}, x.stats.duplicates) for n, x in named],
-    )  # fmt: skip
-    out.add(
-        "source_rate_hertz", "gauge", "Nominal sample rate.",
-        [({"source": n}, x.rate_hz) for n, x in named],
-    )  # fmt: skip
-    out.add(
-        "source_newest_sample_age_seconds", "gauge", "Since the newest sample was taken.",
-        [({"source": n}, (s.t_ns - x.newest_ns) / 1e9) for n, x in named if x.newest_ns],
-    )  # fmt: skip
-    out.add(
-        "source_bad_samples_total", "counter", "Samples of an element that were no number.",
-        [({"source": n}, x.bad_samples) for n, x in named],
-    )  # fmt: skip
-    devices = [(n, x.device) for n, x in named if x.device is not None]
-    out.add(
-        "device_state", "gauge", "1 for the state a device's stream is in.",
-        [({"source": n, "state": str(y)}, y == d.state) for n, d in devices for y in State],
-    )  # fmt: skip
-    out.add(
-        "device_connections_total", "counter", "Times a device was connected since it was opened.",
-        [({"source": n}, d.connections) for n, d in devices],
-    )  # fmt: skip
-    out.add(
-        "device_clock_drift_ratio", "gauge", "How much faster the host's clock runs.",
-        [({"source": n}, d.drift_ppm * 1e-6) for n, d in devices],
-    )  # fmt: skip
+# Of each kind of thing: name, the label that tells several values apart, help, and its value at a
+# time of the host in ns: a number, a `Latency`, or numbers by that label; None: there is none.
+DAEMON: tuple[Row, ...] = (
+    ("build_info", "version", "Version of tactile_rt.", lambda s, _: {s.version: 1}),
+    ("start_time_seconds", "", "When the daemon started, Unix time.",
+     lambda s, now: (s.utc_ns - now + s.started_ns) / 1e9),
+    ("state", "state", "1 for the state the daemon is in.",
+     lambda s, _: {x: x == s.state for x in STATES}),
+    ("degraded_parts", "", "Things that do not work.", lambda s, _: len(s.degraded)),
+    ("config_reloads_total", "", "Times it was reloaded.", lambda s, _: s.reloads),
+    ("clock_steps_total", "", "Jumps of the wall clock.", lambda s, _: s.clock_steps),
+    ("cpu_seconds_total", "", "Processor time of the daemon.", lambda s, _: _read_cpu_s()),
+    ("resident_memory_bytes", "", "Memory of the daemon.", lambda s, _: _read_resident_bytes()),
+)  # fmt: skip
+TROUBLE: tuple[Row, ...] = (
+    ("trouble", "", "1 for each thing that does not work.", lambda t, _: 1),
+)
+PART: tuple[Row, ...] = (
+    ("part_state", "state", "1 for the state a part is in.",
+     lambda p, _: {x: x == p.state for x in PART_STATES}),
+    ("part_starts_total", "", "Times a part was started.", lambda p, _: p.starts),
+    ("part_failures_total", "", "Times a part broke.", lambda p, _: p.failures),
+)  # fmt: skip
+SOURCE: tuple[Row, ...] = (
+    ("source_samples_total", "", "Samples read.", lambda x, _: x.samples),
+    ("source_lost_samples_total", "reason", "Samples lost, by where they were lost.",
+     lambda x, _: {why: getattr(x.stats, why) for why in ("corrupt", "missing", "dropped")}),
+    ("source_duplicate_samples_total", "", "Samples that came twice, taken once.",
+     lambda x, _: x.stats.duplicates),
+    ("source_rate_hertz", "", "Nominal sample rate.", lambda x, _: x.rate_hz),
+    ("source_newest_sample_age_seconds", "", "Since the newest sample was taken.",
+     lambda x, now: _since(x.newest_ns, now)),
+    ("source_bad_samples_total", "", "Samples of an element that were no number.",
+     lambda x, _: x.bad_samples),
+    ("device_state", "state", "1 for the state a device's stream is in.",
+     lambda x, _: x.device and {str(y): y == x.device.state for y in State}),
+    ("device_connections_total", "", "Times a device was connected since it was opened.",
+     lambda x, _: x.device and x.device.connections),
+    ("device_clock_drift_ratio", "", "How much faster the host's clock runs.",
+     lambda x, _: x.device and x.device.drift_ppm * 1e-6),
+)  # fmt: skip
+MODEL: tuple[Row, ...] = (
+    ("model_info", "sha256", "The model that runs.",
+     lambda x, _: {x.sha256: 1} if x.sha256 else None),
+    ("model_decisions_total", "", "Decisions made.", lambda x, _: x.decisions),
+    ("model_final_decisions_total", "", "Last decisions of a contact.", lambda x, _: x.final),
+    ("model_contact", "", "Whether there is contact.", lambda x, _: x.touching),
+    ("model_skips_total", "", "Times it was behind and skipped to the newest sample.",
+     lambda x, _: x.skipped),
+    ("model_late_steps_total", "", "Steps that were late.", lambda x, _: x.late),
+    ("model_behind_seconds", "", "How long the oldest samples wait to be classified.",
+     lambda x, _: x.behind_s),
+    ("model_decision_age_seconds", "",
+     "Age of the newest decision's newest sample when the decision was there.",
+     lambda x, _: x.decision_age_ms / 1e3 if x.decisions else None),
+    ("model_latency_seconds", "", "From the sample that completes a step to the decision.",
+     lambda x, _: x.latency),
+    ("model_step_seconds", "", "Time of the network alone.", lambda x, _: x.step),
+    *_list_queue_rows("model_queue"),
+)  # fmt: skip
+CONSUMER: tuple[Row, ...] = (
+    ("publish_latency_seconds", "",
+     "From the sample that completes a step to its publication.",
+     lambda x, _: x.latency if x.latency.count else None),
+    ("consumer_behind_seconds", "", "How long the oldest item waits to be handled.",
+     lambda x, _: x.behind_s),
+    ("decision_age_seconds", "",
+     "Age of the newest decision's newest sample when it had been published.",
+     lambda x, _: x.decision_age_ms / 1e3 if x.latency.count else None),
+    *_list_queue_rows("consumer_queue"),
+    ("consumer_detail", "detail", "What a consumer tells of itself, as it names it.",
+     lambda x, _: {k: v for k, v in sorted(x.details.items()) if not isinstance(v, str)}),
+)  # fmt: skip
+DISK: tuple[Row, ...] = (
+    ("recorded_samples_total", "", "Samples that are in a recording.", lambda d, _: d.samples),
+    ("recorder_lost_samples_total", "", "Samples that should be in a recording.",
+     lambda d, _: d.lost_samples),
+    ("recorder_written_sample_age_seconds", "",
+     "Since the newest sample that the system has of the recording, while it is recorded.",
+     lambda d, now: _since(d.written_ns, now) if d.meant_ns else None),
+    ("recorder_synced_sample_age_seconds", "",
+     "Since the newest sample of the recording that is on the medium, while it is recorded.",
+     lambda d, now: _since(d.synced_ns, now) if d.meant_ns else None),
+)  # fmt: skip
 
 
-def _models(out: _Text, s: Snapshot) -> None:
-    named = [
-        ({"model": x.part.name.partition(".")[2], "source": x.source}, x) for x in s.models
-    ]  # fmt: skip
-    out.add(
-        "model_info", "gauge", "The model that runs.",
-        [({**n, "sha256": x.sha256}, 1) for n, x in named if x.sha256],
-    )  # fmt: skip
-    out.add(
-        "model_decisions_total", "counter", "Decisions made.",
-        [(n, x.decisions) for n, x in named],
-    )  # fmt: skip
-    out.add(
-        "model_final_decisions_total", "counter", "Last decisions of a contact.",
-        [(n, x.final) for n, x in named],
-    )  # fmt: skip
-    out.add(
-        "model_contact", "gauge", "Whether there is contact.", [(n, x.touching) for n, x in named]
-    )
-    out.add(
-        "model_skips_total", "counter", "Times it was behind and skipped to the newest sample.",
-        [(n, x.skipped) for n, x in named],
-    )  # fmt: skip
-    out.add(
-        "model_late_steps_total",
-        "counter",
-        "Steps that were late.",
-        [(n, x.late) for n, x in named],
-    )
-    out.add(
-        "model_behind_seconds", "gauge", "How long the oldest samples wait to be classified.",
-        [(n, x.behind_s) for n, x in named],
-    )  # fmt: skip
-    out.add(
-        "model_decision_age_seconds", "gauge",
-        "Age of the newest decision's newest sample when the decision was there.",
-        [(n, x.decision_age_ms / 1e3) for n, x in named if x.decisions],
-    )  # fmt: skip
-    out.histogram(
-        "model_latency_seconds", "From the sample that completes a step to the decision.",
-        [(n, x.latency) for n, x in named],
-    )  # fmt: skip
-    out.histogram(
-        "model_step_seconds", "Time of the network alone.", [(n, x.step) for n, x in named]
-    )
-    _queues(out, "model_queue", [(n, x.queue) for n, x in named])
+def _write_histogram(name: str, labels: Labels, latency: Latency) -> Iterator[str]:
+    """Yield a histogram's lines: Prometheus' buckets are cumulative, those of a `Latency` not."""
+    below = 0
+    edges = [*(f"{e:g}" for e in latency.edges_s), "+Inf"]
+    for edge, count in zip(edges, latency.buckets or (0,), strict=True):
+        below += count
+        yield _write_sample(f"{name}_bucket", {**labels, "le": edge}, below)
+    yield _write_sample(f"{name}_sum", labels, latency.sum_s)
+    yield _write_sample(f"{name}_count", labels, below)
 
 
-def _consumers(out: _Text, s: Snapshot) -> None:
-    named = [({"consumer": x.part.name, "kind": x.kind}, x) for x in s.consumers]
-    out.histogram(
-        "publish_latency_seconds", "From the sample that completes a step to its publication.",
-        [(n, x.latency) for n, x in named if x.latency.count],
-    )  # fmt: skip
-    out.add(
-        "consumer_behind_seconds", "gauge", "How long the oldest item waits to be handled.",
-        [(n, x.behind_s) for n, x in named],
-    )  # fmt: skip
-    out.add(
-        "decision_age_seconds", "gauge",
-        "Age of the newest decision's newest sample when it had been published.",
-        [(n, x.decision_age_ms / 1e3) for n, x in named if x.latency.count],
-    )  # fmt: skip
-    _recorded(out, s)
-    _queues(out, "consumer_queue", [(n, x.queue) for n, x in named])
-    out.add(
-        "consumer_detail", "gauge", "What a consumer tells of itself, as it names it.",
-        [
-            ({**n, "detail": key}, value)
-            for n, x in named
-            for key, value in sorted(x.details.items())
-            if not isinstance(value, str)
-        ],
-    )  # fmt: skip
+def _write_sample(name: str, labels: Labels, value: float) -> str:
+    text = ",".join(f'{k}="{_escape(v)}"' for k, v in labels.items())
+    number = int(value) if isinstance(value, bool | int) else float(value)
+    return f"tactile_{name}{{{text}}} {number!r}\n" if text else f"tactile_{name} {number!r}\n"
 
 
-def _recorded(out: _Text, s: Snapshot) -> None:
-    disks = [({"source": name}, d) for c in s.consumers for name, d in c.on_disk.items()]
-    out.add(
-        "recorded_samples_total", "counter", "Samples that are in a recording.",
-        [(n, d.samples) for n, d in disks],
-    )  # fmt: skip
-    out.add(
-        "recorder_lost_samples_total", "counter", "Samples that should be in a recording.",
-        [(n, d.lost_samples) for n, d in disks],
-    )  # fmt: skip
-    out.add(
-        "recorder_written_sample_age_seconds", "gauge",
-        "Since the newest sample that the system has of the recording, while it is recorded.",
-        [(n, (s.t_ns - d.written_ns) / 1e9) for n, d in disks if d.meant_ns and d.written_ns],
-    )  # fmt: skip
-    out.add(
-        "recorder_synced_sample_age_seconds", "gauge",
-        "Since the newest sample of the recording that is on the medium, while it is recorded.",
-        [(n, (s.t_ns - d.synced_ns) / 1e9) for n, d in disks if d.meant_ns and d.synced_ns],
-    )  # fmt: skip
-
-
-def _queues(out: _Text, name: str, rows: list[tuple[dict[str, str], QueueState]]) -> None:
-    def by_class(what: str) -> list[tuple[Labels, float]]:
-        return [
-            ({**n, "class": c}, count) for n, q in rows for c, count in getattr(q, what).items()
-        ]
-
-    out.add(f"{name}_put_total", "counter", "Items for it.", by_class("put"))
-    out.add(f"{name}_taken_total", "counter", "Items it took.", by_class("taken"))
-    out.add(f"{name}_dropped_total", "counter", "Items it was too slow for.", by_class("dropped"))
-    out.add(f"{name}_waiting", "gauge", "Items that wait for it.", by_class("waiting"))
-    out.add(
-        f"{name}_waiting_bytes", "gauge", "Size of what waits.",
-        [(n, q.waiting_bytes) for n, q in rows],
-    )  # fmt: skip
-
-
-def _labels(labels: Labels) -> str:
-    if not labels:
-        return ""
-    return "{" + ",".join(f'{k}="{_escaped(v)}"' for k, v in labels.items()) + "}"
-
-
-def _escaped(text: str) -> str:
+def _escape(text: str) -> str:
     return text.replace("\\", r"\\").replace("\n", r"\n").replace('"', r"\"")
-
-
-def _number(value: Any) -> str:
-    return repr(int(value)) if isinstance(value, bool | int) else repr(float(value))

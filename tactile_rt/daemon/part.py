@@ -27,13 +27,7 @@ class Report(Protocol):
 
 
 class Part(abc.ABC):
-    """Something that works in a thread of its own and is restarted when it breaks.
-
-    Args:
-        name: The name of the part, as in `items.Event`.
-        report: Takes changes of its state.
-        limits: The pauses between tries, and how long a call may take.
-    """
+    """Something that works in a thread of its own and is restarted when it breaks."""
 
     def __init__(self, name: str, report: Report, limits: LimitsConfig) -> None:
         self.name, self.limits = name, limits

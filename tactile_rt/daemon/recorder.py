@@ -103,10 +103,6 @@ class Recorder(Consumer):
     ``rotate`` (begin new files). When the disk has less room than ``min_free_mb`` the files are
     closed, what is not recorded is counted, and it goes on when there is room again. So it does
     when the folder is deleted, moved or may not be written any more.
-
-    Args:
-        name: for the log.
-        config: the table ``[recorder]``.
     """
 
     wants = frozenset(

@@ -22,13 +22,11 @@ class RecordingsFolder:
     """Made where it is not there, and again when it is deleted.
 
     Args:
-        path: of the folder.
-        min_free_mb: room that its disk must have, MB.
+        min_free_mb: The room that its disk must have, MB.
         later: does something without being waited for.
         tell: is told of every change: state, words and level.
 
     Attributes:
-        path: The path of the folder.
         state: What can be said of it: ``on``, ``no folder`` or ``disk full``.
         why: Why nothing can be recorded, with the figures of now; empty if it can.
     """

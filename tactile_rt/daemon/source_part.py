@@ -32,12 +32,7 @@ AWAY_S = 0.3  # how long a source whose device is away may take to end
 
 
 class SourcePart(Part):
-    """Posts `Opened`, `Packet`, `SourceChunk` and `Closed` of one source.
-
-    Args:
-        config: its table.
-        hub, report, limits, clock, lines: of the daemon.
-    """
+    """Posts `Opened`, `Packet`, `SourceChunk` and `Closed` of one source."""
 
     def __init__(
         self,
@@ -183,7 +178,7 @@ class SourcePart(Part):
         with self._telling:
             if self._announced:
                 self._announced = False
-                self._hub.post(Closed(self.config.name, "", time.monotonic_ns()))
+                self._hub.post(Closed(self.config.name, time.monotonic_ns()))
 
     def _turn(self, state: str, reason: str) -> None:
         if not self._left:  # else its end has been told

@@ -23,11 +23,6 @@ LONGEST = 400  # characters of a status
 class Systemd(Consumer):
     """Sends to $NOTIFY_SOCKET; pings the watchdog while nothing is `hanging`.
 
-    Args:
-        name: of the part.
-        options: none.
-        environment: where the variables are.
-
     Raises:
         ConfigError: $NOTIFY_SOCKET or $WATCHDOG_USEC is not what systemd sets.
     """

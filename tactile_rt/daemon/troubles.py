@@ -38,11 +38,7 @@ PERIODS = 3  # of a slow sensor, before a sample of it is old
 
 
 class LossWindow:
-    """How much of a count that only grows was added within the newest second and minute.
-
-    Args:
-        first: the count now.
-    """
+    """How much of a count that only grows was added within the newest second and minute."""
 
     def __init__(self, first: int = 0) -> None:
         self._lock = threading.Lock()
@@ -79,15 +75,13 @@ def troubles(
     clock_stepped: bool = False,
     refused: str = "",
 ) -> tuple[Trouble, ...]:
-    """All that do not do what they promise, in the order of the stream.
+    """Name all that do not do what they promise, in the order of the stream.
 
     Args:
-        sources, models, consumers: how they are.
-        limits: what is too old.
-        now_ns: when all this is true, host CLOCK_MONOTONIC, ns.
-        starved_s: how long the whole process had no turn, within the newest second, s.
-        clock_stepped: whether the wall clock jumped within the newest second.
-        refused: why the newest configuration is not in force; empty: it is.
+        now_ns: The time at which all this is true, host CLOCK_MONOTONIC, ns.
+        starved_s: How long the whole process had no turn, within the newest second, s.
+        clock_stepped: The wall clock jumped within the newest second.
+        refused: The reason why the newest configuration is not in force; empty: it is.
     """
     found = []
     if starved_s:

@@ -19,7 +19,6 @@ __all__ = [
     "SettingNode",
     "find_lines",
     "make_node",
-    "merge",
     "named",
     "parse_toml",
     "plain_value",
@@ -160,39 +159,6 @@ def plain_value(written: str) -> Any:
         return tomllib.loads(f"value = {written}")["value"]
     except (tomllib.TOMLDecodeError, RecursionError, ValueError):
         return written
-
-
-def merge(base: SettingNode, over: SettingNode) -> SettingNode:
-    """`over` on top of `base`: tables by key, lists of tables by the items' name, else replaced."""
-    if isinstance(base.value, dict) and isinstance(over.value, dict):
-        both = dict(base.value)
-        for key, node in over.value.items():
-            both[key] = merge(both[key], node) if key in both else node
-        return SettingNode(both, over.file, over.line, over.folder)
-    if _tables(base) and _tables(over):
-        items = list(base.value)
-        places = {_name(item): i for i, item in enumerate(items) if _name(item)}
-        for item in over.value:
-            place = places.get(_name(item)) if _name(item) else None
-            if place is None:
-                items.append(item)
-            else:
-                items[place] = merge(items[place], item)
-        return SettingNode(items, over.file, over.line, over.folder)
-    return over
-
-
-def _tables(node: SettingNode) -> bool:
-    return isinstance(node.value, list) and all(isinstance(n.value, dict) for n in node.value)
-
-
-def _name(item: SettingNode) -> str:
-    """What identifies an item of a list: its name, or of a publisher its kind."""
-    for key in ("name", "kind"):
-        named = item.value.get(key)
-        if named is not None and isinstance(named.value, str):
-            return str(named.value)
-    return ""
 
 
 def _build(

@@ -155,7 +155,7 @@ def test_whoever_waits_for_room_gets_it_from_the_reader_or_when_there_is_none():
 
 def test_every_item_has_a_class():
     opened = Opened("a", SPEC, "u", ArraySource(SPEC, []), 1, 2)
-    others = (opened, Closed("a", "", 1), Contact("a", "m", "f", True, 1, 2), Control("x"), event())
+    others = (opened, Closed("a", 1), Contact("a", "m", "f", True, 1, 2), Control("x"), event())
     items = (*others, samples(4), Packet("a", b"x", 0), decision())
     box = Mailbox({type(item) for item in items}, 100, 1 << 20)
     for item in items:
@@ -184,7 +184,7 @@ def test_whoever_is_there_hears_of_streams_as_they_open_and_close():
     hub, box = Hub(), Mailbox({Opened, Closed}, 10, 10**6)
     hub.join("x", box)
     opened = Opened("a", SPEC, "url", ArraySource(SPEC, []), 1, OFFSET_NS, ())
-    closed = Closed("a", "", 2)
+    closed = Closed("a", 2)
     hub.post(opened)
     assert dict(hub.streams()) == {"a": opened}
     hub.post(closed)
@@ -195,16 +195,16 @@ def test_who_joins_late_hears_of_open_streams_once_and_of_closed_ones_not_at_all
     hub = Hub()
     for name in ("a", "b"):
         hub.post(Opened(name, SPEC, "u", ArraySource(SPEC, []), 1, 2))
-    hub.post(Closed("a", "", 3))
+    hub.post(Closed("a", 3))
     box = Mailbox({Opened, Closed}, 10, 1 << 20)
     hub.join("x", box)
-    hub.post(Closed("b", "", 4))
+    hub.post(Closed("b", 4))
     assert [(type(i).__name__, i.source) for i in box.take()] == [("Opened", "b"), ("Closed", "b")]
     assert not hub.streams()
     hub.leave("x", Mailbox({Opened}, 10, 10))  # another one of that name: not this one
     assert hub.box("x") is box
     hub.leave("x", box)
-    hub.post(Closed("b", "", 5))
+    hub.post(Closed("b", 5))
     box.close()
     assert box.take() == []
 
@@ -274,7 +274,7 @@ def test_an_array_is_described_and_the_rest_is_not_published():
     assert said["array"]["positions"] == [[0.0, 0.002 * i, 0.0] for i in range(3)]
     assert topic_of(message) == "tactile/a%20b%2F%C3%A4/array"
     assert topic_of(message_of(event()), "robot") == "robot/health"
-    for item in (Closed("a", "", 1), Packet("a", b"", 1), Control("start")):
+    for item in (Closed("a", 1), Packet("a", b"", 1), Control("start")):
         assert message_of(item) is None
 
 

@@ -82,7 +82,7 @@ def test_all_that_happens_is_in_the_file(daemon, tmp_path):
 def test_a_decision_about_the_last_samples_comes_after_the_end(daemon, tmp_path, monkeypatch):
     monkeypatch.setattr("tactile_rt.daemon.recorder.LINGER_NS", 10**15)
     made = begun(daemon, tmp_path, min_free_mb=0)
-    made.handle([opened(), samples(cut(VALUES, 1000.0)[0]), Closed("whiskers", "over", 0)])
+    made.handle([opened(), samples(cut(VALUES, 1000.0)[0]), Closed("whiskers", 0)])
     made.handle([decision()])
     (path,) = files(tmp_path)
     assert not is_finished(path)
@@ -97,7 +97,7 @@ def test_each_source_has_its_own_file(daemon, tmp_path):
     made, chunks = begun(daemon, tmp_path, min_free_mb=0), cut(VALUES, 1000.0)
     made.handle([opened("left"), opened("right")])
     made.handle([samples(chunks[0], "left"), samples(chunks[1], "right"), samples(chunks[2], "no")])
-    made.handle([Closed("left", "over", 0)])
+    made.handle([Closed("left", 0)])
     made.handle([samples(chunks[3], "right")])
     made.close()
     left, right = files(tmp_path)
@@ -241,7 +241,7 @@ def test_a_source_that_fails_before_its_first_sample_leaves_no_file(daemon, tmp_
     made = begun(daemon, tmp_path, mode=mode)
     for _ in range(3):
         made.handle([opened()])
-        made.handle([event("error"), Closed("whiskers", "failed", time.monotonic_ns())])
+        made.handle([event("error"), Closed("whiskers", time.monotonic_ns())])
         look(made)
     assert not list(tmp_path.iterdir())
     assert (made.details()["files"], made.details()["lost_samples"]) == (0, 0)

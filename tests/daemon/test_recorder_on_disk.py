@@ -100,7 +100,7 @@ def test_what_is_synced_outlives_a_power_cut_and_is_told(daemon, tmp_path):
     now = on_disk(made)
     assert (now.samples, now.written_ns, now.lost_samples) == (10, at, 0)
     assert (now.open, now.meant_ns > 0) == (True, True)
-    made.handle([Closed("whiskers", "over", 0)])
+    made.handle([Closed("whiskers", 0)])
     assert not on_disk(made).meant_ns
     made.close()
     assert (on_disk(made).samples, on_disk(made).open, on_disk(made).synced_ns) == (10, False, at)

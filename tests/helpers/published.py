@@ -57,7 +57,7 @@ def opened(spec=None, t_ns=1):
 
 
 def closed(t_ns=9):
-    return Closed("whiskers", "over", t_ns)
+    return Closed("whiskers", t_ns)
 
 
 def event(part="daemon", state="running", reason="", level="info", t_ns=7):

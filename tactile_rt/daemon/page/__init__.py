@@ -25,11 +25,7 @@ SHORTEST_TOKEN = 16
 
 
 class Page(Consumer):
-    """Serves the page.
-
-    Args:
-        name: The name of the part.
-        options: The table ``[page]``.
+    """Serves the page of the table ``[page]``.
 
     Raises:
         ConfigError: Others could reach it without a token.

@@ -73,12 +73,7 @@ class Feed:
         self._decisions: deque[bytes] = deque(maxlen=KEPT_DECISIONS)
 
     def take(self, items: list[Item], watched: Collection[str]) -> list[Line]:
-        """Lines to send now.
-
-        Args:
-            items: as they came.
-            watched: sources whose samples somebody looks at; the others' cost nothing.
-        """
+        """Return the lines to send now; samples of sources nobody watches cost nothing."""
         lines: list[Line] = []
         for item in items:
             if isinstance(item, SourceChunk):

@@ -36,7 +36,6 @@ class Guard:
 
     Args:
         host: The address that the page is bound to, as configured.
-        port: The TCP port of the page.
         token: The secret that a browser must know; empty: none.
     """
 

@@ -77,7 +77,6 @@ class PageRoutes:
     """Answers requests; all in the thread of the page's server.
 
     Args:
-        guard: Decides who may.
         greet: Gives the first lines for a new client.
         control: Asked with an action and who asks; returns whether there is a recorder. None: the
             page may only look.
@@ -110,11 +109,7 @@ class PageRoutes:
                     client.put(line)
 
     async def answer(self, request: Request) -> Response:
-        """What a request gets.
-
-        Raises:
-            Refused: It is not served, for a reason that its status tells.
-        """
+        """What a request gets."""
         path = request.path
         self._guard.check(request.headers, request.method)
         if path in self._files:
@@ -168,11 +163,7 @@ class PageRoutes:
 
 
 async def json_body(request: Request, kind: Any) -> Any:
-    """What a request brings, of this msgspec type.
-
-    Raises:
-        Refused: It brings something else.
-    """
+    """Return what a request brings, of this msgspec type; refuse anything else."""
     # A form of another site cannot send this type without asking first, and is never allowed.
     sent = request.headers.get("content-type", "").partition(";")[0]
     if sent.strip().lower() != "application/json":

@@ -37,16 +37,7 @@ def publisher_class(kind: str) -> Any:
 
 
 def load_class(where: str, what: str, extra: str) -> Any:
-    """A class of this package.
-
-    Args:
-        where: ``module:Class``.
-        what: it is, for messages.
-        extra: that it needs.
-
-    Raises:
-        ConfigError: the extra is not installed.
-    """
+    """Return the class at ``module:Class``, which needs an extra to be installed."""
     module, _, name = where.partition(":")
     try:
         return getattr(import_module(module), name)

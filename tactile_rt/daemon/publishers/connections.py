@@ -33,7 +33,6 @@ class ConnectionLimit:
     """Shuts connections down that are too many, from now on until it is closed.
 
     Args:
-        name: The name of its thread.
         addresses: The TCP ports and the paths of Unix sockets that are listened at.
         most: The number of connections that may stay, all addresses together.
 

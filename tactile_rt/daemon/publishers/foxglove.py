@@ -54,10 +54,8 @@ class FoxgloveOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     Attributes:
         host: The address to listen on. Foxglove's protocol knows no password.
         port: The TCP port to listen on; 0: a free one.
-        prefix: The beginning of all topics.
         rate_hz: The largest number of pictures and values a second, Hz.
         m_per_n: The length of the arrow of a force of 1 N, m; 0: chosen after the largest force.
-        connections: The number of connections at a time; more are shut down.
     """
 
     host: Annotated[str, msgspec.Meta(min_length=1, max_length=255)] = "127.0.0.1"

@@ -40,8 +40,6 @@ class Scene:
     """Pictures of one array.
 
     Args:
-        source: its name.
-        spec: the array.
         m_per_n: length of the arrow of 1 N, m; 0: so that the largest force of the last half
             minute is as long as a third of the array.
     """
@@ -87,7 +85,6 @@ class Scene:
         Args:
             values: (element, channel), forces in each element's own frame, N.
             valid: (element,).
-            utc_ns: of the sample.
         """
         if not self._columns:
             return None

@@ -39,8 +39,6 @@ class SenderOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Options that all of them have.
 
     Attributes:
-        prefix: The beginning of all topics.
-        samples: Whether samples are published, too.
         state_s: The time after which ``state`` and all ``array`` messages are repeated, for those
             that come late, s; 0: never.
     """
@@ -51,21 +49,13 @@ class SenderOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class ListenerOptions(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of those that others connect to.
+    """Options of those that others connect to."""
 
-    Attributes:
-        connections: The number of connections at a time; more are shut down.
-    """
-
-    connections: Connections = 32
+    connections: Connections = 32  # at a time; more are shut down
 
 
 class Due:
-    """Tells when something is due that is done again and again.
-
-    Args:
-        every_s: so often, s; 0: never.
-    """
+    """Tells when something is due that is done every so many seconds; 0: never."""
 
     def __init__(self, every_s: float) -> None:
         self._every_s, self._at = every_s, 0.0
@@ -80,11 +70,7 @@ class Due:
 
 
 class Repeated:
-    """Messages that are sent again and again: the state and the arrays that are open.
-
-    Args:
-        every_s: so often, s; 0: never.
-    """
+    """Messages that are sent again and again: the state and the arrays that are open."""
 
     def __init__(self, every_s: float) -> None:
         self._due = Due(every_s)
@@ -98,12 +84,7 @@ class Repeated:
 
 
 class Sender(Consumer):
-    """Sends each message as it is; `_send` does it.
-
-    Args:
-        name: of the publisher.
-        options: its own.
-    """
+    """Sends each message as it is; `_send` does it."""
 
     def __init__(self, name: str, options: SenderOptions) -> None:
         self.name = name
