@@ -115,6 +115,7 @@ def configured(folder, text, checked=True, stop_s=60):
     file.write_text(
         'version = 1\n[[publisher]]\nkind = "spy"\n[limits]\nretry_first_s = 0.02\n'
         "retry_last_s = 0.1\nstall_s = 600\nbehind_s = 600\nsample_age_s = 600\n"
+        "model_queue_items = 10000\nqueue_items = 100000\nqueue_mb = 512\n"
         f'stop_s = {stop_s}\n[log]\nfile = "log"\n{text}'
     )
     loaded = load_config(file)
@@ -141,14 +142,15 @@ def seqs(spy, name):
 
 
 def test_two_arrays_and_three_models_on_ptys_lose_nothing(robot, tmp_path):
+    """Where the line waits for its reader and the mailboxes hold all, on a busy machine, too."""
     model = write_model(tmp_path / "m.onnx")
     with (
-        FakeSerial(touching(2000), spec=SPEC) as left,
-        FakeSerial(touching(2000, 1), spec=small_spec()) as right,
+        FakeSerial(touching(2000), spec=SPEC, pace="fast") as left,
+        FakeSerial(touching(2000, 1), spec=small_spec(), pace="fast") as right,
     ):
         daemon, spy = robot(
-            source("left", left.url)
-            + source("right", right.url)
+            source("left", f"{left.url}&clock=device")
+            + source("right", f"{right.url}&clock=device")
             + f'[[model]]\nsource = "left"\nfile = "{model}"\n'
             f'[[model]]\nsource = "right"\nfile = "{model}"\n'
             f'[[model]]\nsource = "right"\nname = "last"\nfile = "{model}"\ndecisions = "final"\n'
@@ -161,6 +163,10 @@ def test_two_arrays_and_three_models_on_ptys_lose_nothing(robot, tmp_path):
         told = daemon.snapshot().degraded
         assert all(line.startswith(late) for line in told), told
         until(lambda: all(m.queue.taken["samples"] == 2000 for m in daemon.snapshot().models))
+        # Each has decided all that it will once it has seen the touch end.
+        until(lambda: len({c.model for c in spy.of(Contact) if not c.touching}) == 3)
+        part = daemon._consumers["publisher.spy"][1]
+        until(lambda: part.consumer_state.latency.count == len(spy.of(Decision)))
         snapshot = daemon.snapshot()
     for name in ("left", "right"):
         assert np.array_equal(seqs(spy, name), np.arange(2000))
