@@ -1,6 +1,5 @@
 """Everything that `tactile-rt bench daemon` measures, in turn."""
 
-from bench.daemon.chaos import chaos
 from bench.daemon.kills import kill_nine
 from bench.daemon.overload import overload
 from bench.daemon.power import power_cuts
@@ -15,6 +14,6 @@ __all__ = ["run"]
 def run(quick: bool) -> list[Record]:
     """Measure; quick: two minutes, else half an hour."""
     records = soak_records(soak(QUICK_S if quick else WHOLE_S))
-    records += [*chaos(quick), *kill_nine(quick), *power_cuts(quick), *overload(quick)]
+    records += [*kill_nine(quick), *power_cuts(quick), *overload(quick)]
     records += ros2_records(5 if quick else 60)
     return records

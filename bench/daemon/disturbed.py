@@ -107,7 +107,7 @@ class DisturbedDaemon:
 
     def _begin(self, stack: ExitStack) -> None:
         self.folder = Path(
-            stack.enter_context(tempfile.TemporaryDirectory(prefix="tactile-chaos-"))
+            stack.enter_context(tempfile.TemporaryDirectory(prefix="tactile-disturbed-"))
         )
         specs = {"whiskers": whisker_array(), "finger": finger_array()}
         self.model = self.folder / "wide.onnx"
@@ -162,10 +162,6 @@ class DisturbedDaemon:
     def mark(self) -> int:
         """Where what is told from now on begins."""
         return len(self._told)
-
-    def all_told(self, since: int) -> list[DaemonEvent]:
-        """All events since then."""
-        return self._told[since:]
 
     def told(self, since: int, part: str, state: str) -> list[DaemonEvent]:
         """All such events since then."""

@@ -1,4 +1,4 @@
-"""An end whenever it is asked for, and models that are exchanged: how long it takes, what is lost.
+"""An end whenever it is asked for: how long it takes.
 
 python -m bench.daemon.stopping [--quick]
 """
@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -19,36 +18,21 @@ from rich.console import Console
 from bench.daemon.disturbed import CONFIGURATION
 from bench.daemon.models import finger_array, whisker_array, write_wide_model
 from bench.daemon.overload import HOG, HOGS_PER_CORE, STEP_MS, slow_down
-from bench.daemon.process import DaemonProcess, free_port, messages_of, until
+from bench.daemon.process import DaemonProcess, free_port
 from bench.emulated import ArrayScript, play
 from bench.processes import Helper
-from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.evidence.records import Record, show
 
 __all__ = ["stopping"]
 
 TIMES, QUICK = 25, 2  # of each way
 STATED_S = 2.0
-RELOADS, QUICK_RELOADS = 10, 2
 STREAM_S = 3600.0
-EXCHANGED = """version = 1
-[[source]]
-name = "a"
-url = "synthetic:mouse"
-[[model]]
-file = "model.onnx"
-decisions = "every_step"
-[[publisher]]
-kind = "jsonl"
-options = {{ file = "said.jsonl" }}
-[metrics]
-port = {metrics}
-"""
 
 
 def stopping(quick: bool) -> list[Record]:
-    """Ends at the start, under way, in a reload and under overload; then models exchanged."""
-    return [*_ends(QUICK if quick else TIMES), _exchanges(QUICK_RELOADS if quick else RELOADS)]
+    """End daemons at the start, under way, in a reload and under overload."""
+    return _ends(QUICK if quick else TIMES)
 
 
 class _Rig:
@@ -149,45 +133,6 @@ def _ends(times: int) -> list[Record]:
                 )
             )  # fmt: skip
     return records
-
-
-def _exchanges(times: int) -> Record:
-    good = shipped_model().read_bytes()
-    with tempfile.TemporaryDirectory(prefix="tactile-exchange-") as temporary:
-        folder, port = Path(temporary), free_port()
-
-        def said(kind: str) -> list[dict[str, Any]]:
-            return messages_of(folder / "said.jsonl", kind)
-
-        def admitted() -> int:
-            return sum(m["state"] == "admitted" for m in said("health"))
-
-        def put() -> None:
-            (folder / "new.onnx").write_bytes(good)
-            (folder / "new.onnx").replace(folder / "model.onnx")
-
-        put()
-        with DaemonProcess(folder, EXCHANGED.format(metrics=port), port) as daemon:
-            daemon.await_state(lambda s: s["models"][0]["decisions"] > 5)
-            for n in range(1, times + 1):
-                put()
-                daemon.reload()
-                until(lambda n=n: admitted() == n)  # type: ignore[misc]
-            before = daemon.state()["models"][0]["decisions"]
-            daemon.await_state(lambda s: s["models"][0]["decisions"] > before + 60)
-            daemon.stop()
-        touches: dict[int, int] = {}
-        for decision in said("decision"):
-            touches[decision["onset_ns"]] = touches.get(decision["onset_ns"], 0) + 1
-        steps = list(touches.values())
-        begun = sum(m["touching"] for m in said("contact"))
-        whole = max(steps)
-        # The last one may have been cut short by the end.
-        lost = sum(whole - n for n in steps[:-1]) + whole * max(0, begun - len(steps) - 1)
-    return Record(
-        "daemon.reload.steps_lost", lost, "steps", "== 0", f"{sum(steps)} steps of {len(steps)}",
-        f"{times} reloads of a good model while touches go by",
-    )  # fmt: skip
 
 
 def main() -> None:

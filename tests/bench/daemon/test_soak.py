@@ -9,9 +9,7 @@ import pytest
 pytest.importorskip("onnx", reason="needs onnx: pip install '.[train]'")
 pytest.importorskip("zenoh", reason="needs zenoh: pip install '.[publish]'")
 
-from bench.daemon import chaos
 from bench.daemon.accounts import RecordedSamples, account
-from bench.daemon.disk import disk_full
 from bench.daemon.latencies import latencies
 from bench.daemon.models import finger_array, whisker_array, write_wide_model
 from bench.daemon.soak import soak_records
@@ -50,23 +48,6 @@ def test_under_faults_every_sample_is_delivered_or_counted():
     assert all(len(heard.t_ns) > 20 for heard in result.heard.values())
     pulled = sum(kind == "unplug" for p in result.played.values() for kind, _, _ in p.faults)
     assert sum("device:lost" in line for line in result.log.splitlines()) == pulled
-
-
-@pytest.mark.slow
-def test_what_is_disturbed_loses_no_sample(monkeypatch):
-    """What is told too often depends on who else uses the machine; `bench daemon` counts it."""
-    monkeypatch.setattr(chaos, "disk_full", lambda times: [])  # below
-    records = {r.name.removeprefix("daemon.chaos."): r for r in chaos.chaos(quick=True)}
-    for name in ("whiskers_lost", "finger_lost", "exit_code"):
-        assert records[name].value == 0, records[name]
-    assert {f"{kind}_recovery" for kind in chaos.KINDS} <= set(records)
-
-
-@pytest.mark.slow
-def test_what_a_full_disk_did_not_take_is_counted_to_the_sample():
-    records = {r.name.removeprefix("daemon.chaos.disk_full_"): r for r in disk_full(2)}
-    for name in ("acquisition_lost", "uncounted", "told_wrongly", "exit_code"):
-        assert records[name].value == 0, records[name]
 
 
 class Watching:
