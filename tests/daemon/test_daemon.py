@@ -2,7 +2,6 @@
 
 import io
 import json
-import shutil
 import threading
 import time
 from dataclasses import replace
@@ -307,39 +306,6 @@ def test_a_source_that_breaks_is_opened_again_and_its_counts_add_up(robot, monke
     reasons = [e.reason for e in spy.told("source.a", "waiting")]
     assert reasons[:4] == ["the cable is loose"] * 3 + ["no such port"]
     assert "no samples: source.a fails: no such port" in daemon.snapshot().degraded
-
-
-def test_a_model_that_is_refused_does_not_take_the_place_of_one_that_decides(robot, tmp_path):
-    model = write_model(tmp_path / "m.onnx")
-    good = model.read_bytes()
-    with FakeSerial(touching(60_000), spec=SPEC) as device:
-        loaded = source("a", device.url) + f'[[model]]\nfile = "{model}"\n'
-        daemon, spy = robot(loaded)
-        until(lambda: spy.of(Decision))
-        shutil.copy(model, tmp_path / "keep.onnx")
-        model.write_bytes(b"garbage")
-        # The file is read again only when it is asked to: a running model keeps running.
-        until(lambda: daemon.snapshot().models[0].decisions > 6)
-        with pytest.raises(ConfigError, match=r"model\[0\].file: .* is not a readable ONNX model"):
-            configured(tmp_path, loaded)
-        # Taken all the same, it is tried, and the one before goes on.
-        daemon.reload(configured(tmp_path, loaded, checked=False))
-        until(lambda: spy.told("model.a", "refused"))
-        (line,) = [x for x in daemon.snapshot().degraded if "model.a" in x]
-        assert line.startswith("old model: model.a: the new one is refused: ") and (
-            line.endswith("; the one before decides")
-        )
-        count = daemon.snapshot().models[0].decisions
-        until(lambda: daemon.snapshot().models[0].decisions > count + 4)
-        model.write_bytes(good)
-        daemon.reload(configured(tmp_path, loaded))
-        until(lambda: spy.told("model.a", "admitted"))
-        assert not any("model.a" in x for x in daemon.snapshot().degraded)
-        count = daemon.snapshot().models[0].decisions
-        until(lambda: daemon.snapshot().models[0].decisions > count)
-        assert state_of(daemon, "model.a").starts == 1
-        kept = seqs(spy, "a")
-        assert np.array_equal(kept, kept[0] + np.arange(len(kept)))
 
 
 def renamed(prefix):

@@ -118,21 +118,6 @@ def test_a_flood_of_connections_costs_no_sample_and_leaves_nothing(
     assert seq == list(range(seq[0], seq[0] + len(seq)))
 
 
-def test_who_never_said_a_word_does_not_hinder_the_end(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    ports = free_ports(5)
-    (tmp_path / "robot.toml").write_text(CONFIG.format(*ports))
-    with (tmp_path / "log").open("w") as log, ExitStack() as stack:
-        daemon = subprocess.Popen([*RUN, str(tmp_path / "robot.toml")], cwd=tmp_path, stderr=log)
-        try:
-            until(lambda: all(map(can_connect, ports)))
-            for port in ports:
-                stack.enter_context(socket.create_connection(("127.0.0.1", port), PATIENCE_S))
-        finally:
-            daemon.send_signal(signal.SIGTERM)
-            assert daemon.wait(PATIENCE_S) == 0, (tmp_path / "log").read_text()
-
-
 @pytest.mark.parametrize("unix", [False, True])
 def test_the_first_connections_stay_and_the_rest_are_shut_down(tmp_path, unix):
     with ExitStack() as stack:

@@ -186,25 +186,6 @@ def test_whatever_is_asked_gets_an_answer_of_its_own(served, data, status):
     consumer.handle([])
 
 
-def test_those_who_drip_or_stay_away_are_hung_up_on_and_do_not_hold_others_up(monkeypatch):
-    limits = dataclasses.replace(module.LIMITS, head_s=0.3)
-    monkeypatch.setattr(module, "LIMITS", limits)
-    port = free_port()
-    consumer = Metrics("metrics", MetricsConfig(port=port))
-    with running(consumer, View(snapshot=busy_snapshot())):
-        slow = [
-            socket.create_connection(("127.0.0.1", port), timeout=PATIENCE_S) for _ in range(40)
-        ]
-        for line in slow[::2]:
-            with contextlib.suppress(OSError):
-                line.sendall(b"GET /sta")
-        until(lambda: consumer.details()["refused"] >= 40 - limits.connections)
-        until(lambda: consumer.details()["refused"] >= 40)  # the rest ran out of time
-        assert get(port, "/state")[0] == 200
-        for line in slow:
-            line.close()
-
-
 def test_closing_waits_for_nobody_and_frees_the_port(monkeypatch):
     monkeypatch.setattr(module, "LIMITS", dataclasses.replace(module.LIMITS, head_s=600.0))
     port = free_port()

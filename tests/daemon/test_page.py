@@ -5,7 +5,6 @@ import http.client
 import json
 import re
 import socket
-from contextlib import suppress
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -17,12 +16,12 @@ from tactile_rt.daemon.config import PageConfig
 from tactile_rt.daemon.health import Snapshot
 from tactile_rt.daemon.http import Refused
 from tactile_rt.daemon.items import Control, Decision, Event, Opened, SourceChunk
-from tactile_rt.daemon.page import Page, routes
+from tactile_rt.daemon.page import Page
 from tactile_rt.daemon.page import feed as feed_module
 from tactile_rt.daemon.page.feed import Feed, array_line, map_axes
 from tactile_rt.daemon.page.guard import Guard
 from tactile_rt.daemon.page.routes import LIMITS, MAX_LINES, MAX_STREAMS, STATIC, PageClient
-from tactile_rt.errors import ConfigError, SourceError
+from tactile_rt.errors import ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
 
@@ -246,14 +245,6 @@ def test_a_page_opens_again_after_it_was_closed(serve):
     assert ask(port)[0] == 200
 
 
-def test_a_taken_port_is_told():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        page = Page("page", PageConfig(port=taken.getsockname()[1]))
-        with pytest.raises(SourceError, match=r"listen at 127\.0\.0\.1:\d+: Address already"):
-            page.open(FakeView())
-        page.close()
-
-
 # who is refused
 
 
@@ -375,19 +366,6 @@ def test_control_reaches_the_recorder_and_is_told(serve):
     assert ask(port, "POST", "/control", {"action": "start"})[0] == 404
 
 
-def test_large_requests_are_refused(serve):
-    _, port = serve(control=True)
-    status, _, _ = ask(port, "POST", "/control", {"action": "x" * 5000})
-    assert status == 413
-    with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as line:
-        try:
-            line.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX: " + b"y" * 100_000)
-            assert line.recv(100).split()[1] == b"431"
-        except (BrokenPipeError, ConnectionResetError):
-            pass
-    assert ask(port)[0] == 200
-
-
 def test_every_answer_carries_the_policy(serve):
     _, port = serve(token=TOKEN)
     for path in [*STATIC, "/live", "/nothing"]:
@@ -438,29 +416,3 @@ def test_a_fault_of_the_page_is_told_in_the_log(serve):
     stream.close()
     until(lambda: view.reports)
     assert view.reports[0][:2] == ("page", "request") and "TypeError" in view.reports[0][2]
-
-
-def test_a_connection_that_asks_for_nothing_is_closed(serve, monkeypatch):
-    monkeypatch.setattr(routes, "LIMITS", replace(LIMITS, head_s=0.05))
-    _, port = serve()
-    for begun in (b"", b"GET / HTTP/1.1\r\nHost: loc"):
-        with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as line:
-            line.sendall(begun)
-            told = b""
-            with suppress(ConnectionResetError):
-                while more := line.recv(1000):
-                    told += more
-            assert told == b"" or (begun and told.startswith(b"HTTP/1.1 408 "))
-
-
-def test_a_browser_that_is_gone_without_a_word_loses_its_place(serve, monkeypatch):
-    monkeypatch.setattr(routes, "LIMITS", replace(LIMITS, send_s=0.2))
-    page, port = serve()
-    with socket.create_connection(("127.0.0.1", port), PATIENCE_S) as line:
-        line.sendall(b"GET /live?source=a HTTP/1.1\r\nHost: localhost\r\n\r\n")
-        until(lambda: page.details()["browsers"] == 1)
-        until(  # it reads nothing
-            lambda: not page.details()["browsers"],
-            meanwhile=lambda: page.handle([decision("y" * 50_000)]),
-        )
-    assert ask(port)[0] == 200

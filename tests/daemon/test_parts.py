@@ -64,45 +64,12 @@ def decision():
 # mailbox
 
 
-def test_a_mailbox_drops_the_oldest_and_counts_them():
-    box = Mailbox({SourceChunk, Event}, items=4, size=1 << 20)
-    for seq in range(10):
-        box.put(samples(3, seq=seq))
-    box.put(event())
-    assert box.state.dropped == {"samples": 21, "packets": 0, "decisions": 0, "events": 0}
-    assert box.state.waiting["samples"] == 9 and box.state.waiting["events"] == 1
-    items = box.take()
-    assert [i.chunk.seq[0] for i in items[:3]] == [7, 8, 9] and isinstance(items[3], Event)
-    state = box.state
-    for kind in state.put:
-        assert state.put[kind] == state.taken[kind] + state.dropped[kind] + state.waiting[kind]
-    assert state.waiting_bytes == 0
-
-
-def test_a_mailbox_is_bounded_in_bytes_but_takes_one_of_any_size():
-    box = Mailbox({Packet}, items=1000, size=10_000)
-    for _ in range(100):
-        box.put(Packet("a", bytes(1000), 0))
-    assert box.state.waiting_bytes <= 10_000 and box.state.waiting["packets"] == 6
-    box.put(Packet("a", bytes(50_000), 0))
-    assert [len(i.packet) for i in box.take()] == [50_000]
-    assert box.state.dropped["packets"] == 100
-
-
 def test_a_mailbox_takes_what_it_wants_of_the_source_that_it_wants():
     box = Mailbox({SourceChunk}, 10, 1 << 20, source="a")
     box.put(samples(source="b"))
     box.put(event())
     box.put(samples(source="a"))
     assert [i.source for i in box.take()] == ["a"] and box.state.put["samples"] == 1
-
-
-def test_a_closed_mailbox_gives_out_what_it_has_and_waits_no_more():
-    box = Mailbox({SourceChunk}, 10, 1 << 20)
-    box.put(samples())
-    box.close()
-    box.put(samples())
-    assert len(box.take()) == 1 and box.take() == [] and box.state.dropped["samples"] == 1
 
 
 def test_what_is_urgent_does_not_wait_for_what_is_gathered():
@@ -116,41 +83,6 @@ def test_what_is_urgent_does_not_wait_for_what_is_gathered():
     box.put(event())
     thread.join(PATIENCE_S)
     assert len(taken) == 3
-
-
-def test_many_writers_and_a_reader_lose_nothing_that_is_not_counted():
-    box, taken = Mailbox({SourceChunk}, 16, 1 << 20, gather_s=0.001), []
-
-    def read():
-        while items := box.take():
-            taken.extend(items)
-
-    reader = threading.Thread(target=read)
-    writers = [
-        threading.Thread(target=lambda: [box.put(samples(2)) for _ in range(500)]) for _ in range(4)
-    ]
-    for thread in [reader, *writers]:
-        thread.start()
-    for thread in writers:
-        thread.join()
-    box.close()
-    reader.join()
-    assert sum(len(i.chunk) for i in taken) == box.state.taken["samples"]
-    assert box.state.taken["samples"] + box.state.dropped["samples"] == 4000
-
-
-def test_whoever_waits_for_room_gets_it_from_the_reader_or_when_there_is_none():
-    box = Mailbox({SourceChunk}, 4, 1 << 20)
-    for _ in range(4):
-        box.put(samples())
-    box.wait_for_room(PATIENCE_S)  # nobody takes: there is nobody to wait for
-    box.taking = True
-    thread = threading.Thread(target=lambda: box.wait_for_room(1000.0))
-    thread.start()
-    assert thread.is_alive()
-    box.take()
-    thread.join(PATIENCE_S)
-    assert not thread.is_alive()
 
 
 def test_every_item_has_a_class():

@@ -10,7 +10,6 @@ import socket
 import subprocess
 import sys
 import termios
-import time
 
 import pytest
 
@@ -161,29 +160,6 @@ def test_a_second_one_is_refused_whatever_its_environment(folder, started):
     assert second(folder)[0] == 0  # what was killed keeps nobody away
 
 
-def test_a_configuration_that_is_replaced_is_the_same_one(folder, started):
-    first = started()
-    (folder / "new.toml").write_text(SMALL)
-    os.replace(folder / "new.toml", folder / "robot.toml")
-    assert second(folder) == (3, f"tactile-rt: configuration {folder}/robot.toml is in use by "
-                              f"process {first.pid}\n")  # fmt: skip
-    first.send_signal(signal.SIGHUP)
-    await_told(folder, "daemon", "reloaded")
-    assert second(folder)[0] == 3
-
-
-def test_a_link_that_is_set_elsewhere_is_the_same_configuration(folder, started):
-    (folder / "robot.toml").rename(folder / "one.toml")
-    (folder / "two.toml").write_text(SMALL)
-    (folder / "robot.toml").symlink_to("one.toml")
-    first = started()
-    (folder / "next").symlink_to("two.toml")
-    os.replace(folder / "next", folder / "robot.toml")
-    for file in ("robot.toml", "one.toml"):
-        code, said = second(folder, file)
-        assert code == 3 and f"process {first.pid}" in said
-
-
 def signalled(folder, at, number, seconds):
     """A process that is signalled while it starts."""
     return subprocess.Popen(
@@ -208,33 +184,6 @@ def test_a_reload_asked_for_at_every_moment_of_the_start_ends_nothing(folder):
     process = signalled(folder, 0, signal.SIGHUP, 1.0)
     code, log = ended(process)
     assert code == 0 and "Traceback" not in log and "source.a running" in log, (code, log)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_at_any_time_of_the_first_second_does_what_it_should(folder, number):
-    """By the clock, from the moment at which the process takes signals."""
-    for ms in range(0, 1000, 40):
-        with subprocess.Popen(
-            [*RUN, "run", str(folder / "robot.toml")], stderr=subprocess.PIPE, text=True,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        ) as process:  # fmt: skip
-            until(lambda one=process: takes(one, signal.SIGTERM))
-            time.sleep(ms / 1000)
-            process.send_signal(number)
-            if number == signal.SIGHUP:
-                await_told(folder, "source.a", "running")
-                process.send_signal(signal.SIGTERM)
-            code, log = ended(process)
-            assert code == 0 and "Traceback" not in log, (ms, code, log)
-        (folder / "out.jsonl").unlink(missing_ok=True)
-
-
-def takes(process, number):
-    """Whether a process has a handler for a signal."""
-    with open(f"/proc/{process.pid}/status") as file:
-        (mask,) = (int(line.split()[1], 16) for line in file if line.startswith("SigCgt"))
-    return bool(mask >> (number - 1) & 1)
 
 
 def test_the_example_decides_what_was_touched(tmp_path):

@@ -207,16 +207,6 @@ def test_what_no_file_could_grow_by_is_counted(daemon, tmp_path):
     assert seqs(tmp_path) == [*range(100), *range(300, 400)]
 
 
-def test_below_min_free_mb_what_is_not_recorded_is_counted(daemon, tmp_path):
-    made = begun(daemon, tmp_path, min_free_mb=1e7)
-    made.handle([opened(), samples(CHUNKS[0])])
-    now = on_disk(made)
-    assert (now.samples, now.lost_samples, now.open, now.meant_ns > 0) == (0, 10, False, True)
-    assert "min_free_mb" in now.lost_why
-    assert made.details()["state"] == "disk full"
-    made.close()
-
-
 def test_who_is_stopped_or_waits_for_a_trigger_is_not_meant_to_record(daemon, tmp_path):
     made = begun(daemon, tmp_path, min_free_mb=0, mode="trigger")
     made.handle([opened(), samples(CHUNKS[0])])

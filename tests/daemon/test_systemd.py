@@ -233,24 +233,6 @@ def test_a_source_that_hangs_starves_the_watchdog_and_is_told_once(watched, tmp_
     assert "source.a: not a turn for 1.5 s" in lines_of(log, "systemd withheld")[0]
 
 
-def test_a_queue_that_hangs_starves_the_watchdog(watched, tmp_path):
-    """Whoever posts into it, and be it a source, waits for ever."""
-    one = '[[source]]\nname = "a"\nurl = "synthetic:2x2"\n[limits]\nstall_s = 0.5\n'
-    daemon, notifies, told = watched(
-        one + '[[publisher]]\nkind = "jsonl"\noptions = { file = "out", samples = true }\n'
-    )
-    source, log = daemon._sources["a"], tmp_path / "log"
-    until(lambda: source.source_state.samples and lines_of(log, "daemon running"))
-    with daemon._consumers["publisher.jsonl"][1].box._changed:
-        until(lambda: source.silent_s > 1.7)
-        told()
-        before = notifies.details()["pings"]
-        until(lambda: source.silent_s > 3.5)
-        assert notifies.details()["pings"] == before and "WATCHDOG=1" not in told()
-    until(lambda: notifies.details()["pings"] > before)
-    assert len(lines_of(log, "source.a stalled")) == len(lines_of(log, "systemd withheld")) == 1
-
-
 def test_a_main_loop_that_hangs_starves_the_watchdog(watched, tmp_path):
     daemon, notifies, _ = watched('[[source]]\nname = "a"\nurl = "synthetic:2x2"\n')
     daemon.turned("main")

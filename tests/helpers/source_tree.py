@@ -128,16 +128,6 @@ class SourceModule:
             if isinstance(node, Documented) and (said := ast.get_docstring(node))
         ]
 
-    @cached_property
-    def own_attributes(self) -> dict[ast.ClassDef, set[str]]:
-        """What the methods of a class assign to `self`."""
-        found: dict[ast.ClassDef, set[str]] = {}
-        for node, owner in self.nodes:
-            if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Store) and owner:
-                if isinstance(node.value, ast.Name) and node.value.id == "self":
-                    found.setdefault(owner, set()).add(node.attr)
-        return found
-
 
 @cache
 def modules() -> dict[str, SourceModule]:
@@ -190,52 +180,6 @@ def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
     return found
 
 
-# what a docstring says of attributes
-
-_LEADING = set(
-    "above after at before below below by for from his how in it its likewise of on one ones same"
-    " see since so that their theirs them these they this those to until when where which while"
-    " whose with without as".split()
-)  # what begins a fragment that leans on the attribute's name
-_PRONOUN = re.compile(
-    r"^(\W*\w+\W+){0,2}\W*(it|its|itself|them|they|their|theirs)\b", re.IGNORECASE
-)
-
-
-def attribute_entries(docstring: str) -> Iterator[tuple[str, str]]:
-    """(name, explanation) of every entry under `Attributes:`."""
-    inside, name, text = False, "", ""
-    for line in [*docstring.splitlines(), "end"]:
-        if line and not line.startswith(" "):
-            if name:
-                yield name, " ".join(text.split())
-            inside, name = line.rstrip() == "Attributes:", ""
-        elif inside:
-            entry = re.match(r"^    ([\w`*]+(?:, [\w`*]+)*): (.*)", line)
-            if entry:
-                if name:
-                    yield name, " ".join(text.split())
-                name, text = entry[1], entry[2]
-            else:
-                text += " " + line
-
-
-def why_a_fragment(text: str) -> str:
-    """What keeps an explanation from being understood alone; empty for one that is."""
-    words = re.findall(r"[A-Za-z][\w'-]*", re.sub(r"\([^)]*\)", " ", text))
-    if not re.match(r"[A-Z`(0-9]", text):
-        return "begins with a lower-case letter"
-    if len(words) < 4:
-        return "has fewer than four words"
-    if not re.search(r"[.!?)`]$", text):
-        return "does not end with a full stop"
-    if words[0].lower() in _LEADING:
-        return f"begins with {words[0]!r}"
-    if _PRONOUN.match(text):
-        return "has a pronoun among its first three words"
-    return ""
-
-
 # names in back-ticks
 
 
@@ -244,21 +188,6 @@ def names_in_ticks(docstring: str) -> Iterator[str]:
     for found in re.finditer(r"``.+?``|`([^`\n]+)`", docstring, re.DOTALL):
         if found[1]:
             yield found[1]
-
-
-def parameters(node: ast.AST) -> set[str]:
-    """The names of a function's parameters."""
-    if not isinstance(node, FUNCTIONS):
-        return set()
-    a = node.args
-    every = [*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, [a.vararg, a.kwarg])]
-    return {p.arg for p in every}
-
-
-@cache
-def members(node: ast.ClassDef) -> set[str]:
-    """The names that a class defines in its body."""
-    return set().union(*(_bound(child) for child in node.body))
 
 
 def _bound(node: ast.stmt) -> set[str]:

@@ -150,14 +150,6 @@ def test_a_native_device_that_says_nothing_is_told(tmp_path: Path, monkeypatch) 
         assert np.array_equal(concatenate(list(source)).values, values.astype(np.float32))
 
 
-def test_of_a_recording_of_an_earlier_release_the_file_is_still_read(tmp_path: Path) -> None:
-    from tactile_rt.recording.replay import _array_of
-
-    file = write(tmp_path / "array.json", small_spec())
-    assert _array_of(str(file)) == _array_of(small_spec().to_json()) == small_spec()
-    assert _array_of("") is None
-
-
 def test_counts_are_calibrated_first_then_declared(tmp_path: Path) -> None:
     """Sixteen taxels in counts to newtons, by a gain, as pads of a hand."""
     taxels = check_source("can:virtual:x?codec=xela")
@@ -249,23 +241,12 @@ def test_a_model_s_file_says_what_array_it_is(tmp_path: Path) -> None:
     assert str(caught.value).endswith("; name a model of it")  # declared it cannot be
 
 
-def test_a_declared_array_costs_nothing_where_it_is_so_already(tmp_path: Path) -> None:
-    file = tmp_path / "same.json"
-    with open_source("synthetic:3x6?pace=fast") as source:
-        file.write_text(source.spec.to_json())
-    with open_source(f"synthetic:3x6?pace=fast&array={file}") as source:
-        assert type(source).__name__ == "SyntheticSource"
-
-
 def test_a_calibration_holds_its_array_where_it_is_stored() -> None:
     """As in a recording's metadata."""
     spec = small_spec()
     with_array = replace(Calibration.of("a", spec), array=replace(spec, name="robot"))
     text = msgspec.json.encode(with_array)
     assert msgspec.json.decode(text, type=Calibration) == with_array
-    old = msgspec.json.decode(text)
-    del old["array"]  # of an earlier release
-    assert msgspec.convert(old, Calibration).array is None
 
 
 def test_it_is_one_source_with_all_that_the_device_has(tmp_path: Path) -> None:

@@ -106,11 +106,6 @@ def test_an_unknown_source_is_told_what_there_is(url: str) -> None:
     assert "sim:" in said
 
 
-def test_a_near_miss_is_guessed() -> None:
-    assert refusal(open_source, "sum:mouse").endswith("did you mean sim:?")
-    assert refusal(open_source, "sim").endswith("did you mean sim:?")
-
-
 def test_a_url_that_cannot_be_taken_apart_is_a_config_error_too() -> None:
     assert "sim://[mouse" in refusal(open_source, "sim://[mouse")
 
