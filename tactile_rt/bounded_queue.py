@@ -38,11 +38,6 @@ class QueueState:
     """What became of all that was put into a queue, by kind: put = taken + dropped + waiting.
 
     Attributes:
-        waiting: The number of each kind that waits now.
-        put: The number of each kind that was put so far.
-        taken: The number of each kind that the reader took so far.
-        dropped: The number of each kind that was dropped so far.
-        waiting_bytes: The size of all that waits now, bytes.
         oldest_s: The time that the oldest of all that waits has waited, s; 0 if nothing waits.
     """
 
@@ -62,7 +57,6 @@ class BoundedQueue(Generic[T]):
     """Items that wait for one reader.
 
     Args:
-        items: how many items may wait.
         size: how many bytes may wait; a single item may be larger.
         measure: gives kind, count and bytes of an item, or None: it is left out, uncounted. By
             default all are ``items`` of no size.

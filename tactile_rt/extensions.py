@@ -43,10 +43,6 @@ def added_names(group: str) -> tuple[str, ...]:
 def added(group: str, name: str) -> Any:
     """What another package adds by this name; None if none does.
 
-    Args:
-        group: One of the groups above.
-        name: The name of the entry point.
-
     Raises:
         ConfigError: It cannot be imported; the message names the package.
     """

@@ -28,10 +28,6 @@ def install_line(requirement: str, option: str = "") -> str:
     """The command that installs a package for the Python that is running.
 
     In an environment that uv made there is no pip: there it is uv that installs.
-
-    Args:
-        requirement: What pip calls it.
-        option: Of pip, before it, with a space behind.
     """
     python = Path(sys.executable)
     if find_spec("pip") is None:
@@ -49,8 +45,6 @@ def lacking(what: str, extra: str, error: ModuleNotFoundError) -> ConfigError:
 
     Args:
         what: The words before the package's name, such as "recordings need".
-        extra: What brings the package.
-        error: The failed import.
 
     Raises:
         ModuleNotFoundError: What is missing is a module of ours, which no extra brings.

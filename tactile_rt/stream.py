@@ -42,7 +42,6 @@ class ArraySpec:
     """What a sensor array is. Hashable; travels inside recordings and models.
 
     Attributes:
-        name: The name of the array, e.g. ``mouse-right``.
         elements: The names of the elements, whiskers or taxels, in the order of every sample.
         grid: The place (row, column) of each element on the array's topological grid, from 0.
         positions: The base point (x, y, z) of each element in the mount frame, m.
@@ -50,7 +49,6 @@ class ArraySpec:
             the mount frame.
         channels: The names of the quantities that each element measures, e.g. ``fx``.
         units: The SI unit of each channel, e.g. ``N``.
-        rate_hz: The nominal sample rate, Hz.
         frame: The name of the mount frame, which is right-handed.
 
     Raises:
@@ -109,7 +107,6 @@ class ArraySpec:
         """Say where `other` differs from this spec, one phrase each; [] when they match.
 
         Args:
-            other: the spec to compare with.
             ignore: attribute names not to compare (a model ignores ``name`` and ``rate_hz``).
         """
         found = []
@@ -186,11 +183,7 @@ class Chunk:
 
 
 def concatenate(chunks: list[Chunk]) -> Chunk:
-    """Join consecutive chunks of one stream into one; the samples are copied.
-
-    Raises:
-        ValueError: no chunks.
-    """
+    """Join consecutive chunks of one stream into one; the samples are copied."""
     return Chunk(
         *(
             np.concatenate([getattr(c, name) for c in chunks])
@@ -228,8 +221,6 @@ class Source(abc.ABC):
     A source is its own context manager and iterates over its chunks until it ends.
 
     Attributes:
-        spec: The array that the samples are of.
-        stats: The account of samples delivered and lost since the source was opened.
         live: True if samples come whether or not anyone reads them, as of a device or a
             simulation in real time; a source that is not live waits for its reader.
     """

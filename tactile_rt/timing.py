@@ -9,12 +9,7 @@ STEPS, STEP_MS = 22, 45.0  # of a window (Chung et al. 2025)
 
 @dataclass(frozen=True)
 class Timing:
-    """How a window is cut: into steps, each of so many samples.
-
-    Attributes:
-        steps: The number of steps of a window, after each of which there is a decision.
-        substeps: The number of samples of a step.
-    """
+    """Steps of a window, with a decision after each, of `substeps` samples."""
 
     steps: int = STEPS
     substeps: int = 5

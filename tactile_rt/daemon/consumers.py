@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,7 @@ __all__ = ["Wanted", "wanted_consumers"]
 
 _HERE = "tactile_rt.daemon"
 
-# table: (where the class is, extra that it needs); imported when used
-TABLES = {
-    "recorder": (f"{_HERE}.recorder:Recorder", ""),
-    "page": (f"{_HERE}.page:Page", ""),
-    "metrics": (f"{_HERE}.metrics:Metrics", ""),
-}
+TABLES = ("log", "recorder", "page", "metrics")  # each a class of its own module
 
 
 @dataclass(frozen=True)
@@ -50,31 +46,17 @@ def wanted_consumers(loaded: Loaded) -> list[Wanted]:
         ConfigError: no such kind of publisher, or a wrong option.
     """
     config, limits = loaded.config, loaded.config.limits
-    wanted = [_log(loaded)]
-    for i, publisher in enumerate(config.publisher):
-        wanted.append(_publisher(loaded, i, publisher))
-    for table, (where, extra) in TABLES.items():
-        options = getattr(config, table)
-        if options is not None:
-            try:
-                cls = load_class(where, table, extra)
-            except ConfigError as error:
-                loaded.refuse([table], str(error))
-            wanted.append(
-                Wanted(table, table, (options, limits), _maker(cls, table, options), options)
-            )
+    wanted = [_publisher(loaded, i, publisher) for i, publisher in enumerate(config.publisher)]
+    for table in TABLES:
+        if (options := getattr(config, table)) is not None:
+            cls = load_class(f"{_HERE}.{table}:{table.title()}", table, "")
+            make = partial(cls, table, options)
+            wanted.append(Wanted(table, table, (options, limits), make, options))
+    wanted.sort(key=lambda one: one.kind != "log")  # it is to hear of all others
     if os.environ.get("NOTIFY_SOCKET"):
         cls = load_class(f"{_HERE}.systemd:Systemd", "systemd", "")
-        wanted.append(Wanted("systemd", "systemd", limits, _maker(cls, "systemd", None)))
+        wanted.append(Wanted("systemd", "systemd", limits, partial(cls, "systemd", None)))
     return wanted
-
-
-def _log(loaded: Loaded) -> Wanted:
-    from tactile_rt.daemon.log import Log
-
-    config = loaded.config
-    log = config.log
-    return Wanted("log", "log", (log, config.limits), _maker(Log, "log", log), log)
 
 
 def _publisher(loaded: Loaded, i: int, config: PublisherConfig) -> Wanted:
@@ -96,12 +78,4 @@ def _publisher(loaded: Loaded, i: int, config: PublisherConfig) -> Wanted:
             loaded.refuse(["publisher", i], str(error))
     key = (config.kind, config.name, options, loaded.config.limits)
     name = f"publisher.{config.name}"
-    return Wanted(name, config.kind, key, _maker(cls, name, options), options)
-
-
-def _maker(cls: Any, name: str, options: Any) -> Callable[[], Consumer]:
-    def make() -> Consumer:
-        made: Consumer = cls(name, options)
-        return made
-
-    return make
+    return Wanted(name, config.kind, key, partial(cls, name, options), options)

@@ -8,9 +8,8 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any
 
-from tactile_rt.daemon.acquisition import Acquisition
 from tactile_rt.daemon.admission import file_stamp, model_path
-from tactile_rt.daemon.clock import Clock
+from tactile_rt.daemon.clock import Clock, Turns
 from tactile_rt.daemon.config import config_text
 from tactile_rt.daemon.consumer import ConsumerPart
 from tactile_rt.daemon.consumers import Wanted, wanted_consumers
@@ -20,9 +19,8 @@ from tactile_rt.daemon.loading import Loaded
 from tactile_rt.daemon.mailbox import Hub
 from tactile_rt.daemon.model_part import ModelPart
 from tactile_rt.daemon.part import Part
-from tactile_rt.daemon.source_part import SourcePart
+from tactile_rt.daemon.source_part import Acquisition, SourcePart
 from tactile_rt.daemon.troubles import troubles
-from tactile_rt.daemon.turns import Turns
 from tactile_rt.locks import AlreadyRunning, Locks, device_keys, lock_keys
 from tactile_rt.version import VERSION
 

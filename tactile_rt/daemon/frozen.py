@@ -59,9 +59,6 @@ def frozen_after(spec: ArraySpec, sensor: SensorSpec) -> float:
     Two readings of a channel with white noise of standard deviation s, rounded to steps of q, are
     equal with a probability of about q / (2 s sqrt(pi)), and at most 1; channels are independent.
 
-    Args:
-        spec: the array, for its elements and rate.
-        sensor: what its channels are.
     """
     log_p = 0.0
     for channel in sensor.channels:

@@ -17,7 +17,6 @@ class Mailbox(BoundedQueue[Item]):
 
     Args:
         wants: classes of items that it takes; the others are left out uncounted.
-        items, size: how many items, and of how many bytes, may wait.
         gather_s: how long samples and packets may wait for more of them; all else is urgent.
         source: only items of this source; empty: of all.
     """

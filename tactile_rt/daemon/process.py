@@ -151,16 +151,14 @@ def _reload(daemon: "Daemon", path: Path, sets: Sequence[str]) -> None:
     """In a thread of its own: whatever it takes, signals are obeyed meanwhile."""
     from tactile_rt.daemon.checks import check_config
     from tactile_rt.daemon.loading import load_config
-    from tactile_rt.errors import TactileError
+    from tactile_rt.daemon.part import reason_of
 
     try:
         loaded = load_config(path, sets)
         check_config(loaded)
         daemon.reload(loaded)
-    except TactileError as error:
-        daemon.refuse(str(error))
     except Exception as error:  # else nobody would know that it was not done
-        daemon.refuse(f"{type(error).__name__}: {error}")
+        daemon.refuse(reason_of(error))
 
 
 def leave(code: ExitCode) -> None:

@@ -56,6 +56,7 @@ LINGER_NS = 10**9  # after a source's end, for decisions about its last samples
 SLOW_S = 2.0  # beyond two syncs: a medium that is slow, and not just busy for a moment
 RING_BYTES = 64 << 20  # of each source, before a trigger
 EVER_NS = 1 << 62
+KEEPS = "`tactile-rt recover` keeps what is in it"
 MB, NS = 1e6, 1e9
 
 
@@ -130,12 +131,13 @@ class Recorder(Consumer):
         self._syncer = Syncer()
         if cut := self._folder.open():
             some = ", ".join(cut[:3]) + (f" and {len(cut) - 3} more" if len(cut) > 3 else "")
-            view.report(
-                self._name, "running", f"{self._folder.path}: cut short: {some}; "
-                "`tactile-rt recover` makes whole ones of them", "warning",
-            )  # fmt: skip
+            how = "`tactile-rt recover` makes whole ones of them"
+            self._warn(f"{self._folder.path}: cut short: {some}; {how}", "warning")
         for opened in view.streams().values():
             self._begin(opened)
+
+    def _warn(self, why: str, level: str = "error") -> None:
+        self._view.report(self._name, "running", why, level)
 
     def handle(self, items: list[Item]) -> None:
         for item in items:
@@ -299,12 +301,10 @@ class Recorder(Consumer):
                 self._finish_file(track)
                 track.until_ns = 0
                 track.empty()
-        elif control.action == "trigger":
+        elif control.action in ("trigger", "rotate"):
+            act = self._trigger if control.action == "trigger" else self._rotate
             for track in self._tracks.values():
-                self._trigger(track)
-        elif control.action == "rotate":
-            for track in self._tracks.values():
-                self._rotate(track)
+                act(track)
 
     def _begin(self, opened: Opened) -> None:
         self._end(opened.source)
@@ -368,17 +368,14 @@ class Recorder(Consumer):
             why = f"{file.path} was deleted while it was written"
             samples, packets = file.disown(Extent())
             self._count_lost(track, samples, packets, why)
-            self._view.report(self._name, "running", f"{why}: {samples} samples are lost", "error")
+            self._warn(f"{why}: {samples} samples are lost")
             finish, told = False, True
         try:
             file.close(finish)
         except OSError as error:
             if not told:
-                self._view.report(
-                    self._name, "running", f"{file.path}: not finished "
-                    f"({error.strerror or error}); `tactile-rt recover` keeps what is in it",
-                    "error",
-                )  # fmt: skip
+                why = f"{file.path}: not finished ({error.strerror or error})"
+                self._warn(f"{why}; {KEEPS}")
             self._count_lost(track, *file.disown(file.flushed), words(file.path, error))
         self._bytes += file.stats.bytes
 
@@ -413,10 +410,8 @@ class Recorder(Consumer):
                 continue
             where = file.whereabouts()
             if where == "moved":
-                self._view.report(
-                    self._name, "running", f"{file.path} was moved while it was written: another "
-                    "file is begun", "warning",
-                )  # fmt: skip
+                why = f"{file.path} was moved while it was written: another file is begun"
+                self._warn(why, "warning")
             if where != "there":
                 self._rotate(track)
                 continue
@@ -447,9 +442,7 @@ class Recorder(Consumer):
                 assert file.failed is not None
                 track, why = self._tracks.get(name), words(file.path, file.failed)
                 if samples or packets:
-                    self._view.report(
-                        self._name, "running", f"{why}; {samples} samples may be lost", "error"
-                    )
+                    self._warn(f"{why}; {samples} samples may be lost")
                 self._lost_samples += samples
                 ledger.lose(samples, why)
                 if track is not None:
@@ -460,10 +453,7 @@ class Recorder(Consumer):
         file = track.file
         why = words(file.path if file is not None else self._folder.path, error)
         if file is not None or why != track.trouble:
-            self._view.report(
-                self._name, "running", f"{why}; `tactile-rt recover` keeps what is in it"
-                if file is not None else f"{why}: not recording", "error",
-            )  # fmt: skip
+            self._warn(f"{why}: not recording" if file is None else f"{why}; {KEEPS}")
         track.trouble = why
         if file is not None:
             kept = file.flushed if file.failed is None else file.synced

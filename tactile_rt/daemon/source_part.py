@@ -1,15 +1,22 @@
-"""A source in a thread of its own: opened, read, closed, and opened again when it broke."""
+"""A source in a thread of its own: opened, read, closed, and opened again when it broke.
+
+    lines --> Acquisition (one thread) --> SourcePart --> hub
+
+A source's own thread opens it, waits for what has no line, and opens a lost line again; as long as
+there is a line it lends the source to the thread that reads the lines of all.
+"""
 
 import dataclasses
 import math
 import threading
 import time
+from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from typing import Any
 
 from tactile_rt.classifier.classifier import without_bad_samples
-from tactile_rt.daemon.acquisition import Acquisition
 from tactile_rt.daemon.clock import Clock
 from tactile_rt.daemon.config import LimitsConfig, SourceConfig
 from tactile_rt.daemon.frozen import FrozenJudge, frozen_after
@@ -20,15 +27,82 @@ from tactile_rt.daemon.part import Part, Report
 from tactile_rt.daemon.troubles import LossWindow, oldest_s
 from tactile_rt.drivers.device_source import DeviceSource, device_of
 from tactile_rt.drivers.health import Health, State
+from tactile_rt.drivers.reader import Reader
 from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source, SourceStats
 
-__all__ = ["SourcePart", "keeps_host_time"]
+__all__ = ["Acquisition", "SourcePart", "keeps_host_time"]
 
 POLL_S = 0.1  # how soon it notices that it should stop
 LOOK_NS = 50_000_000  # between two looks at a device's health
 AWAY_S = 0.3  # how long a source whose device is away may take to end
+
+
+@dataclasses.dataclass(eq=False)
+class _Lent:
+    source: Source
+    take: Callable[[Chunk | None], None]
+    wanted: Callable[[], bool]
+    over: threading.Event = dataclasses.field(default_factory=threading.Event)
+    error: Exception | None = None
+
+
+class Acquisition:
+    """Reads what is lent to it; the thread is there while anything is."""
+
+    def __init__(self) -> None:
+        self._reader = Reader()
+        self._new: deque[_Lent] = deque()
+        self._lent: dict[Source, _Lent] = {}
+        self._lock = threading.Lock()  # of the thread's beginning and end
+        self._running = False
+
+    def attend(
+        self, source: Source, take: Callable[[Chunk | None], None], wanted: Callable[[], bool]
+    ) -> None:
+        """Read a source until its line is lost, or it is not wanted any more.
+
+        Args:
+            take: Called in the thread that reads with what comes; several times a second with
+                None, if nothing does.
+            wanted: Tells whether to go on.
+        """
+        lent = _Lent(source, take, wanted)
+        with self._lock:
+            self._new.append(lent)
+            if not self._running:
+                self._running = True
+                threading.Thread(target=self._run, name="tactile-rt lines", daemon=True).start()
+        self._reader.wake()
+        lent.over.wait()
+        if lent.error is not None:
+            raise lent.error
+
+    def _run(self) -> None:
+        while True:
+            with self._lock:
+                while self._new:
+                    lent = self._new.popleft()
+                    self._lent[lent.source] = lent
+                    self._reader.add(lent.source)
+                if not self._lent:
+                    self._running = False
+                    return
+            for source in self._reader.wait():
+                self._read(self._lent[source])
+
+    def _read(self, lent: _Lent) -> None:
+        try:
+            if lent.wanted():
+                lent.take(lent.source.read(0.0))
+                if lent.source.fileno() >= 0:
+                    return
+        except Exception as error:
+            lent.error = error
+        del self._lent[lent.source]
+        self._reader.remove(lent.source)
+        lent.over.set()
 
 
 class SourcePart(Part):

@@ -148,11 +148,8 @@ def _of_model(
     if part.state != "running":
         return []
     if model.behind_s > limits.behind_s:
-        return [
-            Trouble(
-                part.name, "late decisions", f"it is more than {limits.behind_s:g} s behind", still
-            )
-        ]
+        why = f"it is more than {limits.behind_s:g} s behind"
+        return [Trouble(part.name, "late decisions", why, still)]
     if model.skips.second:
         why = "it cannot keep up, and skips to the newest sample"
         return [Trouble(part.name, "missing decisions", why, still)]

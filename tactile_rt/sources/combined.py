@@ -46,7 +46,6 @@ class MemberArray(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         name: The name of the array, put before the names of its elements.
-        url: The URL of the source that delivers the array's samples.
         position: Origin of the array's mount frame in the combined mount frame, m.
         orientation: Unit quaternion (w, x, y, z) that turns the array's mount frame into the
             combined one.
@@ -168,13 +167,9 @@ class CombinedSource(Source):
     invalid until it comes again. The stream ends when all have.
 
     Args:
-        sources: what to combine; closed with this one.
-        parts: name and pose of each.
-        name: of the combined array and its frame.
-        rate_hz: of the combined stream, Hz.
-
-    Raises:
-        ConfigError: they cannot be combined, see `combine_specs`.
+        sources: What to combine; closed with this one.
+        parts: The name and pose of each.
+        name: The name of the combined array and of its frame.
     """
 
     def __init__(

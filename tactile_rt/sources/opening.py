@@ -45,7 +45,6 @@ def open_source(url: str, *, calibration: str = "", array: str = "") -> Source:
     """Open the source that a URL names.
 
     Args:
-        url: as above.
         calibration: a file, or the id of a device calibrated before: corrects what the URL gives.
         array: a file of the array that the source then is, if the URL does not name one.
 
@@ -63,9 +62,6 @@ def check_source(url: str, *, calibration: str = "", array: str = "") -> ArraySp
 
     Returns:
         The array that the source will be of; None where only the device can tell.
-
-    Raises:
-        ConfigError, RecordingError, SpecMismatch: as `open_source`, in the same words.
     """
     return _prepared(url, calibration, array, check=True).spec
 
@@ -76,13 +72,7 @@ def is_made_up(url: str) -> bool:
 
 
 def check_model(model: Path, url: str) -> None:
-    """Refuse a model of another array than the URL's, where that is known beforehand.
-
-    Raises:
-        SpecMismatch: it names URL and file, and says where they differ and what to do.
-        ModelError: the file cannot be read.
-        ConfigError, RecordingError: as `check_source`.
-    """
+    """Refuse a model of another array than the URL's, where that is known beforehand."""
     from tactile_rt.classifier.model_file import fit_source, read_model
 
     card, spec = read_model(model)[0], check_source(url)

@@ -38,9 +38,7 @@ class SyntheticOptions:
     """How fast, how long.
 
     Attributes:
-        rate_hz: Sample rate of the stream, Hz.
         seconds: Length of the stream, s; 0 for an endless one.
-        seed: Seed of the noise; the same seed gives the same stream.
         pace: ``realtime`` delivers samples when they are due, ``fast`` at once.
         touches: Whether bumps pass over the array; without, it is at rest, and there is only noise.
     """
@@ -83,10 +81,6 @@ class SyntheticSource(Source):
     Args:
         size: ``ELEMENTSxCHANNELS``, e.g. ``35x6``; empty: ``5x6``; ``mouse`` for the array of the
             model that comes with the package.
-        options: how fast, how long.
-
-    Raises:
-        ConfigError: not such a size.
     """
 
     Options = SyntheticOptions

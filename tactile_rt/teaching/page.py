@@ -7,8 +7,7 @@ from typing import Any
 import msgspec
 
 from tactile_rt.daemon.http import HttpServer, Refused, Request, Response, listen
-from tactile_rt.daemon.page.guard import HEADERS, Guard
-from tactile_rt.daemon.page.routes import LIMITS, json_body, only
+from tactile_rt.daemon.page.routes import HEADERS, LIMITS, Guard, json_body, only
 
 __all__ = ["TeachingPage"]
 

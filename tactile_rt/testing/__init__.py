@@ -46,9 +46,7 @@ def cut(values: ArrayLike, rate_hz: float, samples: int = 9, start_ns: int = 0) 
 
     Args:
         values: The signal, (n, element, channel), SI units.
-        rate_hz: Sample rate, Hz.
         samples: Samples of each chunk; the last chunk may be shorter.
-        start_ns: Time of the first sample, ns.
     """
     signal = np.asarray(values, dtype=np.float32)
     seq = np.arange(len(signal), dtype=np.int64)
@@ -101,12 +99,8 @@ class FakeSerial(EmulatedSerial):
 
     Args:
         signal: What the device measures: (n, element, channel) in SI units, or a source.
-        codec: Name of the codec that it speaks.
         spec: The array, where neither the codec nor a source tells.
         further: Options of `EmulatedSerial`.
-
-    Raises:
-        ConfigError: The codec or an option is unknown, or the signal has another shape.
     """
 
     paced = False

@@ -3,7 +3,6 @@
 import contextlib
 import re
 import select
-import socket
 import subprocess
 import sys
 import types
@@ -12,6 +11,7 @@ from unittest import mock
 
 import pytest
 
+from bench.daemon.process import free_port
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.loading import load_config
 from tactile_rt.daemon.messages import encode, message_of
@@ -40,12 +40,6 @@ def blocks(page, language):
 def example(kind):
     (text,) = [b for b in blocks("reference/messages.md", "python") if b.startswith(f"# {kind}: ")]
     return text
-
-
-def free_port():
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
 
 
 @contextlib.contextmanager

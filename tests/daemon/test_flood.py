@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from bench.daemon.process import free_port
 from tactile_rt.daemon.publishers.connections import ConnectionLimit
 from tactile_rt.recording import Recording
 from tests.helpers.waiting import PATIENCE_S, until
@@ -42,14 +43,6 @@ port = {3}
 port = {4}
 """
 FLOOD = 2000
-
-
-def free_ports(number):
-    with ExitStack() as stack:
-        taken = [stack.enter_context(socket.socket()) for _ in range(number)]
-        for line in taken:
-            line.bind(("127.0.0.1", 0))
-        return [line.getsockname()[1] for line in taken]
 
 
 def can_connect(port):
@@ -85,7 +78,7 @@ def test_a_flood_of_connections_costs_no_sample_and_leaves_nothing(
     tmp_path, monkeypatch, many_descriptors
 ):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    ports = free_ports(5)
+    ports = [free_port() for _ in range(5)]
     (tmp_path / "robot.toml").write_text(CONFIG.format(*ports))
     with (tmp_path / "log").open("w") as log:
         daemon = subprocess.Popen([*RUN, str(tmp_path / "robot.toml")], cwd=tmp_path, stderr=log)

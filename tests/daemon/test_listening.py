@@ -14,6 +14,7 @@ from tests.helpers.waiting import until
 pytest.importorskip("zmq", reason="needs pyzmq: pip install '.[publish]'")
 pytest.importorskip("zenoh", reason="needs zenoh: pip install '.[publish]'")
 
+from bench.daemon.process import free_port
 from tactile_rt.daemon.checks import check_config
 from tactile_rt.daemon.daemon import Daemon
 from tactile_rt.daemon.loading import load_config
@@ -47,14 +48,6 @@ def own_sockets():
     return waiting
 
 
-def free_ports(n):
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(n)]
-    ports = [s.getsockname()[1] for s in sockets]
-    for s in sockets:
-        s.close()
-    return ports
-
-
 def test_the_kernels_tables_are_read_rightly():
     with socket.create_server(("127.0.0.1", 0)) as one, socket.socket() as other:
         other.bind(("0.0.0.0", 0))
@@ -65,7 +58,7 @@ def test_the_kernels_tables_are_read_rightly():
 
 
 def test_with_everything_on_nothing_listens_beyond_loopback(tmp_path):
-    ports = free_ports(5)
+    ports = [free_port() for _ in range(5)]
     page, metrics, foxglove, zmq, zen = ports
     # Addresses are those that come by default; ports are others, as somebody may have those.
     bind = re.sub(r"\d+\Z", str(zmq), ZmqOptions().bind)

@@ -11,6 +11,7 @@ import msgspec
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from bench.daemon.process import free_port
 from tactile_rt.daemon import metrics as module
 from tactile_rt.daemon.config import MetricsConfig
 from tactile_rt.daemon.health import SourceState
@@ -21,12 +22,6 @@ from tests.helpers.published import View, busy_snapshot, part, running
 from tests.helpers.waiting import PATIENCE_S, until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
-
-
-def free_port():
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bench.daemon.process import free_port
 from tactile_rt.classifier.classifier import Classification
 from tactile_rt.daemon.config import PageConfig
 from tactile_rt.daemon.health import Snapshot
@@ -19,8 +20,7 @@ from tactile_rt.daemon.items import Control, Decision, Event, Opened, SourceChun
 from tactile_rt.daemon.page import Page
 from tactile_rt.daemon.page import feed as feed_module
 from tactile_rt.daemon.page.feed import Feed, array_line, map_axes
-from tactile_rt.daemon.page.guard import Guard
-from tactile_rt.daemon.page.routes import LIMITS, MAX_LINES, MAX_STREAMS, STATIC, PageClient
+from tactile_rt.daemon.page.routes import LIMITS, MAX_LINES, MAX_STREAMS, STATIC, Guard, PageClient
 from tactile_rt.errors import ConfigError
 from tactile_rt.testing import ArraySource, cut, small_spec
 from tests.helpers.waiting import PATIENCE_S, until
@@ -29,12 +29,6 @@ SPEC = small_spec()
 TOKEN = "correct horse battery"
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
-
-
-def free_port():
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        return s.getsockname()[1]
 
 
 def opened(spec=SPEC, name="a"):

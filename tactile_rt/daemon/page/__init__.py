@@ -15,7 +15,7 @@ from tactile_rt.daemon.items import Contact, Control, Decision, Event, Item, Ope
 from tactile_rt.daemon.messages import encode, state_message
 from tactile_rt.daemon.page import routes
 from tactile_rt.daemon.page.feed import FEED_VERSION, Feed, array_line
-from tactile_rt.daemon.page.guard import HEADERS, Guard
+from tactile_rt.daemon.page.routes import HEADERS, Guard
 from tactile_rt.errors import ConfigError, TactileError
 
 __all__ = ["Page"]

@@ -1,13 +1,13 @@
 """The Zenoh publisher against a real session."""
 
 import json
-import socket
 import time
 
 import msgspec
 import pytest
 import zenoh
 
+from bench.daemon.process import free_port
 from tactile_rt.daemon.messages import encode, message_of
 from tactile_rt.daemon.publishers.zenoh import ZenohOptions, ZenohPublisher
 from tactile_rt.errors import ConfigError, SourceError
@@ -24,12 +24,6 @@ from tests.helpers.published import (
 from tests.helpers.waiting import until
 
 pytestmark = pytest.mark.usefixtures("no_thread_left")
-
-
-def free_port():
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ plane in which a whisker bends, at the base of C2; every other load is zero. The
 in arbitrary units, so the scale is: the strongest level bends C2 as hard as the six stimuli do.
 
 Read with h5py, where the authors' exporter puts things
-(github.com/datajoint-company/DJ-NWB-Hires-Gutnisky-2015; all but the electrode in `acquisition`):
+(github.com/datajoint-company/DJ-NWB-Hires-Gutnisky-2015; all but the electrode in ``acquisition``):
 
     SpikeTrain/data, timestamps                             1 where the cell fired
     behavior/touch_onset, touch_offset/data, timestamps     1 where a touch begins, ends
