@@ -1,7 +1,7 @@
 """`tactile-rt array`: arrays by name; a device measured, and its description brought to that."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -14,7 +14,6 @@ from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.sim_backend.measuring.findings import ArrayFinding
-    from tactile_rt.sim_backend.measuring.gains import KnownLoad
 
 array = typer.Typer(help="Arrays by name, and an array's own file.", no_args_is_help=True)
 app.add_typer(array, name="array")
@@ -68,10 +67,6 @@ def fit(
         Path | None, typer.Option(help="Write the file, brought to what was measured, here.")
     ] = None,
     in_place: Annotated[bool, typer.Option("--in-place", help="Change the array's file.")] = False,
-    known: Annotated[
-        list[str] | None,
-        typer.Option(help="WHISKER=NEWTON@MM: a load held across a whisker, so far from its base."),
-    ] = None,
     seconds: Annotated[
         float, typer.Option(min=1, max=3600, help="Read at most so many seconds.")
     ] = 600.0,
@@ -88,7 +83,6 @@ def fit(
         check_output(file)
     from tactile_rt.sources.opening import check_source, open_source
 
-    loads = [_known(text) for text in known or ()]
     if not described.is_file():
         raise ConfigError(f"{described}: no such file")
     url = f"replay:{recording}?speed=0" if Path(recording).is_file() else recording
@@ -108,8 +102,14 @@ def fit(
     with source:
         read_described(described, source.spec)  # a mistake is told before the reading
         chunks = record(source, seconds)
-        fitted = fit_array(described, source.spec, concatenate(chunks), loads)
-    if not told_as_json([_record(f) for f in fitted.findings], json):
+        fitted = fit_array(described, source.spec, concatenate(chunks))
+    if not told_as_json(
+        [
+            {key: value for key, value in vars(found).items() if key != "edits"}
+            for found in fitted.findings
+        ],
+        json,
+    ):
         _show(fitted.findings, Console())
     if target := described if in_place else out:
         write_whole(target, lambda file: file.write(fitted.text.encode()))
@@ -121,29 +121,6 @@ def fit(
             err=json == STDOUT,
         )
     keep_fit(described, recording, fitted.findings, in_place)
-
-
-def _known(text: str) -> "KnownLoad":
-    from tactile_rt.sim_backend.measuring.gains import KnownLoad
-
-    name, _, load = text.partition("=")
-    force, _, place = load.partition("@")
-    try:
-        return KnownLoad(name, float(force), float(place))
-    except ValueError:
-        raise ConfigError(
-            f"--known {text}: write WHISKER=NEWTON@MM, A0=0.001@20 for a mN, 20 mm from the base"
-        ) from None
-
-
-def _record(found: "ArrayFinding") -> dict[str, Any]:
-    return {
-        "what": found.what,
-        "unit": found.unit,
-        "described": found.described,
-        "measured": found.measured,
-        "note": found.note,
-    }
 
 
 def _show(findings: "list[ArrayFinding]", console: Console) -> None:

@@ -14,7 +14,6 @@ from tactile_rt.stream import ArraySpec, Chunk
 
 LINKS, STEPS = 10, 4
 SWING_MS, APART_MS = 900, 1500
-HELD_MS = 3000
 
 
 def swing(whisker: Whisker, angle: float, way: float) -> np.ndarray:
@@ -39,7 +38,6 @@ def plucked(
     rest_s: float = 70.0,
     angle: float = 0.4,
     seed: int = 0,
-    held: tuple[str, list[float]] | None = None,
 ) -> tuple[ArraySpec, Chunk]:
     """What the device of an array's file delivers: rest, then plucks in directions that change.
 
@@ -50,7 +48,6 @@ def plucked(
         rest_s: before the first.
         angle: by which a whisker is bent, rad, give or take.
         seed: of directions, sizes and noise.
-        held: at the end, the eight loads of one whisker for three seconds.
     """
     array = load_array(str(file))
     assert array.sensor is not None
@@ -65,10 +62,6 @@ def plucked(
             begin = int(rng.integers(APART_MS // 2))
             loads[begin : begin + SWING_MS, index] = swing(array.whiskers[index], size, way)
             pieces.append(loads)
-    if held is not None:
-        loads = np.zeros((2 * HELD_MS, *still.shape[1:]))
-        loads[HELD_MS // 2 : -HELD_MS // 2, spec.elements.index(held[0])] = held[1]
-        pieces.append(loads)
     values = np.concatenate(pieces).astype(np.float32)
     seq = np.arange(len(values), dtype=np.int64)
     chunk = Chunk(seq, 10**9 + seq * 10**6, values, np.ones(values.shape[:2], np.bool_))

@@ -20,7 +20,6 @@ from tactile_rt.sim_backend.measuring.findings import (
     pooled,
     spread_of,
 )
-from tactile_rt.sim_backend.measuring.measured import Measured
 from tactile_rt.sim_backend.measuring.resting import FORGETS_S, Rest, drift_likelihood
 from tactile_rt.sim_backend.transducer import FASTEST_HZ
 
@@ -37,16 +36,19 @@ HIDDEN = "noise is less than half a step: rounding hides it"
 
 
 def compare_sensor(
-    sensor: SensorSpec, measured: Measured, untouched: Mapping[str, NDArray[np.float64]]
+    sensor: SensorSpec,
+    rate: Figure,
+    rests: Mapping[str, Rest],
+    untouched: Mapping[str, NDArray[np.float64]],
 ) -> list[ArrayFinding]:
     """Rate, and noise, resolution, drift and offset of every channel.
 
     Args:
         sensor: as it is described.
-        measured: what was found.
+        rate: as it was measured, Hz.
+        rests: of the whiskers, by name.
         untouched: (channel,) readings at rest by whisker, as the description has them.
     """
-    rate = measured.rate
     edits = change(("sensor", "rate_hz"), sensor.rate_hz, about(rate.value, SAME_RATE))
     note = ""
     if edits and rate.low > FASTEST_HZ:
@@ -54,7 +56,7 @@ def compare_sensor(
     findings = [ArrayFinding("rate", "Hz", sensor.rate_hz, rate, note, edits)]
     passed_hz = replace(sensor, rate_hz=rate.value).noise_bandwidth_hz
     for c, channel in enumerate(sensor.channels):
-        said = _Channel(c, channel, measured.rests)
+        said = _Channel(c, channel, rests)
         drift = said.drift()
         known = drift.measured.value if drift.measured else 0.0
         findings += [said.noise(passed_hz, known), said.resolution()]

@@ -9,13 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
-from tactile_rt.sim_backend.arrays.editing import Edit, rounded
-
 __all__ = [
     "MEDIAN",
     "SIGMAS",
     "TO_SIGMA",
     "ArrayFinding",
+    "Edit",
     "Figure",
     "about",
     "change",
@@ -58,6 +57,21 @@ class Figure(NamedTuple):
             if percent >= 1
             else (f"{self.value:.4g} +- {percent:.1f} %")
         )
+
+
+class Edit(NamedTuple):
+    """A value that is to stand in an array's file.
+
+    Attributes:
+        path: The place of the value in the file: tables by name, one of several by its number
+            from 0, and the key, e.g. ``("sensor", "channel", 0, "drift")``.
+        value: The number.
+        why: What was measured, for a comment.
+    """
+
+    path: tuple[str | int, ...]
+    value: float
+    why: str
 
 
 @dataclass(frozen=True)
@@ -137,7 +151,7 @@ def change(
     """
     if described is not None and found.low <= described <= found.high:
         return ()
-    return (Edit(path, rounded(found.value or found.high), f"{found}{why}"),)
+    return (Edit(path, float(f"{found.value or found.high:.4g}"), f"{found}{why}"),)
 
 
 def listed(names: Sequence[str]) -> str:

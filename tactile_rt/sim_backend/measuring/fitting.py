@@ -1,26 +1,39 @@
 """An array's file brought to what a recording of the device tells."""
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
 
 from tactile_rt.errors import ConfigError, SpecMismatch
 from tactile_rt.sensor_spec import SensorSpec
-from tactile_rt.settings import parse_toml, read_text, read_toml
-from tactile_rt.sim_backend.arrays.editing import edited
+from tactile_rt.settings import find_lines, parse_toml, read_text, read_toml
 from tactile_rt.sim_backend.arrays.files import load_array, read_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.measuring.channels import compare_sensor
-from tactile_rt.sim_backend.measuring.findings import ArrayFinding, listed
-from tactile_rt.sim_backend.measuring.gains import KnownLoad, compare_gain, readings
-from tactile_rt.sim_backend.measuring.measured import measure
+from tactile_rt.sim_backend.measuring.findings import (
+    SIGMAS,
+    ArrayFinding,
+    Edit,
+    Figure,
+    listed,
+)
 from tactile_rt.sim_backend.measuring.mechanics import compare_whiskers
-from tactile_rt.sim_backend.transducer import device_spec
-from tactile_rt.stream import ArraySpec, Chunk
+from tactile_rt.sim_backend.measuring.resting import Rest, find_rest
+from tactile_rt.sim_backend.measuring.ringing import Ring, find_swings, fit_ring
+from tactile_rt.sim_backend.transducer import Transducer, device_spec
+from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
-__all__ = ["Fitted", "fit_array", "read_described"]
+__all__ = ["Fitted", "edit_text", "fit_array", "read_described"]
+
+MISSING = 0.1  # of a recording's samples, at most
+LEAST = 64  # samples
+LINE = re.compile(r"(\s*[\w-]+\s*=\s*)(?:\{[^}]*\}|[^#{]*?)(\s*)(#.*)?")
+MEASURED = re.compile(r"(;\s*|#\s*)measured: .*")
 
 
 class Fitted(NamedTuple):
@@ -66,38 +79,47 @@ def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
     return array
 
 
-def fit_array(
-    path: Path, spec: ArraySpec, recorded: Chunk, known: Sequence[KnownLoad] = ()
-) -> Fitted:
+def fit_array(path: Path, spec: ArraySpec, recorded: Chunk) -> Fitted:
     """Measure an array, and bring its description to that; nothing is written.
 
     Args:
         path: the array's .toml file.
         spec: what the samples are of.
         recorded: all samples, of the array at rest and of its whiskers plucked.
-        known: the loads that the longest stillness away from rest of some whiskers is of.
 
     Raises:
-        ConfigError, SpecMismatch: as `read_described`, `measure` and `compare_gain`.
+        ConfigError: too few samples, too many missing, no whisker is at rest for 3 s, or as
+            `read_described`.
+        SpecMismatch: as `read_described`.
     """
     array = read_described(path, spec)
     sensor = array.sensor
     assert sensor is not None
-    measured = measure(spec, recorded, sensor.bandwidth_hz)
+    rate = _measure_rate(recorded)
+    rests, rings = _measure(spec, recorded, rate.value, sensor.bandwidth_hz)
     text = read_text(path)
     whiskers = [w for w in array.whiskers if w.name in spec.elements]
-    swings, fitted = compare_whiskers(whiskers, measured.rings, measured.rate.value, _tables(text))
-    gain = compare_gain(sensor, fitted, measured.rests, known)
-    larger = gain.measured.value if gain.measured and gain.edits else 1.0
-    untouched = {name: larger * readings(sensor, name, [0.0] * 8) for name in measured.rests}
-    findings = [*compare_sensor(sensor, measured, untouched), gain, *swings]
-    if restless := [e for e in spec.elements if e not in measured.rests]:
+    untouched = {name: _predict_rest(sensor, name) for name in rests}
+    findings = [
+        *compare_sensor(sensor, rate, rests, untouched),
+        *compare_whiskers(whiskers, rings, rate.value, _tables(text)),
+    ]
+    if restless := [e for e in spec.elements if e not in rests]:
         note = f"never at rest for 3 s, or often invalid: {listed(restless)}"
         findings.append(ArrayFinding("rest", "", None, None, note))
     findings += _beyond_range(sensor, recorded)
-    text = edited(path, text, [e for f in findings for e in f.edits])
+    text = edit_text(path, text, [e for f in findings for e in f.edits])
     read_animals(path, text)  # what no array can have is told now, not when the file is written
     return Fitted(findings, text)
+
+
+def _predict_rest(sensor: SensorSpec, name: str) -> NDArray[np.float64]:
+    """Return the (channel,) readings of a whisker without any load, as described."""
+    now, there = np.zeros(1, np.int64), np.ones((1, 1), np.bool_)
+    read = Transducer(sensor, (name,)).push(Chunk(now, now, np.zeros((1, 1, 8), np.float32), there))
+    assert read is not None
+    found: NDArray[np.float64] = read.values[0, 0].astype(np.float64)
+    return found
 
 
 def _beyond_range(sensor: SensorSpec, recorded: Chunk) -> list[ArrayFinding]:
@@ -122,3 +144,125 @@ def _tables(text: str) -> dict[str, tuple[int, Mapping[str, Any]]]:
         for number, values in enumerate(file["whisker"])
         for side in sides
     }
+
+
+def _measure(
+    spec: ArraySpec, recorded: Chunk, hz: float, bandwidth_hz: float
+) -> tuple[dict[str, Rest], dict[str, list[Ring]]]:
+    """Find rest and free swings of each whisker, by its name.
+
+    Raises:
+        ConfigError: no whisker is at rest for 3 s.
+    """
+    rests: dict[str, Rest] = {}
+    away: list[NDArray[np.float32]] = []
+    for i, name in enumerate(spec.elements):
+        values = _whole(recorded, i)
+        rest = None if values is None else find_rest(values, hz, bandwidth_hz)
+        if values is None or rest is None:
+            away.append(np.zeros((0, spec.shape[1]), np.float32))
+            continue
+        rests[name] = rest
+        at_s = np.arange(len(values)) / hz
+        levels = [np.interp(at_s, rest.at_s, of_channel) for of_channel in rest.levels.T]
+        noise = np.hypot(rest.noise, rest.step / 12**0.5)
+        noise[noise == 0] = np.inf
+        away.append(((values - np.stack(levels, axis=1)) / noise).astype(np.float32))
+    if not rests:
+        raise ConfigError(
+            f"{spec.name}: no whisker is valid, and at rest for 3 s; record the array untouched "
+            "for a minute, then pluck its whiskers, with some seconds between"
+        )
+    rings: dict[str, list[Ring]] = {}
+    for swing in find_swings(away, hz):
+        ring = fit_ring(away[swing.element][swing.begin : swing.end], hz)
+        if ring is not None:
+            rings.setdefault(spec.elements[swing.element], []).append(ring)
+    return rests, rings
+
+
+def _measure_rate(recorded: Chunk) -> Figure:
+    """Measure the sample rate, Hz: the slope of counts over times."""
+    if len(recorded) < LEAST:
+        raise ConfigError(f"the recording has {len(recorded)} samples: {LEAST} are the least")
+    count = int(recorded.seq[-1] - recorded.seq[0]) + 1
+    if len(recorded) < (1 - MISSING) * count:
+        raise ConfigError(
+            f"the recording lacks {count - len(recorded)} of {count} samples: see `tactile-rt hz`"
+        )
+    t_s = (recorded.t_ns - recorded.t_ns[0]) / NS_PER_S
+    if not t_s[-1] > 0:
+        raise ConfigError("the recording's time stamps do not advance")
+    line = stats.linregress(recorded.seq - recorded.seq[0], t_s)
+    error = SIGMAS * line.stderr / line.slope
+    return Figure(1 / line.slope, (1 - error) / line.slope, (1 + error) / line.slope)
+
+
+def _whole(recorded: Chunk, element: int) -> NDArray[np.float32] | None:
+    """(n, channel) readings of an element, straight lines where a few are missing; else None."""
+    valid = recorded.valid[:, element] & np.isfinite(recorded.values[:, element]).all(axis=1)
+    seq = recorded.seq[valid] - recorded.seq[0]
+    values: NDArray[np.float32] = recorded.values[valid, element]
+    count = int(recorded.seq[-1] - recorded.seq[0]) + 1
+    if len(seq) < (1 - MISSING) * count:
+        return None
+    if len(seq) < count:
+        every = np.arange(count)
+        filled = [np.interp(every, seq, of_channel) for of_channel in values.T]
+        values = np.stack(filled, axis=1).astype(np.float32)
+    return values
+
+
+def edit_text(path: Path, text: str, edits: Sequence[Edit]) -> str:
+    """Change values in the text of an array's file; comments and layout stay.
+
+    A line is changed by its look, which TOML allows to mislead. So what has been written is read
+    again, and refused unless it is the file with just these numbers changed.
+
+    Args:
+        path: of the file, for messages.
+        text: what is in it.
+        edits: the values, each with a comment that says what was measured.
+
+    Raises:
+        ConfigError: a value stands in the file in a way that this cannot change.
+    """
+    ending = "\r\n" if "\r\n" in text else "\n"
+    text = text.replace("\r\n", "\n")
+    wanted = parse_toml(text, str(path)).plain()
+    for edit in edits:
+        at: Any = wanted
+        for part in edit.path[:-1]:
+            at = at[part] if isinstance(part, int) else at.setdefault(part, {})
+        at[edit.path[-1]] = edit.value
+        text = _write_edit(text, edit)
+        try:
+            same = parse_toml(text, str(path)).plain() == wanted
+        except ConfigError:
+            same = False
+        if not same:
+            raise ConfigError(
+                f"{path}: cannot change {edit.path[-1]} as it is written there; put "
+                f"{edit.path[-1]} = {edit.value:g} into its table by hand"
+            )
+    return text.replace("\n", ending)
+
+
+def _write_edit(text: str, edit: Edit) -> str:
+    """Put a value into its line, or into a new line of its table."""
+    lines, numbers = text.split("\n"), find_lines(text)
+    table, said = edit.path[:-1], f"measured: {edit.why}"
+    new = f"{edit.path[-1]} = {edit.value:g} # {said}"
+    if edit.path in numbers:
+        at = numbers[edit.path] - 1
+        if found := LINE.fullmatch(lines[at]):
+            key, gap, comment = found.groups()
+            kept = MEASURED.sub("", comment or "").rstrip()
+            comment = f"{kept}; {said}" if kept else f"# {said}"
+            lines[at] = f"{key}{edit.value:g}{gap or ' '}{comment}"
+    elif table in numbers:
+        keys = [n for p, n in numbers.items() if p[:-1] == table and lines[n - 1].strip()[0] != "["]
+        lines.insert(max([numbers[table], *keys]), new)
+    else:
+        lines += [f"[{'.'.join(map(str, table))}]", new, ""]
+    return "\n".join(lines)

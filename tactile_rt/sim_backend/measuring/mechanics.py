@@ -49,20 +49,16 @@ def compare_whiskers(
     rings: Mapping[str, Sequence[Ring]],
     rate_hz: float,
     tables: Mapping[str, tuple[int, Mapping[str, Any]]],
-) -> tuple[list[ArrayFinding], dict[str, Whisker]]:
-    """Resonance and damping of every plucked whisker, and what of their description that changes.
+) -> list[ArrayFinding]:
+    """Compare resonance and damping of every plucked whisker with its description.
 
     Args:
         whiskers: as they are described.
         rings: their free swings, by name.
         rate_hz: of the samples.
         tables: of each whisker the number of its table in the array's file, and what is in it.
-
-    Returns:
-        What was found, and the whiskers by name, those that were measured as stiff as they are.
     """
     by_name = {w.name: w for w in whiskers}
-    fitted = dict(by_name)
     findings: list[ArrayFinding] = []
     found: dict[str, dict[str, Figure]] = {field: {} for field in UNITS}
     silent: dict[str, list[str]] = {}
@@ -89,13 +85,13 @@ def compare_whiskers(
             findings.append(ArrayFinding(f"{COLUMNS[stiffness]} {of}", "", now, None, note))
             continue
         found[stiffness][whisker.name] = solved
-        fitted[whisker.name] = _changed(whisker, stiffness, solved.value)
-        found[damping][whisker.name] = _damping(fitted[whisker.name], damping, ratio)
+        stiff = _changed(whisker, stiffness, solved.value)
+        found[damping][whisker.name] = _damping(stiff, damping, ratio)
     for why, names in silent.items():
         findings.append(ArrayFinding("resonance", "Hz", None, None, f"{why}: {listed(names)}"))
     for field, figures in found.items():
         findings += _brought(field, figures, by_name, tables)
-    return findings, fitted
+    return findings
 
 
 def _unmeasured(rod: Rod, heard: Sequence[Ring], rate_hz: float) -> str:

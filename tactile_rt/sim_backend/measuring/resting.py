@@ -38,22 +38,17 @@ class Rest(NamedTuple):
         at_s: The (block,) middle times of the blocks at rest, s.
         levels: The (block, channel) mean readings of these blocks.
         noise: The (channel,) standard deviation of a sample about its level, rounding included.
-        jitter: The (channel,) standard deviation of a level about the one before it.
         size: The number of samples in a block.
         block_s: The duration of a block, s.
         step: The (channel,) step that readings are rounded to; 0: none is seen.
-        held: The (block, channel) distance from the level in the longest time that the whisker
-            was held still away from it; none if it was not.
     """
 
     at_s: Floats
     levels: Floats
     noise: Floats
-    jitter: Floats
     size: int
     block_s: float
     step: Floats
-    held: Floats
 
     @property
     def level(self) -> Floats:
@@ -125,13 +120,8 @@ def find_rest(values: NDArray[np.float32], rate_hz: float, bandwidth_hz: float) 
     noise: Floats = (
         np.sqrt(np.median(spread[resting] ** 2, axis=0)) / (1 - 2 / (9 * freedom)) ** 1.5
     )
-    every_s = np.arange(0.5, len(blocks), dtype=np.float64) * (size / rate_hz)
-    at_s = every_s[resting]
-    elsewhere = _longest(_inside(still & ~there))
-    at_rest = [np.interp(every_s[elsewhere], at_s, each) for each in levels[resting].T]
-    held = levels[elsewhere] - np.stack(at_rest, axis=1)
-    jitter = _centre(np.diff(levels[resting], axis=0))[1] / 2**0.5
-    return Rest(at_s, levels[resting], noise, jitter, size, size / rate_hz, step, held)
+    at_s = np.arange(0.5, len(blocks), dtype=np.float64)[resting] * (size / rate_hz)
+    return Rest(at_s, levels[resting], noise, size, size / rate_hz, step)
 
 
 def _centre(levels: Floats) -> tuple[Floats, Floats]:
@@ -145,13 +135,6 @@ def _inside(blocks: NDArray[np.bool_]) -> NDArray[np.bool_]:
     beside = np.concatenate([[True], blocks, [True]])
     inside: NDArray[np.bool_] = beside[:-2] & blocks & beside[2:]
     return inside
-
-
-def _longest(blocks: NDArray[np.bool_]) -> slice:
-    """The longest run of them."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], blocks, [False]])))
-    runs = edges.reshape(-1, 2)
-    return slice(*runs[np.argmax(runs[:, 1] - runs[:, 0])]) if len(runs) else slice(0)
 
 
 def drift_likelihood(rest: Rest, channel: int, sizes: Floats) -> Floats:
