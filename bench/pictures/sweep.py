@@ -6,6 +6,7 @@ Run: python -m bench.pictures.sweep [--out FILE]
 """
 
 import argparse
+from contextlib import closing
 from pathlib import Path
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,8 +19,14 @@ from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.views.camera import Camera
 from tactile_rt.sim_backend.views.footage import record
-from tactile_rt.sim_backend.views.scale import ForceScale
-from tactile_rt.sim_backend.views.sheet import INK, QUIET, ForceMap, draw_scale, draw_traces
+from tactile_rt.sim_backend.views.sheet import (
+    INK,
+    QUIET,
+    ForceMap,
+    ForceScale,
+    draw_scale,
+    draw_traces,
+)
 from tactile_rt.sim_backend.views.stage import Stage
 from tactile_rt.sim_backend.world import PROFILES, array_spec
 
@@ -46,7 +53,7 @@ def draw(out: Path) -> None:
     FigureCanvasAgg(figure)
     traces = figure.add_axes((0.06, 0.07, 0.92, 0.38))
     draw_traces(traces, footage.times_ms, forces, footage.spec.elements)
-    with Stage(footage, CAMERA, SCALE, *SIZE) as stage:
+    with closing(Stage(footage, CAMERA, SCALE, *SIZE)) as stage:
         for k, moment in enumerate(MOMENTS_MS):
             number, left, frame = "①②"[k], 0.01 + 0.5 * k, footage.at(moment)
             scene = figure.add_axes((left, 0.5, 0.29, 0.37))

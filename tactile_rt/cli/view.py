@@ -1,7 +1,8 @@
-"""`tactile-rt view`: a sweep as a picture, as a video, or in a window."""
+"""`tactile-rt view`: a sweep as a picture or as a video."""
 
 import os
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,9 +27,8 @@ WIDTH = {".gif": 800}  # of GIFs, which do not compress well; of all else 1280
 def view(
     target: Annotated[str, typer.Argument(help="What is swept past: mug-17, or a mesh file.")],
     out: Annotated[
-        Path | None,
-        typer.Option(help=".png or .jpg: a picture; .mp4 or .gif: a video. Default: a window."),
-    ] = None,
+        Path, typer.Option(help=".png or .jpg: a picture; .mp4 or .gif: a video.")
+    ] = Path("sweep.png"),
     camera: Annotated[str, typer.Option(help="front, side, top or oblique.")] = "oblique",
     orthographic: Annotated[
         bool, typer.Option("--orthographic", help="Without perspective.")
@@ -51,11 +51,7 @@ def view(
         set_option("Of the sweep or a mesh: size_mm=30, yaw_deg=45, distance_mm=8, hull=true"),
     ] = None,
 ) -> None:
-    """Show a sweep: the scene with force arrows, the map of forces, their traces.
-
-    Without --out it opens a window, where there is a display: the mouse turns
-    and zooms, the space bar stops the time, the arrow keys step it.
-    """
+    """Show a sweep: the scene with force arrows, the map of forces, their traces."""
     check_output(out)
     try:
         with starting():
@@ -65,16 +61,14 @@ def view(
             from tactile_rt.sim_backend.sweep import Sweep, usual_distance
             from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
             from tactile_rt.sim_backend.views.camera import VIEWS
-            from tactile_rt.sim_backend.views.film import Film, camera_of
-            from tactile_rt.sim_backend.views.footage import record
-            from tactile_rt.sim_backend.views.scale import ForceScale
-            from tactile_rt.sim_backend.views.window import check_display, show
-            from tactile_rt.sim_backend.views.writing import (
+            from tactile_rt.sim_backend.views.film import (
                 IMAGES,
+                Film,
                 check_suffix,
                 write_image,
                 write_video,
             )
+            from tactile_rt.sim_backend.views.footage import record
             from tactile_rt.sim_backend.world import PROFILES, world_spec
     except ModuleNotFoundError as error:
         raise needs("view", error) from None
@@ -82,11 +76,9 @@ def view(
         if "MUJOCO_GL" not in os.environ:
             raise
         raise ConfigError(f"MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; unset it") from None
-    suffix = check_suffix(out) if out else ""
+    suffix = check_suffix(out)
     if at is not None and suffix not in IMAGES:
         raise ConfigError("--at is the moment of a picture: give --out a .png or .jpg")
-    if not out:
-        check_display()
     if camera not in VIEWS:
         raise ConfigError(f"no camera {camera!r}: there are {', '.join(VIEWS)}")
     if profile not in PROFILES:
@@ -107,11 +99,6 @@ def view(
     period = PICTURE_MS if suffix in IMAGES else max(1, round(1000 / (fps * slow)))
     with progress_bar(console, "simulating", total=1.0) as update:
         footage = record(simulation, spec, period, lambda done: update(completed=done))
-    if not out:
-        seen = camera_of(footage, camera, orthographic)
-        show(footage, seen, ForceScale.fitting(footage.forces, seen.extent_mm), slow)
-        return
-
     projection = "orthographic" if orthographic else "perspective"
     detail = f"{camera} view, {projection} · {thing.name} moves from nose to ear"
     if suffix in FPS:
@@ -121,7 +108,7 @@ def view(
         f"whiskers of {spec.name[:40]} at {sweep.speed_mm_s:g} mm/s"
     )
     width = pixels or WIDTH.get(suffix, 1280)
-    with Film(footage, camera, orthographic, title, detail, width) as film:
+    with closing(Film(footage, camera, orthographic, title, detail, width)) as film:
         if suffix in IMAGES:
             write_image(out, film.picture(footage.strongest if at is None else footage.at(at)))
             return

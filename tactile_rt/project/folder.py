@@ -288,11 +288,6 @@ def _described(array: str, folder: Path) -> str:
             "copy the columns into [[whisker]] tables as in docs/arrays/robot.toml"
         )
     text = read_text(path)
-    if any(animal.head for animal in load_animals(array)):
-        raise ConfigError(
-            f"{array}: takes a head from another file, which a project's copy would not find; "
-            "remove `head`, which only pictures need"
-        )
     try:
         read_animals(folder / "array.toml", text)
     except ConfigError:

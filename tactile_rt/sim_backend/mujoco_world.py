@@ -12,7 +12,6 @@ from mujoco import rollout
 from numpy.typing import NDArray
 
 from tactile_rt.errors import SourceError
-from tactile_rt.sim_backend.arrays.head import add_head
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, ContactProbe
@@ -51,7 +50,7 @@ def sweep_model(
     """The model of a sweep.
 
     Args:
-        animals: the arrays, on their mounts, with their heads.
+        animals: the arrays, on their mounts.
         names: of the whiskers that are in it.
         pieces: convex, of the object, mm, about its place.
         profile: how finely to cut the whiskers.
@@ -59,9 +58,7 @@ def sweep_model(
     world = empty_world(profile)
     for animal in animals:
         some = tuple(w for w in animal.whiskers if w.name in names)
-        head = add_whiskers(world, some, profile, animal.mount, f"head {animal.name}")
-        if animal.head is not None:
-            add_head(world, head, animal.head)
+        add_whiskers(world, some, profile, animal.mount, f"head {animal.name}")
     body = world.worldbody.add_body(name="object", mocap=True)
     for i, piece in enumerate(pieces):
         world.add_mesh(

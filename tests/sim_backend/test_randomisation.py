@@ -85,7 +85,7 @@ def test_draws_after_an_unrandomised_one_are_the_same() -> None:
 @pytest.mark.parametrize("name", FIELDS)
 def test_each_quantity_changes_its_own_attributes_only(name: str) -> None:
     drawn = Randomisation(**{name: size(name)}).draw(np.random.default_rng(2), MOUSE)
-    assert (drawn.name, drawn.head) == (MOUSE.name, MOUSE.head)
+    assert drawn.name == MOUSE.name
     restored = replace(
         drawn,
         mount=replace(

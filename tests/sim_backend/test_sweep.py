@@ -259,7 +259,7 @@ def test_a_mirrored_sweep_gives_mirrored_loads() -> None:
 def test_animals_share_a_world() -> None:
     """Two mice one above the other: the lower meets the block as it does when alone."""
     above = replace(ALL.mount, position=(-6.934, -11.642, 60.0))
-    both = place((ALL, ALL), (ALL.mount, above))
+    both = place((ALL, replace(ALL, mount=above)))
     sweep = Sweep(gap_mm=0.3, height_mm=-8)
     loads = SweepSimulation(both, block(), sweep, REALTIME).advance(100)
     alone = SweepSimulation(ALL, block(), sweep, REALTIME).advance(100)

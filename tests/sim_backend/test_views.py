@@ -1,6 +1,7 @@
 """Views of a simulation, checked in the pixels: projections, arrows, the map, files."""
 
 import resource
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -22,13 +23,16 @@ from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.views.camera import VIEWS, Camera, framing
-from tactile_rt.sim_backend.views.film import Film, camera_of
+from tactile_rt.sim_backend.views.film import (
+    Film,
+    camera_of,
+    check_suffix,
+    write_image,
+    write_video,
+)
 from tactile_rt.sim_backend.views.footage import Footage, record
-from tactile_rt.sim_backend.views.scale import ForceScale, round_number
-from tactile_rt.sim_backend.views.sheet import ForceMap, rostral_sign
+from tactile_rt.sim_backend.views.sheet import ForceMap, ForceScale, rostral_sign, round_number
 from tactile_rt.sim_backend.views.stage import Stage
-from tactile_rt.sim_backend.views.window import _Player, check_display
-from tactile_rt.sim_backend.views.writing import check_suffix, write_image, write_video
 from tactile_rt.sim_backend.world import OBJECT_BIT, PROFILES, WHISKER_BIT, array_spec
 from tactile_rt.stream import ArraySpec
 
@@ -70,7 +74,7 @@ def thing(kind, size, pos, more=""):
 def photograph(recorded, camera, frame=0):
     """(height, width, 3) picture, or skip where nothing can be drawn."""
     try:
-        with Stage(recorded, camera, SCALE, SIDE, SIDE) as stage:
+        with closing(Stage(recorded, camera, SCALE, SIDE, SIDE)) as stage:
             return stage.picture(frame)
     except ConfigError as error:
         if "no OpenGL" in str(error):
@@ -314,7 +318,7 @@ def test_columns_of_a_face_go_to_the_nose_from_both_sides():
 @pytest.fixture(scope="module")
 def film(footage):
     try:
-        with Film(footage, "oblique", title="a title", pixels=320) as opened:
+        with closing(Film(footage, "oblique", title="a title", pixels=320)) as opened:
             yield opened
     except ConfigError as error:
         pytest.skip(str(error))
@@ -412,29 +416,3 @@ def test_other_files_are_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"ends in \.png, \.jpg for a picture"):
         check_suffix(tmp_path / "a.avi")
     assert check_suffix(tmp_path / "a.MP4") == ".mp4"
-
-
-# ---- the window
-
-
-@pytest.mark.parametrize("display", [None, ":4242"])
-def test_a_window_needs_a_display(monkeypatch, display):
-    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
-    monkeypatch.delenv("DISPLAY", raising=False)
-    if display:
-        monkeypatch.setenv("DISPLAY", display)
-    with pytest.raises(ConfigError, match="write a picture or video with --out"):
-        check_display()
-
-
-def test_the_player_runs_stops_and_steps():
-    player = _Player(moments=10, period_s=0.5)
-    assert [player.moment(now) for now in (100.0, 100.6, 104.1, 105.2)] == [0, 1, 8, 0]
-    player.key(32)
-    assert player.moment(190.0) == 0
-    player.key(263)
-    player.key(263)
-    assert player.moment(191.0) == 8
-    player.key(262)
-    player.key(32)
-    assert player.moment(191.5) == 0

@@ -4,7 +4,6 @@ Both kinds of file have the columns of ``data/mouse.csv`` and may add those of `
 see ``docs/arrays/robot.toml`` and ``robot.csv`` for one array in both. In TOML::
 
     name = "robot"             # the file's name if left out
-    head = "head.stl"          # in the head's frame, mm; its path is relative to this file
     mirror = true              # adds the left side
     [mount]                    # if left out: unturned, the mean base point at the world's origin
     position_mm = [0.0, 0.0, 0.0]
@@ -48,7 +47,6 @@ from tactile_rt.settings import (
 from tactile_rt.sim_backend.arrays.robots import ROBOTS, robot_text
 from tactile_rt.sim_backend.arrays.species import species_array
 from tactile_rt.sim_backend.arrays.whisker_array import (
-    HEAD_FILES,
     Mount,
     Point,
     WhiskerArray,
@@ -86,7 +84,6 @@ class _Sensor(msgspec.Struct, forbid_unknown_fields=True):
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
     name: str = ""
-    head: str = ""
     mirror: bool = False
     mount: _Mount | None = None
     sensor: _Sensor | None = None
@@ -154,9 +151,9 @@ def _toml_animals(path: Path, nodes: SettingNode) -> tuple[WhiskerArray, ...]:
     if bool(file.animal) == bool(file.whisker):
         raise ConfigError(f"{path}: needs [[whisker]] tables or [[animal]] tables, one of the two")
     if file.animal:
-        if any((file.name, file.head, file.mirror, file.mount, file.sensor, file.defaults)):
+        if any((file.name, file.mirror, file.mount, file.sensor, file.defaults)):
             raise ConfigError(
-                f"{path}: beside [[animal]] tables there is nothing else; name, head, mirror, "
+                f"{path}: beside [[animal]] tables there is nothing else; name, mirror, "
                 f"mount, sensor and defaults belong in the file of an array"
             )
         animals = [_animal(path, animal) for animal in file.animal]
@@ -177,7 +174,7 @@ def _toml_animals(path: Path, nodes: SettingNode) -> tuple[WhiskerArray, ...]:
     made = _distinct(path, whiskers)
     mount = _mount(path, file.mount) if file.mount else centred_mount(made)
     name = file.name or path.stem
-    array = WhiskerArray(name, made, mount, _head(path, file.head), _sensor(nodes, file.sensor))
+    array = WhiskerArray(name, made, mount, _sensor(nodes, file.sensor))
     return (both_sides(array, name) if file.mirror else array,)
 
 
@@ -189,17 +186,6 @@ def _animal(path: Path, animal: _Animal) -> WhiskerArray:
         name = str(path.parent / name)
     array = load_array(name)
     return replace(array, mount=_mount(path, animal.mount)) if animal.mount else array
-
-
-def _head(path: Path, name: str) -> Path | None:
-    if not name:
-        return None
-    head = path.parent / name
-    if head.suffix.lower() not in HEAD_FILES:
-        raise ConfigError(f"{path}: head {name!r} must be one of {', '.join(HEAD_FILES)}, in mm")
-    if not head.is_file():
-        raise ConfigError(f"{path}: head {name!r}: no such file in {path.parent}")
-    return head
 
 
 def _mount(path: Path, mount: _Mount) -> Mount:

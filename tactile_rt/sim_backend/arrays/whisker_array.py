@@ -7,7 +7,6 @@ animal's right), y rostral, z dorsal; the left side of an animal is its right si
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +25,6 @@ __all__ = [
     "place",
 ]
 
-HEAD_FILES = (".obj", ".ply", ".stl")  # not .glb, which is in m and y-up by its standard
 Point = tuple[float, float, float]
 
 
@@ -68,7 +66,6 @@ class WhiskerArray:
         name: The name that the array is called by, e.g. ``mouse-right``.
         whiskers: The array's whiskers in the frame of the head, in mm and rad.
         mount: The pose of the head in the world.
-        head: The mesh file of the head, in the head's frame and in mm; None: no head is drawn.
         sensor: What reads the whiskers; None: the base loads are read as they are.
 
     Raises:
@@ -78,7 +75,6 @@ class WhiskerArray:
     name: str
     whiskers: tuple[Whisker, ...]
     mount: Mount = MOUNT
-    head: Path | None = None
     sensor: SensorSpec | None = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
@@ -123,25 +119,15 @@ def both_sides(right: WhiskerArray, name: str) -> WhiskerArray:
     return replace(right, name=name, whiskers=(*kept, *left))
 
 
-def place(
-    arrays: Sequence[WhiskerArray], mounts: Sequence[Mount] | None = None
-) -> tuple[WhiskerArray, ...]:
-    """Several animals in one world: element names and grid cells made distinct.
+def place(arrays: Sequence[WhiskerArray]) -> tuple[WhiskerArray, ...]:
+    """Put several animals in one world: make element names and grid cells distinct.
 
     The k-th animal's whiskers are called ``k.C2`` or ``k.R.C2`` (k from 1), and its rows of the
     grid follow below those of the animals before it. A single animal keeps its names.
 
-    Args:
-        arrays: the animals.
-        mounts: pose of each head in the world; None: every animal's own.
-
     Raises:
-        ConfigError: not as many mounts as arrays, or two in the same pose.
+        ConfigError: two in the same pose.
     """
-    if mounts is not None:
-        if len(mounts) != len(arrays):
-            raise ConfigError(f"{len(mounts)} mounts for {len(arrays)} animals; give each its own")
-        arrays = [replace(a, mount=m) for a, m in zip(arrays, mounts, strict=True)]
     if len(arrays) == 1:
         return (arrays[0],)
     for k, array in enumerate(arrays):

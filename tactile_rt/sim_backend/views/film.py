@@ -1,19 +1,30 @@
-"""Footage, drawn: scene, map and traces in one picture for each moment."""
+"""Footage as pictures and videos: scene, map and traces in one picture for each moment."""
 
-from collections.abc import Iterator
-from types import TracebackType
-from typing import Self
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
 
+import av
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
+from tactile_rt.errors import ConfigError
+from tactile_rt.files import write_whole
 from tactile_rt.sim_backend.views.camera import Camera, framing
 from tactile_rt.sim_backend.views.footage import Footage
-from tactile_rt.sim_backend.views.scale import ForceScale
-from tactile_rt.sim_backend.views.sheet import Sheet, scene_size
+from tactile_rt.sim_backend.views.sheet import ForceScale, Sheet, scene_size
 from tactile_rt.sim_backend.views.stage import Dressed, Stage
 
-__all__ = ["Film", "camera_of"]
+__all__ = ["IMAGES", "VIDEOS", "Film", "camera_of", "check_suffix", "write_image", "write_video"]
+
+IMAGES = (".png", ".jpg")
+VIDEOS = (".mp4", ".gif")
+QUALITY = "20"  # of H.264, constant rate factor: 18 is as the eye sees it, 23 the usual
+COLOURS = 255  # of a GIF
+PAPER = 247  # all three above: meant to be white
+
+Pixels = NDArray[np.uint8]
 
 
 def camera_of(
@@ -34,7 +45,7 @@ def camera_of(
 
 
 class Film:
-    """Complete pictures of footage. A context manager.
+    """Complete pictures of footage; to be closed.
 
     Args:
         footage: what to draw.
@@ -66,24 +77,81 @@ class Film:
         self._sheet = Sheet(footage, view, scale, title, detail, pixels)
         self.size = self._sheet.size
 
-    def picture(self, moment: int) -> NDArray[np.uint8]:
+    def picture(self, moment: int) -> Pixels:
         """(height, width, 3) RGB picture of a moment of the footage."""
         return self._sheet.picture(moment, self._stage.picture(moment))
 
-    def __iter__(self) -> Iterator[NDArray[np.uint8]]:
+    def __iter__(self) -> Iterator[Pixels]:
         return map(self.picture, range(len(self.footage)))
 
     def close(self) -> None:
         """Free what the pictures were drawn with."""
         self._stage.close()
 
-    def __enter__(self) -> Self:
-        return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
+def check_suffix(path: Path) -> str:
+    """Return the suffix of a file's name: one of `IMAGES` and `VIDEOS`.
+
+    Raises:
+        ConfigError: of another kind.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in IMAGES + VIDEOS:
+        raise ConfigError(
+            f"{path}: give a name that ends in {', '.join(IMAGES)} for a picture, "
+            f"or {', '.join(VIDEOS)} for a video"
+        )
+    return suffix
+
+
+def write_image(path: Path, pixels: Pixels) -> None:
+    """Write a picture (height, width, 3) RGB as .png or .jpg."""
+    kind = "PNG" if path.suffix.lower() == ".png" else "JPEG"
+    write_whole(path, lambda file: Image.fromarray(pixels).save(file, kind, optimize=True))
+
+
+def write_video(path: Path, pictures: Iterable[Pixels], fps: int, sample: Pixels) -> None:
+    """Write pictures (height, width, 3) RGB of one even size as .mp4 or .gif.
+
+    Args:
+        path: the file.
+        pictures: in their order.
+        fps: pictures a second. A GIF counts time in 10 ms: 25, 20 and 10 are exact.
+        sample: one that has the colours of them all; a GIF, which loops, gets its palette from it.
+    """
+    if path.suffix.lower() == ".gif":
+        write_whole(path, lambda file: _write_gif(file, pictures, fps, sample))
+    else:
+        write_whole(path, lambda file: _write_mp4(file, pictures, fps))
+
+
+def _write_mp4(out: BinaryIO, pictures: Iterable[Pixels], fps: int) -> None:
+    # by its name, as what comes first is moved there at the end
+    with av.open(str(out.name), "w", "mp4", options={"movflags": "+faststart"}) as file:
+        stream = file.add_stream("libx264", rate=fps, options={"crf": QUALITY})
+        stream.pix_fmt = "yuv420p"  # what every player plays
+        for k, pixels in enumerate(pictures):
+            if k == 0:
+                stream.height, stream.width = pixels.shape[:2]
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
+            file.mux(stream.encode(picture))
+        file.mux(stream.encode())
+
+
+def _write_gif(out: BinaryIO, pictures: Iterable[Pixels], fps: int, sample: Pixels) -> None:
+    palette = Image.fromarray(sample).quantize(COLOURS)
+    colours = np.array(palette.getpalette()).reshape(-1, 3)
+    colours[(colours > PAPER).all(axis=1)] = 255  # paper is white, not nearly so
+    palette.putpalette(colours.ravel().tolist())
+    # No dithering: its noise differs from picture to picture and does not pack.
+    indexed = (
+        Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures
+    )
+    first = next(indexed)
+    every: dict[str, Any] = {
+        "save_all": True,
+        "append_images": indexed,
+        "duration": round(1000 / fps),
+        "loop": 0,
+    }
+    first.save(out, "GIF", **every)

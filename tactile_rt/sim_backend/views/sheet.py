@@ -1,5 +1,6 @@
 """The whole picture: the scene, the array as a map of forces beside it, their traces below."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import mujoco
@@ -17,17 +18,18 @@ from numpy.typing import NDArray
 
 from tactile_rt.sim_backend.views.camera import Camera
 from tactile_rt.sim_backend.views.footage import Footage
-from tactile_rt.sim_backend.views.scale import ForceScale
 from tactile_rt.stream import ArraySpec
 
 __all__ = [
     "INK",
     "QUIET",
     "ForceMap",
+    "ForceScale",
     "Sheet",
     "draw_scale",
     "draw_traces",
     "rostral_sign",
+    "round_number",
     "scene_size",
 ]
 
@@ -40,6 +42,57 @@ INK, QUIET, EMPTY = "#222222", "#6b6b6b", "#f2f2f2"
 REACH = 0.36  # of a cell: half the longest arrow in it
 HARDLY = 0.15  # of a force, along the cheek: less has no direction worth drawing
 NAMED = 6  # strongest traces that get a colour and a name
+RGBA = tuple[float, float, float, float]
+
+_COLOURS = colormaps["plasma_r"]
+_UNTOUCHED: RGBA = (0.62, 0.62, 0.62, 1.0)
+_FELT = 0.01  # of the top: less is drawn as untouched
+_LONGEST = 1.5  # arrows grow no longer than this, so that a snap does not cross the picture
+_HEARD_OF = 98.0  # percentile of the moments' strongest forces that gets the top colour
+
+
+def round_number(value: float) -> float:
+    """Round to the nearest of 1, 2, 5, 10, 20, ... on a logarithmic scale."""
+    if not value > 0:
+        return 1.0
+    choices = [m * 10.0**e for e in range(-9, 10) for m in (1, 2, 5)]
+    return min(choices, key=lambda c: abs(np.log(c / value)))
+
+
+@dataclass(frozen=True)
+class ForceScale:
+    """Colours and arrow lengths of forces.
+
+    Attributes:
+        top_mn: The force that gets the strongest colour, mN.
+        arrow_mm: The length of that force's arrow, mm in the world.
+    """
+
+    top_mn: float
+    arrow_mm: float
+
+    @classmethod
+    def fitting(cls, forces: NDArray[np.float64], extent_mm: float) -> "ForceScale":
+        """Fit a scale to forces (moment, element), N, in a picture of so much height."""
+        strongest = 1e3 * forces.max(axis=1)
+        touched = strongest[strongest > 0.02 * strongest.max()]
+        top = float(np.percentile(touched, _HEARD_OF)) if len(touched) else 0.0
+        return cls(round_number(top / 1.2), round_number(0.2 * extent_mm))
+
+    def draws(self, force_mn: float) -> bool:
+        """True if a force is large enough to be drawn."""
+        return force_mn >= _FELT * self.top_mn
+
+    def colour(self, force_mn: float) -> RGBA:
+        """RGBA of a force; grey for none."""
+        if not self.draws(force_mn):
+            return _UNTOUCHED
+        r, g, b, a = _COLOURS(0.12 + 0.83 * min(force_mn / self.top_mn, 1.0))
+        return r, g, b, a
+
+    def length(self, force_mn: float) -> float:
+        """Length of a force's arrow, mm."""
+        return self.arrow_mm * min(force_mn / self.top_mn, _LONGEST)
 
 
 class Sheet:
@@ -243,7 +296,7 @@ class ForceMap:
         changed: list[Artist] = []
         for i, (force, (cx, cy)) in enumerate(zip(forces, self._centres, strict=True)):
             size = float(np.linalg.norm(force))
-            felt = self._scale.felt(size)
+            felt = self._scale.draws(size)
             cell, arrow, label = self._cells[i], self._arrows[i], self._labels[i]
             ink = "white" if size > 0.5 * self._scale.top_mn else INK
             cell.set_facecolor(self._scale.colour(size) if felt else EMPTY)

@@ -6,8 +6,7 @@ import os
 import sys
 import warnings
 from itertools import product
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,11 +16,11 @@ from PIL import Image
 from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.views.camera import Camera
 from tactile_rt.sim_backend.views.footage import Footage
-from tactile_rt.sim_backend.views.scale import ForceScale
+from tactile_rt.sim_backend.views.sheet import ForceScale
 from tactile_rt.sim_backend.world import OBJECT_BIT
 from tactile_rt.stream import ArraySpec
 
-__all__ = ["Dressed", "Stage", "add_forces", "add_paper", "has_display"]
+__all__ = ["Dressed", "Stage"]
 
 OBJECT, HEAD = (0.62, 0.74, 0.82, 1.0), (0.86, 0.81, 0.76, 1.0)
 FINE = 2  # drawn finer by this factor, then averaged
@@ -101,14 +100,14 @@ class Dressed:
             self.model.geom_rgba[geoms] = scale.colour(force)
 
 
-def add_forces(
+def _add_forces(
     scene: mujoco.MjvScene,
     dressed: Dressed,
     loads: NDArray[np.float64],
     scale: ForceScale,
     extent_mm: float,
 ) -> None:
-    """Add to a scene a dot on every base, and the arrow of the force on it.
+    """Add a dot on every base and the arrow of its force to a scene.
 
     Args:
         scene: to add to.
@@ -123,7 +122,7 @@ def add_forces(
         size = float(np.linalg.norm(force))
         rgba = np.array(scale.colour(size), dtype=np.float32)
         _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, BASE * extent_mm), base, rgba)
-        if scale.felt(size):
+        if scale.draws(size):
             arrow = _add(scene, mujoco.mjtGeom.mjGEOM_ARROW, np.ones(3), base, rgba)
             end = base + force / size * scale.length(size)
             shaft = SHAFT * extent_mm
@@ -131,7 +130,7 @@ def add_forces(
             arrow.size[2] *= 2  # MuJoCo draws an arrow half as long as it connects
 
 
-def add_paper(scene: mujoco.MjvScene, camera: Camera) -> None:
+def _add_paper(scene: mujoco.MjvScene, camera: Camera) -> None:
     """Add to a scene a white room around everything: MuJoCo's own background is black."""
     white, far = np.ones(4, dtype=np.float32), ROOM * (camera.extent_mm + camera.distance_mm)
     for axis in np.eye(3):
@@ -154,7 +153,7 @@ def _add(
 
 
 class Stage:
-    """Pictures of the states in footage, drawn offscreen. A context manager.
+    """Pictures of the states in footage, drawn offscreen; to be closed.
 
     Args:
         footage: what to draw.
@@ -197,8 +196,8 @@ class Stage:
         self.dressed.cover(opacity)
         everything = mujoco.mjtCatBit.mjCAT_ALL.value
         mujoco.mjv_updateScene(model, data, mujoco.MjvOption(), None, self._view, everything, scene)
-        add_forces(scene, self.dressed, loads, self.scale, self.camera.extent_mm)
-        add_paper(scene, self.camera)
+        _add_forces(scene, self.dressed, loads, self.scale, self.camera.extent_mm)
+        _add_paper(scene, self.camera)
         pixels = np.empty((self._size[1], self._size[0], 3), dtype=np.uint8)
         area = mujoco.MjrRect(0, 0, *self._size)
         self._gl.make_current()
@@ -214,24 +213,6 @@ class Stage:
             self._gl.free()
             self._gl = None
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
-
-
-def has_display() -> bool:
-    """Whether a window can be opened on this machine's screen."""
-    if sys.platform != "linux":
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
-
 
 def _painter(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoco.MjrContext]:
     """An OpenGL context, and MuJoCo's in it: that of MUJOCO_GL if set, else the first that works.
@@ -242,7 +223,8 @@ def _painter(model: mujoco.MjModel, width: int, height: int) -> tuple[Any, mujoc
     if asked in ("egl", "osmesa", "glfw", "cgl"):
         kinds = [asked]
     elif sys.platform == "linux":
-        kinds = ["egl", "glfw"] if has_display() else ["egl"]
+        screen = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+        kinds = ["egl", "glfw"] if screen else ["egl"]
     else:
         kinds = ["cgl", "glfw"] if sys.platform == "darwin" else ["glfw"]
     failures = []

@@ -1,4 +1,4 @@
-"""Arrays by name and from files: mirror images, several animals, heads, mistakes."""
+"""Arrays by name and from files: mirror images, several animals, mistakes."""
 
 import subprocess
 import sys
@@ -12,15 +12,13 @@ pytest.importorskip("mujoco")
 pytest.importorskip("trimesh")
 
 import mujoco
-import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError
-from tactile_rt.sim_backend.arrays import head as head_module
+from tactile_rt.sim_backend.arrays import files as files_module
 from tactile_rt.sim_backend.arrays.files import load_animals, load_array, read_animals
-from tactile_rt.sim_backend.arrays.head import HEAD_BIT, add_head
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers, rat_whiskers
 from tactile_rt.sim_backend.arrays.whisker_array import (
     MOUNT,
@@ -34,11 +32,9 @@ from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.world import (
     CHANNELS,
     PROFILES,
-    WHISKER_BIT,
     add_whiskers,
     array_spec,
     empty_world,
-    quaternion,
     read_base_loads,
     set_damping,
 )
@@ -182,7 +178,7 @@ def test_both_sides_make_a_face() -> None:
 
 def test_animals_in_one_world_have_names_and_cells_of_their_own() -> None:
     there = Mount((0.0, 60.0, 0.0), (0.0, 0.0, np.pi))
-    first, second = place([load_array("mouse-both"), load_array("rat")], [MOUNT, there])
+    first, second = place([load_array("mouse-both"), replace(load_array("rat"), mount=there)])
     assert (first.name, second.name) == ("1.mouse-both", "2.rat-right")
     assert first.whiskers[0].name == "1.R.A0" and second.whiskers[0].name == "2.A0"
     assert (first.mount, second.mount) == (MOUNT, there)
@@ -197,8 +193,6 @@ def test_animals_are_not_put_in_the_same_place() -> None:
     mouse = load_array("mouse")
     with pytest.raises(ConfigError, match=r"animal 2 \(mouse-right\) stands in another"):
         place([mouse, mouse])
-    with pytest.raises(ConfigError, match="1 mounts for 2 animals"):
-        place([mouse, mouse], [MOUNT])
     with pytest.raises(ConfigError, match="must be finite"):
         Mount((0.0, np.nan, 0.0), (0.0, 0.0, 0.0))
 
@@ -219,7 +213,7 @@ def test_an_array_holds_each_whisker_once() -> None:
 def test_the_example_is_the_same_array_in_both_formats() -> None:
     toml, table = (load_array(str(EXAMPLES / f"robot.{kind}")) for kind in ("toml", "csv"))
     assert toml == table
-    assert (toml.name, len(toml.whiskers), toml.head) == ("robot", 8, None)
+    assert (toml.name, len(toml.whiskers)) == ("robot", 8)
     assert {(w.row, w.column) for w in toml.whiskers} == {(r, c) for r in (0, 1) for c in range(4)}
     for w in toml.whiskers:
         assert (w.curvature, w.base_radius, w.tip_radius) == (0.0, 0.06, 0.06)
@@ -233,7 +227,7 @@ def test_the_example_is_the_same_array_in_both_formats() -> None:
 
 
 def test_the_mouses_own_table_is_the_mouse() -> None:
-    table = Path(head_module.__file__).parent / "data" / "mouse.csv"
+    table = Path(files_module.__file__).parent / "data" / "mouse.csv"
     assert load_array(str(table)).whiskers == mouse_whiskers()
 
 
@@ -314,21 +308,17 @@ def test_a_mistake_in_a_table_is_one_line(tmp_path: Path, text: str, said: str) 
     assert "\n" not in str(caught.value) and str(caught.value).startswith(str(path))
 
 
-def test_a_toml_array_has_a_mount_a_head_and_defaults(tmp_path: Path) -> None:
-    write(tmp_path, "skull.stl", "solid\nendsolid\n")
-    top = (
-        'name = "bot"\nhead = "skull.stl"\n'
-        "mount = { position_mm = [1, 2, 3.5], roll_pitch_yaw_rad = [0, 0.1, 0] }\n"
-    )
+def test_a_toml_array_has_a_mount_and_defaults(tmp_path: Path) -> None:
+    top = 'name = "bot"\nmount = { position_mm = [1, 2, 3.5], roll_pitch_yaw_rad = [0, 0.1, 0] }\n'
     text = top + DEFAULTS + WHISKERS.replace("= 30", "= 30\nfriction = 0.1\nbase_y_mm = 9")
     array = load_array(str(write(tmp_path, "a.toml", text)))
-    assert (array.name, array.head) == ("bot", tmp_path / "skull.stl")
+    assert array.name == "bot"
     assert array.mount == Mount((1.0, 2.0, 3.5), (0.0, 0.1, 0.0))
     a0, a1 = array.whiskers
     assert (a0.base, a0.friction) == ((0.0, 1.0, 2.5), 0.5)
     assert (a1.base, a1.friction) == ((0.0, 9.0, 2.5), 0.1)
     plain = load_array(str(write(tmp_path, "b.toml", DEFAULTS + WHISKERS)))
-    assert (plain.name, plain.head) == ("b", None)
+    assert plain.name == "b"
     assert plain.mount.position == (0.0, -1.0, -2.5)  # its middle at the origin
     two = load_array(str(write(tmp_path, "c.toml", "mirror = true\n" + DEFAULTS + WHISKERS)))
     assert two == both_sides(replace(plain, name="c"), "c")
@@ -356,8 +346,6 @@ def test_a_toml_array_has_a_mount_a_head_and_defaults(tmp_path: Path) -> None:
             r"a.toml: mount.roll_pitch_yaw_rad must be within a turn, 6.28, not -90: mind the unit",
         ),
         ("name = 3" + DEFAULTS + WHISKERS, r"name: expected text, got 3"),
-        ("head = 'x.glb'" + DEFAULTS + WHISKERS, "head 'x.glb' must be one of .obj, .ply, .stl"),
-        ("head = 'x.stl'" + DEFAULTS + WHISKERS, "head 'x.stl': no such file"),
         (DEFAULTS + "densty = 3\n" + WHISKERS, "a.toml:11: defaults has no key 'densty'"),
         (DEFAULTS + WHISKERS + "frction = 3", r"a.toml:22: whisker\[1\] has no key .* friction\?"),
         (WHISKERS, r"whisker\[0\] \(A0\): no curvature_a_per_mm"),
@@ -442,72 +430,6 @@ def test_arrays_come_without_a_simulator() -> None:
         "sys.exit(bool({'mujoco', 'trimesh', 'torch'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
-
-
-# Heads
-
-
-def skull(folder: Path, name: str = "skull.stl", scale: float = 1.0, cut: bool = False) -> Path:
-    """A box from (1, 2, 3) to (11, 22, 33) mm, or all but one of its triangles."""
-    mesh = trimesh.creation.box(bounds=[[1, 2, 3], [11, 22, 33]])
-    mesh.apply_scale(scale)
-    if cut:
-        mesh.update_faces(np.arange(len(mesh.faces)) > 0)
-    mesh.export(folder / name)
-    return folder / name
-
-
-@pytest.mark.parametrize("name", ["skull.stl", "skull.obj", "skull.ply"])
-@pytest.mark.parametrize("cut", [False, True])
-def test_a_head_is_drawn_where_its_file_has_it(tmp_path: Path, name: str, cut: bool) -> None:
-    world = mujoco.MjSpec()
-    turn = Mount((5.0, 0.0, -7.0), (0.3, -0.2, 0.9))
-    body = world.worldbody.add_body(name="head", pos=turn.position, quat=quaternion(turn.rotation))
-    add_head(world, body, skull(tmp_path, name, cut=cut))
-    model = world.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    seen = data.geom_xpos[0] + model.mesh_vert @ data.geom_xmat[0].reshape(3, 3).T
-    seen = (seen - turn.position) @ turn.rotation  # back into the head's frame
-    np.testing.assert_allclose(seen.min(axis=0), [1, 2, 3], atol=1e-5)
-    np.testing.assert_allclose(seen.max(axis=0), [11, 22, 33], atol=1e-5)
-    assert model.geom_contype[0] == model.geom_conaffinity[0] == 0
-    assert model.body_mass.sum() == 0
-
-
-@pytest.mark.parametrize(("collide", "contacts"), [(False, False), (True, True)])
-def test_a_head_is_felt_only_if_asked(tmp_path: Path, collide: bool, contacts: bool) -> None:
-    world = mujoco.MjSpec()
-    body = world.worldbody.add_body(name="head")
-    add_head(world, body, skull(tmp_path), collide=collide)
-    other = world.worldbody.add_body(pos=(0.5, 12, 18))
-    other.add_freejoint()
-    other.add_geom(size=(1, 0, 0), contype=WHISKER_BIT, conaffinity=0)
-    model = world.compile()
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    assert (data.ncon > 0) == contacts
-    assert head_module.WHISKER_BIT == WHISKER_BIT
-    assert collide == (HEAD_BIT in model.geom_contype)
-
-
-def test_a_head_that_cannot_be_used_is_named(tmp_path: Path) -> None:
-    write(tmp_path, "text.stl", "not a mesh")
-    write(tmp_path, "empty.obj", "# nothing\n")
-    write(tmp_path, "void.stl", "")
-    skull(tmp_path, "metres.stl", 1e-3)
-    for name, said in (
-        ("none.stl", "no such file"),
-        ("skull.glb", "a head is one of .obj, .ply, .stl"),
-        ("text.stl", "cannot be read|no triangles"),
-        ("empty.obj", "cannot be read|no triangles"),
-        ("void.stl", "cannot be read|no triangles"),
-        ("metres.stl", "is 0.03 mm large; export it in mm"),
-    ):
-        world = mujoco.MjSpec()
-        with pytest.raises(ConfigError, match=f"{name}: .*({said})") as caught:
-            add_head(world, world.worldbody.add_body(name="head"), tmp_path / name)
-        assert "\n" not in str(caught.value)
 
 
 # Streams
