@@ -162,7 +162,6 @@ class SensorSpec:
     """The sensor of every whisker of an array.
 
     Attributes:
-        channels: The channels, in the order of a sample.
         rate_hz: The sample rate of the device, Hz.
         bandwidth_hz: The corner frequency of its first-order low-pass, Hz; 0: it has none.
         latency_ms: The time from a sample to its receipt by the host, ms.
@@ -263,7 +262,6 @@ def channel_limits(
     """What a network may believe of each channel.
 
     Args:
-        spec: the array.
         sensor: what it is read by; None: by one that is as quiet as a mouse's whiskers need.
         period_ns: of the network's samples; the noise of a sensor that samples faster is averaged
             by the resampler.

@@ -14,7 +14,6 @@ from tactile_rt.settings import (
     make_node,
     nearest,
     no_such,
-    parse_options,
     parse_toml,
     read_csv,
     read_toml,
@@ -60,12 +59,12 @@ def test_each_takes_what_it_knows():
     ],
 )
 def test_a_mistake_is_named(fields, said):
-    assert refusal(parse_options, "sensor", fields, Line).startswith(said)
+    assert refusal(take_options, "sensor", fields, Line).startswith(said)
 
 
 @pytest.mark.parametrize("text", ["nan", "-inf", "1e999"])
 def test_what_is_no_quantity_is_refused_in_text_and_in_toml(text):
-    assert refusal(parse_options, "sensor", {"scale": text}, Device) == (
+    assert refusal(take_options, "sensor", {"scale": text}, Device) == (
         f"sensor: scale: {float(text)} is no quantity"
     )
     if text != "1e999":

@@ -15,7 +15,6 @@ class CalibratedSource(Source):
 
     Args:
         source: of raw samples; closed with this one.
-        calibration: for its device.
 
     Raises:
         SpecMismatch: it is for another array.
@@ -64,10 +63,6 @@ def declare(source: Source, array: ArraySpec) -> Source:
 
 
 def declared(spec: ArraySpec, array: ArraySpec) -> Calibration:
-    """What makes the samples of one array those of another.
-
-    Raises:
-        SpecMismatch: as `declare`.
-    """
+    """What makes the samples of one array those of another."""
     device = re.sub(r"[^\w.:+-]+", "-", spec.name, flags=re.ASCII).strip(".-") or "device"
     return replace(Calibration.of(device, spec), array=array)

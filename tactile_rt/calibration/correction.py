@@ -34,8 +34,6 @@ class Calibration:
 
     Attributes:
         device: Id of the device, which names the file: letters, digits, and ``_ . : + -``.
-        elements: Names of the elements that the device sends.
-        channels: Names of the channels that the device sends.
         units: Units of the raw channels, which may be counts (``1``).
         output_channels: Names of the channels that come out; empty for the raw ones.
         output_units: Units of the channels that come out; empty for the raw ones.
@@ -73,11 +71,7 @@ class Calibration:
 
     @classmethod
     def of(cls, device: str, spec: ArraySpec) -> "Calibration":
-        """One that changes nothing yet, of this device.
-
-        Raises:
-            ConfigError: no id that could name a file.
-        """
+        """One that changes nothing yet, of this device."""
         return cls(device, spec.elements, spec.channels, spec.units)
 
     def __post_init__(self) -> None:
@@ -255,11 +249,7 @@ class Calibration:
         )
 
     def noted(self, line: str, **changes: Any) -> "Calibration":
-        """This one with other attributes, and a line more of history.
-
-        Raises:
-            ConfigError: the changes do not fit.
-        """
+        """This one with other attributes, and a line more of history."""
         return replace(self, history=(*self.history, line)[-HISTORY:], **changes)
 
 
@@ -282,11 +272,7 @@ class _Plan:
 
 
 def check_device(device: str) -> None:
-    """Refuse an id that could not name a file.
-
-    Raises:
-        ConfigError: it has other characters, or begins with a dot.
-    """
+    """Refuse an id that could not name a file."""
     if not DEVICE.fullmatch(device):
         raise ConfigError(f"device id {device!r}: use letters, digits, '_', '.', ':', '+' and '-'")
 

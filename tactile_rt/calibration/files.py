@@ -59,11 +59,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def calibration_path(device: str) -> Path:
-    """Where the calibration of a device is kept unless one says otherwise.
-
-    Raises:
-        ConfigError: no id that could name a file.
-    """
+    """Where the calibration of a device is kept unless one says otherwise."""
     check_device(device)
     return _folder() / f"{device}.toml"
 
@@ -73,9 +69,6 @@ def load_calibration(which: str | Path) -> Calibration:
 
     Args:
         which: a path if it ends in ``.toml`` or has a folder in it; else a device's id.
-
-    Raises:
-        ConfigError: there is none, or what is wrong with it: file, key, sizes.
     """
     named = str(which)
     path = Path(which)
@@ -92,12 +85,8 @@ def load_calibration(which: str | Path) -> Calibration:
 def save_calibration(calibration: Calibration, path: Path | None = None) -> Path:
     """Write it where `load_calibration` finds it, or to a file of your own.
 
-    Returns:
-        The file.
-
     Raises:
         ConfigError: the folder of `path` is not there.
-        OSError: it cannot be written.
     """
     if path is None:
         path = calibration_path(calibration.device)

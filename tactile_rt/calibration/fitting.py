@@ -25,7 +25,6 @@ class Fit:
     """A matrix and how well it does.
 
     Attributes:
-        axes: Names of the axes of the known loads.
         matrix: (axis, channel) load per raw unit.
         tare: (channel,) raw reading at no load.
         residuals: (row, axis) known load minus fitted load, N and N m.
@@ -64,7 +63,6 @@ def calibrate(
     Args:
         raw: (row, channel) readings.
         loads: (row, axis) known loads, N and N m.
-        axes: names of the loads.
         channels: names of the readings, for messages; empty: numbers from 0.
 
     Raises:

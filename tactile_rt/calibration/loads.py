@@ -51,11 +51,7 @@ class LoadTable:
 
 
 def read_loads(path: Path) -> LoadTable:
-    """Read a table of loads.
-
-    Raises:
-        ConfigError: one line that names the file, the line, the column, and what to do.
-    """
+    """Read a table of loads."""
     table = read_csv(path)
     if not table.rows:
         raise ConfigError(f"{path}: needs a line of column names, and lines of loads")
@@ -88,8 +84,6 @@ def raw_readings(
     Args:
         table: with times.
         recorded: of raw samples; the table's second 0 is its first sample's.
-        spec: what they are samples of.
-        element: of it.
 
     Raises:
         ConfigError: no such element, or no valid sample in one of the ranges (which line).

@@ -33,9 +33,6 @@ class Mirror:
             of their curvature; where elements have the mount's axes, the same as `axis`.
         signs: Factor 1 or -1 by output channel, where its name and unit do not tell (an angle, a
             count).
-
-    Raises:
-        ConfigError: no such axis, or a sign that is none.
     """
 
     axis: str = "x"

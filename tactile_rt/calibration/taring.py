@@ -36,7 +36,6 @@ class Tare:
     """What a quiet array reads.
 
     Attributes:
-        spec: The raw array, as the device describes it.
         offset: (element, channel) median, raw units; 0 of an element without enough valid samples.
         noise: (element, channel) standard deviation of a sample, raw units; 0 likewise.
         samples: (element,) valid samples that these rest on.

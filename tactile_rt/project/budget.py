@@ -83,12 +83,7 @@ def write_budget(project: Project, budget: Budget) -> None:
 
 
 def budget_sweeps(project: Project, seconds: float) -> Budget:
-    """Time some sweeps, and decide how many fit.
-
-    Args:
-        project: which.
-        seconds: given for all that is made.
-    """
+    """Time some sweeps, and decide how many fit."""
     recipe = project.recipe()
     each_s = _time_of_a_sweep(recipe)
     cores = 1 + AT_ONCE * ((os.cpu_count() or 1) - 1)

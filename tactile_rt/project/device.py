@@ -21,7 +21,6 @@ class DeviceFit(msgspec.Struct, frozen=True):
     """What `tactile-rt array fit` told, in words.
 
     Attributes:
-        recording: The recording that was measured.
         when: The UTC time of the measurement, ISO 8601.
         since: What has become of the array's file.
         rows: The name of each quantity, its unit, the value described, that measured, their ratio.
@@ -39,9 +38,6 @@ def keep_fit(array: Path, recording: str, findings: Sequence[ArrayFinding], chan
     """Write ``fit.json`` beside the array's file, if that is a project's.
 
     Args:
-        array: the array's file.
-        recording: what was measured.
-        findings: what was found.
         changed: whether the array's file is brought to that.
     """
     try:
@@ -61,11 +57,7 @@ def keep_fit(array: Path, recording: str, findings: Sequence[ArrayFinding], chan
 
 
 def read_fit(project: Project) -> DeviceFit | None:
-    """What was measured of a project's device; None: nothing was.
-
-    Raises:
-        ConfigError: the file is damaged.
-    """
+    """What was measured of a project's device; None: nothing was."""
     if not project.fit.exists():
         return None
     try:

@@ -61,8 +61,6 @@ class DeviceLine:
     Attributes:
         wire: The kind of line, ``serial`` or ``can``.
         port: The serial port, or INTERFACE:CHANNEL of a bus.
-        codec: The name of the codec that the device speaks.
-        options: The options of the codec.
     """
 
     wire: str
@@ -73,14 +71,7 @@ class DeviceLine:
 
 @dataclass(frozen=True)
 class Project:
-    """A project's folder.
-
-    Attributes:
-        folder: The path of the project's folder.
-
-    Raises:
-        ConfigError: there is no such folder, or a file of it is missing.
-    """
+    """A project's folder."""
 
     folder: Path
 
@@ -120,11 +111,7 @@ class Project:
         return self.folder / "fit.json"
 
     def recipe(self) -> SweepRecipe:
-        """What is to be swept past the array; its numbers of objects and sweeps are the most.
-
-        Raises:
-            ConfigError: a mistake in the file.
-        """
+        """What is to be swept past the array; its numbers of objects and sweeps are the most."""
         recipe = read_recipe(str(self.folder / "sweeps.toml"), self.folder)
         if Path(recipe.array).resolve() != self.array.resolve():
             raise ConfigError(f'{self.folder / "sweeps.toml"}: array must be "array.toml"')
@@ -190,9 +177,6 @@ class Project:
         Args:
             codec: instead of that of robot.toml.
             options: instead of those of robot.toml, or beside them.
-
-        Raises:
-            ConfigError: robot.toml has a mistake, or its source is no device.
         """
         line = self.line()
         codec = codec or line.codec
@@ -204,10 +188,8 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
     """Begin a project in a new or an empty folder.
 
     Args:
-        folder: where.
         array: the name of an array, or a .toml file; a file or a robot's is copied. Empty: eight
             nylon whiskers on a plate, to be changed into one's own.
-        kinds: the categories of objects that it is to tell apart.
 
     Raises:
         ConfigError: the folder holds something, no such array or category, or an array that is

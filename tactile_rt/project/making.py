@@ -48,7 +48,6 @@ class MakeProgress:
     """How far a project is.
 
     Attributes:
-        name: The name of what is being made.
         done, of: The amount of it that is there, and the amount that is to be.
         left_s: The time that everything still takes, s.
     """
@@ -70,16 +69,8 @@ def make(project: Project, minutes: float, tell: Tell = lambda _: None) -> list[
     """Make a project's model within a time, or go on with what was begun.
 
     Args:
-        project: which.
         minutes: for everything, from now on. A little time makes a smaller set and a shorter
             training, and so a worse model, but a model.
-        tell: is told of every step.
-
-    Returns:
-        The figures of the report.
-
-    Raises:
-        ConfigError: too little time, or a mistake in one of the project's files.
     """
     if not minutes >= LEAST_MINUTES:
         raise ConfigError(f"--minutes must be at least {LEAST_MINUTES:g}, not {minutes:g}")

@@ -36,16 +36,7 @@ CONFUSED = 0.05  # share of a kind's sweeps that are taken for another: more is 
 
 
 def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> Path:
-    """Write ``report/report.html`` and the pictures on it.
-
-    Args:
-        project: whose.
-        sweeps: the set that the model is tested on.
-        records: the figures of `evaluate_model`, whose pictures are there already.
-
-    Returns:
-        The page.
-    """
+    """Write ``report/report.html`` and the pictures on it."""
     session, card = load_model(project.model)
     test = SweepSet.read(sweeps, "test")
     run = stepped(session, card)
@@ -90,7 +81,6 @@ def confused(
 
     Args:
         table: (true, decided) counts.
-        labels: of the classes.
         share: the least that is told.
     """
     shares = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
@@ -116,7 +106,6 @@ def draw_over_time(
         labels: (sweep,).
         objects: (sweep,) names.
         step_ms: the time that a step takes, ms.
-        path: the picture.
     """
     figure = Figure(figsize=(7.2, 3.8), layout="constrained")
     axes = figure.subplots()
@@ -150,11 +139,7 @@ def _rows(records: Sequence[tuple[Record, str]]) -> str:
 
 
 def device_section(project: Project) -> str:
-    """How far the device is from its description, HTML; empty where nobody has measured it.
-
-    Raises:
-        ConfigError: what was measured cannot be read.
-    """
+    """How far the device is from its description, HTML; empty where nobody has measured it."""
     fit = read_fit(project)
     if fit is None:
         return ""

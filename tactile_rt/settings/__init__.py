@@ -27,7 +27,6 @@ from tactile_rt.settings.tree import (
 from tactile_rt.settings.written import (
     CsvTable,
     check_columns,
-    parse_options,
     read_csv,
     set_key,
     set_keys,
@@ -47,7 +46,6 @@ __all__ = [
     "named",
     "nearest",
     "no_such",
-    "parse_options",
     "parse_toml",
     "read_csv",
     "read_text",

@@ -1,8 +1,7 @@
 """What was written, as a tree in which every value knows the file and the line that it came from.
 
-`tomllib` tells values but not where they stand, so the lines are found beside it: `find_lines`
-reads the text a second time, line by line. It looks at no values, only at headers, keys, and
-whether a line ends within a string or within brackets; the document is known to be valid by then.
+`tomllib` tells values but not where they stand, so the lines are found beside it: `find_lines` has
+it read a valid document a second time, statement by statement.
 """
 
 import os
@@ -27,7 +26,12 @@ __all__ = [
 ]
 
 LARGEST = 1 << 26  # bytes of a file that people write, or have a program write for them
-BARE = re.compile(r"[A-Za-z0-9_-]+")
+# Strings and comments, in which a bracket or a line's end means nothing; and what ends a statement.
+TOKEN = re.compile(
+    r'"""(?:\\.|[^\\])*?"""(?!")|"(?:\\.|[^"\\])*"'
+    r"|'''.*?'''(?!')|'[^']*'|#[^\n]*|[][{}\n]",
+    re.DOTALL,
+)
 INT64 = 2**63
 
 
@@ -95,7 +99,6 @@ def read_text(path: Path, largest: int = LARGEST) -> str:
     """The text of a file that a user names, without a byte order mark.
 
     Args:
-        path: of the file.
         largest: number of bytes that it may have.
 
     Raises:
@@ -120,15 +123,7 @@ def read_text(path: Path, largest: int = LARGEST) -> str:
 
 
 def read_toml(path: Path, largest: int = LARGEST) -> SettingNode:
-    """Read a TOML file.
-
-    Args:
-        path: of the file.
-        largest: number of bytes that it may have.
-
-    Raises:
-        ConfigError: as `read_text` and `parse_toml`.
-    """
+    """Read a TOML file."""
     folder = Path(os.path.abspath(path)).parent
     return parse_toml(read_text(path, largest), str(path), folder)
 
@@ -137,8 +132,6 @@ def parse_toml(text: str, where: str, folder: Path = Path()) -> SettingNode:
     """A TOML document as a tree.
 
     Args:
-        text: the document.
-        where: it comes from, for messages.
         folder: what relative paths in it are meant from.
 
     Raises:
@@ -197,114 +190,36 @@ def _syntax(path: str, message: str, text: str) -> str:
 
 
 def find_lines(text: str) -> dict[tuple[str | int, ...], int]:
-    """Line of every key and header of a valid TOML document, by path; values in brackets have the
-    line of the key before them."""
+    """Find the line of every key and header of a valid TOML document, by path.
+
+    Values in brackets have the line of the key before them.
+    """
+    text += "\n"
     lines: dict[tuple[str | int, ...], int] = {}
     counts: dict[tuple[str | int, ...], int] = {}
     table: tuple[str | int, ...] = ()
-    state = _Within()
-    for number, line in enumerate(text.split("\n"), 1):
-        if state.open:
-            state.scan(line)
+    begin, depth, next_line = 0, 0, 1
+    for token in TOKEN.finditer(text):
+        depth += (token[0] in "[{") - (token[0] in "]}")
+        if token[0] != "\n" or depth:
             continue
-        bare = line.strip()
-        if not bare or bare.startswith("#"):
-            continue
-        if bare.startswith("["):
-            several = bare.startswith("[[")
-            keys, _ = _keys(bare[2 if several else 1 :])
-            table = _resolve((), keys[:-1], counts)
-            table = (*table, keys[-1]) if keys else table
-            if several:
+        statement, line = text[begin : token.end()], next_line
+        begin, next_line = token.end(), line + statement.count("\n")
+        keys, below = list[str](), tomllib.loads(statement)
+        while isinstance(below, dict) and len(below) == 1:
+            ((key, below),) = below.items()
+            keys.append(key)
+        if statement.lstrip().startswith("["):
+            table = ()
+            for key in keys:
+                table = (*table, counts[table]) if table in counts else table
+                table = (*table, key)
+            if isinstance(below, list):  # [[one of several]]
                 counts[table] = counts.get(table, -1) + 1
-                lines.setdefault(table, number)
+                lines.setdefault(table, line)
                 table = (*table, counts[table])
-            elif table in counts:
-                table = (*table, counts[table])
-            lines.setdefault(table, number)
-            continue
-        keys, rest = _keys(bare)
-        for n in range(1, len(keys) + 1):
-            lines.setdefault((*table, *keys[:n]), number)
-        state.scan(rest)
+            lines.setdefault(table, line)
+        else:
+            for n in range(1, len(keys) + 1):
+                lines.setdefault((*table, *keys[:n]), line)
     return lines
-
-
-def _resolve(
-    path: tuple[str | int, ...], keys: list[str], counts: dict[tuple[str | int, ...], int]
-) -> tuple[str | int, ...]:
-    for key in keys:
-        path = (*path, key)
-        if path in counts:
-            path = (*path, counts[path])
-    return path
-
-
-def _keys(text: str) -> tuple[list[str], str]:
-    """A dotted key at the beginning of a text, and what follows it."""
-    keys: list[str] = []
-    while True:
-        text = text.lstrip()
-        if text[:1] in ('"', "'"):
-            end = _string_end(text, 1, text[0])
-            try:
-                keys.append(str(tomllib.loads(f"k = {text[:end]}")["k"]))
-            except tomllib.TOMLDecodeError:
-                keys.append(text[1 : end - 1])
-            text = text[end:]
-        else:
-            found = BARE.match(text)
-            if not found:
-                return keys, text
-            keys.append(found[0])
-            text = text[found.end() :]
-        text = text.lstrip()
-        if not text.startswith("."):
-            return keys, text
-        text = text[1:]
-
-
-def _string_end(text: str, at: int, quote: str) -> int:
-    """Where a string that began before `at` ends; the text's end if it does not."""
-    while at < len(text):
-        if quote[0] == '"' and text[at] == "\\":
-            at += 2
-        elif text.startswith(quote, at):
-            return at + len(quote)
-        else:
-            at += 1
-    return len(text) + 1
-
-
-class _Within:
-    """Whether a line ends within brackets or a string of several lines."""
-
-    def __init__(self) -> None:
-        self._depth, self._quote = 0, ""
-
-    @property
-    def open(self) -> bool:
-        return bool(self._depth or self._quote)
-
-    def scan(self, text: str) -> None:
-        at = 0
-        if self._quote:
-            at = _string_end(text, 0, self._quote)
-            if at > len(text):
-                return
-            self._quote = ""
-        while at < len(text):
-            c = text[at]
-            if c == "#":
-                return
-            if c in "[{":
-                self._depth += 1
-            elif c in "]}":
-                self._depth = max(0, self._depth - 1)
-            elif c in "\"'":
-                quote = 3 * c if text.startswith(3 * c, at) else c
-                at = _string_end(text, at + len(quote), quote)
-                if at > len(text) and len(quote) == 3:
-                    self._quote = quote
-                continue
-            at += 1

@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from tactile_rt.errors import ConfigError
@@ -15,7 +15,6 @@ from tactile_rt.settings.tree import SettingNode, make_node, named, plain_value,
 __all__ = [
     "CsvTable",
     "check_columns",
-    "parse_options",
     "read_csv",
     "set_key",
     "set_keys",
@@ -23,8 +22,6 @@ __all__ = [
     "take_options",
     "take_sets",
 ]
-
-T = TypeVar("T")
 
 LONGEST_URL = 4096  # characters
 NAMES = ("name", "kind")  # keys that an item of a list goes by
@@ -83,11 +80,7 @@ def set_keys(
     Args:
         nodes: the tree; it is changed.
         sets: ``a.b=value`` each; of the same key twice the last holds.
-        kind: the struct or dataclass that the tree is to be.
         known: its keys that may be set; None: all.
-
-    Raises:
-        ConfigError: not of that form, or no such key.
     """
     known = list(types_of(kind)) if known is None else known
     for text in sets:
@@ -108,12 +101,7 @@ def take_sets(
 
     Args:
         what: whose they are, for the message of values that do not go together.
-        sets: ``key=value`` each.
-        kinds: dataclasses of the settings.
         usual: values where nothing is set, beside the dataclasses' own.
-
-    Raises:
-        ConfigError: not of that form, a key that none knows, or a value that cannot be.
     """
     known = {name: kind for kind in kinds for name in types_of(kind)}
     made = []
@@ -169,28 +157,12 @@ def split_url(url: str) -> tuple[str, str, dict[str, str]]:
     return parts.scheme, unquote(parts.netloc + parts.path), fields
 
 
-def parse_options(what: str, fields: Mapping[str, str], kind: type[T]) -> T:
-    """All options as one dataclass.
-
-    Args:
-        what: whose options they are, for the message.
-        fields: as written.
-        kind: dataclass of the options.
-
-    Raises:
-        ConfigError: unknown or ill-typed option.
-    """
-    (made,) = take_options(what, fields, kind)
-    return made  # type: ignore[no-any-return]
-
-
 def take_options(what: str, fields: Mapping[str, str], *kinds: type[Any]) -> tuple[Any, ...]:
     """The options shared out among dataclasses: each takes those that it knows.
 
     Args:
         what: whose options they are, for the message.
         fields: as written; numbers may be hexadecimal, as CAN identifiers are.
-        kinds: dataclasses of the options.
 
     Raises:
         ConfigError: an option that none knows, or ill-typed.
@@ -220,7 +192,6 @@ class CsvTable:
 
     Attributes:
         where: File and line of the column names, for messages.
-        columns: The column names, in their order.
         rows: A table for each row, which has the text of each cell by its column.
     """
 
@@ -267,11 +238,7 @@ def _cells(line: str, where: str) -> list[str]:
 
 
 def check_columns(table: CsvTable, known: Sequence[str], needed: Sequence[str] = ()) -> None:
-    """Refuse a column that is not known, and the lack of one that is needed.
-
-    Raises:
-        ConfigError: there is one; names the nearest that is known.
-    """
+    """Refuse a column that is not known, and the lack of one that is needed."""
     for column in table.columns:
         if column not in known:
             raise ConfigError(f"{table.where}: no column {shown(column)}; {hint(column, known)}")

@@ -70,8 +70,6 @@ def way_to_contact(
     """How far pieces can move along -y before they meet a whisker at rest.
 
     Args:
-        whiskers: the array.
-        lines: their `centrelines`.
         pieces: convex, in the world, mm.
 
     Returns:
@@ -122,7 +120,6 @@ def within_reach(
     """Which pieces any whisker could touch at all, however it bends, while they move along y.
 
     Args:
-        lines: `centrelines` of the whiskers.
         lengths: of the whiskers, mm.
         pieces: convex, in the world, mm.
     """

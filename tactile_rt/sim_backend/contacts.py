@@ -26,7 +26,6 @@ class ContactProbe:
     Args:
         model: with the whiskers, and one object as mocap body.
         whiskers: those in the model, in the order in which they are to be reported.
-        profile: that they were built with.
     """
 
     def __init__(

@@ -50,10 +50,7 @@ def sweep_model(
     """The model of a sweep.
 
     Args:
-        animals: the arrays, on their mounts.
-        names: of the whiskers that are in it.
         pieces: convex, of the object, mm, about its place.
-        profile: how finely to cut the whiskers.
     """
     world = empty_world(profile)
     for animal in animals:
@@ -83,9 +80,6 @@ class MujocoWorld:
     """See `sweep_simulation.World`.
 
     Args:
-        model: a `sweep_model`.
-        whiskers: those in it.
-        profile: how finely it was cut.
         start: (3,) where the object is at first, mm.
     """
 

@@ -53,8 +53,6 @@ def strains(whiskers: Sequence[Whisker], links: int, angles: NDArray[np.float64]
     """The largest strain of each whisker at its surface: curvature times radius.
 
     Args:
-        whiskers: whose joints they are.
-        links: how many cells each is cut into.
         angles: (joint,) angles of all whiskers' hinges, one whisker after the other, rad.
     """
     found, first = [], 0

@@ -45,9 +45,6 @@ class Sensor:
     as no load.
 
     Args:
-        model: what is wrong with the sensor.
-        spec: the array that it belongs to.
-        seed: of everything that is drawn.
         described: what the array's description says of its sensor, which adds to the model; None:
             nothing.
         drawn: whether what the description says of noise, offset and drift counts; else only what

@@ -64,10 +64,6 @@ class PacedSource(Source):
     still for as long as it is behind and goes on from there: samples of the past help nobody. What
     a device would have measured meanwhile counts as dropped.
 
-    Args:
-        spec: what the samples are.
-        pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
-
     Attributes:
         live: Whether samples wait for nobody (real-time pace).
     """
@@ -84,9 +80,6 @@ class PacedSource(Source):
     @abc.abstractmethod
     def _simulate(self, start_ns: int) -> Chunk | None:
         """The next samples; None when all of them are dropped.
-
-        Args:
-            start_ns: when the stream began.
 
         Raises:
             EndOfStream: there are no more.
@@ -231,7 +224,6 @@ class SimSource(PacedSource):
     Args:
         array: which array, see `files.load_animals`: ``mouse`` (also if empty), ``rat-left``, a
             .csv or .toml file.
-        options: what it meets.
 
     Attributes:
         passes: The objects that have come by so far, in order.

@@ -100,11 +100,7 @@ class Surface:
         step_mm: tuple[float, float, float] = (1.0, 1.0, 0.0),
         radius_mm: float = 63.6,
     ) -> "Surface":
-        """One of `STIMULI`, its distance `step_mm` apart from the next.
-
-        Raises:
-            ConfigError: no such stimulus, or an impossible size.
-        """
+        """One of `STIMULI`, its distance `step_mm` apart from the next."""
         if name not in STIMULI:
             raise ConfigError(f"no stimulus {name!r}: there are {', '.join(STIMULI)}")
         shape, _, distance = name.partition("-")
@@ -232,10 +228,7 @@ def write_input(
 
     Args:
         path: ends in .npz; both files appear whole or not at all.
-        felt: what the array felt, by name of the stimulus.
-        spec: of the array.
         angles: (sample, element, 3) base angles theta, phi, zeta at 1 kHz, rad.
-        parameters: what else belongs into the .json.
 
     Raises:
         ConfigError: a stimulus is not touched, or for too short a time.

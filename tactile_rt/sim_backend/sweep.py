@@ -55,9 +55,6 @@ class Sweep:
         shake_g: The amplitude of the acceleration with which the head is shaken along (1, 1, 1), as
             a robot's that walks or flies, in multiples of the Earth's (9.80665 m/s^2).
         shake_hz: The frequency of that, Hz.
-
-    Raises:
-        ConfigError: a value that cannot be.
     """
 
     size_mm: float = 40.0
@@ -142,7 +139,6 @@ def draw_sweep(
     """Draw the parameters of one sweep: any yaw, a spread of heights, distances and speeds.
 
     Args:
-        rng: to draw from.
         distance_mm: about which distances spread, see `usual_distance`.
         chosen: parameters that are not drawn, by their names.
     """

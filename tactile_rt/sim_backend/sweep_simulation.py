@@ -70,9 +70,6 @@ class World(Protocol):
         Returns:
             (sample, whisker, 6) loads, N and N m, and (sample, whisker, 3) contacts, see
             `contacts.CONTACT_CHANNELS`.
-
-        Raises:
-            SourceError: the simulation has become unstable.
         """
 
 
@@ -86,9 +83,6 @@ class SweepSimulation:
         array: the whiskers; a tuple of arrays for several animals in one world
             (`whisker_array.place`). The object passes on the side to which most of the whiskers
             reach.
-        target: the object.
-        sweep: how it moves.
-        profile: how finely to simulate.
         whole: simulate everything all the same: the loads are those, and a picture is complete.
 
     Attributes:
@@ -187,15 +181,11 @@ class SweepSimulation:
         """As `advance`, and where each whisker touches.
 
         Args:
-            samples: as for `advance`.
             every: where looking costs as much as a step, look only at every so many samples, from
                 the first, and take what is seen to last until the next look.
 
         Returns:
             The loads, and (samples, element, 3) contacts, see `contacts.CONTACT_CHANNELS`.
-
-        Raises:
-            SourceError: as `advance`.
         """
         return self._advance(samples, every)
 
@@ -272,13 +262,7 @@ def draw_simulation(
     profile: Profile,
     draw: Callable[[np.random.Generator], Sweep] = draw_sweep,
 ) -> tuple[Sweep, SweepSimulation]:
-    """Draw sweeps until the object meets the array; give up, with a miss, after many tries.
-
-    Args:
-        rng: to draw from.
-        array, target, profile: see `SweepSimulation`.
-        draw: draws the parameters of one sweep.
-    """
+    """Draw sweeps until the object meets the array; give up, with a miss, after many tries."""
     for _ in range(DRAWS):
         sweep = draw(rng)
         simulation = SweepSimulation(array, target, sweep, profile)

@@ -68,9 +68,6 @@ class Whisk:
         column_lag_deg: The phase by which each column lags behind the one caudal to it, degrees.
         ramp_s: The time from rest until the whisking is whole, s.
         duration_s: The length of the whole trajectory, s.
-
-    Raises:
-        ConfigError: a value out of range.
     """
 
     frequency_hz: float = 8.0
@@ -178,9 +175,6 @@ def read_trajectory(path: Path, whiskers: tuple[Whisker, ...], ramp_s: float = 0
     protraction being rostral: ``theta_deg`` of all whiskers, ``theta_deg_C`` of a row,
     ``theta_deg_C2`` of one whisker; the most specific column counts. ``phi_deg`` and ``zeta_deg``
     likewise; without them elevation and torsion follow theta (Knutsen et al. 2008).
-
-    Raises:
-        ConfigError: what is wrong in which file, line and column.
     """
     columns, rows, lines = _read_table(path)
     if columns[0] != "time_s":

@@ -65,11 +65,7 @@ def sensor_of(animals: Sequence[WhiskerArray]) -> SensorSpec | None:
 
 
 def device_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
-    """Describe what the sensors of all arrays in one world deliver; without any, the base loads.
-
-    Raises:
-        ConfigError: as `sensor_of`.
-    """
+    """Describe what the sensors of all arrays in one world deliver; without any, the base loads."""
     spec, sensor = world_spec(animals), sensor_of(animals)
     if sensor is None:
         return spec
@@ -87,7 +83,6 @@ class Transducer:
     The result does not depend on how the samples were cut into chunks.
 
     Args:
-        sensor: what it is.
         elements: the names of the whiskers, in the order of the samples.
     """
 
@@ -165,7 +160,6 @@ def dipole_field(magnet: MagnetSpec, turns: Floats) -> Floats:
     """(..., 3) field, T, in the element's frame, of a magnet whose base is turned.
 
     Args:
-        magnet: where it is at rest.
         turns: (..., 2) turns of the base about the element's y and z, rad: a rotation vector.
     """
     axis = np.array(magnet.axis) / np.linalg.norm(magnet.axis)

@@ -47,9 +47,6 @@ class WhiskSimulation:
     """An array that whisks, alone or against an object that stands still.
 
     Args:
-        whiskers: the array.
-        trajectory: how the bases turn.
-        profile: how finely to simulate.
         pieces: (points, 3) corners of the convex pieces of an object, mm, in the world frame.
         mount: pose of the head frame in the world.
 
@@ -110,9 +107,6 @@ class WhiskSimulation:
             (samples, element, 6) base loads, N and N m, each the mean over its millisecond, in
             the element's own frame, which turns with its base; and (samples, element) whether it
             touched the object.
-
-        Raises:
-            SourceError: the simulation has become unstable.
         """
         samples = min(samples, self.samples - self._step // self._steps_per_sample)
         sensors = np.zeros((samples, self.model.nsensordata))

@@ -110,7 +110,6 @@ class WhiskingSource(PacedSource):
     Args:
         array: which array, see `files.load_array`: ``mouse`` (also if empty), ``rat-left``, a
             .csv or .toml file.
-        options: how it whisks, and against what.
 
     Attributes:
         commands: The pairs (first sample that it concerns, command), in order.

@@ -184,10 +184,7 @@ def add_whiskers(
     """Add an array to a world, with force and torque sensors at every whisker's base.
 
     Args:
-        world: what to add to.
         whiskers: the array; names of all whiskers in one world differ.
-        profile: how finely to cut them.
-        mount: pose of the head.
         head: name of the head's body, which is returned.
     """
     body = world.worldbody.add_body(name=head, pos=mount.position, quat=quaternion(mount.rotation))
@@ -264,7 +261,6 @@ def set_damping(model: mujoco.MjModel, whiskers: Iterable[Whisker] = ()) -> dict
     the whisker stays over-damped.
 
     Args:
-        model: the array, compiled.
         whiskers: where the damping ratios are from; of whiskers not among them, the published one.
 
     Returns:

@@ -20,7 +20,7 @@ from tactile_rt.classifier.array_file import read_array
 from tactile_rt.drivers.opening import Prepared
 from tactile_rt.errors import ConfigError, SpecMismatch
 from tactile_rt.extras import lacking
-from tactile_rt.settings import nearest, parse_options, split_url
+from tactile_rt.settings import nearest, split_url, take_options
 from tactile_rt.stream import ArraySpec, Source
 
 __all__ = ["SCHEMES", "check_model", "check_source", "is_made_up", "open_source"]
@@ -114,7 +114,7 @@ def _of_scheme(
     kind = getattr(made, "Options", None)
     if kind is None:
         return Prepared(None, partial(made, target, fields))
-    options = parse_options(f"{scheme}:{target}", fields, kind)
+    (options,) = take_options(f"{scheme}:{target}", fields, kind)
     spec = made.check(target, options) if check and hasattr(made, "check") else None
     return Prepared(spec, partial(made, target, options))
 

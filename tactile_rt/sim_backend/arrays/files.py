@@ -109,11 +109,7 @@ def load_array(name: str) -> WhiskerArray:
 
 
 def load_animals(name: str) -> tuple[WhiskerArray, ...]:
-    """The arrays that share one world: one by its name, or all that a .toml file places in it.
-
-    Raises:
-        ConfigError: no such array, or a file with a mistake.
-    """
+    """The arrays that share one world: one by its name, or all that a .toml file places in it."""
     path = Path(name)
     if path.suffix.lower() in ARRAY_FILES:
         return read_animals(path)
@@ -127,7 +123,6 @@ def read_animals(path: Path, text: str | None = None) -> tuple[WhiskerArray, ...
     """Read the array, or the several animals, of a .csv or .toml file.
 
     Args:
-        path: of the file.
         text: what is about to be written to it, of a .toml file; None: what is in it.
 
     Raises:

@@ -58,9 +58,6 @@ def species_array(name: str) -> WhiskerArray:
     sides stand on one head, mounted as for the right side alone. The rat's pose in the published
     sweeps is not known: its head is turned as the mouse's and placed so that the mean of its base
     points is where the mouse's is.
-
-    Raises:
-        ConfigError: no such array.
     """
     animal, _, side = name.partition("-")
     known = [*SPECIES, *(f"{a}-{s}" for a in SPECIES for s in SIDES)]

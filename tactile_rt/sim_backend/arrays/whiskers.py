@@ -97,9 +97,6 @@ class Whisker:
         mount_damping: The damping of that rotation, N m s / rad.
         strain_limit: The strain that the material bears without staying bent, 0.01 for 1 %; 0: not
             known, and nothing is said of it.
-
-    Raises:
-        ConfigError: a value that no whisker can have.
     """
 
     name: str
@@ -171,9 +168,6 @@ class Whisker:
 
         Rows are counted from 1 there, as in the field's tables. An optional value that is absent
         or empty is keratin's; a radius or density given for the base alone holds to the tip.
-
-        Raises:
-            ConfigError: a value is missing, not a number, or none that a whisker can have.
         """
         given = {k: v for k, v in values.items() if v is not None and v != ""}
         missing = [column for column in REQUIRED if column not in given]

@@ -76,7 +76,6 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
     simulation fails. Given the same seed and actions it is the same on every machine.
 
     Args:
-        task: ``classify`` or ``locate``.
         array: which array, see `files.load_array`.
         whiskers: the names of those of the array that there are; none: all.
         kinds: categories of objects, see `objects.catalogue`; a label is an index into them.
@@ -88,12 +87,8 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
         render_mode: ``rgb_array`` for pictures (extra ``view``).
 
     Attributes:
-        array_spec: The `ArraySpec` of the loads.
         reach_mm: The distance that a guess of 1 stands for, mm.
         speed_mm_s: The fastest that the head is told to go along an axis, mm/s.
-
-    Raises:
-        ConfigError: an argument that cannot be.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012 (as Gymnasium has it)
@@ -164,7 +159,6 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Stand another object there.
 
         Args:
-            seed: as Gymnasium has it.
             options: ``{"object": "mug-50"}`` names the object, of one of the kinds.
 
         Raises:

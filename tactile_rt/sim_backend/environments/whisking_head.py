@@ -42,8 +42,6 @@ class Placed:
     """An object beside an array, and where the head may go.
 
     Attributes:
-        name: The name of the object, ``mug-3``.
-        pieces: The convex pieces of the object, about its place.
         centre: The (3,) place of the object's centre in the world, mm.
         low, high: The (3,) corners of the box in which the head may move, from where it starts, mm.
     """
@@ -63,7 +61,6 @@ class Stretch:
         loads: The (sample, element, 6) base loads, N and N m, in the elements' frames, which turn.
         angle: The (sample,) protraction from rest, mean over the sample, rad, rostral positive.
         touching: The (sample, element) bool that tells which whiskers touched the object.
-        touches: The number of times that a whisker began to touch.
     """
 
     loads: Floats
@@ -90,8 +87,6 @@ def place_beside(
     """Stand an object ahead of an array, to the side to which its whiskers reach.
 
     Args:
-        array: the whiskers, on their head.
-        name: of the object, see `catalogue.load_object`.
         size_mm, yaw_deg, height_mm, distance_mm, gap_mm: as in `Sweep`.
 
     Returns:
@@ -128,9 +123,7 @@ class WhiskingHead:
 
     Args:
         array: the whiskers, on their head; it looks along +y of the world.
-        placed: the object, and where the head may go.
         profile: how finely to simulate; by `rods`, whatever the profile's engine.
-        whisking: the first command.
 
     Attributes:
         samples: The number of samples of 1 ms simulated so far.
@@ -193,7 +186,6 @@ class WhiskingHead:
         """Go and whisk for some samples of 1 ms.
 
         Args:
-            samples: how many.
             velocity_mm_s: (3,) commanded to the head, mm/s, in the world.
 
         Raises:

@@ -44,9 +44,6 @@ def compare_sensor(
     """Rate, and noise, resolution, drift and offset of every channel.
 
     Args:
-        sensor: as it is described.
-        rate: as it was measured, Hz.
-        rests: of the whiskers, by name.
         untouched: (channel,) readings at rest by whisker, as the description has them.
     """
     edits = change(("sensor", "rate_hz"), sensor.rate_hz, about(rate.value, SAME_RATE))

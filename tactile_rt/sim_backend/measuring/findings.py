@@ -35,7 +35,6 @@ class Figure(NamedTuple):
 
     Attributes:
         value: The best estimate; 0 where only a limit is known.
-        low: The lower end of the interval.
         high: The upper end of the interval, or the limit.
     """
 
@@ -65,8 +64,6 @@ class Edit(NamedTuple):
     Attributes:
         path: The place of the value in the file: tables by name, one of several by its number
             from 0, and the key, e.g. ``("sensor", "channel", 0, "drift")``.
-        value: The number.
-        why: What was measured, for a comment.
     """
 
     path: tuple[str | int, ...]

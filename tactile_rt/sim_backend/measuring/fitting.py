@@ -37,12 +37,7 @@ MEASURED = re.compile(r"(;\s*|#\s*)measured: .*")
 
 
 class Fitted(NamedTuple):
-    """An array's description beside a recording of the array.
-
-    Attributes:
-        findings: Everything that was compared.
-        text: The array's file, brought to what was measured.
-    """
+    """An array's description beside a recording of the array."""
 
     findings: list[ArrayFinding]
     text: str
@@ -50,10 +45,6 @@ class Fitted(NamedTuple):
 
 def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
     """The array of a file, if a recording can be compared with it.
-
-    Args:
-        path: of a .toml file.
-        spec: what the recording is of.
 
     Raises:
         ConfigError: no such file, a mistake in it, or it does not describe a sensor.
@@ -83,8 +74,6 @@ def fit_array(path: Path, spec: ArraySpec, recorded: Chunk) -> Fitted:
     """Measure an array, and bring its description to that; nothing is written.
 
     Args:
-        path: the array's .toml file.
-        spec: what the samples are of.
         recorded: all samples, of the array at rest and of its whiskers plucked.
 
     Raises:
@@ -218,11 +207,6 @@ def edit_text(path: Path, text: str, edits: Sequence[Edit]) -> str:
 
     A line is changed by its look, which TOML allows to mislead. So what has been written is read
     again, and refused unless it is the file with just these numbers changed.
-
-    Args:
-        path: of the file, for messages.
-        text: what is in it.
-        edits: the values, each with a comment that says what was measured.
 
     Raises:
         ConfigError: a value stands in the file in a way that this cannot change.

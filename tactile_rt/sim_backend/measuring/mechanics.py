@@ -53,9 +53,6 @@ def compare_whiskers(
     """Compare resonance and damping of every plucked whisker with its description.
 
     Args:
-        whiskers: as they are described.
-        rings: their free swings, by name.
-        rate_hz: of the samples.
         tables: of each whisker the number of its table in the array's file, and what is in it.
     """
     by_name = {w.name: w for w in whiskers}

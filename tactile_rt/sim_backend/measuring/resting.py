@@ -38,7 +38,6 @@ class Rest(NamedTuple):
         at_s: The (block,) middle times of the blocks at rest, s.
         levels: The (block, channel) mean readings of these blocks.
         noise: The (channel,) standard deviation of a sample about its level, rounding included.
-        size: The number of samples in a block.
         block_s: The duration of a block, s.
         step: The (channel,) step that readings are rounded to; 0: none is seen.
     """
@@ -92,7 +91,6 @@ def find_rest(values: NDArray[np.float32], rate_hz: float, bandwidth_hz: float) 
 
     Args:
         values: (n, channel) readings, nothing missing.
-        rate_hz: of them.
         bandwidth_hz: of the sensor's low-pass, whose noise is alike from sample to sample; 0: none.
     """
     step = np.array([rounding_step(of_channel) for of_channel in values.T])

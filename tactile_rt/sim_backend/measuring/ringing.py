@@ -40,7 +40,6 @@ class Ring(NamedTuple):
         hz: The natural frequency, Hz: that of the same whisker without damping.
         ratio: The damping ratio; 1 is critical.
         hz_error: The standard error of the frequency, Hz.
-        ratio_error: The standard error of the damping ratio.
     """
 
     hz: float
@@ -53,7 +52,6 @@ class Swing(NamedTuple):
     """A stretch in which a whisker is away from its rest.
 
     Attributes:
-        element: The index of the whisker.
         begin, end: The indices of the first sample, and of one a little after the last.
         size: The largest distance from rest, in standard deviations of the noise.
     """
@@ -69,7 +67,6 @@ def find_swings(away: Sequence[NDArray[np.float32]], rate_hz: float) -> list[Swi
 
     Args:
         away: (n, channel) of every whisker, distance from rest in standard deviations of the noise.
-        rate_hz: of the samples.
     """
     found, tail = [], round(APART_S / 4 * rate_hz)
     for element, values in enumerate(away):
@@ -98,7 +95,6 @@ def fit_ring(away: NDArray[np.float32], rate_hz: float) -> Ring | None:
 
     Args:
         away: (n, channel) distance from rest in standard deviations of the noise.
-        rate_hz: of the samples.
     """
     furthest = int(np.argmax((away**2).sum(axis=1)))
     side = away[furthest:] @ away[furthest]

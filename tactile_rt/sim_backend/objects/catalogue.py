@@ -107,7 +107,6 @@ def make_object(category: str, index: int) -> TactileObject:
 
     Args:
         category: "mug", say, or "varied-mug".
-        index: which.
 
     Raises:
         ConfigError: no such category, or a negative index.

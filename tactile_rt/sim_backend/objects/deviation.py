@@ -8,24 +8,58 @@ between the points, which are TILE apart, or farther on a surface of more than `
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import manifold3d
 import numpy as np
 import trimesh
 from manifold3d import Manifold
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tactile_rt.sim_backend.objects.manifolds import surface_of
-
 __all__ = [
     "FACES",
     "TILE",
     "Deviation",
     "TriangleSurface",
+    "bodies_of",
     "deviation",
+    "outer_solid",
     "shuffled",
     "some",
+    "surface_of",
     "tiles",
 ]
+
+
+def bodies_of(mesh: trimesh.Trimesh) -> list[Manifold]:
+    """Return the connected parts of a closed mesh, all wound outward, if its faces match.
+
+    Turning one that is wound inward fills it if it is a void, which nothing can touch, and puts it
+    right if it is a body.
+    """
+    arrays = manifold3d.Mesh64(np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.uint64))
+    return [b if b.volume() > 0 else _turn_outward(b) for b in Manifold(arrays).decompose()]
+
+
+def outer_solid(bodies: Sequence[Manifold]) -> Manifold:
+    """The union of bodies, without the voids between them."""
+    union = Manifold.batch_boolean(list(bodies), manifold3d.OpType.Add)
+    shells = [shell for shell in union.decompose() if shell.volume() > 0]
+    return Manifold.batch_boolean(shells, manifold3d.OpType.Add)
+
+
+def surface_of(solid: Manifold) -> trimesh.Trimesh:
+    """The solid's surface."""
+    arrays = solid.to_mesh64()
+    return trimesh.Trimesh(
+        arrays.vert_properties[:, :3].copy(), arrays.tri_verts.astype(np.int64), process=False
+    )
+
+
+def _turn_outward(body: Manifold) -> Manifold:
+    arrays = body.to_mesh64()
+    corners, faces = arrays.vert_properties[:, :3], arrays.tri_verts[:, ::-1]
+    return Manifold(manifold3d.Mesh64(corners.copy(), faces.copy()))
+
 
 Floats = NDArray[np.float64]
 

@@ -24,9 +24,6 @@ class MeshDetail:
             bounded.
         up: The axis of the file that points up, "y" or "z"; empty: as its format has it (y in
             glTF), else z.
-
-    Raises:
-        ConfigError: a value out of range.
     """
 
     surface_error_mm: float = 0.1

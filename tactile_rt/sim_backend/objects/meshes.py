@@ -4,16 +4,26 @@ A simulator fills every hollow of a mesh given to it whole. What a file becomes 
 object's `made_by`:
 
     bodies      its bodies as they are: all are convex
-    pieces      its solid bodies in convex pieces (see `solid_pieces`), to 0.1 mm of 40 mm if it can
-    plates      the same, and what encloses nothing as thin plates (see `sheet_pieces`)
+    pieces      its solid bodies in convex pieces (see `convex_parts`), to 0.1 mm of 40 mm if it can
+    plates      the same, and what encloses nothing as thin plates (see `convex_parts`)
     hull        its convex hull, as asked for
 
 How far the outside of the pieces is from the mesh, and the mesh from them, is measured every time
-and kept as the object's `surface_error`. Results are cached.
+and kept as the object's `surface_error`.
+
+Cutting a mesh takes seconds and reading pieces does not, so they are kept in $TACTILE_RT_CACHE,
+else $XDG_CACHE_HOME/tactile_rt/pieces, else ~/.cache/tactile_rt/pieces: one .npz each, named by a
+hash of all that they depend on. A file that is damaged counts as missing; a folder that cannot be
+written to is no error.
 """
 
+import contextlib
+import hashlib
 import logging
+import os
+import tempfile
 import time
+from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
@@ -21,24 +31,150 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from fast_simplification import simplify
 from manifold3d import Manifold
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.objects.deviation import TriangleSurface, deviation
-from tactile_rt.sim_backend.objects.manifolds import bodies_of, outer_solid, surface_of
+from tactile_rt.sim_backend.objects.convex_parts import SheetPieces, SolidPieces
+from tactile_rt.sim_backend.objects.deviation import (
+    TriangleSurface,
+    bodies_of,
+    deviation,
+    outer_solid,
+    some,
+    surface_of,
+)
 from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM, STANDARD, MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import (
     check_mesh_file,
     mesh_content,
     read_triangles,
 )
-from tactile_rt.sim_backend.objects.piece_cache import Pieces, cache_key, read_pieces, write_pieces
-from tactile_rt.sim_backend.objects.sheet_pieces import SheetPieces
-from tactile_rt.sim_backend.objects.simplification import simplified
-from tactile_rt.sim_backend.objects.solid_pieces import SolidPieces
 from tactile_rt.sim_backend.objects.solids import TactileObject
 
-__all__ = ["load_mesh"]
+__all__ = ["Pieces", "cache_key", "load_mesh", "read_pieces", "simplify_mesh", "write_pieces"]
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Convex pieces of a mesh, in the unit box, and how they came about.
+
+    Attributes:
+        meshes: The convex pieces themselves, closed and wound outward.
+        surface_error: The farthest that their surface is from the mesh's, in fractions of the
+            largest extent.
+        made_by: The way in which the mesh became pieces, one of those that `meshes` lists.
+    """
+
+    meshes: tuple[trimesh.Trimesh, ...]
+    surface_error: float
+    made_by: str
+
+
+def cache_key(content: bytes, *settings: object) -> str:
+    """Name for what is made of a file's content with these settings."""
+    return hashlib.sha256(hashlib.sha256(content).digest() + repr(settings).encode()).hexdigest()
+
+
+def read_pieces(key: str) -> Pieces | None:
+    """Read the pieces under this key; None if there are none, or they are damaged."""
+    path = _path(key)
+    if path is None:
+        return None
+    try:
+        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as file:
+            corners = np.split(file["vertices"], np.cumsum(file["corners"])[:-1])
+            faces = np.split(file["faces"].astype(np.int64), np.cumsum(file["sides"])[:-1])
+            error, made_by = float(file["surface_error"]), str(file["made_by"])
+    except Exception:  # damage shows itself in a dozen ways
+        return None
+    meshes = tuple(
+        trimesh.Trimesh(v, f, process=False) for v, f in zip(corners, faces, strict=True)
+    )
+    return Pieces(meshes, error, made_by)
+
+
+def write_pieces(key: str, pieces: Pieces) -> None:
+    """Keep the pieces under this key, if there is a place to keep them."""
+    path = _path(key)
+    if path is None:
+        return
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, name = tempfile.mkstemp(dir=path.parent, suffix=".part")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez(
+                    file,
+                    vertices=np.concatenate([m.vertices for m in pieces.meshes]),
+                    faces=np.concatenate([m.faces for m in pieces.meshes]).astype(np.int32),
+                    corners=[len(m.vertices) for m in pieces.meshes],
+                    sides=[len(m.faces) for m in pieces.meshes],
+                    surface_error=pieces.surface_error,
+                    made_by=pieces.made_by,
+                )
+            os.replace(name, path)  # another process may have written the same meanwhile
+        except BaseException:
+            os.unlink(name)
+            raise
+
+
+def _path(key: str) -> Path | None:
+    """Return the file of a key; None where a user has no home."""
+    own = os.environ.get("TACTILE_RT_CACHE")
+    if own:
+        return Path(own) / f"{key}.npz"
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    if not os.path.isabs(base):  # the specification has relative paths ignored
+        base = os.path.expanduser("~/.cache")
+    return Path(base) / "tactile_rt" / "pieces" / f"{key}.npz" if os.path.isabs(base) else None
+
+
+SHARES = (0.25, 0.5, 1.0)  # of the most triangles, that are tried
+HASTE = (3.0, 7.0, 10.0)  # how fast the cost of an edge that goes may grow, until few are left
+
+
+def simplify_mesh(mesh: trimesh.Trimesh, tolerance: float, most: int) -> trimesh.Trimesh:
+    """Take triangles away within a tolerance, to about `most` of them.
+
+    Edges go in the order of quadric error metrics (Garland and Heckbert 1997); how far the surface
+    has moved is measured, both ways. A mesh with more triangles than can be dealt with is
+    simplified farther than the tolerance.
+
+    Args:
+        mesh: in the unit box.
+        tolerance: how far the surface may move, in largest extents.
+        most: the number of triangles that can be dealt with.
+    """
+    if len(mesh.faces) <= SHARES[0] * most:
+        return mesh
+    before, fewer = TriangleSurface(mesh.triangles), mesh
+    points = some(before.points)
+    for number in (round(share * most) for share in SHARES):
+        if len(mesh.faces) <= number:
+            return mesh
+        fewer = _with_faces(mesh, number)
+        after = TriangleSurface(fewer.triangles)
+        moved = max(after.distance(points).max(), before.distance(some(after.points)).max())
+        if moved <= tolerance:
+            break
+    return fewer
+
+
+def _with_faces(mesh: trimesh.Trimesh, number: int) -> trimesh.Trimesh:
+    fewer = mesh
+    for haste in HASTE:
+        corners, faces = simplify(
+            np.asarray(mesh.vertices, np.float64),
+            np.asarray(mesh.faces, np.int32),
+            target_count=number,
+            agg=haste,
+        )
+        fewer = trimesh.Trimesh(corners, faces, process=False)
+        if len(faces) <= 1.2 * number:
+            break
+    return fewer
+
 
 Floats = NDArray[np.float64]
 
@@ -67,13 +203,6 @@ def load_mesh(path: Path, detail: MeshDetail = STANDARD) -> TactileObject:
     """What a mesh file holds, as convex pieces in the unit box.
 
     A scene is taken as one rigid object. The unit of the file does not matter.
-
-    Args:
-        path: the file.
-        detail: how finely it is told apart into pieces, and which way is up.
-
-    Raises:
-        ConfigError: it cannot be used: what file, what is wrong, what to do, in one line.
     """
     check_mesh_file(path)
     asked = (detail.surface_error_mm, detail.max_pieces, detail.hull, detail.up)
@@ -107,7 +236,7 @@ def _pieces(mesh: trimesh.Trimesh, detail: MeshDetail) -> Pieces:
         hull = (mesh.convex_hull,)
         return Pieces(hull, deviation(drawn, hull).largest, "hull")
     tolerance = detail.surface_error_mm / SIZE_MM
-    bodies, sheet = _simplified(*_bodies_and_sheet(_mended(mesh)), SIMPLER * tolerance)
+    bodies, sheet = _simplify_parts(*_bodies_and_sheet(_mended(mesh)), SIMPLER * tolerance)
     if len(bodies) > detail.max_pieces:
         bodies = [outer_solid(bodies)]
     solids = [SolidPieces(body) for body in bodies]
@@ -203,18 +332,18 @@ def _bodies_and_sheet(mesh: trimesh.Trimesh) -> tuple[list[Manifold], trimesh.Tr
     return bodies, sheet
 
 
-def _simplified(
+def _simplify_parts(
     bodies: list[Manifold], sheet: trimesh.Trimesh, tolerance: float
 ) -> tuple[list[Manifold], trimesh.Trimesh]:
-    """Bodies and sheet with fewer triangles, each its share of those that can be dealt with."""
+    """Simplify bodies and sheet, each to its share of the triangles allowed."""
     number = sum(body.num_tri() for body in bodies) + len(sheet.faces)
     share = MOST_FACES / max(number, MOST_FACES)
     simpler = []
     for body in bodies:
         least = max(LEAST_FACES, round(share * body.num_tri()))
-        found = _solid(simplified(surface_of(body), tolerance, least))
+        found = _solid(simplify_mesh(surface_of(body), tolerance, least))
         simpler += found or [body]
-    fewer = simplified(sheet, tolerance, max(LEAST_FACES, round(share * len(sheet.faces))))
+    fewer = simplify_mesh(sheet, tolerance, max(LEAST_FACES, round(share * len(sheet.faces))))
     if len(fewer.faces) < len(sheet.faces):  # a large face at a border may have gone altogether
         places = np.concatenate([sheet.triangles, sheet.triangles_center[:, None]], axis=1)
         away = TriangleSurface(fewer.triangles).distance(places.reshape(-1, 3)).reshape(-1, 4)

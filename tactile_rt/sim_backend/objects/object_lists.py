@@ -91,11 +91,7 @@ def shipped_lists() -> tuple[str, ...]:
 
 
 def read_list(name: str) -> tuple[ListedObject, ...]:
-    """The objects of the list of this name that ships with the package, or of a .csv file.
-
-    Raises:
-        ConfigError: no such list, or a row of it is wrong.
-    """
+    """The objects of the list of this name that ships with the package, or of a .csv file."""
     if Path(name).suffix == ".csv":
         path = Path(name)
     elif name in shipped_lists():
@@ -132,11 +128,8 @@ def get_objects(
     """Get objects into a folder; those that it has already stay.
 
     Args:
-        objects: which.
-        folder: where; made if it is not there.
         clones: a folder of clones of the repositories, each by its name, or one clone; None: they
             are fetched from GitHub.
-        progress: told of every object that is there.
 
     Returns:
         Why objects could not be got, by their names; nothing of them is in the folder.

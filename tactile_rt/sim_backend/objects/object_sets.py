@@ -77,9 +77,7 @@ class ObjectSet:
     """The objects of a folder.
 
     Attributes:
-        folder: The folder that the objects are in.
         paths: The file of every object, by its name ``category/object``, in alphabetical order.
-        detail: The fineness in which meshes are told apart into pieces, and which way is up.
         origins: The source and the shape of objects, by their names, as far as they are known.
         skipped: The names of objects found broken so far, and why each is.
     """
@@ -101,11 +99,7 @@ class ObjectSet:
         return {name: name.rpartition("/")[0] for name in self.paths}
 
     def path(self, name: str) -> Path:
-        """An object's file.
-
-        Raises:
-            ConfigError: no such object.
-        """
+        """An object's file."""
         if name not in self.paths:
             raise ConfigError(f"{self.folder}: holds no object {name!r}")
         return self.paths[name]
@@ -148,7 +142,6 @@ def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
     """The objects in a folder.
 
     Args:
-        where: the folder, of either layout.
         detail: how meshes become pieces; in a ShapeNet folder y is up, unless it says otherwise.
 
     Raises:

@@ -74,7 +74,6 @@ def place(chain: Chain, q: A, pose: Pose) -> None:
     """Fill in where a chain is whose first node and first frame at rest stand in `pose` already.
 
     Args:
-        chain, pose: see there.
         q: (degree of freedom,) rad.
     """
     clamped, turn, length = chain.clamped, chain.turn, chain.length
@@ -107,7 +106,6 @@ def mass_matrix(chain: Chain, pose: Pose, work: A, matrix: A) -> None:
     """The lower triangle of the mass matrix.
 
     Args:
-        chain, pose: see there.
         work: (3, 3) scratch.
         matrix: (degree of freedom, degree of freedom) filled.
     """
@@ -162,7 +160,6 @@ def inertial_forces(
     """What an acceleration takes, less what pushes from outside.
 
     Args:
-        chain, pose: see there.
         v, a: (degree of freedom,) rad/ms and rad/ms^2.
         base: (4, 3) of the base: velocity (not used), angular velocity, acceleration, angular
             acceleration.

@@ -33,7 +33,6 @@ def impulses(count: int, response: A, free: A, friction: float, drag: A, found: 
         response: (3 contact, 3 contact) change of relative velocity per impulse.
         free: (3 contact,) relative velocity without any impulse, along the normal with the gap to
             be closed added, mm/ms.
-        friction: Coulomb's coefficient.
         drag: (contact,) where to begin: friction's impulse per slip; filled with what was found.
         found: (3 contact,) impulses, from where to begin; filled.
 

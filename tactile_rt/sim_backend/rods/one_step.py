@@ -117,7 +117,6 @@ def step(
             same length will do.
         matched: whether with the masses with which the modes have their frequencies at this length
             of a step, or with the true ones.
-        chain, pose: see there.
         q, v: (degree of freedom,) rad and rad/ms.
         base: see `chains.inertial_forces`.
         surface: (3,) velocity of the object, mm/ms.

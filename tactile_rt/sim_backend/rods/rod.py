@@ -27,12 +27,9 @@ class Rod:
     """One whisker, cut and ready to be stepped.
 
     Attributes:
-        steps_per_sample: The number of steps in a sample.
         resonance_hz: The first resonance of the whisker on its mount, Hz.
         wanted_ratio: The damping ratio of the first mode, that of the mount included.
         damping_ratio: The damping ratio with which it rings when stepped.
-        chain: The links and joints of the whisker.
-        segments: The parts of the whisker between which contacts are sought.
         to_element: The (3, 3) rotation from the frame of the first link to that of the element.
     """
 
@@ -53,7 +50,6 @@ def make_rod(whisker: Whisker, links: int, steps_per_sample: int, sample_ms: flo
     the step is halved, for whiskers whose ringing samples can hold at all.
 
     Args:
-        whisker: to cut.
         links: how many cells; one more link.
         steps_per_sample: the fewest steps in a sample.
         sample_ms: length of a sample, ms.
@@ -128,7 +124,6 @@ def matched(omega: float, ratio: float, h: float) -> tuple[float, float]:
 
     Args:
         omega: the mode's natural angular frequency, rad/ms.
-        ratio: its damping ratio.
         h: the step, ms.
 
     Returns:

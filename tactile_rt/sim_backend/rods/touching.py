@@ -143,7 +143,6 @@ def find_near(
     neighbours' are looked at anew.
 
     Args:
-        pose, segments, thing: see there.
         centre: (3,) where the object is, mm.
         seen: see there; carried on.
         ends: (segment, 2, 3) scratch.

@@ -53,15 +53,12 @@ class RodWorld:
     """Whiskers on bases that turn or stand still, and an object that moves among them, not turning.
 
     Args:
-        whiskers: the array.
         roots: (whisker, 4, 3) base point (mm) and, in the rows after it, the element's frame in the
             world.
-        pieces: of the object.
         links: how many cells a whisker is cut into.
         steps_per_sample: the fewest steps in a sample of 1 ms.
 
     Attributes:
-        rods: The whiskers as they are stepped.
         angles: The (joint,) angles of all whiskers' hinges, one whisker after the other, rad.
         turns: The (sample, whisker, 2) turns of bases that give in the samples of the last
             `advance`, means, about the element's y and z, rad.

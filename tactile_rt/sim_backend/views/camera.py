@@ -37,9 +37,6 @@ class Camera:
         orthographic: Whether there is no perspective: sizes are independent of depth, parallels
             stay parallel.
         fovy_deg: The vertical field of view in perspective, degrees; small is far away.
-
-    Raises:
-        ConfigError: nothing can be seen so.
     """
 
     azimuth: float
@@ -110,12 +107,8 @@ def framing(
     Args:
         view: one of `VIEWS`.
         points: (n, 3) world, mm: the whiskers at rest, and what they touch.
-        orthographic: see `Camera`.
         aspect: width of the picture over its height.
         left: whether these are whiskers of the animal's left side: the view's mirror image.
-
-    Raises:
-        ConfigError: no such view.
     """
     if view not in VIEWS:
         raise ConfigError(f"no camera {view!r}: there are {', '.join(VIEWS)}")

@@ -30,11 +30,7 @@ Pixels = NDArray[np.uint8]
 def camera_of(
     footage: Footage, view: str, orthographic: bool = False, aspect: float = 1.5
 ) -> Camera:
-    """The camera of a named view, on the whiskers at rest and on what presses them most.
-
-    Raises:
-        ConfigError: no such view.
-    """
+    """The camera of a named view, on the whiskers at rest and on what presses them most."""
     dressed = Dressed(footage.model, footage.spec)
     footage.restore(0, dressed.data)
     left = all(x < 0 for x, _, _ in footage.spec.positions)
@@ -48,9 +44,7 @@ class Film:
     """Complete pictures of footage; to be closed.
 
     Args:
-        footage: what to draw.
         view: a camera, or the name of a view.
-        orthographic: of a named view.
         title: what is seen, one line.
         detail: how it is seen, one line in small print.
         pixels: width of the pictures; their height is 9/16 of it.
@@ -90,11 +84,7 @@ class Film:
 
 
 def check_suffix(path: Path) -> str:
-    """Return the suffix of a file's name: one of `IMAGES` and `VIDEOS`.
-
-    Raises:
-        ConfigError: of another kind.
-    """
+    """Return the suffix of a file's name: one of `IMAGES` and `VIDEOS`."""
     suffix = path.suffix.lower()
     if suffix not in IMAGES + VIDEOS:
         raise ConfigError(
@@ -114,8 +104,6 @@ def write_video(path: Path, pictures: Iterable[Pixels], fps: int, sample: Pixels
     """Write pictures (height, width, 3) RGB of one even size as .mp4 or .gif.
 
     Args:
-        path: the file.
-        pictures: in their order.
         fps: pictures a second. A GIF counts time in 10 ms: 25, 20 and 10 are exact.
         sample: one that has the colours of them all; a GIF, which loops, gets its palette from it.
     """

@@ -42,8 +42,6 @@ class Footage:
     """A simulation as it went, moment by moment.
 
     Attributes:
-        model: The MuJoCo model of the simulation.
-        spec: The description of the array.
         period_ms: The time between moments, ms.
         loads: The (moment, element, 6) base loads, N and N m, each the mean over the period before.
         states: The (moment, n) places of everything at the end of each period.
@@ -100,7 +98,6 @@ def record(
     Args:
         simulation: fresh or advanced; it goes on from where it is. All whiskers of the array
             must be in it: a `SweepSimulation` is to be made with `whole=True`.
-        spec: its array.
         period_ms: between moments, whole ms.
         progress: called with the share that is done, 0 to 1.
     """

@@ -98,14 +98,6 @@ class ForceScale:
 class Sheet:
     """Pictures of footage, one for each moment. What stays is drawn once.
 
-    Args:
-        footage: what to draw.
-        camera: of the scene.
-        scale: of the forces.
-        title: what is seen, one line.
-        detail: how it is seen (projection, speed), one line in small print.
-        pixels: width of the pictures; their height is 9/16 of it.
-
     Attributes:
         size: The (width, height) of the pictures in pixels, both even.
         scene_size: The (width, height) in pixels of the scene in the pictures.
@@ -162,7 +154,6 @@ class Sheet:
         """The picture of one moment: (height, width, 3) RGB.
 
         Args:
-            moment: which of the footage.
             scene: its (height, width, 3) picture of `scene_size`.
         """
         time = float(self._footage.times_ms[moment])
@@ -230,10 +221,7 @@ class ForceMap:
     and dorsal (z); it is long where all of the force is in that plane.
 
     Args:
-        figure: to draw in.
         place: in it: left, bottom, width, height, fractions.
-        spec: the array.
-        scale: of the colours.
         mirrored: whether column 0 is on the right, as in a picture with the nose on the left.
     """
 

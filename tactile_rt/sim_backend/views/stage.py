@@ -110,10 +110,7 @@ def _add_forces(
     """Add a dot on every base and the arrow of its force to a scene.
 
     Args:
-        scene: to add to.
-        dressed: in the state to draw.
         loads: (element, 6) base loads in the element frames, N and N m.
-        scale: of colours and lengths.
         extent_mm: height of the picture, mm.
     """
     for site, load in zip(dressed.sites, loads, strict=True):
@@ -156,9 +153,6 @@ class Stage:
     """Pictures of the states in footage, drawn offscreen; to be closed.
 
     Args:
-        footage: what to draw.
-        camera: from where.
-        scale: of the forces.
         width, height: of the pictures, pixels.
 
     Raises:

@@ -8,7 +8,7 @@ pytest.importorskip("trimesh")
 
 import trimesh
 
-from tactile_rt.sim_backend.objects.piece_cache import Pieces, read_pieces, write_pieces
+from tactile_rt.sim_backend.objects.meshes import Pieces, read_pieces, write_pieces
 
 
 @pytest.fixture

@@ -34,7 +34,6 @@ def _supports(rng: Generator, x: float, y: float, high: float, solid: float) -> 
     """What carries a plate of x by y at a height: legs, a foot, runners, panels or a block.
 
     Args:
-        rng: draws which, how many and how thick.
         x, y, high: of the plate.
         solid: the probability of panels or a block.
     """
