@@ -6,20 +6,17 @@ correction         what one device needs, applied to its chunks
 calibrated_source  the same on a whole source, which may be declared to be another array's
 files              stored per device id, as TOML that people can read
 taring             offsets and noise, measured while nothing is touched
-loads              tables of known loads
-fitting            the matrix, by least squares from such a table
+fitting            tables of known loads, and the matrix that they give
 """
 
 from tactile_rt.calibration.calibrated_source import CalibratedSource, declare, declared
-from tactile_rt.calibration.correction import Calibration
+from tactile_rt.calibration.correction import Calibration, Mirror
 from tactile_rt.calibration.files import (
     calibration_path,
     load_calibration,
     save_calibration,
 )
-from tactile_rt.calibration.fitting import Fit, calibrate
-from tactile_rt.calibration.loads import LoadTable, raw_readings, read_loads
-from tactile_rt.calibration.mirroring import Mirror
+from tactile_rt.calibration.fitting import Fit, LoadTable, calibrate, raw_readings, read_loads
 from tactile_rt.calibration.taring import Tare, tare
 
 __all__ = [

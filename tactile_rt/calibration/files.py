@@ -13,8 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from tactile_rt.calibration.correction import Calibration, check_device
-from tactile_rt.calibration.mirroring import Mirror
+from tactile_rt.calibration.correction import Calibration, Mirror, check_device
 from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
 from tactile_rt.settings import SettingNode, convert, nearest, read_toml
@@ -38,12 +37,6 @@ class _Output(msgspec.Struct, forbid_unknown_fields=True):
     units: tuple[str, ...] = ()
 
 
-class _Mirror(msgspec.Struct, forbid_unknown_fields=True):
-    axis: str = "x"
-    element_axis: str = "z"
-    signs: dict[str, int] = {}
-
-
 class _File(msgspec.Struct, forbid_unknown_fields=True):
     version: int
     device: str
@@ -55,7 +48,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     noise: dict[str, Row] = {}
     matrix: dict[str, tuple[Row, ...]] = {}
     mapping: dict[str, str] = {}
-    mirror: _Mirror | None = None
+    mirror: Mirror | None = None
 
 
 def calibration_path(device: str) -> Path:
@@ -131,7 +124,7 @@ def _calibration(nodes: SettingNode) -> Calibration:
             noise=file.noise,
             matrices=file.matrix,
             mapping=file.mapping,
-            mirror=Mirror(**msgspec.structs.asdict(file.mirror)) if file.mirror else None,
+            mirror=file.mirror,
             history=file.history,
         )
     except ConfigError as error:  # how its parts fit together

@@ -34,8 +34,7 @@ def show(json: Json = None) -> None:
         with starting():
             from tactile_rt import extensions
             from tactile_rt.sim_backend.arrays.files import load_animals
-            from tactile_rt.sim_backend.arrays.robots import ROBOTS
-            from tactile_rt.sim_backend.arrays.species import SPECIES
+            from tactile_rt.sim_backend.arrays.species import ROBOTS, SPECIES
             from tactile_rt.sim_backend.transducer import device_spec
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
@@ -89,7 +88,7 @@ def fit(
     check_source(url)
     try:
         with starting():
-            from tactile_rt.project.device import keep_fit
+            from tactile_rt.project.folder import keep_fit
             from tactile_rt.sim_backend.measuring.fitting import fit_array, read_described
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None

@@ -44,12 +44,7 @@ def tare(
     Refused if an element is touched meanwhile, or drifts. What else the
     device's file holds (matrices, mapping, mirror) stays.
     """
-    from tactile_rt.calibration import (
-        CalibratedSource,
-        Calibration,
-        calibration_path,
-        save_calibration,
-    )
+    from tactile_rt.calibration import Calibration, calibration_path, save_calibration
     from tactile_rt.calibration import tare as measure
     from tactile_rt.sources.opening import open_source
 
@@ -58,12 +53,7 @@ def tare(
     with starting():
         opened = open_source(source)
     with opened:
-        raw: Source = opened
-        before: Calibration | None = None
-        while isinstance(raw, CalibratedSource):
-            before = raw.calibration
-            raw = raw.source
-        _check_raw(raw, source)
+        raw, before = _find_raw(opened, source)
         name = device or (before.device if before else _own_id(raw))
         path = out or calibration_path(name)
         known = _existing(path, device) or before or Calibration.of(name, raw.spec)
@@ -196,7 +186,6 @@ def _existing(path: Path, device: str) -> "Calibration | None":
 
 def _recorded(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArraySpec]":
     """The raw samples that the times of a table are of."""
-    from tactile_rt.calibration import CalibratedSource
     from tactile_rt.calibration.taring import record
     from tactile_rt.sources.opening import open_source
     from tactile_rt.stream import concatenate
@@ -206,37 +195,33 @@ def _recorded(table: Path, loads: "LoadTable", url: str) -> "tuple[Chunk, ArrayS
     with starting():
         opened = open_source(url)
     with opened:
-        raw: Source = opened
-        while isinstance(raw, CalibratedSource):
-            raw = raw.source
-        _check_raw(raw, url)
+        raw, _ = _find_raw(opened, url)
         return concatenate(record(raw, float(loads.times.max()))), raw.spec
 
 
-def _check_raw(source: "Source", url: str) -> None:
-    """Refuse samples that were calibrated before they were recorded: they are not what the device
-    sent.
+def _find_raw(source: "Source", url: str) -> "tuple[Source, Calibration | None]":
+    """Return the source of raw samples below a calibrated one, and the calibration.
 
     Raises:
-        ConfigError: they are.
+        ConfigError: the samples were calibrated before they were recorded.
     """
+    from tactile_rt.calibration import CalibratedSource
+
+    known = None
+    while isinstance(source, CalibratedSource):
+        known, source = source.calibration, source.source
     if getattr(source, "calibrated", False):
         raise ConfigError(f"{url}: its samples are calibrated: from=wire gives the raw ones")
+    return source, known
 
 
 def _order(channels: tuple[str, ...], known: "Calibration") -> list[int]:
-    """Where each raw channel of a device is among those of the table."""
-    for channel in known.channels:
-        if channel not in channels:
-            raise ConfigError(
-                f"no reading raw_{channel}; {known.device} has channels {', '.join(known.channels)}"
-            )
-    for channel in channels:
-        if channel not in known.channels:
-            raise ConfigError(
-                f"raw_{channel} is of no channel of {known.device}, which has "
-                f"{', '.join(known.channels)}"
-            )
+    """Find where each raw channel of a device is among those of the table."""
+    for channel in (*known.channels, *channels):
+        if channel in channels and channel in known.channels:
+            continue
+        what = f"no reading raw_{channel}" if channel in known.channels else f"raw_{channel}"
+        raise ConfigError(f"{what}; {known.device} has channels {', '.join(known.channels)}")
     return [channels.index(c) for c in known.channels]
 
 

@@ -1,7 +1,6 @@
 """`tactile-rt whisk`: the array whisks against an object, or the barrel-cortex stimuli."""
 
 import hashlib
-import math
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,32 +16,16 @@ from tactile_rt.settings import take_sets
 
 
 @dataclass(frozen=True)
-class Placing:
-    """Where what the array whisks against stands.
+class Spacing:
+    """How the stimuli stand.
 
     Attributes:
-        position_mm: The centre of an object: ``x,y,z``, x lateral (away from the head), y rostral,
-            z up, mm.
-        size_mm: The largest extent of an object, mm.
-        yaw_deg: The turn of an object about z, degrees.
         radius_mm: The radius of the stimuli's arc, mm.
         step_mm: The vector from a stimulus to the next further one: ``x,y,z``, mm.
-
-    Raises:
-        ConfigError: a value that cannot be.
     """
 
-    position_mm: str = "25,5,0"
-    size_mm: float = 20.0
-    yaw_deg: float = 0.0
     radius_mm: float = 63.6
     step_mm: str = "1,1,0"
-
-    def __post_init__(self) -> None:
-        if not 0 < self.size_mm < 1e3:
-            raise ConfigError(f"size_mm must be above 0 and below 1000, not {self.size_mm:g}")
-        if not math.isfinite(self.yaw_deg):
-            raise ConfigError(f"yaw_deg must be a number of degrees, not {self.yaw_deg}")
 
 
 @app.command()
@@ -87,39 +70,37 @@ def whisk(
             import numpy as np
 
             from tactile_rt.sim_backend.arrays.files import load_array
-            from tactile_rt.sim_backend.arrays.whiskers import rotation
             from tactile_rt.sim_backend.objects.catalogue import load_object
             from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
             from tactile_rt.sim_backend.stimuli import STIMULI, Surface, whisk_against, write_input
             from tactile_rt.sim_backend.trajectories import Whisk, base_angles, read_trajectory
             from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
+            from tactile_rt.sim_backend.whisking_source import Placing, parse_point
             from tactile_rt.sim_backend.world import PROFILES, array_spec
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
     if profile not in PROFILES:
         raise ConfigError(f"no profile {profile!r}: there are {', '.join(PROFILES)}")
     animal = load_array(array)
-    regular, place, mesh = take_sets("whisk", sets or (), Whisk, Placing, MeshDetail)
+    kinds = (Whisk, Placing, Spacing, MeshDetail)
+    regular, placing, spacing, mesh = take_sets("whisk", sets or (), *kinds)
     moves = read_trajectory(trajectory, animal.whiskers) if trajectory else regular
     pieces, described = {}, {}
     # The stimuli stand on the right of the head, those of an array of the left on its left.
     left = all(w.base[0] < 0 for w in animal.whiskers)
-    head, mirror = (HEAD.mirrored(), (-1.0, 1.0, 1.0)) if left else (HEAD, (1.0, 1.0, 1.0))
+    head, mirror = (HEAD.mirrored(), np.array([-1.0, 1.0, 1.0])) if left else (HEAD, np.ones(3))
     if target is not None:
         thing = load_object(target, mesh)
-        at = np.array(_three(place.position_mm, "position_mm")) * mirror
-        turn = rotation("z", np.radians(place.yaw_deg))
-        pieces[thing.name] = tuple(p.vertices * place.size_mm @ turn.T + at for p in thing.pieces)
+        pieces[thing.name] = placing.place(thing, left)
         described[thing.name] = {
-            "position_mm": at.tolist(),
-            "size_mm": place.size_mm,
-            "yaw_deg": place.yaw_deg,
+            **asdict(placing),
+            "position_mm": (mirror * parse_point(placing.position_mm, "position_mm")).tolist(),
         }
     else:
-        step = _three(place.step_mm, "step_mm")
+        step = parse_point(spacing.step_mm, "step_mm")
         names = STIMULI if stimulus in (None, "all") else stimulus.split(",")
         for name in dict.fromkeys(n.strip() for n in names):
-            surface = Surface.named(name, step, place.radius_mm)
+            surface = Surface.named(name, step, spacing.radius_mm)
             pieces[name] = tuple(corners * mirror for corners in surface.pieces())
             described[name] = {
                 **asdict(surface),
@@ -168,16 +149,6 @@ def whisk(
             f"{len(animal.whiskers)} whiskers touch it"
         )
     console.print(f"{out} and {beside}: {len(felt)} stimuli")
-
-
-def _three(text: str, key: str) -> tuple[float, float, float]:
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-        if not all(map(math.isfinite, (x, y, z))):
-            raise ValueError
-    except ValueError:
-        raise ConfigError(f"{key} is three numbers, x,y,z, in mm; not {text!r}") from None
-    return x, y, z
 
 
 def _described(trajectory: Path) -> dict[str, str]:

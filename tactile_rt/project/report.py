@@ -18,8 +18,7 @@ from tactile_rt.evidence.records import Record
 from tactile_rt.files import write_whole
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.project.device import read_fit
-from tactile_rt.project.folder import Project
+from tactile_rt.project.folder import Project, read_fit
 
 __all__ = ["confused", "device_section", "draw_over_time", "write_report"]
 

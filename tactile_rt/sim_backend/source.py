@@ -5,7 +5,6 @@ Like every simulated source (`PacedSource`) it is simulated when it is read, and
 sim:mouse?objects=mug-50,bottle-51&seed=3&pace=fast&profile=realtime&sweeps=10
 sim:mouse?noise_force=1e-5&noise_moment=5e-8&latency_ms=2&drop_probability=0.01
 sim:mouse?friction=0.3&young_modulus=0.2&angles_deg=3&mount_mm=0.5
-sim:springs.toml?base_turns=true
 sim:mouse?recipe=wide24&speed_mm_s=34
 
 An array whose file has a [sensor] delivers what that sensor reads, at its own rate and in its own
@@ -39,21 +38,51 @@ from tactile_rt.sim_backend.transducer import Transducer, device_spec, sensor_of
 from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
-__all__ = ["CHUNK_SAMPLES", "PACES", "PacedSource", "Pass", "SimOptions", "SimSource", "check_pace"]
+__all__ = [
+    "CHUNK_SAMPLES",
+    "PACES",
+    "PacedOptions",
+    "PacedSource",
+    "Pass",
+    "SimOptions",
+    "SimSource",
+]
 
 log = logging.getLogger("tactile_rt.sim_backend")
 CHUNK_SAMPLES: Final = 9
 PACES: Final = ("realtime", "fast")
-TURNS: Final = ("turn_y", "turn_z")
 DRAGGED_SAMPLES = 300  # more, while an object that has passed by still drags a whisker along
 LATEST_NS = 100_000_000  # how far a live simulation may be behind real time
 REST_SAMPLES = 600  # after an object its episode ends and contact is released; before one, a tare
 
 
-def check_pace(pace: str) -> None:
-    """Raise a `ConfigError` if there is no such pace."""
-    if pace not in PACES:
-        raise ConfigError(f"no pace {pace!r}: there are {', '.join(PACES)}")
+@dataclass(frozen=True)
+class PacedOptions(SensorModel, MeshDetail):
+    """What all simulated arrays have options for.
+
+    The fields of `SensorModel` are options too; left out, the sensors are perfect. So are those of
+    `MeshDetail`, which hold for all mesh files named.
+
+    Attributes:
+        seed: The seed of all that is drawn; the same seed gives the same stream, and the same
+            objects and sweeps whatever the sensors.
+        profile: The name of the simulation profile, one of `world.PROFILES`.
+        pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
+    """
+
+    seed: int = 0
+    profile: str = "realtime"
+    pace: str = "realtime"
+
+    def __post_init__(self) -> None:
+        SensorModel.__post_init__(self)
+        MeshDetail.__post_init__(self)
+        if self.profile not in PROFILES:
+            raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
+        if self.pace not in PACES:
+            raise ConfigError(f"no pace {self.pace!r}: there are {', '.join(PACES)}")
+        if self.seed < 0:
+            raise ConfigError(f"seed must be 0 or more, not {self.seed}")
 
 
 class PacedSource(Source):
@@ -127,12 +156,11 @@ class PacedSource(Source):
 
 
 @dataclass(frozen=True)
-class SimOptions(SensorModel, Randomisation, MeshDetail):
+class SimOptions(PacedOptions, Randomisation):
     """What the simulated array meets, what its sensors make of it, how it differs from the design.
 
-    The fields of `SensorModel` are options too; left out, the sensors are perfect. So are those of
-    `Randomisation`, whose array is drawn afresh for every sweep, and those of `MeshDetail`, which
-    hold for all mesh files named.
+    The fields of `PacedOptions` are options too, and those of `Randomisation`, whose array is
+    drawn afresh for every sweep.
 
     Attributes:
         objects: Comma-separated names (``mug-50``), categories (``mug``: its first instance) or
@@ -140,10 +168,6 @@ class SimOptions(SensorModel, Randomisation, MeshDetail):
             a file's name is written ``%2C``, in a URL ``%252C``.
         sweeps: The number of different objects that pass before the stream ends; 0: endless.
         repeat: The number of sweeps of the same object in succession.
-        seed: The seed of the drawn objects, sweep parameters, arrays and sensor imperfections; the
-            same seed gives the same stream, and the same objects and sweeps whatever the sensors.
-        profile: The name of the simulation profile, one of `world.PROFILES`.
-        pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
         recipe: The name of a recipe (see `datasets.recipes`), or its .toml file, which names others
             as seen from its folder: sweeps are drawn as its are, but for the parameters given here.
             Empty: what is not given is drawn as below.
@@ -152,17 +176,11 @@ class SimOptions(SensorModel, Randomisation, MeshDetail):
         roll_deg, pitch_deg, heading_deg, climb_deg, ramp_ms, head_moves, surface_friction, shake_g,
             shake_hz: The parameters of every sweep, see `sweep.Sweep`; left out, it is level, as
             fast at once and not shaken.
-        base_turns: Two more channels, ``turn_y`` and ``turn_z``: by how much the base of a whisker
-            whose mount gives is turned about the element's y and z, rad. They are the truth: the
-            sensor's imperfections leave them alone.
     """
 
     objects: str = ""
     sweeps: int = 0
     repeat: int = 1
-    seed: int = 0
-    profile: str = "realtime"
-    pace: str = "realtime"
     recipe: str = ""
     size_mm: float | None = None
     speed_mm_s: float | None = None
@@ -179,20 +197,13 @@ class SimOptions(SensorModel, Randomisation, MeshDetail):
     surface_friction: float | None = None
     shake_g: float | None = None
     shake_hz: float | None = None
-    base_turns: bool = False
 
     def __post_init__(self) -> None:
-        SensorModel.__post_init__(self)
+        PacedOptions.__post_init__(self)
         Randomisation.__post_init__(self)
-        MeshDetail.__post_init__(self)
-        if self.profile not in PROFILES:
-            raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
-        check_pace(self.pace)
         check_sweep(Sweep(**self.chosen), PROFILES[self.profile])
         if self.sweeps < 0 or self.repeat < 1:
             raise ConfigError("sweeps must be 0 or more, and repeat 1 or more")
-        if self.seed < 0:
-            raise ConfigError(f"seed must be 0 or more, not {self.seed}")
 
     @property
     def chosen(self) -> dict[str, float]:
@@ -233,12 +244,11 @@ class SimSource(PacedSource):
 
     def __init__(self, array: str, options: SimOptions) -> None:
         self._animals = load_animals(array or "mouse")
-        _check_turns(self._animals, options)
         spec, described = device_spec(self._animals), sensor_of(self._animals)
         self._sensor = Sensor(options, spec, options.seed, described)
         self._transducer = Transducer(described, spec.elements) if described else None
-        self._feels_turns = options.base_turns or bool(described and described.feels_turns)
-        super().__init__(_spec(self._animals, options), options.pace)
+        self._feels_turns = bool(described and described.feels_turns)
+        super().__init__(spec, options.pace)
         self._options = options
         self._objects = _objects(options) or [promised_object(name) for name in CATEGORIES]
         self._rng = np.random.default_rng(options.seed)
@@ -260,10 +270,9 @@ class SimSource(PacedSource):
     def check(array: str, options: SimOptions) -> ArraySpec:
         """The array that it would be; raises the `ConfigError` that opening it would raise."""
         animals = load_animals(array or "mouse")
-        _check_turns(animals, options)
         _drawing(animals, options)
         _objects(options)
-        return _spec(animals, options)
+        return device_spec(animals)
 
     def close(self) -> None:
         super().close()
@@ -273,18 +282,12 @@ class SimSource(PacedSource):
         true = self._true(start_ns)
         if self._transducer is not None:
             sampled = self._transducer.push(true)
-            read = self._sensor.push(sampled) if sampled is not None else None
-            self.stats.missing = self._sensor.dropped
-            return read
-        channels = len(CHANNELS)
-        loads = Chunk(true.seq, true.t_ns, true.values[..., :channels], true.valid)
-        received = self._sensor.push(loads)
+            if sampled is None:
+                return None
+            true = sampled
+        read = self._sensor.push(true)
         self.stats.missing = self._sensor.dropped
-        if received is None or not self._options.base_turns:
-            return received
-        turns = true.values[received.seq - true.seq[0], :, channels:]
-        values = np.concatenate([received.values, turns], axis=2)
-        return Chunk(received.seq, received.t_ns, values, received.valid)
+        return read
 
     def _true(self, start_ns: int) -> Chunk:
         """What the array really feels next."""
@@ -292,7 +295,7 @@ class SimSource(PacedSource):
             self._begin_sweep(start_ns)
         if self._rest:
             n = min(CHUNK_SAMPLES, self._rest)
-            channels = len(CHANNELS) + (len(TURNS) if self._feels_turns else 0)
+            channels = len(CHANNELS) + (2 if self._feels_turns else 0)
             values = np.zeros((n, len(self.spec.elements), channels), dtype=np.float32)
             self._rest -= n
         else:
@@ -371,24 +374,6 @@ def _drawing(
         return replace(sweeps.draw(rng, int(rng.integers(len(sweeps))), rng), **chosen)
 
     return draw
-
-
-def _spec(animals: tuple[WhiskerArray, ...], options: SimOptions) -> ArraySpec:
-    """What the samples are."""
-    spec = device_spec(animals)
-    if not options.base_turns:
-        return spec
-    return replace(spec, channels=spec.channels + TURNS, units=(*spec.units, "rad", "rad"))
-
-
-def _check_turns(animals: tuple[WhiskerArray, ...], options: SimOptions) -> None:
-    if options.base_turns and sensor_of(animals) is not None:
-        raise ConfigError("base_turns: the array's [sensor] says already what is measured")
-    if options.base_turns and not any(w.mount_stiffness for a in animals for w in a.whiskers):
-        raise ConfigError(
-            f"base_turns: no mount of {' and '.join(a.name for a in animals)} gives; "
-            "a .toml array says how much with mount_stiffness_nm_rad"
-        )
 
 
 def _objects(options: SimOptions) -> list[Callable[[], TactileObject]]:

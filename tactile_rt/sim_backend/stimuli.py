@@ -32,18 +32,7 @@ from tactile_rt.sim_backend.world import SAMPLE_MS
 from tactile_rt.stream import ArraySpec, Chunk
 from tactile_rt.version import VERSION
 
-__all__ = [
-    "DISTANCES",
-    "PERIOD_NS",
-    "SHAPES",
-    "STIMULI",
-    "WINDOW_SAMPLES",
-    "Surface",
-    "Touch",
-    "model_input",
-    "whisk_against",
-    "write_input",
-]
+__all__ = ["DISTANCES", "SHAPES", "STIMULI", "Surface", "whisk_against", "write_input"]
 
 SHAPES = ("convex", "concave")
 DISTANCES = ("close", "medium", "far")

@@ -11,18 +11,19 @@ import trimesh
 from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError
-from tactile_rt.sim_backend.approach import (
-    centrelines,
-    faces_right,
-    way_to_contact,
-    within_reach,
-)
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS
 from tactile_rt.sim_backend.mujoco_world import MujocoWorld, sweep_model
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.remarks import strains
-from tactile_rt.sim_backend.sweep import Sweep, draw_sweep
+from tactile_rt.sim_backend.sweep import (
+    Sweep,
+    centrelines,
+    draw_sweep,
+    faces_right,
+    way_to_contact,
+    within_reach,
+)
 from tactile_rt.sim_backend.world import SAMPLE_MS, Profile, engine_of
 
 __all__ = ["SweepSimulation", "World", "check_sweep", "draw_simulation"]

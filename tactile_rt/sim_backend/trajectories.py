@@ -4,7 +4,6 @@ The base of a whisker turns in azimuth (theta, protraction), elevation (phi) and
 the last two follow the first with a slope that differs from row to row.
 """
 
-import csv
 import re
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,20 +15,10 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from tactile_rt.errors import ConfigError
+from tactile_rt.settings import convert, read_csv
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 
-__all__ = [
-    "ANGLES",
-    "ELEVATION_SLOPES",
-    "TORSION_SLOPES",
-    "Recorded",
-    "Trajectory",
-    "Whisk",
-    "base_angles",
-    "coupled",
-    "mirror",
-    "read_trajectory",
-]
+__all__ = ["ANGLES", "Trajectory", "Whisk", "base_angles", "coupled", "mirror", "read_trajectory"]
 
 # d phi / d theta and d zeta / d theta of rows A-E (Knutsen et al. 2008, Neuron)
 ELEVATION_SLOPES = (0.398, 0.591, 0.578, 0.393, 0.217)
@@ -176,9 +165,11 @@ def read_trajectory(path: Path, whiskers: tuple[Whisker, ...], ramp_s: float = 0
     ``theta_deg_C2`` of one whisker; the most specific column counts. ``phi_deg`` and ``zeta_deg``
     likewise; without them elevation and torsion follow theta (Knutsen et al. 2008).
     """
-    columns, rows, lines = _read_table(path)
+    table = read_csv(path)
+    columns, lines = table.columns, [row.line for row in table.rows]
     if columns[0] != "time_s":
-        raise ConfigError(f"{path}, line 1: the first column must be time_s, not {columns[0]!r}")
+        raise ConfigError(f"{table.where}: the first column must be time_s, not {columns[0]!r}")
+    rows = np.array([list(convert(row, dict[str, float], lax=True).values()) for row in table.rows])
     names = {w.name for w in whiskers}
     letters = {_letter(w.row) for w in whiskers}
     found: dict[tuple[str, str], int] = {}
@@ -187,20 +178,18 @@ def read_trajectory(path: Path, whiskers: tuple[Whisker, ...], ramp_s: float = 0
         target = (match[2] or "") if match else ""
         if match is None or (target and target not in names | letters):
             raise ConfigError(
-                f"{path}, line 1: column {column!r} is none of theta_deg, phi_deg, zeta_deg, or "
+                f"{table.where}: column {column!r} is none of theta_deg, phi_deg, zeta_deg, or "
                 "these with _ and the letter of a row or the name of a whisker of the array"
             )
-        if (match[1], target) in found:
-            raise ConfigError(f"{path}, line 1: column {column!r} is there twice")
         found[match[1], target] = i
+    if len(rows) < 4:
+        raise ConfigError(f"{path}: {len(rows)} samples; a cubic spline needs at least 4")
     times = rows[:, 0]
-    if len(times) < 4:
-        raise ConfigError(f"{path}: {len(times)} samples; a cubic spline needs at least 4")
     if (late := np.flatnonzero(np.diff(times) <= 0)).size:
-        raise ConfigError(f"{path}, line {lines[late[0] + 1]}: time_s does not increase")
+        raise ConfigError(f"{path}:{lines[late[0] + 1]}: time_s does not increase")
     if (far := np.argwhere(np.abs(rows[:, 1:]) > LARGEST_DEG)).size:
         raise ConfigError(
-            f"{path}, line {lines[far[0, 0]]}: {columns[far[0, 1] + 1]} is beyond "
+            f"{path}:{lines[far[0, 0]]}: {columns[far[0, 1] + 1]} is beyond "
             f"{LARGEST_DEG:g} degrees; it is the turn from rest that is wanted"
         )
     turns = np.empty((len(times), len(whiskers), 3))
@@ -219,46 +208,6 @@ def read_trajectory(path: Path, whiskers: tuple[Whisker, ...], ramp_s: float = 0
 
 def _letter(row: int) -> str:
     return chr(ord("A") + row)
-
-
-def _read_table(path: Path) -> tuple[list[str], NDArray[np.float64], list[int]]:
-    """Header, numbers (line, column) and line numbers of a CSV file; # begins a comment line."""
-    rows: list[list[float]] = []
-    lines: list[int] = []
-    columns: list[str] = []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file)
-            for cells in reader:
-                where = f"{path}, line {reader.line_num}"
-                if not "".join(cells).strip() or cells[0].startswith("#"):
-                    continue
-                if not columns:
-                    columns = [cell.strip() for cell in cells]
-                    continue
-                if len(cells) != len(columns):
-                    raise ConfigError(f"{where}: {len(cells)} values for {len(columns)} columns")
-                rows.append([])
-                lines.append(reader.line_num)
-                for column, cell in zip(columns, cells, strict=True):
-                    rows[-1].append(_number(cell, f"{where}, column {column}"))
-    except (UnicodeDecodeError, csv.Error):
-        raise ConfigError(f"{path}: not a CSV file of text; export it again") from None
-    except FileNotFoundError:
-        raise ConfigError(f"{path}: no such file") from None
-    if not rows:
-        raise ConfigError(f"{path}: holds no samples; it needs a header and lines of numbers")
-    return columns, np.array(rows), lines
-
-
-def _number(cell: str, where: str) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        value = float("nan")
-    if not np.isfinite(value):
-        raise ConfigError(f"{where}: {cell.strip()!r} is not a finite number")
-    return value
 
 
 def base_angles(

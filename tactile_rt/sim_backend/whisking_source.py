@@ -14,26 +14,72 @@ from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.objects.catalogue import load_object
-from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
+from tactile_rt.sim_backend.objects.solids import TactileObject
 from tactile_rt.sim_backend.sensor import Sensor
-from tactile_rt.sim_backend.sensor_model import SensorModel
-from tactile_rt.sim_backend.source import CHUNK_SAMPLES, PacedSource, check_pace
+from tactile_rt.sim_backend.source import CHUNK_SAMPLES, PacedOptions, PacedSource
 from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
 from tactile_rt.sim_backend.whisking_drive import Drive, Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
 from tactile_rt.stream import ArraySpec, Chunk, EndOfStream
 
-__all__ = ["WhiskingOptions", "WhiskingSource"]
+__all__ = ["Placing", "WhiskingOptions", "WhiskingSource", "parse_point"]
 
 LARGEST_MM = 1e3  # of an object and its position
 
 
 @dataclass(frozen=True)
-class WhiskingOptions(SensorModel, MeshDetail):
+class Placing:
+    """Where the object that an array whisks against stands.
+
+    Attributes:
+        position_mm: The position of the object's centre: ``x,y,z``, x lateral (away from the head),
+            y rostral, z up, from the array's origin, mm.
+        size_mm: The largest extent of the object, mm.
+        yaw_deg: The rotation of the object about z, degrees.
+    """
+
+    position_mm: str = "25,5,0"
+    size_mm: float = 20.0
+    yaw_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not 0 < self.size_mm <= LARGEST_MM:
+            raise ConfigError(f"size_mm must be above 0, at most {LARGEST_MM:g}: {self.size_mm:g}")
+        if not math.isfinite(self.yaw_deg):
+            raise ConfigError(f"yaw_deg must be a number of degrees, not {self.yaw_deg}")
+        parse_point(self.position_mm, "position_mm")
+
+    def place(self, thing: TactileObject, left: bool) -> tuple[NDArray[np.float64], ...]:
+        """Return the (points, 3) corners of the object's convex pieces in the world, mm.
+
+        Args:
+            thing: the object.
+            left: whether it stands on the left, as the mirror image has it.
+        """
+        at = np.array(parse_point(self.position_mm, "position_mm")) * (1 - 2 * left, 1, 1)
+        turn = rotation("z", np.radians(self.yaw_deg))
+        return tuple(p.vertices * self.size_mm @ turn.T + at for p in thing.pieces)
+
+
+def parse_point(text: str, key: str) -> tuple[float, float, float]:
+    """Read a point ``x,y,z``, mm."""
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+        if not all(abs(v) <= LARGEST_MM for v in (x, y, z)):
+            raise ValueError
+    except ValueError:
+        raise ConfigError(
+            f"{key} is three numbers x,y,z of at most {LARGEST_MM:g}, not {text!r}"
+        ) from None
+    return x, y, z
+
+
+@dataclass(frozen=True)
+class WhiskingOptions(PacedOptions, Placing):
     """How the array whisks at first, against what, and what its sensors make of it.
 
-    The fields of `SensorModel` are options too and concern the loads; angles are true. So are those
-    of `MeshDetail`, for an object from a mesh file.
+    The fields of `PacedOptions` are options too, and concern the loads; angles are true. So are
+    those of `Placing`.
 
     Attributes:
         frequency_hz: The whisking cycles per second, Hz.
@@ -41,63 +87,27 @@ class WhiskingOptions(SensorModel, MeshDetail):
             rostral positive, degrees. See `Whisking` for the ranges.
         object: The name (``mug-50``), category or mesh file of what stands beside the array; empty:
             the array whisks in air.
-        position_mm: The position of the object's centre: ``x,y,z``, x lateral (away from the head),
-            y rostral, z up, from the array's origin, mm.
-        size_mm: The largest extent of the object, mm.
-        yaw_deg: The rotation of the object about z, degrees.
         seconds: The length of the stream, s; 0: without end.
-        seed: The seed of the sensors' imperfections.
-        profile: The name of the simulation profile, one of `world.PROFILES`.
-        pace: ``realtime`` delivers samples when they are due, ``fast`` as soon as simulated.
     """
 
     frequency_hz: float = 8.0
     amplitude_deg: float = 20.0
     offset_deg: float = 0.0
     object: str = ""
-    position_mm: str = "25,5,0"
-    size_mm: float = 20.0
-    yaw_deg: float = 0.0
     seconds: float = 0.0
-    seed: int = 0
-    profile: str = "realtime"
-    pace: str = "realtime"
 
     def __post_init__(self) -> None:
-        SensorModel.__post_init__(self)
-        MeshDetail.__post_init__(self)
-        check_pace(self.pace)
-        if self.profile not in PROFILES:
-            raise ConfigError(f"no profile {self.profile!r}: there are {', '.join(PROFILES)}")
-        if not 0 < self.size_mm <= LARGEST_MM:
-            raise ConfigError(f"size_mm must be above 0, at most {LARGEST_MM:g}: {self.size_mm:g}")
-        if not math.isfinite(self.yaw_deg):
-            raise ConfigError(f"yaw_deg must be a number of degrees, not {self.yaw_deg}")
+        PacedOptions.__post_init__(self)
+        Placing.__post_init__(self)
         if not 0 <= self.seconds < math.inf:
             raise ConfigError(f"seconds must be 0 or more, not {self.seconds}")
-        if self.seed < 0:
-            raise ConfigError(f"seed must be 0 or more, not {self.seed}")
-        _ = self.whisking, self.position
+        _ = self.whisking
 
     @property
     def whisking(self) -> Whisking:
         """The first command."""
         turns = math.radians(self.amplitude_deg), math.radians(self.offset_deg)
         return Whisking(self.frequency_hz, *turns)
-
-    @property
-    def position(self) -> tuple[float, float, float]:
-        """`position_mm` as numbers."""
-        try:
-            x, y, z = (float(part) for part in self.position_mm.split(","))
-            if not all(abs(v) <= LARGEST_MM for v in (x, y, z)):
-                raise ValueError
-        except ValueError:
-            raise ConfigError(
-                f"position_mm is three numbers x,y,z of at most {LARGEST_MM:g}, not "
-                f"{self.position_mm!r}"
-            ) from None
-        return x, y, z
 
 
 class WhiskingSource(PacedSource):
@@ -134,7 +144,7 @@ class WhiskingSource(PacedSource):
             animal.whiskers,
             self._drive,
             profile,
-            _pieces(options, left),
+            options.place(load_object(options.object, options), left) if options.object else (),
             HEAD.mirrored() if left else HEAD,
         )
         steps = np.arange(round(SAMPLE_MS / profile.timestep_ms))
@@ -203,13 +213,3 @@ class WhiskingSource(PacedSource):
             self._drive.protraction(times.ravel()).reshape(times.shape).mean(axis=1)
         )
         return means
-
-
-def _pieces(options: WhiskingOptions, left: bool) -> tuple[NDArray[np.float64], ...]:
-    """Corners (points, 3) of the object's convex pieces in the world, mm."""
-    if not options.object:
-        return ()
-    at = np.array(options.position) * (-1.0 if left else 1.0, 1.0, 1.0)
-    turn = rotation("z", np.radians(options.yaw_deg))
-    pieces = load_object(options.object, options).pieces
-    return tuple(p.vertices * options.size_mm @ turn.T + at for p in pieces)

@@ -9,11 +9,9 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("numba")
 
-from tactile_rt.project.device import read_fit
-from tactile_rt.project.folder import Project, new_project
+from tactile_rt.project.folder import Project, new_project, read_fit
 from tactile_rt.sim_backend.arrays.files import load_array
-from tactile_rt.sim_backend.arrays.robots import ROBOTS
-from tactile_rt.sim_backend.arrays.species import SPECIES
+from tactile_rt.sim_backend.arrays.species import ROBOTS, SPECIES
 from tests.helpers.plucked import plucked
 from tests.helpers.recordings import write
 from tests.helpers.source_tree import ROOT

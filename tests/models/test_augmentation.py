@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from tactile_rt.calibration.mirroring import Mirror
+from tactile_rt.calibration.correction import Mirror
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.array_symmetries import compose, symmetries
 from tactile_rt.models.augmentation import (

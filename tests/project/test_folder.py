@@ -23,7 +23,7 @@ from tactile_rt.project.folder import KINDS, Project, new_project
 from tactile_rt.project.making import make
 from tactile_rt.project.report import confused
 from tactile_rt.sim_backend.arrays.files import load_array
-from tactile_rt.sim_backend.arrays.robots import ROBOTS, robot_text
+from tactile_rt.sim_backend.arrays.species import ROBOTS, robot_text
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.sources.opening import check_source, open_source

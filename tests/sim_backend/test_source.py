@@ -12,7 +12,7 @@ from tactile_rt.sim_backend import source as source_module
 from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
 from tactile_rt.sim_backend.source import CHUNK_SAMPLES, REST_SAMPLES, SimOptions, SimSource
-from tactile_rt.sim_backend.world import CHANNELS, array_spec
+from tactile_rt.sim_backend.world import array_spec
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, EndOfStream, SourceStats, concatenate
 
@@ -329,70 +329,6 @@ def test_objects_pass_a_rat_further_out() -> None:
             source.read()
             distances.append(source.passes[0].sweep.distance_mm)
     assert distances[1] == pytest.approx(distances[0] * 8.75 / 6.5)
-
-
-SPRINGS = """
-name = "springs"
-[defaults]
-mount_stiffness_nm_rad = 2e-4
-mount_damping_nms_rad = 1e-7
-row = 1
-arc_length_mm = 30
-curvature_a_per_mm = 0.0
-base_x_mm = 0.0
-base_y_mm = 0.0
-base_theta_rad = 1.2
-base_phi_rad = 0.0
-base_zeta_rad = 0.0
-base_radius_mm = 0.1
-tip_radius_mm = 0.1
-young_modulus_pa = 2.9e9
-density_base_kg_m3 = 1130
-density_tip_kg_m3 = 1130
-damping_ratio = 0.3
-friction = 0.3
-[[whisker]]
-whisker = "top"
-col = 0
-base_z_mm = 4
-[[whisker]]
-whisker = "bottom"
-col = 1
-base_z_mm = -4
-"""
-
-
-@pytest.fixture
-def springs(tmp_path: Path) -> str:
-    path = tmp_path / "springs.toml"
-    path.write_text(SPRINGS, encoding="utf-8")
-    return f"sim:{path}?objects=bottle-3&pace=fast&sweeps=1&seed=4&base_turns=true"
-
-
-def test_turns_of_bases_that_give_are_channels(springs: str) -> None:
-    pytest.importorskip("numba")
-    with open_source(springs) as source:
-        assert source.spec.channels == (*CHANNELS, "turn_y", "turn_z")
-        assert source.spec.units[-2:] == ("rad", "rad")
-        true = concatenate(list(source))
-    turn = true.values[..., 6:]
-    assert turn.max() - turn.min() > 0.01
-    # a spring: all but its slight damping, which tells as a whisker slips off, is the moment over
-    # the stiffness
-    most = abs(turn).max()
-    slow = abs(np.gradient(turn, axis=0)).max(axis=(1, 2)) < 0.01 * most
-    assert slow.mean() > 0.9
-    np.testing.assert_allclose(turn[slow], true.values[slow, :, 4:6] / 2e-4, atol=0.02 * most)
-    with open_source(springs + "&drop_probability=0.3&bias_moment=1e-6&gain=0.1") as source:
-        received = concatenate(list(source))
-    assert 0.5 < len(received) / len(true) < 0.8
-    np.testing.assert_array_equal(received.values[..., 6:], turn[received.seq])
-    assert (received.values[..., :6] != true.values[received.seq][..., :6]).any()
-
-
-def test_a_mount_that_does_not_give_has_no_turns_to_show() -> None:
-    with pytest.raises(ConfigError, match=r"base_turns: no mount of mouse-right gives; a \.toml"):
-        open_source("sim:mouse?base_turns=true")
 
 
 def test_what_is_compiled_is_so_before_the_clock_begins(monkeypatch) -> None:

@@ -414,18 +414,18 @@ def test_a_recorded_trajectory_is_followed(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("", "holds no samples"),
-        ("time_s,theta_deg\n", "holds no samples"),
-        ("t,theta_deg\n0,1\n", "line 1: the first column must be time_s"),
-        ("time_s,theta\n0,1\n", "line 1: column 'theta' is none of"),
-        ("time_s,theta_deg_Z9\n0,1\n", "line 1: column 'theta_deg_Z9' is none of"),
-        ("time_s,theta_deg,theta_deg\n0,1,1\n", "line 1: column 'theta_deg' is there twice"),
-        ("time_s,theta_deg\n0,1\n0.1,x\n", "line 3, column theta_deg: 'x' is not a finite"),
-        ("time_s,theta_deg\n0,1\n0.1,nan\n", "line 3, column theta_deg: 'nan' is not a finite"),
-        ("time_s,theta_deg\n0,1\n0.1\n", "line 3: 1 values for 2 columns"),
+        ("", "is empty; its first line names the columns"),
+        ("time_s,theta_deg\n", "0 samples; a cubic spline needs"),
+        ("t,theta_deg\n0,1\n", ":1: the first column must be time_s"),
+        ("time_s,theta\n0,1\n", ":1: column 'theta' is none of"),
+        ("time_s,theta_deg_Z9\n0,1\n", ":1: column 'theta_deg_Z9' is none of"),
+        ("time_s,theta_deg,theta_deg\n0,1,1\n", ":1: column 'theta_deg' is there twice"),
+        ("time_s,theta_deg\n0,1\n0.1,x\n", ":3: theta_deg: expected a number, got 'x'"),
+        ("time_s,theta_deg\n0,1\n0.1,nan\n", ":3: theta_deg: nan is no quantity"),
+        ("time_s,theta_deg\n0,1\n0.1\n", ":3: 1 values for 2 columns"),
         ("time_s,theta_deg\n0,1\n1,1\n2,1\n", "3 samples; a cubic spline needs at least 4"),
-        ("time_s,theta_deg\n0,1\n1,1\n1,1\n2,1\n", "line 4: time_s does not increase"),
-        ("time_s,theta_deg\n0,1\n1,1\n2,150\n3,1\n", "line 4: theta_deg is beyond 120"),
+        ("time_s,theta_deg\n0,1\n1,1\n1,1\n2,1\n", ":4: time_s does not increase"),
+        ("time_s,theta_deg\n0,1\n1,1\n2,150\n3,1\n", ":4: theta_deg is beyond 120"),
         ("time_s,theta_deg_C\n0,1\n1,1\n2,1\n3,1\n", "no theta_deg for whisker A1"),
     ],
 )
@@ -442,5 +442,5 @@ def test_a_recording_that_is_not_there_or_not_text(tmp_path):
         read_trajectory(tmp_path / "none.csv", FEW)
     path = tmp_path / "angles.csv"
     path.write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(ConfigError, match="not a CSV file of text"):
+    with pytest.raises(ConfigError, match="not UTF-8 text"):
         read_trajectory(path, FEW)

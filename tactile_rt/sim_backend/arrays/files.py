@@ -44,8 +44,7 @@ from tactile_rt.settings import (
     read_csv,
     read_toml,
 )
-from tactile_rt.sim_backend.arrays.robots import ROBOTS, robot_text
-from tactile_rt.sim_backend.arrays.species import species_array
+from tactile_rt.sim_backend.arrays.species import ROBOTS, robot_text, species_array
 from tactile_rt.sim_backend.arrays.whisker_array import (
     Mount,
     Point,

@@ -8,12 +8,12 @@ import csv
 import difflib
 from collections.abc import Callable
 from importlib import resources
+from types import MappingProxyType
 
 import numpy as np
 
 from tactile_rt import extensions
 from tactile_rt.errors import ConfigError, name_some
-from tactile_rt.sim_backend.arrays.robots import ROBOTS
 from tactile_rt.sim_backend.arrays.whisker_array import (
     MOUNT,
     Mount,
@@ -24,7 +24,22 @@ from tactile_rt.sim_backend.arrays.whisker_array import (
 )
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 
-__all__ = ["SIDES", "SPECIES", "mouse_whiskers", "rat_whiskers", "species_array"]
+__all__ = ["ROBOTS", "SPECIES", "mouse_whiskers", "robot_text", "species_array"]
+
+# By name: the options of the serial URL that reads the array.
+ROBOTS = MappingProxyType(
+    {
+        "hx711_whisker": "codec=hx711_whisker",
+        "mlx_hex": "codec=mlx_hex",
+        "rattechan": "codec=anyskin&magnetometers=3&temperature=false&rate_hz=300",
+    }
+)
+
+
+def robot_text(name: str) -> str:
+    """The description of one of `ROBOTS`: what is in its .toml file."""
+    file = resources.files(__package__).joinpath("data", f"{name}.toml")
+    return file.read_text(encoding="utf-8")
 
 
 def mouse_whiskers() -> tuple[Whisker, ...]:

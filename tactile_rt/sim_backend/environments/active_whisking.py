@@ -8,12 +8,14 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from tactile_rt.errors import ConfigError, SourceError, name_some
 from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.environments.whisking_head import Stretch, WhiskingHead, place_beside
 from tactile_rt.sim_backend.objects.catalogue import promised_object
+from tactile_rt.sim_backend.rods.chains import Pose, place
 from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import usual_distance, usual_size
@@ -21,7 +23,68 @@ from tactile_rt.sim_backend.whisking_drive import Whisking
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, array_spec
 from tactile_rt.stream import Chunk
 
-__all__ = ["KINDS", "LOGITS", "MOTION", "ActiveWhisking"]
+__all__ = ["KINDS", "LOGITS", "MOTION", "ActiveWhisking", "picture", "whisker_nodes"]
+
+Floats = NDArray[np.float64]
+
+SIDE, MARGIN_MM = 320, 25.0
+PAPER, THING, EDGE = (255, 255, 255), (214, 186, 140), (170, 130, 80)
+WHISKER, TOUCHING = (60, 60, 70), (200, 40, 40)
+VIEWS = ((0, 1), (1, 2))  # from above: x to the right, y up; from the side: y to the right, z up
+
+
+def whisker_nodes(head: WhiskingHead) -> list[Floats]:
+    """Return the (node, 3) points of every whisker, base to tip, mm, from the start."""
+    frames = head.frames(np.array([head.samples]))[0]
+    nodes, at = [], 0
+    for whisker, rod, frame in zip(head.array.whiskers, head.world.rods, frames, strict=True):
+        chain = rod.chain
+        links, joints = len(chain.length), len(chain.stiffness)
+        pose = Pose(np.empty((links + 1, 3)), np.empty((links, 3, 3)), np.empty((joints, 3)))
+        mount = head.array.mount
+        pose.nodes[0] = mount.rotation @ np.array(whisker.base) + mount.position
+        pose.frames[0] = frame @ rod.to_element.T
+        place(chain, head.world.angles[at : at + joints], pose)
+        nodes.append(pose.nodes + head.position)
+        at += joints
+    return nodes
+
+
+def picture(head: WhiskingHead) -> NDArray[np.uint8]:
+    """(320, 640, 3) the array, red where whiskers touch, and the object.
+
+    Raises:
+        ModuleNotFoundError: without Pillow (extra ``view``).
+    """
+    from PIL import Image, ImageDraw
+
+    placed = head.placed
+    corners = [piece.corners + placed.centre for piece in placed.pieces]
+    everything = np.concatenate([*corners, placed.low[None], placed.high[None]])
+    image = Image.new("RGB", (len(VIEWS) * SIDE, SIDE), PAPER)
+    draw = ImageDraw.Draw(image)
+    touching = head.touching
+    for panel, axes in enumerate(VIEWS):
+        low, high = everything[:, axes].min(axis=0), everything[:, axes].max(axis=0)
+        middle, span = (low + high) / 2, (high - low).max() + MARGIN_MM
+
+        def project(
+            points: Floats,
+            axes: tuple[int, int] = axes,
+            middle: Floats = middle,
+            span: float = span,
+            panel: int = panel,
+        ) -> list[tuple[float, float]]:
+            at = (points[:, axes] - middle) * (SIDE / span)
+            return [(panel * SIDE + SIDE / 2 + u, SIDE / 2 - v) for u, v in at]
+
+        for points in corners:
+            outline = points[ConvexHull(points[:, axes]).vertices]
+            draw.polygon(project(outline), fill=THING, outline=EDGE)
+        for line, touches in zip(whisker_nodes(head), touching, strict=True):
+            draw.line(project(line), fill=TOUCHING if touches else WHISKER, width=2)
+    return np.asarray(image, dtype=np.uint8)
+
 
 # Kinds of the catalogue that differ in what whiskers can feel of them: edges, rims, gaps, curves.
 KINDS: Final = ("bottle", "bowl", "car", "chair", "gear", "mug", "mushroom", "table")
@@ -35,7 +98,6 @@ FRAMES: Final = 5  # in which the samples of a step are averaged
 FULL_SCALE: Final = (*(5e-3,) * 3, *(2e-5,) * 3)  # N, N m: beyond, a reading saturates
 DRAWS: Final = 100  # tries to stand an object where the array meets it
 
-Floats = NDArray[np.float64]
 Observation = dict[str, NDArray[np.float32]]
 
 
@@ -229,7 +291,7 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
         """A picture (height, width, 3) from above and from the side, or None without a mode."""
         if self.render_mode is None or self._head is None:
             return None
-        from tactile_rt.sim_backend.environments.picture import picture
+        from tactile_rt.sim_backend.environments.active_whisking import picture
 
         return picture(self._head)
 

@@ -17,12 +17,12 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from tactile_rt.sim_backend.approach import centrelines, faces_right, way_to_contact
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import rotation
 from tactile_rt.sim_backend.contacts import TOUCHING_SHARE
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
 from tactile_rt.sim_backend.rods.world import Piece, RodWorld
+from tactile_rt.sim_backend.sweep import centrelines, faces_right, way_to_contact
 from tactile_rt.sim_backend.trajectories import base_angles
 from tactile_rt.sim_backend.whisking_drive import LAG_S, Drive, Whisking
 from tactile_rt.sim_backend.world import SAMPLE_MS, Profile

@@ -39,13 +39,7 @@ from tactile_rt.files import write_whole
 from tactile_rt.settings import check_columns, convert, no_such, read_csv
 from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
 
-__all__ = [
-    "ListedFile",
-    "ListedObject",
-    "get_objects",
-    "read_list",
-    "shipped_lists",
-]
+__all__ = ["get_objects", "read_list"]
 
 RAW = "https://raw.githubusercontent.com"
 AT_ONCE = 8  # files that are got at one time

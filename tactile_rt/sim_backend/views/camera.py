@@ -46,19 +46,6 @@ class Camera:
     orthographic: bool = False
     fovy_deg: float = 35.0
 
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.azimuth) and abs(self.elevation) <= 90):
-            raise ConfigError(
-                f"camera: azimuth {self.azimuth} and elevation {self.elevation} degrees: "
-                "the elevation must be from -90 to 90"
-            )
-        if not (np.isfinite(self.extent_mm) and self.extent_mm > 0):
-            raise ConfigError(f"camera: extent of {self.extent_mm} mm must be more than 0")
-        if not np.isfinite(self.lookat).all():
-            raise ConfigError(f"camera: looks at {self.lookat}, must be three numbers")
-        if not 1 <= self.fovy_deg <= 120:
-            raise ConfigError(f"camera: field of view {self.fovy_deg} must be 1 to 120 degrees")
-
     @property
     def distance_mm(self) -> float:
         """From the eye to the point looked at, mm."""

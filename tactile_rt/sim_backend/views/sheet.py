@@ -1,7 +1,6 @@
 """The whole picture: the scene, the array as a map of forces beside it, their traces below."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -334,39 +333,24 @@ def draw_traces(
     """Forces (sample, element) in mN over time; the strongest in colour and by name."""
     peaks = forces.max(axis=0)
     top = max(float(peaks.max()), 1e-6)
-    wide = float(times_ms[-1])
-    taken: list[tuple[float, float]] = []
     for rank, i in enumerate(np.argsort(-peaks)):
         if peaks[i] < 0.01 * top:
             break
         named = rank < NAMED
         hue = colormaps["tab10"](rank) if named else (0.75, 0.75, 0.75, 1.0)
         axes.plot(
-            times_ms, forces[:, i], color=hue, lw=1.5 if named else 0.7, zorder=2 - rank / 100
+            times_ms,
+            forces[:, i],
+            color=hue,
+            lw=1.5 if named else 0.7,
+            zorder=2 - rank / 100,
+            label=names[i] if named else None,
         )
-        if named:
-            x, y = _free_place(times_ms, forces[:, i], taken, 0.03 * wide, 0.14 * top)
-            taken.append((x, y))
-            box = {"facecolor": "white", "edgecolor": "none", "pad": 0.4, "alpha": 0.8}
-            style: dict[str, Any] = {"ha": "center", "va": "bottom", "weight": "bold"}
-            axes.text(x, y, names[i], color=hue, fontsize=9, bbox=box, zorder=3, **style)
-    axes.set_xlim(0, wide)
-    axes.set_ylim(0, max([y for _, y in taken], default=top) + 0.2 * top)
+    if peaks.any():
+        axes.legend(loc="upper right", ncols=NAMED, fontsize=9, frameon=False)
+    axes.set_xlim(0, float(times_ms[-1]))
+    axes.set_ylim(0, 1.2 * top)
     axes.set_xlabel("time (ms)", color=INK)
     axes.set_ylabel("force on base (mN)", color=INK)
     axes.spines[["top", "right"]].set_visible(False)
     axes.tick_params(labelsize=9.5)
-
-
-def _free_place(
-    x: NDArray[np.float64],
-    y: NDArray[np.float64],
-    taken: list[tuple[float, float]],
-    width: float,
-    height: float,
-) -> tuple[float, float]:
-    """The highest point of a curve with room for a label: this far from all that are there."""
-    for k in np.argsort(-y):
-        if not any(abs(x[k] - a) < width and abs(y[k] - b) < height for a, b in taken):
-            return float(x[k]), float(y[k])
-    return float(x[y.argmax()]), float(y.max())

@@ -330,7 +330,9 @@ def test_cutting_says_nothing(tmp_path: Path, capfd: pytest.CaptureFixture[str])
     assert capfd.readouterr() == ("", "")
 
 
-def test_what_takes_seconds_says_so_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_takes_seconds_says_so_once(
+    tmp_path: Path, cache: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     path = save(mesh_truth.blob(4), tmp_path / "lump.ply")
     with caplog.at_level("INFO", "tactile_rt.sim_backend.objects"):
         load_mesh(path)
