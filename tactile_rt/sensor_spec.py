@@ -133,7 +133,6 @@ class MagnetSpec:
     Attributes:
         moment_a_m2: The magnetic moment, A m^2: remanence times volume over the vacuum's
             permeability, 1.25 T x 0.79 mm^3 -> 7.8e-4.
-        axis: The direction of the moment at rest.
         position_mm: The magnet's place at rest.
         sensor_mm: The place in which the field is measured.
 

@@ -17,8 +17,7 @@ from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
-from tactile_rt.sim_backend.views.camera import Camera
-from tactile_rt.sim_backend.views.footage import record
+from tactile_rt.sim_backend.views.footage import Camera, record
 from tactile_rt.sim_backend.views.sheet import (
     INK,
     QUIET,

@@ -13,8 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays.files import load_array
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers
+from tactile_rt.sim_backend.arrays.files import load_array, mouse_whiskers
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.world import (
     Mount,

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from bench.sim.beams import ARRAYS, GRAVITY, flat
 from bench.sim.pegs import PEG_RADIUS_MM
-from tactile_rt.sim_backend.arrays.files import load_array
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers
+from tactile_rt.sim_backend.arrays.files import load_array, mouse_whiskers
 from tests.helpers import beams as theory
 
 DATA = Path(__file__).parent / "data"

@@ -134,7 +134,6 @@ class Calibration:
         array: Array that the output is declared to be; None for the device's own. Its elements are
             those of the same names or, if the names are not all the same, those in the same place
             of the order. Its channels are those of the same name and unit; others are left out.
-        history: Measurements that the numbers come from, one line each with its date.
 
     Raises:
         ConfigError: sizes disagree, a name is unknown, or a number is not finite.

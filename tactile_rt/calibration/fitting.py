@@ -88,7 +88,6 @@ def raw_readings(
     """Return the (row, channel) medians of an element under each load of a table.
 
     Args:
-        table: with times.
         recorded: of raw samples; the table's second 0 is its first sample's.
 
     Raises:

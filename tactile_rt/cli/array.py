@@ -33,8 +33,7 @@ def show(json: Json = None) -> None:
     try:
         with starting():
             from tactile_rt import extensions
-            from tactile_rt.sim_backend.arrays.files import load_animals
-            from tactile_rt.sim_backend.arrays.species import ROBOTS, SPECIES
+            from tactile_rt.sim_backend.arrays.files import ROBOTS, SPECIES, load_animals
             from tactile_rt.sim_backend.transducer import device_spec
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
@@ -88,7 +87,6 @@ def fit(
     check_source(url)
     try:
         with starting():
-            from tactile_rt.project.folder import keep_fit
             from tactile_rt.sim_backend.measuring.fitting import fit_array, read_described
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
@@ -119,7 +117,6 @@ def fit(
             "not written: --in-place changes the array's file, --out FILE makes another",
             err=json == STDOUT,
         )
-    keep_fit(described, recording, fitted.findings, in_place)
 
 
 def _show(findings: "list[ArrayFinding]", console: Console) -> None:

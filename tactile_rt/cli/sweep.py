@@ -69,7 +69,7 @@ def sweep(
                 make_sweeps,
             )
             from tactile_rt.sim_backend.datasets.inventory import tally
-            from tactile_rt.sim_backend.remarks import ringing
+            from tactile_rt.sim_backend.sweep_simulation import ringing
             from tactile_rt.sim_backend.world import PROFILES
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None

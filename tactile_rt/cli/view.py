@@ -19,16 +19,15 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 PICTURE_MS = 4  # between the samples of a picture's traces
-FPS = {".mp4": 25, ".gif": 20}
-WIDTH = {".gif": 800}  # of GIFs, which do not compress well; of all else 1280
+FPS = 25
 
 
 @app.command()
 def view(
     target: Annotated[str, typer.Argument(help="What is swept past: mug-17, or a mesh file.")],
-    out: Annotated[
-        Path, typer.Option(help=".png or .jpg: a picture; .mp4 or .gif: a video.")
-    ] = Path("sweep.png"),
+    out: Annotated[Path, typer.Option(help=".png or .jpg: a picture; .mp4: a video.")] = Path(
+        "sweep.png"
+    ),
     camera: Annotated[str, typer.Option(help="front, side, top or oblique.")] = "oblique",
     orthographic: Annotated[
         bool, typer.Option("--orthographic", help="Without perspective.")
@@ -39,9 +38,7 @@ def view(
     slow: Annotated[
         float, typer.Option(min=1, max=40, help="How much slower than real a video is.")
     ] = 10.0,
-    pixels: Annotated[
-        int | None, typer.Option(min=320, max=3840, help="Width. Default: 1280, of a GIF 800.")
-    ] = None,
+    pixels: Annotated[int, typer.Option(min=320, max=3840, help="Width.")] = 1280,
     array: Annotated[str, typer.Option(help="mouse, rat, rat-left, ..., or a file.")] = "mouse",
     profile: Annotated[
         str, typer.Option(help="How finely: realtime, dataset (finer), accurate, mujoco.")
@@ -60,7 +57,6 @@ def view(
             from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
             from tactile_rt.sim_backend.sweep import Sweep, usual_distance
             from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
-            from tactile_rt.sim_backend.views.camera import VIEWS
             from tactile_rt.sim_backend.views.film import (
                 IMAGES,
                 Film,
@@ -68,7 +64,7 @@ def view(
                 write_image,
                 write_video,
             )
-            from tactile_rt.sim_backend.views.footage import record
+            from tactile_rt.sim_backend.views.footage import VIEWS, record
             from tactile_rt.sim_backend.world import PROFILES, world_spec
     except ModuleNotFoundError as error:
         raise needs("view", error) from None
@@ -95,20 +91,18 @@ def view(
     console = Console(stderr=True)
     if not simulation.touches:
         console.print(f"{thing.name} passes without touching: --set height_mm or distance_mm")
-    fps = FPS.get(suffix, 25)
-    period = PICTURE_MS if suffix in IMAGES else max(1, round(1000 / (fps * slow)))
+    period = PICTURE_MS if suffix in IMAGES else max(1, round(1000 / (FPS * slow)))
     with progress_bar(console, "simulating", total=1.0) as update:
         footage = record(simulation, spec, period, lambda done: update(completed=done))
     projection = "orthographic" if orthographic else "perspective"
     detail = f"{camera} view, {projection} · {thing.name} moves from nose to ear"
-    if suffix in FPS:
-        detail += f" · {fps * period / 1000:.2g} x real speed"
+    if suffix not in IMAGES:
+        detail += f" · {FPS * period / 1000:.2g} x real speed"
     title = (
         f"{thing.name[:40]}, {sweep.size_mm:g} mm large, sweeps past the {len(spec.elements)} "
         f"whiskers of {spec.name[:40]} at {sweep.speed_mm_s:g} mm/s"
     )
-    width = pixels or WIDTH.get(suffix, 1280)
-    with closing(Film(footage, camera, orthographic, title, detail, width)) as film:
+    with closing(Film(footage, camera, orthographic, title, detail, pixels)) as film:
         if suffix in IMAGES:
             write_image(out, film.picture(footage.strongest if at is None else footage.at(at)))
             return
@@ -119,4 +113,4 @@ def view(
                     yield picture
                     update(advance=1)
 
-            write_video(out, pictures(), fps, film.picture(footage.strongest))
+            write_video(out, pictures(), FPS)

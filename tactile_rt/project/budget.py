@@ -38,9 +38,7 @@ class Budget(msgspec.Struct, forbid_unknown_fields=True):
     """What was decided for a project.
 
     Attributes:
-        described: The fingerprint of the files that it was decided for.
         per_category, validation, test: The numbers of objects of a category, and of those held out.
-        draws: The number of sweeps of an object.
         updates: The number of updates of the training; 0: not decided yet.
     """
 

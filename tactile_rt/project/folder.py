@@ -6,20 +6,16 @@ robot.toml       the device and the model of `tactile-rt run robot.toml`
 test_robot.py    your robot's own code, driven by the device that does not exist yet
 README.md        the commands, in order
 model.onnx, report/, build/  what `tactile-rt make` makes
-fit.json         what `tactile-rt array fit` has measured of the device
 """
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from importlib import resources
 from pathlib import Path
 from string import Template
 from types import MappingProxyType
 from urllib.parse import quote, urlencode
-
-import msgspec
 
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.daemon.loading import load_config
@@ -29,40 +25,23 @@ from tactile_rt.files import write_whole
 from tactile_rt.sensor_faults import LARGEST
 from tactile_rt.sensor_spec import channel_limits
 from tactile_rt.settings import no_such, read_text, split_url
-from tactile_rt.sim_backend.arrays.files import ARRAY_FILES, load_animals, read_animals
-from tactile_rt.sim_backend.arrays.species import ROBOTS, robot_text
+from tactile_rt.sim_backend.arrays.files import (
+    ARRAY_FILES,
+    ROBOTS,
+    load_animals,
+    read_animals,
+    robot_text,
+)
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
-from tactile_rt.sim_backend.measuring.findings import ArrayFinding
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, added_categories
 from tactile_rt.sim_backend.sweep import Sweep, usual_distance, usual_size
 from tactile_rt.sim_backend.transducer import device_spec, sensor_of
 from tactile_rt.sim_backend.world import PROFILES
 
-__all__ = ["KINDS", "DeviceFit", "DeviceLine", "Project", "keep_fit", "new_project", "read_fit"]
-
-CHANGED = "array.toml has been brought to that: what is described is what it said before."
-LEFT = "array.toml has not been changed."
-
-
-class DeviceFit(msgspec.Struct, frozen=True):
-    """What `tactile-rt array fit` told, in words.
-
-    Attributes:
-        when: The UTC time of the measurement, ISO 8601.
-        since: What has become of the array's file.
-        rows: The name of each quantity, its unit, the value described, that measured, their ratio.
-        notes: What could not be measured, and whose value deviates.
-    """
-
-    recording: str
-    when: str
-    since: str
-    rows: list[tuple[str, str, str, str, str]]
-    notes: list[str]
-
+__all__ = ["KINDS", "DeviceLine", "Project", "new_project"]
 
 RANGES = {"N": "range_n", "N m": "range_nm"}  # options of the native codec
 KINDS = ("bottle", "car", "chair", "gear", "mug", "pumpkin")
@@ -129,11 +108,6 @@ class Project:
     def report(self) -> Path:
         """The folder of the report card."""
         return self.folder / "report"
-
-    @property
-    def fit(self) -> Path:
-        """How far the device is from its description, if `tactile-rt array fit` has looked."""
-        return self.folder / "fit.json"
 
     def recipe(self) -> SweepRecipe:
         """What is to be swept past the array; its numbers of objects and sweeps are the most."""
@@ -207,38 +181,6 @@ class Project:
         codec = codec or line.codec
         own = line.options if codec == line.codec else {}
         return codec, {**own, **self.full_scale(codec), **options}
-
-
-def keep_fit(array: Path, recording: str, findings: Sequence[ArrayFinding], changed: bool) -> None:
-    """Write ``fit.json`` beside the array's file, if that is a project's.
-
-    Args:
-        changed: whether the array's file is brought to that.
-    """
-    try:
-        project = Project(array.parent)
-    except ConfigError:
-        return
-    if array.name != project.array.name:
-        return
-    fit = DeviceFit(
-        recording,
-        datetime.now(UTC).isoformat(timespec="seconds"),
-        CHANGED if changed else LEFT,
-        [f.words() for f in findings],
-        [f"{f.what}: {f.note}" for f in findings if f.note],
-    )
-    write_whole(project.fit, lambda file: file.write(msgspec.json.encode(fit)))
-
-
-def read_fit(project: Project) -> DeviceFit | None:
-    """Read what was measured of a project's device; None: nothing was."""
-    if not project.fit.exists():
-        return None
-    try:
-        return msgspec.json.decode(project.fit.read_bytes(), type=DeviceFit)
-    except msgspec.MsgspecError as error:
-        raise ConfigError(f"{project.fit} is damaged ({error}): run `array fit` again") from None
 
 
 def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> Project:

@@ -18,9 +18,9 @@ from tactile_rt.evidence.records import Record
 from tactile_rt.files import write_whole
 from tactile_rt.models import evaluation
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.project.folder import Project, read_fit
+from tactile_rt.project.folder import Project
 
-__all__ = ["confused", "device_section", "draw_over_time", "write_report"]
+__all__ = ["confused", "draw_over_time", "write_report"]
 
 HEADLINES = {
     "top-1": "right on objects it never met, no sensor noise",
@@ -64,7 +64,6 @@ def write_report(project: Project, sweeps: Path, records: Sequence[Record]) -> P
         headlines=_rows([(found[n], words) for n, words in HEADLINES.items() if n in found]),
         robust=_rows([(r, r.name.removeprefix("models.top-1, ")) for r in robust]),
         confused=_confusions(confused(table, card.classes)),
-        device=device_section(project),
         over_time=_picture(project.report / "over_time.png"),
         confusion=_picture(project.report / "confusion.png"),
     )
@@ -80,7 +79,6 @@ def confused(
 
     Args:
         table: (true, decided) counts.
-        share: the least that is told.
     """
     shares = table / np.maximum(table.sum(axis=1, keepdims=True), 1)
     pairs = [
@@ -134,23 +132,6 @@ def _rows(records: Sequence[tuple[Record, str]]) -> str:
         f"<tr><td>{escape(words)}</td><td class=n>{r.value:.1f} {escape(r.unit)}</td>"
         f"<td>{escape(r.anchor.partition(',')[0].replace('95 % interval ', ''))}</td></tr>"
         for r, words in records
-    )
-
-
-def device_section(project: Project) -> str:
-    """How far the device is from its description, HTML; empty where nobody has measured it."""
-    fit = read_fit(project)
-    if fit is None:
-        return ""
-    heads = ("what", "unit", "described", "measured", "ratio")
-    lines = [heads, *fit.rows]
-    cells = ("".join(f"<td>{escape(cell)}</td>" for cell in line) for line in lines)
-    table = "\n".join(f"<tr>{row}</tr>" for row in cells)
-    notes = "".join(f"<li>{escape(note)}</li>" for note in fit.notes)
-    return (
-        "<h2>How far the device is from its description</h2>\n"
-        f"<p>Measured {escape(fit.when)} from {escape(fit.recording)}. {escape(fit.since)}</p>\n"
-        f"<table>\n{table}\n</table>\n<ul>{notes}</ul>"
     )
 
 

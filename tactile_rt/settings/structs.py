@@ -53,7 +53,6 @@ def convert(
     """What stands at a path of a tree, as a type.
 
     Args:
-        kind: A msgspec struct, a dataclass, or what else msgspec converts to.
         top: the type of the whole tree, to tell a table that stands in another one's place; by
             default `kind` if the path is empty.
         lax: whether the values are text as written, so that ``"5"`` is a number.

@@ -37,7 +37,6 @@ def set_key(nodes: SettingNode, text: str, kind: Any) -> SettingNode:
         nodes: the tree; it is changed.
         text: ``a.b=value``, of which ``source.NAME.url=...`` or ``source.0.url=...`` names an item
             of a list. The value is TOML, or text that need not be quoted.
-        kind: the struct that the whole tree is to be, for what is a list and what is text.
 
     Raises:
         ConfigError: not of that form, or no such item.
@@ -100,7 +99,6 @@ def take_sets(
     """Settings of a command shared out among dataclasses: each takes those that it knows.
 
     Args:
-        what: whose they are, for the message of values that do not go together.
         usual: values where nothing is set, beside the dataclasses' own.
     """
     known = {name: kind for kind in kinds for name in types_of(kind)}
@@ -161,7 +159,6 @@ def take_options(what: str, fields: Mapping[str, str], *kinds: type[Any]) -> tup
     """The options shared out among dataclasses: each takes those that it knows.
 
     Args:
-        what: whose options they are, for the message.
         fields: as written; numbers may be hexadecimal, as CAN identifiers are.
 
     Raises:
@@ -188,12 +185,7 @@ def _decimal(value: str) -> str:
 
 @dataclass(frozen=True)
 class CsvTable:
-    """A CSV file as read.
-
-    Attributes:
-        where: File and line of the column names, for messages.
-        rows: A table for each row, which has the text of each cell by its column.
-    """
+    """A CSV file as read."""
 
     where: str
     columns: tuple[str, ...]

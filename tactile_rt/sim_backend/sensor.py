@@ -54,7 +54,6 @@ class Sensor:
         dead: The (element,) bool that tells which elements are dead.
         bias: The (element, channel) constant offset, SI.
         saturated: The number of readings (of one channel in one sample) clipped so far.
-        dropped: The number of samples dropped so far.
     """
 
     def __init__(

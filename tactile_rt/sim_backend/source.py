@@ -29,11 +29,15 @@ from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES, TactileObject, promised_object
 from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.randomisation import Randomisation
-from tactile_rt.sim_backend.remarks import ringing
 from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel
 from tactile_rt.sim_backend.sweep import Sweep, draw_sweep, usual_distance
-from tactile_rt.sim_backend.sweep_simulation import SweepSimulation, check_sweep, draw_simulation
+from tactile_rt.sim_backend.sweep_simulation import (
+    SweepSimulation,
+    check_sweep,
+    draw_simulation,
+    ringing,
+)
 from tactile_rt.sim_backend.transducer import Transducer, device_spec, sensor_of
 from tactile_rt.sim_backend.world import CHANNELS, PROFILES, SAMPLE_MS
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
@@ -235,9 +239,6 @@ class SimSource(PacedSource):
     Args:
         array: which array, see `files.load_animals`: ``mouse`` (also if empty), ``rat-left``, a
             .csv or .toml file.
-
-    Attributes:
-        passes: The objects that have come by so far, in order.
     """
 
     Options = SimOptions

@@ -268,7 +268,6 @@ def draw_sweep(
 
     Args:
         distance_mm: about which distances spread, see `usual_distance`.
-        chosen: parameters that are not drawn, by their names.
     """
     drawn = {
         "speed_mm_s": float(rng.uniform(28, 40)),

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
-from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS
-from tactile_rt.sim_backend.mujoco_world import MujocoWorld, sweep_model
+from tactile_rt.sim_backend.arrays.whiskers import Whisker, link_nodes
+from tactile_rt.sim_backend.mujoco_world import CONTACT_CHANNELS, MujocoWorld, sweep_model
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
-from tactile_rt.sim_backend.remarks import strains
 from tactile_rt.sim_backend.sweep import (
     Sweep,
     centrelines,
@@ -24,9 +23,62 @@ from tactile_rt.sim_backend.sweep import (
     way_to_contact,
     within_reach,
 )
-from tactile_rt.sim_backend.world import SAMPLE_MS, Profile, engine_of
+from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile, engine_of
 
-__all__ = ["SweepSimulation", "World", "check_sweep", "draw_simulation"]
+__all__ = ["SweepSimulation", "World", "check_sweep", "draw_simulation", "ringing", "strains"]
+
+TOO_MUCH = 1.1  # a damping ratio so many times the wanted one is told
+FINER = ("dataset", "accurate")
+
+
+def ringing(animals: Sequence[WhiskerArray], profile: Profile) -> str:
+    """Say which whiskers ring too shortly at a profile; empty: none."""
+    if engine_of(profile) != "rods":
+        return ""
+    whiskers = [w for animal in animals for w in animal.whiskers]
+    off = _off(whiskers, profile)
+    if not off:
+        return ""
+    wanted, had, worst = max(off, key=lambda one: one[1] / one[0])
+    left = {key: len(_off(whiskers, PROFILES[key])) for key in FINER}
+    best = min(left, key=lambda key: left[key])
+    better = f"; at profile {best} {left[best] or 'none'}" if left[best] < len(off) else ""
+    return (
+        f"{len(off)} of {len(whiskers)} whiskers ring shorter than they should at steps of "
+        f"{profile.timestep_ms:g} ms, {worst} with a damping ratio of {had:.2g} instead of "
+        f"{wanted:.2g}{better}"
+    )
+
+
+def _off(whiskers: Sequence[Whisker], profile: Profile) -> list[tuple[float, float, str]]:
+    """Return (ratio wanted, ratio had, name) of the whiskers that ring too shortly."""
+    from tactile_rt.sim_backend.rods.rod import HEARD_HZ, make_rod
+
+    steps = round(SAMPLE_MS / profile.timestep_ms)
+    rods = [make_rod(w, profile.links, steps) for w in whiskers]
+    return [
+        (rod.wanted_ratio, rod.damping_ratio, w.name)
+        for rod, w in zip(rods, whiskers, strict=True)
+        if rod.resonance_hz < HEARD_HZ and rod.damping_ratio > TOO_MUCH * rod.wanted_ratio
+    ]
+
+
+def strains(whiskers: Sequence[Whisker], links: int, angles: NDArray[np.float64]) -> list[float]:
+    """The largest strain of each whisker at its surface: curvature times radius.
+
+    Args:
+        angles: (joint,) angles of all whiskers' hinges, one whisker after the other, rad.
+    """
+    found, first = [], 0
+    for whisker in whiskers:
+        first += 2 if whisker.mount_stiffness else 0  # the mount's own, which strain nothing
+        bends = angles[first : first + 2 * links].reshape(-1, 2)
+        first += 2 * links
+        radii = whisker.radius(link_nodes(whisker, links)[1:-1])
+        cell = whisker.length / links
+        found.append(float((np.hypot(bends[:, 0], bends[:, 1]) / cell * radii).max()))
+    return found
+
 
 FAR_MM = 200.0  # where the object is when the way to first contact is measured
 DRAWS = 20  # tries to draw parameters with which an object meets the array at all
@@ -176,7 +228,7 @@ class SweepSimulation:
             SourceError: the simulation has become unstable: whiskers too stiff for the profile
                 jam against the object.
         """
-        return self._advance(samples, 0)[0]
+        return self.advance_with_contacts(samples, 0)[0]
 
     def advance_with_contacts(self, samples: int, every: int = 1) -> tuple[Floats, Floats]:
         """As `advance`, and where each whisker touches.
@@ -188,15 +240,12 @@ class SweepSimulation:
         Returns:
             The loads, and (samples, element, 3) contacts, see `contacts.CONTACT_CHANNELS`.
         """
-        return self._advance(samples, every)
-
-    def _advance(self, samples: int, look_every: int) -> tuple[Floats, Floats]:
         loads = np.zeros((samples, self._elements, 6))
         contacts = np.zeros((samples, self._elements, len(CONTACT_CHANNELS)))
         way = self._place(self._samples + np.arange(samples + 1))
         self._samples += samples
         if len(self._simulated):
-            found = self._world.advance(way, look_every, self._shaken(samples))
+            found = self._world.advance(way, every, self._shaken(samples))
             loads[:, self._simulated], contacts[:, self._simulated] = found
         return loads, contacts
 

@@ -81,9 +81,6 @@ class Transducer:
     """An array's sensor at work on one stream of loads, without its noise and its limits.
 
     The result does not depend on how the samples were cut into chunks.
-
-    Args:
-        elements: the names of the whiskers, in the order of the samples.
     """
 
     def __init__(self, sensor: SensorSpec, elements: Sequence[str]) -> None:

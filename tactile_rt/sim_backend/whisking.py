@@ -48,7 +48,6 @@ class WhiskSimulation:
 
     Args:
         pieces: (points, 3) corners of the convex pieces of an object, mm, in the world frame.
-        mount: pose of the head frame in the world.
 
     Attributes:
         samples: The number of samples of 1 ms that the trajectory lasts; `ENDLESS` if it has no

@@ -118,11 +118,7 @@ class _Segment:
 
 
 class Drive:
-    """A `Trajectory` without end that commands change.
-
-    Args:
-        whisking: the first command, carried out from rest.
-    """
+    """A `Trajectory` without end that commands change."""
 
     duration_s = math.inf
 

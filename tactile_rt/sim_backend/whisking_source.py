@@ -53,7 +53,6 @@ class Placing:
         """Return the (points, 3) corners of the object's convex pieces in the world, mm.
 
         Args:
-            thing: the object.
             left: whether it stands on the left, as the mirror image has it.
         """
         at = np.array(parse_point(self.position_mm, "position_mm")) * (1 - 2 * left, 1, 1)

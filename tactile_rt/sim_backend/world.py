@@ -15,9 +15,15 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays.cells import joint_stiffness, link_inertia, link_nodes
 from tactile_rt.sim_backend.arrays.whisker_array import MOUNT, Mount, WhiskerArray
-from tactile_rt.sim_backend.arrays.whiskers import DAMPING_RATIO, Whisker, rotation
+from tactile_rt.sim_backend.arrays.whiskers import (
+    DAMPING_RATIO,
+    Whisker,
+    joint_stiffness,
+    link_inertia,
+    link_nodes,
+    rotation,
+)
 from tactile_rt.stream import ArraySpec
 
 __all__ = [

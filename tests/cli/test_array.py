@@ -9,9 +9,8 @@ import pytest
 pytest.importorskip("mujoco")
 pytest.importorskip("numba")
 
-from tactile_rt.project.folder import Project, new_project, read_fit
-from tactile_rt.sim_backend.arrays.files import load_array
-from tactile_rt.sim_backend.arrays.species import ROBOTS, SPECIES
+from tactile_rt.project.folder import Project, new_project
+from tactile_rt.sim_backend.arrays.files import ROBOTS, SPECIES, load_array
 from tests.helpers.plucked import plucked
 from tests.helpers.recordings import write
 from tests.helpers.source_tree import ROOT
@@ -78,25 +77,6 @@ def test_the_page_s_commands_measure_and_then_write(project: Project, call) -> N
     assert array.whiskers[0].damping_ratio == pytest.approx(0.03, rel=0.25)
 
 
-def test_the_report_card_shows_the_table(project: Project, call) -> None:
-    pytest.importorskip("torch")
-    pytest.importorskip("matplotlib")
-    from tactile_rt.project.report import device_section
-
-    assert device_section(project) == ""
-    call(*page_commands()[0])
-    section = device_section(project)
-    assert "<h2>How far the device is from its description</h2>" in section
-    assert re.search(r"<td>resonance of A0</td><td>Hz</td><td>[\d.]+</td><td>[\d.]+ \+- ", section)
-    assert "has not been changed" in section
-    fit = read_fit(project)
-    assert fit is not None
-    assert fit.recording == "plucks.mcap"
-    project.fit.write_text("{")
-    with pytest.raises(Exception, match=r"fit.json is damaged .* run `array fit` again"):
-        read_fit(project)
-
-
 def test_another_file_is_written_whole_and_nothing_kept(project: Project, call, tmp_path) -> None:
     alone = tmp_path / "alone.toml"
     alone.write_text(project.array.read_text())
@@ -107,7 +87,6 @@ def test_another_file_is_written_whole_and_nothing_kept(project: Project, call, 
     assert code == 0
     assert "fitted.toml: " in said
     assert load_array(str(out)).whiskers[0].young_modulus == pytest.approx(4.1e9, rel=0.05)
-    assert not (tmp_path / "fit.json").exists()
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         "alone.toml", "fitted.toml", "plucks.mcap", "whiskers",
     ]  # fmt: skip
@@ -127,4 +106,3 @@ def test_a_mistake_is_one_line(project: Project, refused, words, said) -> None:
     before = project.array.read_text()
     assert said in refused("array", "fit", *words)
     assert project.array.read_text() == before
-    assert not project.fit.exists()

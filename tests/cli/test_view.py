@@ -63,17 +63,10 @@ def test_a_video_lasts_as_much_longer_as_it_is_slower(view):
     assert abs(frames[4] - 2 * frames[2]) <= 2
 
 
-def test_a_gif(view):
-    with Image.open(view("a.gif", "--slow", 2)) as image:
-        assert image.size == (320, 180)
-        assert image.n_frames > 3
-        assert image.info["duration"] == 50
-
-
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--out", "a.avi"), "ends in .png, .jpg for a picture, or .mp4, .gif for a video"),
+        (("--out", "a.avi"), "ends in .png, .jpg for a picture, or .mp4 for a video"),
         (("--out", "nowhere/a.png"), "no folder nowhere to write a.png in"),
         (("--out", "a.png", "--camera", "above"), "no camera 'above': there are front, side, top"),
         (("--out", "a.png", "--profile", "fast"), "no profile 'fast'"),

@@ -1,24 +1,16 @@
-"""Closed meshes to cut, and another measure of how far pieces are from them.
-
-The package tiles both surfaces and looks from the middles of the tiles; here both are sampled at
-random, and what of a piece lies in another is told by the planes of its triangles.
-"""
+"""Closed meshes to cut, and another measure of how far pieces are from them: by brute force."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
-import manifold3d
 import numpy as np
 import trimesh
 from manifold3d import CrossSection, Manifold
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull
 
 Floats = NDArray[np.float64]
 
-NEAREST = 24  # samples whose triangles are asked for their distance
-ON = 1e-7  # so near to a face's plane, in largest extents, is on it
-OFF = 5e-5  # so far off its face a sample is looked for in another piece
+TOGETHER = 64  # triangles
 
 
 def as_mesh(solid: Manifold) -> trimesh.Trimesh:
@@ -28,15 +20,6 @@ def as_mesh(solid: Manifold) -> trimesh.Trimesh:
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices = (vertices - (low + high) / 2) / (high - low).max()
     return trimesh.Trimesh(vertices, arrays.tri_verts.astype(int), process=False)
-
-
-def one_mesh(pieces: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """The union of closed meshes as one closed mesh."""
-    solids = [
-        Manifold(manifold3d.Mesh64(np.array(p.vertices), np.array(p.faces, np.uint64)))
-        for p in pieces
-    ]
-    return as_mesh(Manifold.batch_boolean(solids, manifold3d.OpType.Add))
 
 
 def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> Manifold:
@@ -80,17 +63,6 @@ def bowl(sides: int = 24) -> trimesh.Trimesh:
     return as_mesh(Manifold.revolve(CrossSection([outer + inner]), sides))
 
 
-def mug(sides: int = 24) -> trimesh.Trimesh:
-    """A cup 40 mm high with a handle."""
-    cup = Manifold.cylinder(40, 14, 14, sides) - Manifold.cylinder(40, 11.5, 11.5, sides).translate(
-        [0, 0, 3]
-    )
-    turns = np.arange(8) * np.pi / 4
-    ring = CrossSection([[(9 + 2.5 * np.cos(a), 2.5 * np.sin(a)) for a in turns]])
-    handle = Manifold.revolve(ring, 16).rotate([90, 0, 0]).translate([15, 0, 20])
-    return as_mesh(cup + (handle - Manifold.cylinder(40, 12.5, 12.5, sides)))
-
-
 def blob(subdivisions: int) -> trimesh.Trimesh:
     """A smooth lump with hollows: 20 * 4^subdivisions triangles."""
     mesh = trimesh.creation.icosphere(subdivisions=subdivisions)
@@ -117,70 +89,40 @@ def sheet_chair() -> trimesh.Trimesh:
     return trimesh.util.concatenate([seat, back, *legs])
 
 
-@dataclass(frozen=True)
-class Sampled:
-    """Distances between a mesh and the outside of a union of pieces, both sampled at random.
-
-    Attributes:
-        beyond: the farthest that the outside of the pieces is from the mesh.
-        missed: (least, most) that the farthest of the mesh can be from the outside: where a point
-            is inside, its distance is bounded by its depth in any one piece and by the nearest
-            sample of the outside.
-    """
-
-    beyond: float
-    missed: tuple[float, float]
-
-
-def sampled(
-    mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh], count: int = 12_000
-) -> Sampled:
-    """Measure with about so many samples of each surface; largest extent 1."""
-    points, _ = trimesh.sample.sample_surface(mesh, count, seed=1)
-    points = np.concatenate([points, mesh.vertices])
-    areas = np.array([piece.area for piece in pieces])
-    made, faces, offset = [], [], 0
-    for k, piece in enumerate(pieces):
-        number = max(20, int(10 * count * areas[k] / areas.sum()))
-        some, face = trimesh.sample.sample_surface(piece, number, seed=k)
-        off = some + OFF * piece.face_normals[face]
-        out = depths(off, [p for p in pieces if p is not piece]) <= 0
-        made.append(some[out])
-        faces.append(face[out] + offset)
-        offset += len(piece.faces)
-    outside, face = np.concatenate(made), np.concatenate(faces)
-    triangles = np.concatenate([piece.triangles for piece in pieces])
-    deep = depths(points, pieces)
-    free = deep <= ON
-    most = np.where(
-        free, to_faces(points, outside, triangles[face]), cKDTree(outside).query(points)[0]
-    )
-    least = np.where(free, most, deep)
-    drawn, owner = trimesh.sample.sample_surface(mesh, 4 * count, seed=2)
-    beyond = to_faces(outside[:: max(1, len(outside) // count)], drawn, mesh.triangles[owner])
-    return Sampled(float(beyond.max()), (float(least.max()), float(most.max())))
-
-
-def depths(points: Floats, pieces: Sequence[trimesh.Trimesh]) -> Floats:
-    """(n,) how deep points are in that piece in which they are deepest; negative outside."""
-    deepest = np.full(len(points), -np.inf)
-    for piece in pieces:
-        low, high = piece.bounds
-        near = np.flatnonzero(((points > low) & (points < high)).all(axis=1))
-        if len(near):
-            normals = piece.face_normals
-            planes = np.einsum("ij,ij->i", normals, piece.triangles[:, 0])
-            real = normals.any(axis=1)  # a triangle without height has none
-            depth = (planes[real, None] - normals[real] @ points[near].T).min(axis=0)
-            deepest[near] = np.maximum(deepest[near], depth)
-    return deepest
-
-
-def to_faces(points: Floats, samples: Floats, triangles: Floats) -> Floats:
-    """(n,) distance to the nearest of those triangles that the nearest samples were drawn from."""
-    _, near = cKDTree(samples).query(points, k=NEAREST)
+def to_triangles(points: Floats, triangles: Floats) -> Floats:
+    """(n,) distance of each point to the nearest triangle, all of them tried."""
     best = np.full(len(points), np.inf)
-    for k in near.T:
-        nearest = trimesh.triangles.closest_point(triangles[k], points)
-        best = np.minimum(best, np.linalg.norm(nearest - points, axis=1))
+    for some in np.array_split(triangles, 1 + len(triangles) // TOGETHER):
+        every, at = np.repeat(some, len(points), axis=0), np.tile(points, (len(some), 1))
+        away = np.linalg.norm(at - trimesh.triangles.closest_point(every, at), axis=1)
+        best = np.minimum(best, away.reshape(len(some), -1).min(axis=0))
     return best
+
+
+def depth(points: Floats, piece: trimesh.Trimesh) -> Floats:
+    """(n,) how deep inside a convex piece; negative outside."""
+    planes = ConvexHull(piece.vertices).equations
+    deep: Floats = -(points @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+    return deep
+
+
+def sampled(mesh: trimesh.Trimesh, pieces: Sequence[trimesh.Trimesh]) -> tuple[float, ...]:
+    """Farthest that the outside of the pieces is from the mesh; that the mesh is from the pieces
+    where outside them; and that it lies deep inside one: each by brute force on random points."""
+    skin = []
+    for k, piece in enumerate(pieces):
+        number = max(10, int(2000 * piece.area / sum(p.area for p in pieces)))
+        points, _ = trimesh.sample.sample_surface(piece, number, seed=k)
+        others = [depth(points, p) for p in pieces if p is not piece]
+        skin.append(points[np.max(others, axis=0) < -1e-6] if others else points)
+    beyond = to_triangles(np.concatenate(skin), mesh.triangles)
+    points, _ = trimesh.sample.sample_surface(mesh, 600, seed=1)
+    points = np.concatenate([points, mesh.vertices[:600]])
+    depths = np.max([depth(points, p) for p in pieces], axis=0)
+    out = points[depths < -1e-7]
+    away = np.full(len(out), np.inf)
+    for piece in pieces:
+        near = ((out > piece.bounds[0] - 0.01) & (out < piece.bounds[1] + 0.01)).all(axis=1)
+        if near.any():
+            away[near] = np.minimum(away[near], to_triangles(out[near], piece.triangles))
+    return float(beyond.max()), float(away.max(initial=0.0)), float(depths.max())

@@ -22,8 +22,7 @@ from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized,
 from tactile_rt.project.folder import KINDS, Project, new_project
 from tactile_rt.project.making import make
 from tactile_rt.project.report import confused
-from tactile_rt.sim_backend.arrays.files import load_array
-from tactile_rt.sim_backend.arrays.species import ROBOTS, robot_text
+from tactile_rt.sim_backend.arrays.files import ROBOTS, load_array, robot_text
 from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.transducer import device_spec
 from tactile_rt.sources.opening import check_source, open_source
@@ -202,12 +201,6 @@ def test_an_array_of_other_files_is_copied_only_if_the_copy_finds_them(tmp_path:
     pair.write_text(f'[[animal]]\narray = "{MAGNETS}"\n')
     mine = new_project(tmp_path / "mine", str(pair))
     assert load_array(str(mine.array)).whiskers == load_array(str(MAGNETS)).whiskers
-
-
-def test_an_array_in_another_encoding_is_told_with_its_line(refused, tmp_path: Path) -> None:
-    array = tmp_path / "array.toml"
-    array.write_bytes(b'name = "x"\n# Gr\xf6\xdfe\n')
-    assert "array.toml:2: not UTF-8" in refused("new", tmp_path / "mine", "--array", array)
 
 
 def test_the_commands_of_its_readme_are_commands(project: Project, call) -> None:

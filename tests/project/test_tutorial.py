@@ -109,14 +109,13 @@ def test_the_report_tells_what_it_promises(folder: Path) -> None:
 def test_made_again_it_only_writes_the_report_anew(folder: Path) -> None:
     run = folder / "whiskers" / "build" / "run"
     before = (run / "best.pt").stat().st_mtime_ns, (run / "history.csv").read_text()
-    done(folder, commands()["make"])
+    make(Project(folder / "whiskers"), 60)
     assert ((run / "best.pt").stat().st_mtime_ns, (run / "history.csv").read_text()) == before
 
 
-@pytest.mark.parametrize("further", [[], ["--wire", "slcan"]], ids=["serial", "slcan"])
-def test_the_wire_decides_as_the_simulation(folder: Path, further: list[str]) -> None:
+def test_the_wire_decides_as_the_simulation(folder: Path) -> None:
     words = ["2" if word == "4" else word for word in commands()["hil"]]
-    out = done(folder, [*words, *further])
+    out = done(folder, words)
     (same,) = re.findall(r"same labels\s*│\s*(\d+) of (\d+)", out)
     assert int(same[1]) > 0
     assert int(same[0]) >= 0.99 * int(same[1])

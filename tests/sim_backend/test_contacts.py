@@ -14,9 +14,7 @@ import mujoco
 from bench.sim.beams import flat
 from bench.sim.pegs import SLIDE_MM_S, _steps, press, presses
 from tactile_rt.errors import ConfigError, RecordingError
-from tactile_rt.sim_backend.arrays.cells import link_nodes
 from tactile_rt.sim_backend.arrays.files import load_array
-from tactile_rt.sim_backend.contacts import ContactProbe, contact_distances
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps, simulate_sweep
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict
 from tactile_rt.sim_backend.datasets.recipes import (
@@ -26,6 +24,7 @@ from tactile_rt.sim_backend.datasets.recipes import (
     SweepChoice,
     SweepRecipe,
 )
+from tactile_rt.sim_backend.mujoco_world import ContactProbe, contact_distances
 from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
@@ -64,13 +63,6 @@ def test_a_peg_is_recorded_where_the_elastica_has_it(case) -> None:
     assert force * 1e3 == pytest.approx(normal, rel=0.06)
 
 
-def test_links_tile_the_whisker_by_arc_length() -> None:
-    whisker, profile = flat("C2"), PROFILES["realtime"]
-    nodes = link_nodes(whisker, profile.links)
-    assert (nodes[0], nodes[-1], len(nodes)) == (0, whisker.length, profile.links + 2)
-    assert (np.diff(nodes) > 0).all()
-
-
 def test_looking_at_contacts_changes_no_load() -> None:
     def simulation() -> SweepSimulation:
         sweep = Sweep(gap_mm=0.5)
@@ -98,7 +90,9 @@ def test_looking_at_contacts_changes_no_load() -> None:
 def test_by_mujoco_contacts_are_looked_at_now_and_then() -> None:
     sweep, mug = Sweep(gap_mm=0.5), make_object("mug", 0)
     loads, every, held = (
-        SweepSimulation(load_array("mouse"), mug, sweep, PROFILES["mujoco"])._advance(120, n)
+        SweepSimulation(load_array("mouse"), mug, sweep, PROFILES["mujoco"]).advance_with_contacts(
+            120, n
+        )
         for n in (0, 1, 3)
     )
     assert np.array_equal(loads[0], every[0]) and np.array_equal(loads[0], held[0])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from tactile_rt.errors import ConfigError
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers, rat_whiskers
+from tactile_rt.sim_backend.arrays.files import mouse_whiskers, rat_whiskers
 from tactile_rt.sim_backend.arrays.whisker_array import MOUNT, WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.randomisation import Randomisation

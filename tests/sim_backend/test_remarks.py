@@ -14,8 +14,8 @@ import trimesh
 
 from bench.sim.beams import flat
 from tactile_rt.sim_backend.arrays.files import load_array
-from tactile_rt.sim_backend.remarks import ringing, strains
 from tactile_rt.sim_backend.rods.world import Piece, RodWorld
+from tactile_rt.sim_backend.sweep_simulation import ringing, strains
 from tactile_rt.sim_backend.world import PROFILES
 from tactile_rt.sources.opening import open_source
 

@@ -184,15 +184,6 @@ def test_channels_of_other_units_have_no_force_or_moment_errors() -> None:
     np.testing.assert_array_equal(received.values[..., OTHER], chunk.values[..., OTHER])
 
 
-def test_whole_numbers_will_do() -> None:
-    """In Python as in a URL, where ``latency_ms=2`` becomes a float on its way."""
-    whole = {f.name: 1 for f in fields(SensorModel) if f.name != "drop_probability"}
-    both = (
-        sensed(SensorModel(**{n: c(v) for n, v in whole.items()}), busy(9)) for c in (int, float)
-    )
-    same(*both)
-
-
 # Values
 
 
@@ -206,13 +197,6 @@ def test_noise_is_white_with_the_stated_deviation() -> None:
     across = np.corrcoef(flat.T) - np.eye(flat.shape[1])
     along = (flat[1:] * flat[:-1]).mean(axis=0)
     assert np.abs(across).max() < 6 / np.sqrt(n) and np.abs(along).max() < 6 / np.sqrt(n)
-
-
-def test_force_noise_alone_leaves_moments_alone() -> None:
-    chunk = busy(50)
-    values = sensed(SensorModel(noise_force=1e-5), chunk).values
-    np.testing.assert_array_equal(values[..., MOMENT], chunk.values[..., MOMENT])
-    assert (values[..., FORCE] != chunk.values[..., FORCE]).all()
 
 
 def test_bias_is_constant_and_spread_over_channels() -> None:
@@ -355,22 +339,6 @@ def test_flicker_has_the_density_and_the_allan_deviation_it_should() -> None:
     assert not out.values[..., MOMENT].any()
 
 
-def test_drift_averages_as_its_process_does() -> None:
-    """Allan variance of an Ornstein-Uhlenbeck process in closed form."""
-    spec, n = grid_spec(2, 2), 60_000
-    time_s, spread = 0.5, 1e-5
-    out = Sensor(SensorModel(drift_force=spread, drift_time_s=time_s), spec, seed=1).push(
-        stream(np.zeros((n, *spec.shape)))
-    )
-    assert out is not None
-    force = out.values[..., FORCE].reshape(n, -1).astype(np.float64)
-    for samples in (10, 100, 1000):
-        x = samples * PERIOD_NS * 1e-9 / time_s
-        wanted = spread**2 / x**2 * (2 * x - 3 + 4 * np.exp(-x) - np.exp(-2 * x))
-        means = force[: n // samples * samples].reshape(-1, samples, force.shape[1]).mean(axis=1)
-        assert np.mean(np.diff(means, axis=0) ** 2) / 2 == pytest.approx(wanted, rel=0.2), samples
-
-
 def test_a_bandwidth_damps_and_delays_as_a_first_order_low_pass() -> None:
     corner, n = 5.0, 4000
     t = np.arange(n) * PERIOD_NS * 1e-9
@@ -456,16 +424,6 @@ def test_latency_moves_the_time_stamps_and_nothing_else() -> None:
     assert out.values is chunk.values and out.seq is chunk.seq and out.valid is chunk.valid
 
 
-def test_small_jitter_is_an_exponential_delay() -> None:
-    chunk = rest(8000)
-    out = sensed(SensorModel(latency_ms=1.0, jitter_ms=0.05), chunk)
-    delay = (out.t_ns - chunk.t_ns) * 1e-6 - 1.0
-    assert delay.min() >= 0
-    assert delay.mean() == pytest.approx(0.05, rel=0.05)
-    assert delay.std() == pytest.approx(0.05, rel=0.07)
-    assert np.abs(np.corrcoef(delay[1:], delay[:-1])[0, 1]) < 0.05
-
-
 @pytest.mark.parametrize("jitter_ms", [0.5, 1.0, 1.5, 5.0, 20.0])
 def test_jitter_of_any_length_keeps_its_mean_and_the_order(jitter_ms: float) -> None:
     """At a kilohertz, where most samples would overtake each other if each were late by itself."""
@@ -496,13 +454,6 @@ def test_dropped_samples_leave_gaps_and_are_counted() -> None:
     # Independent: a drop is followed by a drop no more often than by anything else.
     lost = np.setdiff1d(np.arange(5000), out.seq)
     assert (np.diff(lost) == 1).mean() == pytest.approx(0.1, abs=0.06)
-
-
-def test_a_chunk_of_which_nothing_is_left_gives_none() -> None:
-    sensor = Sensor(SensorModel(drop_probability=0.9), SPEC, 1)
-    out = [sensor.push(rest(1)) for _ in range(200)]
-    assert out.count(None) == sensor.dropped
-    assert 150 < sensor.dropped < 200
 
 
 # Configuration

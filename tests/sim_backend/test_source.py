@@ -1,4 +1,3 @@
-import time
 from pathlib import Path
 
 import numpy as np
@@ -9,10 +8,8 @@ pytest.importorskip("trimesh")
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend import source as source_module
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers
 from tactile_rt.sim_backend.objects.catalogue import CATEGORIES
 from tactile_rt.sim_backend.source import CHUNK_SAMPLES, REST_SAMPLES, SimOptions, SimSource
-from tactile_rt.sim_backend.world import array_spec
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import Chunk, EndOfStream, SourceStats, concatenate
 
@@ -160,21 +157,6 @@ def test_dropped_samples_are_missing_and_everything_else_comes_as_it_would(
     assert poor.passes == source.passes
 
 
-def test_in_real_time_latency_is_waited_for() -> None:
-    with SimSource("mouse", SimOptions(objects="mug", latency_ms=40, jitter_ms=1)) as source:
-        for _ in range(5):
-            chunk = source.read()
-            assert chunk is not None and chunk.t_ns[-1] <= time.monotonic_ns()
-
-
-def test_it_describes_the_mouse() -> None:
-    with fast(objects="mug") as source:
-        assert source.spec == array_spec(mouse_whiskers(), "mouse-right")
-        assert source.live is False
-    with SimSource("", SimOptions(objects="mug")) as source:
-        assert source.live is True
-
-
 def test_a_closed_source_is_over() -> None:
     source = fast(objects="mug")
     assert source.read() is not None
@@ -217,14 +199,6 @@ def test_in_real_time_samples_come_when_they_are_due(clock: Clock) -> None:
         stream = concatenate(chunks)
         assert stream.t_ns[0] == began
         assert stream.t_ns[-1] - stream.t_ns[0] == (len(stream) - 1) * 1_000_000
-
-
-def test_by_the_clock_on_the_wall_nothing_comes_early() -> None:
-    with SimSource("mouse", SimOptions(objects="mug")) as source:
-        began = time.monotonic()
-        stream = first(source, 300 // 9 * 9)
-        assert time.monotonic() - began > 0.28
-        assert stream.t_ns[-1] <= time.monotonic_ns()
 
 
 def test_a_read_without_patience_gets_none_until_samples_are_due(clock: Clock) -> None:

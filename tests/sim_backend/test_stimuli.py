@@ -11,7 +11,7 @@ pytest.importorskip("mujoco")
 import mujoco
 
 from tactile_rt.errors import ConfigError
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers
+from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.stimuli import (
     PERIOD_NS,
     STIMULI,

@@ -11,7 +11,7 @@ import mujoco
 
 from tactile_rt.errors import ConfigError, SourceError
 from tactile_rt.sim_backend import whisking
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers
+from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.arrays.whisker_array import Mount, mirrored
 from tactile_rt.sim_backend.trajectories import Whisk, base_angles, mirror, read_trajectory
 from tactile_rt.sim_backend.whisking import HEAD, WhiskSimulation
@@ -241,12 +241,6 @@ def test_slow_whisking_in_air_bends_nothing():
     assert np.abs(fast[..., :3]).max() < 5e-6
 
 
-def test_it_begins_without_a_jolt():
-    loads, _ = WhiskSimulation(FEW, Whisk(duration_s=0.3), DATASET).advance(300)
-    force = np.linalg.norm(loads[..., :3], axis=2)
-    assert force[:5].max() < 0.1 * force[150:].max()
-
-
 def test_turning_against_a_post_is_the_same_as_a_post_that_comes():
     """Slow and without friction, the moving base against a fixed base and a moving post."""
     c2 = dataclasses.replace(MOUSE["C2"], friction=0.0)
@@ -435,12 +429,3 @@ def test_mistakes_in_a_recording_are_named(tmp_path, text, said):
         read_trajectory(path, FEW)
     assert str(error.value).startswith(str(path))
     assert said in str(error.value)
-
-
-def test_a_recording_that_is_not_there_or_not_text(tmp_path):
-    with pytest.raises(ConfigError, match="no such file"):
-        read_trajectory(tmp_path / "none.csv", FEW)
-    path = tmp_path / "angles.csv"
-    path.write_bytes(b"\xff\xfe\x00\x01")
-    with pytest.raises(ConfigError, match="not UTF-8 text"):
-        read_trajectory(path, FEW)

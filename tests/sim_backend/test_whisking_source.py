@@ -16,9 +16,7 @@ from scipy.integrate import solve_ivp
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_common import IMPOSSIBLE, MessageType
 from tactile_rt.errors import ConfigError
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers
-from tactile_rt.sim_backend.trajectories import ELEVATION_SLOPES, Whisk
-from tactile_rt.sim_backend.whisking import ENDLESS, WhiskSimulation
+from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.whisking_drive import LAG_S, LARGEST_RAD, MOST, Drive, Whisking
 from tactile_rt.sim_backend.whisking_source import WhiskingOptions, WhiskingSource
 from tactile_rt.sim_backend.world import PROFILES, array_spec
@@ -135,13 +133,6 @@ def test_no_sequence_of_commands_makes_it_jump_or_leave_its_range(seed: int) -> 
     assert np.abs(np.diff(acceleration)).max() < MOST * h * (3 / LAG_S + 2 * np.pi * 30 * 2)
 
 
-def test_it_stands_still_until_it_begins() -> None:
-    drive = Drive(Whisking(30.0, 0.2, 0.8))
-    t = np.array([-0.01, 0.0, 1e-6])
-    assert drive.protraction(t)[:2].tolist() == [0.0, 0.0]
-    assert abs(drive.protraction(t)[2]) < 1e-12
-
-
 def test_angles_do_not_depend_on_when_they_are_asked_for() -> None:
     t = np.arange(2000) * 5e-4
     one, other = Drive(CHANGES[0][1]), Drive(CHANGES[0][1])
@@ -181,31 +172,6 @@ def test_what_is_out_of_range_is_refused(asked: tuple[float, float, float], said
 
 
 # ---- in MuJoCo
-
-
-def test_a_trajectory_is_followed_in_any_pieces() -> None:
-    move = Whisk(duration_s=0.06)
-    whole, pieces = (WhiskSimulation(FEW, move, REALTIME) for _ in range(2))
-    assert whole.samples == 60
-    loads, _ = whole.advance(60)
-    parts = [pieces.advance(n)[0] for n in (1, 20, 7, 100)]
-    assert [len(p) for p in parts] == [1, 20, 7, 32]
-    np.testing.assert_array_equal(np.concatenate(parts), loads)
-
-
-def test_bases_stand_where_the_drive_says() -> None:
-    drive = Drive(Whisking(8.0, 0.35, 0.1))
-    simulation = WhiskSimulation(FEW, drive, REALTIME)
-    assert simulation.samples == ENDLESS
-    simulation.advance(300)
-    drive.command(Whisking(12.0, 0.2, -0.2), 0.3)
-    simulation.advance(50)
-    theta = drive.protraction(np.array([0.35]))[0]
-    assert abs(theta) > 0.01
-    for whisker in FEW:
-        turns = [simulation.data.joint(f"{whisker.name} {a}").qpos[0] for a in ("theta", "phi")]
-        want = [theta, theta * ELEVATION_SLOPES[whisker.row]]
-        np.testing.assert_allclose(turns, want, rtol=0, atol=1e-6)
 
 
 # ---- the source

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers
+from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.world import (
     CHANNELS,

@@ -24,15 +24,20 @@ or, for several animals in one world, ``[[animal]]`` tables with ``array = "rat-
 or a file) and a ``mount`` of their own.
 """
 
-from collections.abc import Mapping
+import csv
+import difflib
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from importlib import resources
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from tactile_rt import extensions
-from tactile_rt.errors import ConfigError
+from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.sensor_spec import ChannelSpec, MagnetSpec, SensorSpec
 from tactile_rt.settings import (
     SettingNode,
@@ -44,18 +49,103 @@ from tactile_rt.settings import (
     read_csv,
     read_toml,
 )
-from tactile_rt.sim_backend.arrays.species import ROBOTS, robot_text, species_array
 from tactile_rt.sim_backend.arrays.whisker_array import (
+    MOUNT,
     Mount,
     Point,
     WhiskerArray,
     both_sides,
     centred_mount,
+    mirrored,
     place,
 )
 from tactile_rt.sim_backend.arrays.whiskers import OPTIONAL, REQUIRED, TURN, Whisker
 
-__all__ = ["load_animals", "load_array", "read_animals"]
+__all__ = [
+    "ROBOTS",
+    "SPECIES",
+    "load_animals",
+    "load_array",
+    "mouse_whiskers",
+    "read_animals",
+    "robot_text",
+    "species_array",
+]
+
+# By name: the options of the serial URL that reads the array.
+ROBOTS = MappingProxyType(
+    {
+        "hx711_whisker": "codec=hx711_whisker",
+        "mlx_hex": "codec=mlx_hex",
+        "rattechan": "codec=anyskin&magnetometers=3&temperature=false&rate_hz=300",
+    }
+)
+
+
+def robot_text(name: str) -> str:
+    """The description of one of `ROBOTS`: what is in its .toml file."""
+    file = resources.files(__package__).joinpath("data", f"{name}.toml")
+    return file.read_text(encoding="utf-8")
+
+
+def mouse_whiskers() -> tuple[Whisker, ...]:
+    """The 30 right-side mystacial whiskers of the mouse (Bresee et al. 2023)."""
+    return _read_species("mouse.csv")
+
+
+def rat_whiskers() -> tuple[Whisker, ...]:
+    """The 30 right-side mystacial whiskers of the rat (Belli et al. 2017, 2018)."""
+    return _read_species("rat.csv")
+
+
+def _read_species(file: str) -> tuple[Whisker, ...]:
+    text = resources.files(__package__).joinpath("data", file).read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    return tuple(Whisker.from_columns(row) for row in csv.DictReader(lines))
+
+
+SPECIES: dict[str, Callable[[], tuple[Whisker, ...]]] = {
+    "mouse": mouse_whiskers,
+    "rat": rat_whiskers,
+}
+SIDES = ("right", "left", "both")
+
+
+def species_array(name: str) -> WhiskerArray:
+    """The array of an animal: ``mouse``, ``rat``, ``mouse-left``, ``rat-both`` ...
+
+    ``mouse`` is ``mouse-right``. An animal's left side alone is mounted as its right side's mirror
+    image, whiskers reaching along world -x, so that a mirrored sweep gives mirrored loads; both
+    sides stand on one head, mounted as for the right side alone. The rat's pose in the published
+    sweeps is not known: its head is turned as the mouse's and placed so that the mean of its base
+    points is where the mouse's is.
+    """
+    animal, _, side = name.partition("-")
+    known = [*SPECIES, *(f"{a}-{s}" for a in SPECIES for s in SIDES)]
+    if name not in known:
+        known += [*ROBOTS, *extensions.added_names(extensions.ARRAYS)]
+        near = difflib.get_close_matches(name, known, 1)
+        raise ConfigError(
+            f"no simulated array {name!r}: "
+            + (f"did you mean {near[0]}?" if near else f"there are {name_some(known, 8)}")
+            + " (or give a .csv or .toml file)"
+        )
+    side = side or "right"
+    whiskers = SPECIES[animal]()
+    right = WhiskerArray(f"{animal}-right", whiskers, _mount_species(whiskers))
+    if side == "left":
+        left = tuple(mirrored(w) for w in whiskers)
+        return WhiskerArray(f"{animal}-left", left, right.mount.mirrored())
+    return right if side == "right" else both_sides(right, f"{animal}-both")
+
+
+def _mount_species(whiskers: tuple[Whisker, ...]) -> Mount:
+    mouse = mouse_whiskers()
+    if whiskers == mouse:
+        return MOUNT
+    middle = MOUNT.position + MOUNT.rotation @ np.mean([w.base for w in mouse], axis=0)
+    return centred_mount(whiskers, tuple(middle), MOUNT.roll_pitch_yaw)
+
 
 ARRAY_FILES = (".csv", ".toml")
 COLUMNS = (*REQUIRED, *OPTIONAL)

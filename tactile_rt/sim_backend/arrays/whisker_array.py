@@ -65,7 +65,6 @@ class WhiskerArray:
     Attributes:
         name: The name that the array is called by, e.g. ``mouse-right``.
         whiskers: The array's whiskers in the frame of the head, in mm and rad.
-        mount: The pose of the head in the world.
         sensor: What reads the whiskers; None: the base loads are read as they are.
 
     Raises:

@@ -23,12 +23,12 @@ from tactile_rt.errors import ConfigError, SourceError, TactileError
 from tactile_rt.sensor_spec import LOADS
 from tactile_rt.settings import no_such
 from tactile_rt.sim_backend.arrays.files import load_animals
-from tactile_rt.sim_backend.contacts import CONTACT_CHANNELS, contact_distances
 from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
 from tactile_rt.sim_backend.datasets.inventory import write_sums, written_sum
 from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove_leftovers
 from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObjects, choose_objects
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
+from tactile_rt.sim_backend.mujoco_world import CONTACT_CHANNELS, contact_distances
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sensor import Sensor
 from tactile_rt.sim_backend.sensor_model import SensorModel

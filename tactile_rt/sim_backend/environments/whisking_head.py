@@ -19,7 +19,7 @@ from scipy.linalg import expm
 
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
 from tactile_rt.sim_backend.arrays.whiskers import rotation
-from tactile_rt.sim_backend.contacts import TOUCHING_SHARE
+from tactile_rt.sim_backend.mujoco_world import TOUCHING_SHARE
 from tactile_rt.sim_backend.objects.catalogue import TactileObject, load_object
 from tactile_rt.sim_backend.rods.world import Piece, RodWorld
 from tactile_rt.sim_backend.sweep import centrelines, faces_right, way_to_contact
@@ -129,7 +129,6 @@ class WhiskingHead:
         samples: The number of samples of 1 ms simulated so far.
         position, velocity: The (3,) place of the head from where it started, mm, and its velocity,
             mm/s, in the world.
-        touches: The number of times that a whisker began to touch since the start.
     """
 
     def __init__(

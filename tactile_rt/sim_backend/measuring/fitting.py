@@ -14,12 +14,12 @@ from tactile_rt.sensor_spec import SensorSpec
 from tactile_rt.settings import find_lines, parse_toml, read_text, read_toml
 from tactile_rt.sim_backend.arrays.files import load_array, read_animals
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
-from tactile_rt.sim_backend.measuring.channels import compare_sensor
 from tactile_rt.sim_backend.measuring.findings import (
     SIGMAS,
     ArrayFinding,
     Edit,
     Figure,
+    compare_sensor,
     listed,
 )
 from tactile_rt.sim_backend.measuring.mechanics import compare_whiskers
@@ -72,9 +72,6 @@ def read_described(path: Path, spec: ArraySpec) -> WhiskerArray:
 
 def fit_array(path: Path, spec: ArraySpec, recorded: Chunk) -> Fitted:
     """Measure an array, and bring its description to that; nothing is written.
-
-    Args:
-        recorded: all samples, of the array at rest and of its whiskers plucked.
 
     Raises:
         ConfigError: too few samples, too many missing, no whisker is at rest for 3 s, or as

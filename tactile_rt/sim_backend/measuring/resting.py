@@ -15,12 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.measuring.findings import TO_SIGMA
-
-__all__ = ["FORGETS_S", "Rest", "drift_likelihood", "find_rest", "rounding_step"]
+__all__ = ["FORGETS_S", "TO_SIGMA", "Rest", "drift_likelihood", "find_rest", "rounding_step"]
 
 Floats = NDArray[np.float64]
 
+TO_SIGMA = 1.4826  # standard deviation of normal noise over its median absolute deviation
 BLOCK = 32  # samples at least
 REMEMBERED = 16.0  # times the inverse bandwidth: a hundred times what a low-pass remembers
 QUIETEST, NOISIER, AWAY = 0.25, 2.0, 8.0

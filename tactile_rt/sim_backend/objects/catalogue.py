@@ -105,9 +105,6 @@ def added_categories() -> tuple[str, ...]:
 def make_object(category: str, index: int) -> TactileObject:
     """Instance `index` (0 or more) of a category: the same one every time, everywhere.
 
-    Args:
-        category: "mug", say, or "varied-mug".
-
     Raises:
         ConfigError: no such category, or a negative index.
     """

@@ -39,9 +39,6 @@ class Joining(Generic[P]):
 
     A join that was refused once stays so however the two grow, until it is asked with more
     indulgence.
-
-    Args:
-        neighbours: pairs of numbers of patches.
     """
 
     def __init__(
@@ -247,11 +244,7 @@ class SolidPieces:
         self._joining.join(self._join_pair)
 
     def corners(self, spare: int) -> list[Floats]:
-        """The (n, 3) corners of each piece, those of the pieces in the middle at the end.
-
-        Args:
-            spare: so many pieces there may be in the middle.
-        """
+        """The (n, 3) corners of each piece, those of the pieces in the middle at the end."""
         if self._joining is None:
             return [self._mesh.vertices]
         outer = [p for p in self._joining.patches if _hull(p) is not None]

@@ -180,7 +180,6 @@ def deviation(
 
     Args:
         drawn: of largest extent 1.
-        pieces: convex, in the same frame.
         solids: what the surface encloses. What of a piece lies inside them is not its outside.
     """
     made = TriangleSurface(_broad(np.concatenate([piece.triangles for piece in pieces])))

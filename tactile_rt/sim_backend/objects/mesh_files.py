@@ -243,7 +243,6 @@ def read_parts(paths: Sequence[Path], up: str = "") -> trimesh.Trimesh:
     """All triangles of the files of one object in one mesh, z up, in the unit of the files.
 
     Args:
-        paths: the files, each a part of the object in its place.
         up: see `read_triangles`.
     """
     parts = [_part(path, up) for path in paths]

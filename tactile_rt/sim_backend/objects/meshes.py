@@ -60,7 +60,6 @@ class Pieces:
     """Convex pieces of a mesh, in the unit box, and how they came about.
 
     Attributes:
-        meshes: The convex pieces themselves, closed and wound outward.
         surface_error: The farthest that their surface is from the mesh's, in fractions of the
             largest extent.
         made_by: The way in which the mesh became pieces, one of those that `meshes` lists.
@@ -144,7 +143,6 @@ def simplify_mesh(mesh: trimesh.Trimesh, tolerance: float, most: int) -> trimesh
     Args:
         mesh: in the unit box.
         tolerance: how far the surface may move, in largest extents.
-        most: the number of triangles that can be dealt with.
     """
     if len(mesh.faces) <= SHARES[0] * most:
         return mesh

@@ -64,11 +64,7 @@ class ListedFile(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class ListedObject:
-    """An object of a list.
-
-    Attributes:
-        files: The mesh files of its parts, at least one.
-    """
+    """An object of a list."""
 
     files: tuple[ListedFile, ...]
 

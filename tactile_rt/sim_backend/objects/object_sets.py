@@ -42,7 +42,6 @@ class Origin(msgspec.Struct, frozen=True):
     Attributes:
         shape: The same for objects of a category that are variants, mirror images or copies of one
             thing; empty: no other is like it.
-        source: The repository that it is from.
         licence: The SPDX name of the licence that it comes under.
     """
 
@@ -78,8 +77,6 @@ class ObjectSet:
 
     Attributes:
         paths: The file of every object, by its name ``category/object``, in alphabetical order.
-        origins: The source and the shape of objects, by their names, as far as they are known.
-        skipped: The names of objects found broken so far, and why each is.
     """
 
     folder: Path
@@ -119,11 +116,7 @@ class ObjectSet:
         return replace(found, name=name.replace("/", "-"), category=self.categories[name])
 
     def check(self, progress: Callable[[str], None] = lambda name: None) -> SetReport:
-        """Load every object once: how many can be used, how well, and why the others cannot.
-
-        Args:
-            progress: told of every object before it is loaded.
-        """
+        """Load every object once: how many can be used, how well, and why the others cannot."""
         errors: dict[str, float] = {}
         made_by: Counter[str] = Counter()
         for name in self.names:

@@ -123,7 +123,6 @@ def step(
         count, near: what is near, see `touching.find_near`.
         link_of: (segment,) the link on which each segment is.
         last: see `stepping.RodState`.
-        room: see there.
     """
     clamped, stiffness, friction = chain.clamped, chain.stiffness, chain.friction
     nodes, frames, axes = pose

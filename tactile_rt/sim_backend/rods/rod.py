@@ -8,8 +8,13 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays.cells import joint_stiffness, link_inertia, link_nodes
-from tactile_rt.sim_backend.arrays.whiskers import Whisker, rotation
+from tactile_rt.sim_backend.arrays.whiskers import (
+    Whisker,
+    joint_stiffness,
+    link_inertia,
+    link_nodes,
+    rotation,
+)
 from tactile_rt.sim_backend.rods.chains import Chain, chain_mass
 from tactile_rt.sim_backend.rods.touching import Segments
 

@@ -55,7 +55,6 @@ class RodWorld:
     Args:
         roots: (whisker, 4, 3) base point (mm) and, in the rows after it, the element's frame in the
             world.
-        links: how many cells a whisker is cut into.
         steps_per_sample: the fewest steps in a sample of 1 ms.
 
     Attributes:
@@ -113,7 +112,6 @@ class RodWorld:
         """See `sweep_simulation.World`; loads and contacts are means over each sample.
 
         Args:
-            way, look_every: see there.
             shaken: (sample, 3) acceleration of the head, mm/ms^2, in the world; the object's way is
                 then relative to the head. None: it is not accelerated.
             turning: (sample + 3, whisker, 3, 3) frames of the elements in the world where bases

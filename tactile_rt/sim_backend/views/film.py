@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 import av
 import numpy as np
@@ -11,18 +11,15 @@ from PIL import Image
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.files import write_whole
-from tactile_rt.sim_backend.views.camera import Camera, framing
-from tactile_rt.sim_backend.views.footage import Footage
+from tactile_rt.sim_backend.views.footage import Camera, Footage, framing
 from tactile_rt.sim_backend.views.sheet import ForceScale, Sheet, scene_size
 from tactile_rt.sim_backend.views.stage import Dressed, Stage
 
 __all__ = ["IMAGES", "VIDEOS", "Film", "camera_of", "check_suffix", "write_image", "write_video"]
 
 IMAGES = (".png", ".jpg")
-VIDEOS = (".mp4", ".gif")
+VIDEOS = (".mp4",)
 QUALITY = "20"  # of H.264, constant rate factor: 18 is as the eye sees it, 23 the usual
-COLOURS = 255  # of a GIF
-PAPER = 247  # all three above: meant to be white
 
 Pixels = NDArray[np.uint8]
 
@@ -44,9 +41,6 @@ class Film:
     """Complete pictures of footage; to be closed.
 
     Args:
-        view: a camera, or the name of a view.
-        title: what is seen, one line.
-        detail: how it is seen, one line in small print.
         pixels: width of the pictures; their height is 9/16 of it.
 
     Raises:
@@ -100,17 +94,9 @@ def write_image(path: Path, pixels: Pixels) -> None:
     write_whole(path, lambda file: Image.fromarray(pixels).save(file, kind, optimize=True))
 
 
-def write_video(path: Path, pictures: Iterable[Pixels], fps: int, sample: Pixels) -> None:
-    """Write pictures (height, width, 3) RGB of one even size as .mp4 or .gif.
-
-    Args:
-        fps: pictures a second. A GIF counts time in 10 ms: 25, 20 and 10 are exact.
-        sample: one that has the colours of them all; a GIF, which loops, gets its palette from it.
-    """
-    if path.suffix.lower() == ".gif":
-        write_whole(path, lambda file: _write_gif(file, pictures, fps, sample))
-    else:
-        write_whole(path, lambda file: _write_mp4(file, pictures, fps))
+def write_video(path: Path, pictures: Iterable[Pixels], fps: int) -> None:
+    """Write pictures (height, width, 3) RGB of one even size as .mp4 (H.264)."""
+    write_whole(path, lambda file: _write_mp4(file, pictures, fps))
 
 
 def _write_mp4(out: BinaryIO, pictures: Iterable[Pixels], fps: int) -> None:
@@ -124,22 +110,3 @@ def _write_mp4(out: BinaryIO, pictures: Iterable[Pixels], fps: int) -> None:
             picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format="rgb24")
             file.mux(stream.encode(picture))
         file.mux(stream.encode())
-
-
-def _write_gif(out: BinaryIO, pictures: Iterable[Pixels], fps: int, sample: Pixels) -> None:
-    palette = Image.fromarray(sample).quantize(COLOURS)
-    colours = np.array(palette.getpalette()).reshape(-1, 3)
-    colours[(colours > PAPER).all(axis=1)] = 255  # paper is white, not nearly so
-    palette.putpalette(colours.ravel().tolist())
-    # No dithering: its noise differs from picture to picture and does not pack.
-    indexed = (
-        Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures
-    )
-    first = next(indexed)
-    every: dict[str, Any] = {
-        "save_all": True,
-        "append_images": indexed,
-        "duration": round(1000 / fps),
-        "loop": 0,
-    }
-    first.save(out, "GIF", **every)

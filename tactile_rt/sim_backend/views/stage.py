@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tactile_rt.errors import ConfigError
-from tactile_rt.sim_backend.views.camera import Camera
-from tactile_rt.sim_backend.views.footage import Footage
+from tactile_rt.sim_backend.views.footage import Camera, Footage
 from tactile_rt.sim_backend.views.sheet import ForceScale
 from tactile_rt.sim_backend.world import OBJECT_BIT
 from tactile_rt.stream import ArraySpec
@@ -36,7 +35,6 @@ class Dressed:
 
     Attributes:
         model, data: The copies of the simulation's model and of a state.
-        links: The geoms of each element from base to tip, by number.
         sites: The site at each element's base, by number, in the order of the elements.
     """
 

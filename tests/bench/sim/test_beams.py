@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import curve_fit
 
 from bench.sim.beams import GRAVITY, ORIGIN, beams, flat, measure, ring
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers
+from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.world import (
     PROFILES,
     Profile,

@@ -17,9 +17,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError
-from tactile_rt.sim_backend.arrays import files as files_module
-from tactile_rt.sim_backend.arrays.files import load_animals, load_array, read_animals
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers, rat_whiskers
+from tactile_rt.sim_backend.arrays.files import (
+    load_animals,
+    load_array,
+    mouse_whiskers,
+    rat_whiskers,
+    read_animals,
+)
 from tactile_rt.sim_backend.arrays.whisker_array import (
     MOUNT,
     Mount,
@@ -30,7 +34,6 @@ from tactile_rt.sim_backend.arrays.whisker_array import (
 )
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.world import (
-    CHANNELS,
     PROFILES,
     add_whiskers,
     array_spec,
@@ -38,7 +41,6 @@ from tactile_rt.sim_backend.world import (
     read_base_loads,
     set_damping,
 )
-from tactile_rt.sources.opening import open_source
 from tests.helpers.source_tree import ROOT
 
 Floats = NDArray[np.float64]
@@ -115,20 +117,6 @@ def test_the_left_side_alone_is_the_right_one_in_a_mirror() -> None:
         np.testing.assert_allclose(
             points(w, left.mount), points(r, right.mount) @ MIRROR, atol=1e-12
         )
-
-
-def test_reflected_pushes_give_reflected_loads() -> None:
-    """Statics: the load at the base of a force on the tip, in each whisker's own frame."""
-    rng = np.random.default_rng(2)
-    for right in mouse_whiskers():
-        force = rng.normal(size=3)
-        loads = []
-        for w, push in ((right, force), (mirrored(right), MIRROR @ force)):
-            tip = w.orientation @ w.centreline(np.array([w.length]))[0]
-            loads.append(
-                np.concatenate([push @ w.orientation, np.cross(tip, push) @ w.orientation])
-            )
-        np.testing.assert_allclose(loads[1], FLIPS * loads[0], atol=1e-12)
 
 
 def test_a_reflected_push_in_the_simulator_gives_reflected_loads() -> None:
@@ -224,11 +212,6 @@ def test_the_example_is_the_same_array_in_both_formats() -> None:
     assert lengths == {f"{r}{c}": 24 - 3 * c for r in "AB" for c in range(4)}
     middle = np.mean([points(w, toml.mount)[0] for w in toml.whiskers], axis=0)
     np.testing.assert_allclose(middle, 0, atol=1e-12)
-
-
-def test_the_mouses_own_table_is_the_mouse() -> None:
-    table = Path(files_module.__file__).parent / "data" / "mouse.csv"
-    assert load_array(str(table)).whiskers == mouse_whiskers()
 
 
 HEADER = (
@@ -393,18 +376,6 @@ def test_a_toml_file_places_several_animals(tmp_path: Path) -> None:
         load_array(path)
 
 
-def test_what_is_no_text_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe\x00a")
-    (tmp_path / "folder.toml").mkdir()
-    for name, said in (
-        ("none.csv", "no such file"),
-        ("bytes.csv", "1: not UTF-8 text"),
-        ("folder.toml", "cannot be read"),
-    ):
-        with pytest.raises(ConfigError, match=f"{name}:.*{said}"):
-            load_array(str(tmp_path / name))
-
-
 @settings(max_examples=150, deadline=None)
 @given(
     text=st.text(max_size=12), cell=st.integers(0, 7 * 18), kind=st.sampled_from(["csv", "toml"])
@@ -433,18 +404,3 @@ def test_arrays_come_without_a_simulator() -> None:
 
 
 # Streams
-
-
-@pytest.mark.parametrize("name", ["rat", str(EXAMPLES / "robot.toml")])
-def test_a_stream_of_any_array(name: str) -> None:
-    with open_source(f"sim:{name}?objects=bottle-3&pace=fast&sweeps=1&seed=4") as source:
-        array = load_array(name)
-        assert source.spec == array_spec(array.whiskers, array.name)
-        assert source.spec.channels == CHANNELS
-        felt = np.zeros(source.spec.shape[0], dtype=bool)
-        for _ in range(150):
-            chunk = source.read()
-            assert chunk is not None and np.isfinite(chunk.values).all()
-            felt |= (np.abs(chunk.values[..., :3]) > 1e-6).any(axis=(0, 2))
-            assert np.abs(chunk.values[..., :3]).max() < 1  # N: bent, not jammed
-        assert felt.any()

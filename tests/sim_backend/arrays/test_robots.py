@@ -15,8 +15,13 @@ from tactile_rt.calibration import declared
 from tactile_rt.drivers.codec import Codec
 from tactile_rt.drivers.opening import make_codec
 from tactile_rt.sensor_spec import SensorSpec
-from tactile_rt.sim_backend.arrays.files import load_animals, load_array, read_animals
-from tactile_rt.sim_backend.arrays.species import ROBOTS, robot_text
+from tactile_rt.sim_backend.arrays.files import (
+    ROBOTS,
+    load_animals,
+    load_array,
+    read_animals,
+    robot_text,
+)
 from tactile_rt.sim_backend.sweep import Sweep, usual_size
 from tactile_rt.sim_backend.transducer import device_spec, sensor_of
 from tactile_rt.sources.opening import open_source

@@ -11,8 +11,8 @@ pytest.importorskip("numba")
 import mujoco
 from numpy.typing import NDArray
 
-from tactile_rt.sim_backend.arrays.cells import link_inertia, link_nodes
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers
+from tactile_rt.sim_backend.arrays.files import mouse_whiskers
+from tactile_rt.sim_backend.arrays.whiskers import link_inertia, link_nodes
 from tactile_rt.sim_backend.rods import chains
 from tactile_rt.sim_backend.rods.rod import make_rod, matched
 from tactile_rt.sim_backend.world import Mount, Profile, add_whiskers, empty_world

@@ -11,7 +11,7 @@ pytest.importorskip("numba")
 from numpy.typing import NDArray
 
 from bench.sim.beams import flat
-from tactile_rt.sim_backend.arrays.species import mouse_whiskers
+from tactile_rt.sim_backend.arrays.files import mouse_whiskers
 from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.rods.world import Piece, RodWorld
 from tactile_rt.sim_backend.trajectories import base_angles

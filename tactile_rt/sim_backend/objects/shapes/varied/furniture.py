@@ -31,12 +31,7 @@ def _plate(rng: Generator, x: float, y: float, low: float, high: float) -> Trime
 
 
 def _supports(rng: Generator, x: float, y: float, high: float, solid: float) -> list[Trimesh]:
-    """What carries a plate of x by y at a height: legs, a foot, runners, panels or a block.
-
-    Args:
-        x, y, high: of the plate.
-        solid: the probability of panels or a block.
-    """
+    """What carries a plate of x by y at a height: legs, a foot, runners, panels or a block."""
     u = rng.uniform
     if rng.random() < solid:
         inset = u(0.8, 1.0)
