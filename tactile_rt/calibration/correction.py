@@ -24,6 +24,9 @@ COMPONENT = re.compile(r"(?:[A-Za-z]?|.*[_.\- ])([xyz])\d*")
 POLAR = ("N", "m", "m/s", "m/s^2", "m/s2")
 AXIAL = ("N m", "T", "rad/s")
 UNTOLD = ("rad", "1", "")  # angles about who knows what, counts of who knows what
+Row = tuple[float, ...]
+DEVICE = re.compile(r"[A-Za-z0-9_+-][\w.:+-]*")  # it names a file
+HISTORY = 20  # entries kept: a robot that tares every morning must not grow a file for ever
 
 
 @dataclass(frozen=True)
@@ -102,12 +105,6 @@ def _times(p: Quaternion, q: Quaternion) -> Quaternion:
         a * g - b * h + c * e + d * f,
         a * h + b * g - c * f + d * e,
     )
-
-
-Row = tuple[float, ...]
-
-DEVICE = re.compile(r"[A-Za-z0-9_+-][\w.:+-]*")  # it names a file
-HISTORY = 20  # entries kept: a robot that tares every morning must not grow a file for ever
 
 
 @dataclass(frozen=True)

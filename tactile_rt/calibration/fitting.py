@@ -27,6 +27,8 @@ __all__ = ["AXES", "Fit", "LoadTable", "calibrate", "raw_readings", "read_loads"
 AXES = {"fx": "N", "fy": "N", "fz": "N", "mx": "N m", "my": "N m", "mz": "N m"}
 RAW = "raw_"
 TIMES = ("start_s", "end_s")
+WORST = 5
+WEAK = 0.01  # least share of load that an axis must have of its own; conditions go with 1 / WEAK
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,10 +129,6 @@ def _check_header(where: str, header: Sequence[str]) -> None:
             f"{where}: needs readings ({RAW}CHANNEL) or times in a recording (start_s, end_s), "
             "one of the two"
         )
-
-
-WORST = 5
-WEAK = 0.01  # least share of load that an axis must have of its own; conditions go with 1 / WEAK
 
 
 @dataclass(frozen=True, eq=False)

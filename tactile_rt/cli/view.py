@@ -29,9 +29,6 @@ def view(
         "sweep.png"
     ),
     camera: Annotated[str, typer.Option(help="front, side, top or oblique.")] = "oblique",
-    orthographic: Annotated[
-        bool, typer.Option("--orthographic", help="Without perspective.")
-    ] = False,
     at: Annotated[
         float | None, typer.Option(help="Moment of a picture, ms. Default: of the most force.")
     ] = None,
@@ -94,15 +91,14 @@ def view(
     period = PICTURE_MS if suffix in IMAGES else max(1, round(1000 / (FPS * slow)))
     with progress_bar(console, "simulating", total=1.0) as update:
         footage = record(simulation, spec, period, lambda done: update(completed=done))
-    projection = "orthographic" if orthographic else "perspective"
-    detail = f"{camera} view, {projection} · {thing.name} moves from nose to ear"
+    detail = f"{camera} view · {thing.name} moves from nose to ear"
     if suffix not in IMAGES:
         detail += f" · {FPS * period / 1000:.2g} x real speed"
     title = (
         f"{thing.name[:40]}, {sweep.size_mm:g} mm large, sweeps past the {len(spec.elements)} "
         f"whiskers of {spec.name[:40]} at {sweep.speed_mm_s:g} mm/s"
     )
-    with closing(Film(footage, camera, orthographic, title, detail, pixels)) as film:
+    with closing(Film(footage, camera, title, detail, pixels)) as film:
         if suffix in IMAGES:
             write_image(out, film.picture(footage.strongest if at is None else footage.at(at)))
             return

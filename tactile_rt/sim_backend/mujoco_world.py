@@ -40,6 +40,14 @@ Floats = NDArray[np.float64]
 # Additive, so that they can be averaged over time as loads are.
 CONTACT_CHANNELS = ("touching", "normal force, N", "normal force x arc length, N m")
 TOUCHING_SHARE = 0.5  # of a sample's time
+UNSTABLE = tuple(
+    int(kind)
+    for kind in (
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+    )
+)
 
 
 class ContactProbe:
@@ -113,16 +121,6 @@ def contact_distances(felt: NDArray[np.float32]) -> NDArray[np.float32]:
         touching, felt[..., 2] / np.where(touching, felt[..., 1], 1.0), np.nan
     ).astype(np.float32)
     return distances
-
-
-UNSTABLE = tuple(
-    int(kind)
-    for kind in (
-        mujoco.mjtWarning.mjWARN_BADQPOS,
-        mujoco.mjtWarning.mjWARN_BADQVEL,
-        mujoco.mjtWarning.mjWARN_BADQACC,
-    )
-)
 
 
 def sweep_model(

@@ -257,7 +257,6 @@ class SimSource(PacedSource):
         self._array_rng = np.random.default_rng([options.seed, 1])
         self._draw = _drawing(self._animals, options)
         self.passes: list[Pass] = []
-        self._strained: set[str] = set()  # whiskers of which it has been told
         if line := ringing(self._animals, PROFILES[options.profile]):
             log.warning(line)
         self._sent = 0  # samples simulated so far
@@ -310,18 +309,7 @@ class SimSource(PacedSource):
             self._left -= n
             if not self._left and contacts[-1, :, 0].any():
                 self._left = DRAGGED_SAMPLES
-            self._tell_of_strains(self._simulation)
         return self._stamp(values, start_ns)
-
-    def _tell_of_strains(self, simulation: SweepSimulation) -> None:
-        for name, (strain, limit) in simulation.strains().items():
-            if strain > limit and name not in self._strained:
-                self._strained.add(name)
-                log.warning(
-                    "whisker %s is bent to a strain of %.2g, more than its material bears (%g): it "
-                    "would stay bent or break",
-                    name, strain, limit,
-                )  # fmt: skip
 
     def _stamp(self, values: np.ndarray, start_ns: int) -> Chunk:
         seq = self._sent + np.arange(len(values), dtype=np.int64)

@@ -37,6 +37,19 @@ TOUCH_MM = 0.15  # counts as contact: both soft layers, and a link's chord off t
 PASSED_BY_MM = 0.5  # a miss by less is simulated
 
 Floats = NDArray[np.float64]
+NOTHING: Mapping[str, float] = MappingProxyType({})
+LIMITS = {
+    "size_mm": (1e-3, 1e4),
+    "speed_mm_s": (1e-3, 1e4),
+    "gap_mm": (0.0, 1e4),
+    "heading_deg": (-60.0, 60.0),  # beyond, it comes at the head itself
+    "climb_deg": (-60.0, 60.0),
+    "ramp_ms": (0.0, 1e4),
+    "head_moves": (0.0, 1.0),
+    "surface_friction": (0.0, 10.0),
+    "shake_g": (0.0, 5.0),
+    "shake_hz": (0.1, 200.0),  # samples are a millisecond apart
+}
 
 
 def centrelines(whiskers: Sequence[Whisker], mount: Mount) -> list[Floats]:
@@ -151,9 +164,6 @@ def within_reach(
     return kept
 
 
-NOTHING: Mapping[str, float] = MappingProxyType({})
-
-
 @dataclass(frozen=True)
 class Sweep:
     """How an object is swept past the array (Chung et al. 2025, appendix A1), in any pose.
@@ -220,20 +230,6 @@ class Sweep:
         """(3, 3) rotation into a frame in which the object's way is along -y."""
         heading, climb = np.radians((self.heading_deg, self.climb_deg))
         return rotation("x", climb) @ rotation("z", -heading)
-
-
-LIMITS = {
-    "size_mm": (1e-3, 1e4),
-    "speed_mm_s": (1e-3, 1e4),
-    "gap_mm": (0.0, 1e4),
-    "heading_deg": (-60.0, 60.0),  # beyond, it comes at the head itself
-    "climb_deg": (-60.0, 60.0),
-    "ramp_ms": (0.0, 1e4),
-    "head_moves": (0.0, 1.0),
-    "surface_friction": (0.0, 10.0),
-    "shake_g": (0.0, 5.0),
-    "shake_hz": (0.1, 200.0),  # samples are a millisecond apart
-}
 
 
 def usual_distance(animals: tuple[WhiskerArray, ...]) -> float:

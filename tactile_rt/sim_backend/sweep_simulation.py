@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.sim_backend.arrays.whisker_array import WhiskerArray
-from tactile_rt.sim_backend.arrays.whiskers import Whisker, link_nodes
+from tactile_rt.sim_backend.arrays.whiskers import Whisker
 from tactile_rt.sim_backend.mujoco_world import CONTACT_CHANNELS, MujocoWorld, sweep_model
 from tactile_rt.sim_backend.objects.catalogue import TactileObject
 from tactile_rt.sim_backend.sweep import (
@@ -25,10 +25,16 @@ from tactile_rt.sim_backend.sweep import (
 )
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile, engine_of
 
-__all__ = ["SweepSimulation", "World", "check_sweep", "draw_simulation", "ringing", "strains"]
+__all__ = ["SweepSimulation", "World", "check_sweep", "draw_simulation", "ringing"]
 
 TOO_MUCH = 1.1  # a damping ratio so many times the wanted one is told
 FINER = ("dataset", "accurate")
+FAR_MM = 200.0  # where the object is when the way to first contact is measured
+DRAWS = 20  # tries to draw parameters with which an object meets the array at all
+G = 9.80665e-3  # mm/ms^2
+SHAKEN_IN_MS = 50.0  # in which shaking grows to its whole
+CLEAR_MM = 5.0  # how far past the last whisker a sweep goes on
+Floats = NDArray[np.float64]
 
 
 def ringing(animals: Sequence[WhiskerArray], profile: Profile) -> str:
@@ -61,32 +67,6 @@ def _off(whiskers: Sequence[Whisker], profile: Profile) -> list[tuple[float, flo
         for rod, w in zip(rods, whiskers, strict=True)
         if rod.resonance_hz < HEARD_HZ and rod.damping_ratio > TOO_MUCH * rod.wanted_ratio
     ]
-
-
-def strains(whiskers: Sequence[Whisker], links: int, angles: NDArray[np.float64]) -> list[float]:
-    """The largest strain of each whisker at its surface: curvature times radius.
-
-    Args:
-        angles: (joint,) angles of all whiskers' hinges, one whisker after the other, rad.
-    """
-    found, first = [], 0
-    for whisker in whiskers:
-        first += 2 if whisker.mount_stiffness else 0  # the mount's own, which strain nothing
-        bends = angles[first : first + 2 * links].reshape(-1, 2)
-        first += 2 * links
-        radii = whisker.radius(link_nodes(whisker, links)[1:-1])
-        cell = whisker.length / links
-        found.append(float((np.hypot(bends[:, 0], bends[:, 1]) / cell * radii).max()))
-    return found
-
-
-FAR_MM = 200.0  # where the object is when the way to first contact is measured
-DRAWS = 20  # tries to draw parameters with which an object meets the array at all
-G = 9.80665e-3  # mm/ms^2
-SHAKEN_IN_MS = 50.0  # in which shaking grows to its whole
-CLEAR_MM = 5.0  # how far past the last whisker a sweep goes on
-
-Floats = NDArray[np.float64]
 
 
 def check_sweep(sweep: Sweep, profile: Profile) -> None:
@@ -178,7 +158,7 @@ class SweepSimulation:
         self._simulated = np.flatnonzero(met | whole | bool(sweep.shake_g))
         self._elements = len(whiskers)
         self._animals, self._profile = animals, profile
-        felt = self._felt = [whiskers[i] for i in self._simulated]
+        felt = [whiskers[i] for i in self._simulated]
         self._names = {w.name for w in felt}
         touched = [lines[i] for i in self._simulated]
         kept = (
@@ -287,17 +267,6 @@ class SweepSimulation:
         turns = np.zeros((len(found), self._elements, 2))
         turns[:, self._simulated] = found
         return turns
-
-    def strains(self) -> dict[str, tuple[float, float]]:
-        """The strains of the whiskers whose limit is known, now, and their limits, by name."""
-        if not any(w.strain_limit for w in self._felt):
-            return {}
-        found = strains(self._felt, self._profile.links, self._world.angles)
-        return {
-            w.name: (strain, w.strain_limit)
-            for w, strain in zip(self._felt, found, strict=True)
-            if w.strain_limit
-        }
 
     def loads(self, samples_at_once: int = 50) -> Iterator[Floats]:
         """Advance in pieces until the object has passed."""

@@ -52,9 +52,6 @@ class Whisk:
     Attributes:
         frequency_hz: The whisking cycles per second, Hz.
         protraction_deg, retraction_deg: The furthest turn forward and backward of rest, degrees.
-        asymmetry: The fraction of a cycle spent protracting; 0.5 is a sinusoid.
-        phase_deg: The phase of the cycle at time 0, degrees; 0 is fully retracted.
-        column_lag_deg: The phase by which each column lags behind the one caudal to it, degrees.
         ramp_s: The time from rest until the whisking is whole, s.
         duration_s: The length of the whole trajectory, s.
     """
@@ -62,9 +59,6 @@ class Whisk:
     frequency_hz: float = 8.0
     protraction_deg: float = 35.0
     retraction_deg: float = 10.0
-    asymmetry: float = 0.5
-    phase_deg: float = 0.0
-    column_lag_deg: float = 0.0
     ramp_s: float = 0.1
     duration_s: float = 1.5
 
@@ -73,9 +67,6 @@ class Whisk:
             "frequency_hz": (0.0, 50.0),
             "protraction_deg": (-LARGEST_DEG, LARGEST_DEG),
             "retraction_deg": (-LARGEST_DEG, LARGEST_DEG),
-            "asymmetry": (0.3, 0.7),  # where the phase below still runs forward
-            "phase_deg": (-360.0, 360.0),
-            "column_lag_deg": (-360.0, 360.0),
             "ramp_s": (0.01, 60.0),
             "duration_s": (0.01, 600.0),
         }
@@ -90,15 +81,11 @@ class Whisk:
     ) -> NDArray[np.float64]:
         """See `Trajectory`."""
         t = np.maximum(np.asarray(t_s, dtype=np.float64), 0.0)[:, None]
-        start = self.phase_deg - self.column_lag_deg * np.array([w.column for w in whiskers])
-        turn = 2 * np.pi * (self.frequency_hz * t + start / 360)
-        # A warped phase, pi (full protraction) at the wanted fraction of the cycle.
-        peak = 2 * np.pi * self.asymmetry
-        phase = turn - (peak - np.pi) / (1 - np.cos(peak)) * (1 - np.cos(turn))
+        phase = 2 * np.pi * self.frequency_hz * t  # 0 is fully retracted
         middle = (self.protraction_deg - self.retraction_deg) / 2
         amplitude = (self.protraction_deg + self.retraction_deg) / 2
         theta = np.radians(middle - amplitude * np.cos(phase)) * _ramp(t / self.ramp_s)
-        return coupled(theta, whiskers)
+        return coupled(np.repeat(theta, len(whiskers), axis=1), whiskers)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tactile_rt.calibration import CalibratedSource, Calibration, declare, declared
 from tactile_rt.errors import SpecMismatch
-from tactile_rt.stream import ArraySpec, Chunk, Source
+from tactile_rt.stream import ArraySpec, Source
 from tactile_rt.testing import ArraySource, cut, small_spec
 
 CHANNELS = (("bx", "T"), ("by", "T"), ("bz", "T"), ("temperature", "K"), ("fx", "N"))
@@ -138,10 +138,3 @@ def test_what_it_cannot_be_is_said_exactly(spec: ArraySpec, said: str) -> None:
 def test_whatever_an_array_is_called_it_can_be_declared(name: str) -> None:
     spec = replace(device(), name=name)
     assert declared(spec, ROBOT).output_spec(spec).name == "robot"
-
-
-def test_a_sample_of_another_shape_is_refused() -> None:
-    bad = Chunk(np.zeros(1, np.int64), np.zeros(1, np.int64), np.zeros((1, 3, 2), np.float32),
-                np.ones((1, 3), np.bool_))  # fmt: skip
-    with pytest.raises(SpecMismatch, match=r"is for samples of \(3, 4\)"):
-        declared(device(), ROBOT).apply(bad)

@@ -36,9 +36,9 @@ def pixels(path):
 
 
 def test_a_picture_of_a_moment(view):
-    early = pixels(view("a.png", "--at", 1, "--camera", "side", "--orthographic"))
+    early = pixels(view("a.png", "--at", 1, "--camera", "side"))
     assert early.shape == (180, 320, 3)
-    late = pixels(view("a.png", "--at", 60, "--camera", "side", "--orthographic"))
+    late = pixels(view("a.png", "--at", 60, "--camera", "side"))
     assert (early != late).any()
 
 

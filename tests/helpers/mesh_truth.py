@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import manifold3d
 import numpy as np
 import trimesh
 from manifold3d import CrossSection, Manifold
@@ -20,6 +21,15 @@ def as_mesh(solid: Manifold) -> trimesh.Trimesh:
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     vertices = (vertices - (low + high) / 2) / (high - low).max()
     return trimesh.Trimesh(vertices, arrays.tri_verts.astype(int), process=False)
+
+
+def one_mesh(pieces: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """The union of closed meshes as one closed mesh."""
+    solids = [
+        Manifold(manifold3d.Mesh64(np.array(p.vertices), np.array(p.faces, np.uint64)))
+        for p in pieces
+    ]
+    return as_mesh(Manifold.batch_boolean(solids, manifold3d.OpType.Add))
 
 
 def box(x: tuple[float, float], y: tuple[float, float], z: tuple[float, float]) -> Manifold:

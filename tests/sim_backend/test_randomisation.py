@@ -73,15 +73,6 @@ def test_the_generator_decides_everything_and_each_draw_is_another() -> None:
     assert second == randomisation.draw(same, MOUSE)
 
 
-def test_draws_after_an_unrandomised_one_are_the_same() -> None:
-    """A set in which one array is left alone has the same others."""
-    some = Randomisation(base_mm=0.1)
-    one, other = np.random.default_rng(1), np.random.default_rng(1)
-    Randomisation().draw(one, MOUSE)
-    some.draw(other, MOUSE)
-    assert some.draw(one, MOUSE) == some.draw(other, MOUSE)
-
-
 @pytest.mark.parametrize("name", FIELDS)
 def test_each_quantity_changes_its_own_attributes_only(name: str) -> None:
     drawn = Randomisation(**{name: size(name)}).draw(np.random.default_rng(2), MOUSE)

@@ -94,37 +94,21 @@ def extent_of(mask):
 AHEAD = Camera(0.0, 0.0, (0.0, 0.0, 0.0), 40.0)  # looks along +x, y to the left, z up
 
 
-@pytest.mark.parametrize("orthographic", [False, True])
 @pytest.mark.parametrize("depth", [-12, 0, 30])
-def test_size_over_depth_is_that_of_the_projection(orthographic, depth):
-    camera = Camera(0.0, 0.0, (0, 0, 0), 40.0, orthographic)
+def test_size_over_depth_is_that_of_the_projection(depth):
+    camera = Camera(0.0, 0.0, (0, 0, 0), 40.0)
     plate = thing("box", ".01 4 6", f"{depth} 0 0")
     width, height = extent_of(bluish(photograph(still(plate), camera)))
     eye = 20 / np.tan(np.radians(35 / 2))
-    shrink = 1.0 if orthographic else eye / (eye + depth)
+    shrink = eye / (eye + depth)
     assert width == pytest.approx(8 * SIDE / 40 * shrink, abs=1.5)
     assert height == pytest.approx(12 * SIDE / 40 * shrink, abs=1.5)
 
 
-def test_parallel_edges_stay_parallel_only_without_perspective():
-    beam = thing("box", "14 .01 3", "0 0 0", 'euler="0 0 35"')  # recedes to the left
-    heights = {}
-    for orthographic in (False, True):
-        camera = Camera(0.0, 0.0, (0, 0, 0), 40.0, orthographic)
-        mask = bluish(photograph(still(beam), camera))
-        columns = np.flatnonzero(mask.any(axis=0))
-        heights[orthographic] = [int(mask[:, columns[i]].sum()) for i in (2, -3)]
-    far, near = heights[True]
-    assert far == pytest.approx(near, abs=1)
-    far, near = heights[False]
-    assert near > 1.2 * far
-
-
-@pytest.mark.parametrize("orthographic", [False, True])
 @pytest.mark.parametrize("view", VIEWS)
-def test_the_axes_of_a_camera_are_those_of_its_picture(view, orthographic):
+def test_the_axes_of_a_camera_are_those_of_its_picture(view):
     azimuth, elevation = VIEWS[view]
-    camera = Camera(azimuth, elevation, (3.0, -5.0, 2.0), 40.0, orthographic)
+    camera = Camera(azimuth, elevation, (3.0, -5.0, 2.0), 40.0)
     place = np.array(camera.lookat) + 9 * camera.right + 4 * camera.up
     ball = thing("sphere", "1", " ".join(map(str, place)))
     rows, columns = np.nonzero(bluish(photograph(still(ball), camera)))
@@ -144,7 +128,7 @@ def test_named_views_are_what_they_are_called():
 @pytest.mark.parametrize("left", [False, True])
 def test_a_named_view_shows_all_that_it_frames(view, left):
     points = np.random.default_rng(3).normal(size=(50, 3)) * (9, 2, 5) + (40, -7, 1)
-    camera = framing(view, points, True, aspect=2.0, left=left)
+    camera = framing(view, points, aspect=2.0, left=left)
     from_middle = points - camera.lookat
     assert np.abs(from_middle @ camera.right).max() < camera.extent_mm * 2.0 / 2
     assert np.abs(from_middle @ camera.up).max() < camera.extent_mm / 2
@@ -176,7 +160,7 @@ def test_drawing_changes_neither_the_model_nor_the_loads(footage):
 def test_a_force_is_an_arrow_from_the_base_as_long_as_its_scale_says():
     # y of the element frame is -x of the world: half the scale's force points left, from above
     recorded = still(site='pos="6 2 0" euler="0 0 90"', load=(0, 0.5e-3, 0, 0, 0, 0))
-    picture = photograph(recorded, Camera(*VIEWS["top"], (0, 0, 0), 40.0, orthographic=True))
+    picture = photograph(recorded, Camera(*VIEWS["top"], (0, 0, 0), 40.0))
     rows, columns = np.nonzero((picture < 240).any(axis=2))
     pixel = SIDE / 40
     assert columns.min() == pytest.approx(SIDE / 2 + (6 - 0.5 * SCALE.arrow_mm) * pixel, abs=2)

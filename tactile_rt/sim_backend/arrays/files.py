@@ -80,6 +80,10 @@ ROBOTS = MappingProxyType(
         "rattechan": "codec=anyskin&magnetometers=3&temperature=false&rate_hz=300",
     }
 )
+SIDES = ("right", "left", "both")
+ARRAY_FILES = (".csv", ".toml")
+COLUMNS = (*REQUIRED, *OPTIONAL)
+ORIGIN = (0.0, 0.0, 0.0)
 
 
 def robot_text(name: str) -> str:
@@ -108,7 +112,6 @@ SPECIES: dict[str, Callable[[], tuple[Whisker, ...]]] = {
     "mouse": mouse_whiskers,
     "rat": rat_whiskers,
 }
-SIDES = ("right", "left", "both")
 
 
 def species_array(name: str) -> WhiskerArray:
@@ -145,11 +148,6 @@ def _mount_species(whiskers: tuple[Whisker, ...]) -> Mount:
         return MOUNT
     middle = MOUNT.position + MOUNT.rotation @ np.mean([w.base for w in mouse], axis=0)
     return centred_mount(whiskers, tuple(middle), MOUNT.roll_pitch_yaw)
-
-
-ARRAY_FILES = (".csv", ".toml")
-COLUMNS = (*REQUIRED, *OPTIONAL)
-ORIGIN = (0.0, 0.0, 0.0)
 
 
 class _Mount(msgspec.Struct, forbid_unknown_fields=True):

@@ -59,9 +59,8 @@ OPTIONAL = {
     "friction": "friction",
     "mount_stiffness_nm_rad": "mount_stiffness",
     "mount_damping_nms_rad": "mount_damping",
-    "strain_limit": "strain_limit",
 }
-NOT_NEGATIVE = ("damping_ratio", "friction", "mount_stiffness", "mount_damping", "strain_limit")
+NOT_NEGATIVE = ("damping_ratio", "friction", "mount_stiffness", "mount_damping")
 POSITIVE = {"arc_length_mm": "length"} | {
     column: field for column, field in OPTIONAL.items() if field not in NOT_NEGATIVE
 }
@@ -100,8 +99,6 @@ class Whisker:
         mount_stiffness: The rotational stiffness of what the whisker stands on, about each axis
             across the whisker, N m / rad; 0: it does not give.
         mount_damping: The damping of that rotation, N m s / rad.
-        strain_limit: The strain that the material bears without staying bent, 0.01 for 1 %; 0: not
-            known, and nothing is said of it.
     """
 
     name: str
@@ -120,7 +117,6 @@ class Whisker:
     friction: float = FRICTION
     mount_stiffness: float = 0.0
     mount_damping: float = 0.0
-    strain_limit: float = 0.0
 
     def __post_init__(self) -> None:
         who = f"whisker {self.name}"

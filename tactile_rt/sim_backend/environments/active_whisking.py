@@ -31,6 +31,18 @@ SIDE, MARGIN_MM = 320, 25.0
 PAPER, THING, EDGE = (255, 255, 255), (214, 186, 140), (170, 130, 80)
 WHISKER, TOUCHING = (60, 60, 70), (200, 40, 40)
 VIEWS = ((0, 1), (1, 2))  # from above: x to the right, y up; from the side: y to the right, z up
+# Kinds of the catalogue that differ in what whiskers can feel of them: edges, rims, gaps, curves.
+KINDS: Final = ("bottle", "bowl", "car", "chair", "gear", "mug", "mushroom", "table")
+FREQUENCY_HZ: Final = 8.0
+AMPLITUDE_RAD: Final = 0.45
+OFFSET_RAD: Final = 0.45
+SPEED_MM_S: Final = 60.0
+MOTION: Final = ("amplitude", "offset", "velocity x", "velocity y", "velocity z")
+LOGITS: Final = 5.0  # a guess of +1 for one kind and -1 for another sets them apart by 2 x 5
+FRAMES: Final = 5  # in which the samples of a step are averaged
+FULL_SCALE: Final = (*(5e-3,) * 3, *(2e-5,) * 3)  # N, N m: beyond, a reading saturates
+DRAWS: Final = 100  # tries to stand an object where the array meets it
+Observation = dict[str, NDArray[np.float32]]
 
 
 def whisker_nodes(head: WhiskingHead) -> list[Floats]:
@@ -84,21 +96,6 @@ def picture(head: WhiskingHead) -> NDArray[np.uint8]:
         for line, touches in zip(whisker_nodes(head), touching, strict=True):
             draw.line(project(line), fill=TOUCHING if touches else WHISKER, width=2)
     return np.asarray(image, dtype=np.uint8)
-
-
-# Kinds of the catalogue that differ in what whiskers can feel of them: edges, rims, gaps, curves.
-KINDS: Final = ("bottle", "bowl", "car", "chair", "gear", "mug", "mushroom", "table")
-FREQUENCY_HZ: Final = 8.0
-AMPLITUDE_RAD: Final = 0.45
-OFFSET_RAD: Final = 0.45
-SPEED_MM_S: Final = 60.0
-MOTION: Final = ("amplitude", "offset", "velocity x", "velocity y", "velocity z")
-LOGITS: Final = 5.0  # a guess of +1 for one kind and -1 for another sets them apart by 2 x 5
-FRAMES: Final = 5  # in which the samples of a step are averaged
-FULL_SCALE: Final = (*(5e-3,) * 3, *(2e-5,) * 3)  # N, N m: beyond, a reading saturates
-DRAWS: Final = 100  # tries to stand an object where the array meets it
-
-Observation = dict[str, NDArray[np.float32]]
 
 
 class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):

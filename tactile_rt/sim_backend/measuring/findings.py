@@ -34,6 +34,14 @@ MEDIAN = math.sqrt(math.pi / 2)  # standard error of a median over that of a mea
 SIGMAS = 1.96  # of an interval's half
 EVEN = 1.2  # how much longer one half of an interval may be than the other to be told as one
 MANY = 6  # whiskers that are named
+NOISIER = 1.5  # than most whiskers: it is named
+FEWEST = 4  # whiskers that an offset's spread is told from
+STRANGE = 5.0  # an offset so many times as large as most are
+OTHER = 8.0  # of a log-likelihood: a whisker whose drift is surely not that of most
+SURE = 1.92  # of a log-likelihood, at the ends of an interval
+DRIFTS = np.geomspace(1e-3, 1e3, 560)  # in standard deviations of the noise
+SAME_RATE = 1e-3  # clocks differ by less
+HIDDEN = "noise is less than half a step: rounding hides it"
 
 
 class Figure(NamedTuple):
@@ -159,16 +167,6 @@ def listed(names: Sequence[str]) -> str:
     """The first of several names, and how many more there are."""
     more = f" and {len(names) - MANY} more" if len(names) > MANY else ""
     return ", ".join(names[:MANY]) + more
-
-
-NOISIER = 1.5  # than most whiskers: it is named
-FEWEST = 4  # whiskers that an offset's spread is told from
-STRANGE = 5.0  # an offset so many times as large as most are
-OTHER = 8.0  # of a log-likelihood: a whisker whose drift is surely not that of most
-SURE = 1.92  # of a log-likelihood, at the ends of an interval
-DRIFTS = np.geomspace(1e-3, 1e3, 560)  # in standard deviations of the noise
-SAME_RATE = 1e-3  # clocks differ by less
-HIDDEN = "noise is less than half a step: rounding hides it"
 
 
 def compare_sensor(

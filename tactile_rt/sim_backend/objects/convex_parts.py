@@ -32,6 +32,17 @@ from tactile_rt.sim_backend.objects.deviation import FACES, TILE, shuffled, surf
 __all__ = ["Joining", "SheetPieces", "SolidPieces"]
 
 P = TypeVar("P")
+Floats = NDArray[np.float64]
+FOLDED = 0.5  # cosine of the angle by which a patch's parts may be turned against it
+ALONG = np.linspace(0, 1, 4, endpoint=False)[:, None, None]  # where an outline is looked at
+DEEP = 0.05  # of a face's piece, in largest extents, at most: 2 mm at 40 mm
+SHALLOW = 2e-4  # at least
+SHARE = 0.6  # of the way through the solid, at most: the pieces of opposite walls overlap
+ASIDE = 1e-5  # from a corner begins the ray that looks how far it is through the solid
+APART = TILE / 2  # points on the surface that are nearer than this tell the same
+OUT = 2.0  # from any place in the unit box, that is out of it
+VOID, VOID_DEPTH = 1e-7, 5e-5  # volume, and volume over area, of what is too small to be filled
+MOST_VOIDS = 2000  # looked at
 
 
 class Joining(Generic[P]):
@@ -96,12 +107,6 @@ class Joining(Generic[P]):
                     refused[k].add(c)
                 else:
                     heapq.heappush(queue, (self._sizes[c] + self._sizes[k], c, k))
-
-
-Floats = NDArray[np.float64]
-
-FOLDED = 0.5  # cosine of the angle by which a patch's parts may be turned against it
-ALONG = np.linspace(0, 1, 4, endpoint=False)[:, None, None]  # where an outline is looked at
 
 
 @dataclass(frozen=True)
@@ -200,16 +205,6 @@ def _outline(points: Floats, normal: Floats) -> ConvexHull | None:
         return ConvexHull(_flat(points, normal))
     except QhullError:
         return None
-
-
-DEEP = 0.05  # of a face's piece, in largest extents, at most: 2 mm at 40 mm
-SHALLOW = 2e-4  # at least
-SHARE = 0.6  # of the way through the solid, at most: the pieces of opposite walls overlap
-ASIDE = 1e-5  # from a corner begins the ray that looks how far it is through the solid
-APART = TILE / 2  # points on the surface that are nearer than this tell the same
-OUT = 2.0  # from any place in the unit box, that is out of it
-VOID, VOID_DEPTH = 1e-7, 5e-5  # volume, and volume over area, of what is too small to be filled
-MOST_VOIDS = 2000  # looked at
 
 
 class SolidPieces:

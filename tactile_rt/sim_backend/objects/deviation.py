@@ -29,6 +29,17 @@ __all__ = [
     "tiles",
 ]
 
+Floats = NDArray[np.float64]
+TILE = 1 / 80  # longest edge of a tile, in largest extents: 0.5 mm at 40 mm
+NEAR = 4  # tiles looked at for each point; all that could be nearer, for the farthest points
+BATCH = 64
+FACES = 24  # of a piece looked at together
+NEEDLE = 1e-6  # triangles lower than this, in largest extents, have no normal to speak of
+INSIDE = 1e-5  # what is nearer to the surface than this counts wherever it lies
+RAY = np.array([2.1, 0.13, 0.37])  # out of the unit box, along no axis
+MOST_POINTS = 20_000  # looked at, of either surface
+TIE = 1e-9  # tiles as near as each other
+
 
 def bodies_of(mesh: trimesh.Trimesh) -> list[Manifold]:
     """Return the connected parts of a closed mesh, all wound outward, if its faces match.
@@ -59,19 +70,6 @@ def _turn_outward(body: Manifold) -> Manifold:
     arrays = body.to_mesh64()
     corners, faces = arrays.vert_properties[:, :3], arrays.tri_verts[:, ::-1]
     return Manifold(manifold3d.Mesh64(corners.copy(), faces.copy()))
-
-
-Floats = NDArray[np.float64]
-
-TILE = 1 / 80  # longest edge of a tile, in largest extents: 0.5 mm at 40 mm
-NEAR = 4  # tiles looked at for each point; all that could be nearer, for the farthest points
-BATCH = 64
-FACES = 24  # of a piece looked at together
-NEEDLE = 1e-6  # triangles lower than this, in largest extents, have no normal to speak of
-INSIDE = 1e-5  # what is nearer to the surface than this counts wherever it lies
-RAY = np.array([2.1, 0.13, 0.37])  # out of the unit box, along no axis
-MOST_POINTS = 20_000  # looked at, of either surface
-TIE = 1e-9  # tiles as near as each other
 
 
 @dataclass(frozen=True)

@@ -40,6 +40,10 @@ MOST_POINTS: Final = 6_000_000  # of a mesh that Draco compressed
 
 GLB_JSON: Final = struct.Struct("<4sIIII")  # head of the file and of its first chunk
 DRACO: Final = b"DRACO"
+Y_UP = (".glb", ".gltf")  # by their standard; COLLADA files say it, and the reader turns them
+MAX_FACES = 2_000_000  # a minute
+POINT = 1e-9  # of all extents: smaller is none
+_Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
 def _check_archive(name: str, content: bytes) -> None:
@@ -183,11 +187,6 @@ FORMATS: Final[dict[str, Callable[[str, bytes], None] | None]] = {
     ".3mf": _check_archive,
 }
 MESH_SUFFIXES = tuple(FORMATS)
-Y_UP = (".glb", ".gltf")  # by their standard; COLLADA files say it, and the reader turns them
-MAX_FACES = 2_000_000  # a minute
-POINT = 1e-9  # of all extents: smaller is none
-
-_Y_UP_TO_Z_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 
 
 def check_mesh_file(path: Path) -> None:

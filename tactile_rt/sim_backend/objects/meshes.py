@@ -54,6 +54,28 @@ from tactile_rt.sim_backend.objects.solids import TactileObject
 
 __all__ = ["Pieces", "cache_key", "load_mesh", "read_pieces", "simplify_mesh", "write_pieces"]
 
+SHARES = (0.25, 0.5, 1.0)  # of the most triangles, that are tried
+HASTE = (3.0, 7.0, 10.0)  # how fast the cost of an edge that goes may grow, until few are left
+Floats = NDArray[np.float64]
+log = logging.getLogger("tactile_rt.sim_backend.objects")
+RECIPE = 4  # of the pieces; raised when the same file would become others
+DIGITS = 7  # of a largest extent: corners nearer than 4e-6 mm at 40 mm are one
+MERGE_DIGITS = 6  # vertices closer than 1e-6 of the largest extent are one
+SPECK = 1e-6  # a body of less volume than this (largest extent cubed) touches nothing
+FOIL = 1e-5  # a body of which this is volume over area, in largest extents, is a sheet
+# What is allowed of the distance for fewer triangles, and for joining pieces; the rest is for what
+# falls between the points looked at.
+SIMPLER, JOINED = 0.4, 0.55
+WIDER, WIDEST = 1.25, 0.2  # distances that are tried where the pieces allowed are too few
+MOST_FACES = 6000  # of all bodies and the sheet together, where there are more
+LEAST_FACES = 400  # that each of them may keep
+GONE = 5e-3  # so far from what is left is a face that simplification took away: 0.2 mm at 40 mm
+FLAPS = 1e-4  # of area (largest extent squared) of what hangs on a solid without having volume
+SMALL_HOLE = 0.05  # of which this is the length round it is damage, not an opening
+LONGEST_LOOP = 64  # of edges round a hole that is looked at
+FLUSH = 0.999  # so parallel (cosine) to a neighbour is a face that got lost
+MANY = 2000  # triangles that take some seconds
+
 
 @dataclass(frozen=True)
 class Pieces:
@@ -129,10 +151,6 @@ def _path(key: str) -> Path | None:
     return Path(base) / "tactile_rt" / "pieces" / f"{key}.npz" if os.path.isabs(base) else None
 
 
-SHARES = (0.25, 0.5, 1.0)  # of the most triangles, that are tried
-HASTE = (3.0, 7.0, 10.0)  # how fast the cost of an edge that goes may grow, until few are left
-
-
 def simplify_mesh(mesh: trimesh.Trimesh, tolerance: float, most: int) -> trimesh.Trimesh:
     """Take triangles away within a tolerance, to about `most` of them.
 
@@ -172,29 +190,6 @@ def _with_faces(mesh: trimesh.Trimesh, number: int) -> trimesh.Trimesh:
         if len(faces) <= 1.2 * number:
             break
     return fewer
-
-
-Floats = NDArray[np.float64]
-
-log = logging.getLogger("tactile_rt.sim_backend.objects")
-
-RECIPE = 4  # of the pieces; raised when the same file would become others
-DIGITS = 7  # of a largest extent: corners nearer than 4e-6 mm at 40 mm are one
-MERGE_DIGITS = 6  # vertices closer than 1e-6 of the largest extent are one
-SPECK = 1e-6  # a body of less volume than this (largest extent cubed) touches nothing
-FOIL = 1e-5  # a body of which this is volume over area, in largest extents, is a sheet
-# What is allowed of the distance for fewer triangles, and for joining pieces; the rest is for what
-# falls between the points looked at.
-SIMPLER, JOINED = 0.4, 0.55
-WIDER, WIDEST = 1.25, 0.2  # distances that are tried where the pieces allowed are too few
-MOST_FACES = 6000  # of all bodies and the sheet together, where there are more
-LEAST_FACES = 400  # that each of them may keep
-GONE = 5e-3  # so far from what is left is a face that simplification took away: 0.2 mm at 40 mm
-FLAPS = 1e-4  # of area (largest extent squared) of what hangs on a solid without having volume
-SMALL_HOLE = 0.05  # of which this is the length round it is damage, not an opening
-LONGEST_LOOP = 64  # of edges round a hole that is looked at
-FLUSH = 0.999  # so parallel (cosine) to a neighbour is a face that got lost
-MANY = 2000  # triangles that take some seconds
 
 
 def load_mesh(path: Path, detail: MeshDetail = STANDARD) -> TactileObject:

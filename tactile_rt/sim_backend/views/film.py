@@ -24,9 +24,7 @@ QUALITY = "20"  # of H.264, constant rate factor: 18 is as the eye sees it, 23 t
 Pixels = NDArray[np.uint8]
 
 
-def camera_of(
-    footage: Footage, view: str, orthographic: bool = False, aspect: float = 1.5
-) -> Camera:
+def camera_of(footage: Footage, view: str, aspect: float = 1.5) -> Camera:
     """The camera of a named view, on the whiskers at rest and on what presses them most."""
     dressed = Dressed(footage.model, footage.spec)
     footage.restore(0, dressed.data)
@@ -34,7 +32,7 @@ def camera_of(
     whiskers = dressed.points()
     footage.restore(footage.strongest, dressed.data)
     points = np.concatenate([whiskers, dressed.object_points()])
-    return framing(view, points, orthographic, aspect, left)
+    return framing(view, points, aspect, left)
 
 
 class Film:
@@ -51,7 +49,6 @@ class Film:
         self,
         footage: Footage,
         view: Camera | str = "oblique",
-        orthographic: bool = False,
         title: str = "",
         detail: str = "",
         pixels: int = 1280,
@@ -59,7 +56,7 @@ class Film:
         self.footage = footage
         width, height = scene_size(pixels)
         if isinstance(view, str):
-            view = camera_of(footage, view, orthographic, width / height)
+            view = camera_of(footage, view, width / height)
         scale = ForceScale.fitting(footage.forces, view.extent_mm)
         self._stage = Stage(footage, view, scale, width, height)
         self._sheet = Sheet(footage, view, scale, title, detail, pixels)

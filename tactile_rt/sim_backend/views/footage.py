@@ -23,18 +23,22 @@ VIEWS: dict[str, tuple[float, float]] = {
     "oblique": (26.0, -27.0),
 }
 MARGIN = 1.15  # around the framed points: room for arrows
+# What places everything: joint angles, and the poses of the bodies that are moved.
+_STATE = int(
+    mujoco.mjtState.mjSTATE_QPOS
+    | mujoco.mjtState.mjSTATE_MOCAP_POS
+    | mujoco.mjtState.mjSTATE_MOCAP_QUAT
+)
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A point of view. Both projections show the same height at the point looked at.
+    """A point of view, in perspective.
 
     Attributes:
         azimuth, elevation: The direction of view, degrees.
         lookat: The point (x, y, z) in the middle of the picture, world, mm.
         extent_mm: The height of what the picture shows at that point, mm.
-        orthographic: Whether there is no perspective: sizes are independent of depth, parallels
-            stay parallel.
         fovy_deg: The vertical field of view in perspective, degrees; small is far away.
     """
 
@@ -42,7 +46,6 @@ class Camera:
     elevation: float
     lookat: tuple[float, float, float]
     extent_mm: float
-    orthographic: bool = False
     fovy_deg: float = 35.0
 
     @property
@@ -73,9 +76,7 @@ class Camera:
         camera.lookat[:] = self.lookat
         camera.distance = self.distance_mm
         camera.azimuth, camera.elevation = self.azimuth, self.elevation
-        camera.orthographic = int(self.orthographic)
-        # MuJoCo reads the field of view of an orthographic camera as its extent.
-        model.vis.global_.fovy = self.extent_mm if self.orthographic else self.fovy_deg
+        model.vis.global_.fovy = self.fovy_deg
         model.stat.extent = self.extent_mm
         model.vis.map.znear = 0.02
         model.vis.map.zfar = 50 * (1 + self.distance_mm / self.extent_mm)
@@ -84,7 +85,6 @@ class Camera:
 def framing(
     view: str,
     points: NDArray[np.float64],
-    orthographic: bool = False,
     aspect: float = 1.5,
     left: bool = False,
 ) -> Camera:
@@ -107,15 +107,7 @@ def framing(
     x, y, z = (frame.T @ ((low + high) / 2)).tolist()
     wide, tall = (high - low)[:2]
     extent = MARGIN * max(float(wide) / aspect, float(tall), 1e-3)
-    return Camera(azimuth, elevation, (x, y, z), extent, orthographic)
-
-
-# What places everything: joint angles, and the poses of the bodies that are moved.
-_STATE = int(
-    mujoco.mjtState.mjSTATE_QPOS
-    | mujoco.mjtState.mjSTATE_MOCAP_POS
-    | mujoco.mjtState.mjSTATE_MOCAP_QUAT
-)
+    return Camera(azimuth, elevation, (x, y, z), extent)
 
 
 class Simulation(Protocol):
