@@ -19,7 +19,7 @@ def label(
         list[Path],
         typer.Argument(
             metavar="RECORDING... OUT",
-            help="Recordings: .mcap, .npz, .csv, .h5; then the folder of the sweep set.",
+            help="Recordings, .mcap; then the folder of the sweep set.",
         ),
     ],
     labels: Annotated[

@@ -174,7 +174,7 @@ def convert(
         list[Path],
         typer.Argument(
             metavar="RECORDING... OUTPUT",
-            help="A .mcap of tactile-rt, .npz, .csv, .h5, LeRobot dataset; then another of them.",
+            help="A .mcap; then a .npz, .csv or .h5, or a folder.",
         ),
     ],
     to: Annotated[
@@ -191,19 +191,17 @@ def convert(
             "the first sample it begins; may be repeated."
         ),
     ] = None,
-    episode: Annotated[int, typer.Option(min=0, help="Which one of a LeRobot dataset.")] = 0,
     force: Force = False,
     json: Json = None,
 ) -> None:
-    """Write a recording as arrays (.npz, .h5), text (.csv), bag or dataset, or make it one again.
+    """Write a recording as arrays (.npz, .h5), text (.csv), bag or dataset.
 
-    Samples, description, decisions, events and health come back bit for
-    bit; raw packets are in the .mcap and in bags alone. A .csv has a
-    .csv.json beside it, with all that is no sample. OUTPUT may be left out
-    with --to: RECORDING-ros2, RECORDING-lerobot.
+    Arrays hold samples, description, decisions, events and health; a .csv
+    and a dataset hold the samples; raw packets are in the .mcap and in
+    bags alone. OUTPUT may be left out with --to: RECORDING-ros2,
+    RECORDING-lerobot.
     """
     from tactile_rt.recording.conversion import convert as converted
-    from tactile_rt.recording.conversion import outputs_of
 
     check_output(json)
     console = Console(stderr=True)
@@ -215,10 +213,9 @@ def convert(
     if len(files) != 2:
         raise ConfigError("name a recording and what to write, or say what --to")
     recording, output = files
-    for file in outputs_of(output):
-        check_new(file, force)
+    check_new(output, force)
     with working(console, f"converting {recording}"):
-        samples = converted(recording, output, episode)
+        samples = converted(recording, output)
     _tell({"output": output, "samples": samples}, json)
 
 

@@ -3,7 +3,7 @@
     data/chunk-000/file-000.parquet      rows, a file for each episode
     videos/...                           what a camera saw, if there is a film of it
     meta/info.json, tasks, episodes, stats
-    meta/tactile_rt/episode-000000.json  what is no sample, so that it becomes the recording again
+    meta/tactile_rt/episode-000000.json  what the recording is of: units, frame, calibration, UTC
 
 What is needed: a camera has 30 frames a second, a sensor a thousand samples, and none may be lost;
 LeRobot knows one rate, that of the rows, and arrays of one shape.
@@ -15,25 +15,20 @@ could know then. ``observation.state``, which every policy reads, is the newest 
 It is read and written piece by piece; it need not fit into memory.
 """
 
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError, RecordingError, SpecMismatch
 from tactile_rt.files import whole_folder
-from tactile_rt.recording.as_arrays import COLUMNS, TEXTS, Told, raws_of
-from tactile_rt.recording.as_csv import told_of, told_text
-from tactile_rt.recording.description import Description
-from tactile_rt.recording.layout import SAMPLES, Raw
+from tactile_rt.recording.conversion import about_text
 from tactile_rt.recording.lerobot_film import CameraFilm, write_film
 from tactile_rt.recording.lerobot_meta import (
     DATA,
     FRAME,
-    INFO,
     Episode,
     Statistics,
     need_pyarrow,
@@ -42,7 +37,7 @@ from tactile_rt.recording.lerobot_meta import (
 from tactile_rt.recording.reader import Recording
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
-__all__ = ["is_dataset", "read_dataset", "write_dataset"]
+__all__ = ["write_dataset"]
 
 STATE = "observation.state"
 TACTILE = "observation.tactile"
@@ -52,11 +47,6 @@ MOST_PADDING = 8  # times the samples: else they do not come as evenly as rows n
 FREE_CELLS = 1_000_000
 
 _Arrays = dict[str, NDArray[Any]]
-
-
-def is_dataset(path: Path) -> bool:
-    """Whether it is the folder of a LeRobot dataset."""
-    return (path / INFO).is_file()
 
 
 def write_dataset(
@@ -99,12 +89,12 @@ def write_dataset(
             about = recording.description
             said = task or about.session.get("task") or spec.name
             episode = Episode(k, len(end), first, said, tasks.setdefault(said, len(tasks)))
-            told, state, values = Told(), Statistics(), Statistics()
+            state, values = Statistics(), Statistics()
             path = made / DATA.format(k // 1000, k % 1000)
             path.parent.mkdir(parents=True, exist_ok=True)
             # A dictionary of values takes all kinds of NaN for one.
             with pq.ParquetWriter(path, schema, compression="zstd", use_dictionary=False) as file:
-                for columns, samples in _blocks(recording, told, end, width):
+                for columns, samples in _blocks(recording, end, width):
                     n += len(samples["seq"])
                     state.add(columns[STATE])
                     values.add(samples["values"], samples["valid"])
@@ -114,9 +104,9 @@ def write_dataset(
             episode.statistics[f"{TACTILE}.values"] = values.found(repeat=width)
             for film in films:
                 episode.statistics[film.key] = write_film(film, made, len(end), fps)
-            beside = _beside(made, k)
+            beside = made / "meta" / "tactile_rt" / f"episode-{k:06d}.json"
             beside.parent.mkdir(parents=True, exist_ok=True)
-            beside.write_bytes(told_text(about, told))
+            beside.write_text(about_text(about), "utf-8")
             episodes.append(episode)
             first += episode.rows
         write_meta(made, fps, {**_features(spec, width), **FRAME}, episodes, tasks, films)
@@ -151,12 +141,12 @@ def _uneven(recording: Recording, rows: int, samples: int) -> RecordingError:
 
 
 def _blocks(
-    recording: Recording, told: Told, ends: NDArray[np.int64], width: int
+    recording: Recording, ends: NDArray[np.int64], width: int
 ) -> Iterator[tuple[_Arrays, _Arrays]]:
-    """Columns of some rows, and the samples in them; all else is kept in `told`."""
+    """Columns of some rows, and the samples in them."""
     spec = recording.spec
     counts = np.diff(ends, prepend=0)
-    chunks = told.chunks(spec, recording.raw(SAMPLES, *TEXTS))
+    chunks = iter(recording)
     held: _Arrays = {
         "seq": np.zeros(0, np.int64), "t_ns": np.zeros(0, np.int64),
         "values": np.zeros((0, *spec.shape), np.float32),
@@ -193,8 +183,6 @@ def _blocks(
             states.append(newest.ravel())
         columns[STATE] = np.array(states)
         yield columns, samples
-    for _ in chunks:  # what was told after the last sample
-        pass
 
 
 def _newest(
@@ -249,54 +237,3 @@ def _table(pa: Any, schema: Any, columns: _Arrays) -> Any:
                 made = pa.FixedSizeListArray.from_arrays(made, size)
         arrays.append(made)
     return pa.Table.from_arrays(arrays, schema=schema)
-
-
-def _beside(folder: Path, episode: int) -> Path:
-    return folder / "meta" / "tactile_rt" / f"episode-{episode:06d}.json"
-
-
-def read_dataset(folder: Path, episode: int = 0) -> tuple[Description, Generator[Raw, None, None]]:
-    """What an episode is of, and its messages.
-
-    Raises:
-        ConfigError: No such episode, or pyarrow is missing.
-        RecordingError: It was not made of a recording, or is damaged.
-    """
-    _, pq = need_pyarrow()
-    beside = _beside(folder, episode)
-    if not beside.is_file():
-        there = len(list(beside.parent.glob("*.json")))
-        if not there:
-            raise RecordingError(
-                f"{folder} was not made of recordings, or is no longer as it was: no {beside}"
-            )
-        raise ConfigError(f"{folder} has episodes 0 to {there - 1}, not {episode}")
-    about, arrays, texts = told_of(beside)
-    what = f"{folder}, episode {episode}"
-    try:
-        info = msgspec.json.decode((folder / INFO).read_bytes(), type=dict[str, Any])
-        names = [COUNT, *(f"{TACTILE}.{name}" for name in COLUMNS)]
-        filters = [("episode_index", "==", episode)]
-        pieces: list[_Arrays] = []
-        for path in sorted((folder / "data").glob("*/*.parquet")):
-            table = pq.read_table(path, columns=[*names, "episode_index"], filters=filters)
-            pieces += [_samples(batch, info["features"]) for batch in table.to_batches()]
-        arrays |= {name: np.concatenate([p[name] for p in pieces]) for name in COLUMNS}
-    except Exception as error:  # as for any damaged file
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise RecordingError(f"{what} is damaged ({reason})") from None
-    return about, raws_of(what, about, arrays, texts)
-
-
-def _samples(batch: Any, features: dict[str, Any]) -> _Arrays:
-    """The samples of some rows, without what fills the rows up."""
-    count = batch.column(COUNT).to_numpy(zero_copy_only=False)
-    found = {}
-    for name in COLUMNS:
-        feature = features[f"{TACTILE}.{name}"]
-        column = batch.column(f"{TACTILE}.{name}")
-        while hasattr(column.type, "value_type"):
-            column = column.flatten()
-        padded = column.to_numpy(zero_copy_only=False).reshape(len(count), *feature["shape"])
-        found[name] = padded[np.arange(padded.shape[1]) < count[:, None]]
-    return found

@@ -1,120 +1,236 @@
-"""A recording as plain arrays or text, and these, or an episode of a LeRobot dataset, as a
-recording again: bit for bit."""
+"""A recording as arrays (.npz, .h5) or as text (.csv), for programs that read those.
 
-from collections.abc import Generator, Iterable
-from contextlib import closing
+    seq, t_ns, values, valid       the samples, as in `Chunk`
+    decisions, events, health      messages, JSON, each with its time in ..._log_ns
+    about                          what the recording is of, JSON
+
+A .csv has the samples alone. In an .npz, texts are JSON lines in arrays of bytes: in numpy's own
+text each takes the room of the longest. HDF5 is written piece by piece, and needs the extra
+``hdf5``.
+"""
+
+import csv
+import io
+import os
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
-from tactile_rt.errors import ConfigError
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.extras import lacking
 from tactile_rt.files import write_whole
-from tactile_rt.recording.as_arrays import TEXTS, read_npz, write_npz
-from tactile_rt.recording.as_csv import beside, read_csv, write_csv
-from tactile_rt.recording.as_hdf5 import need_h5py, read_hdf5, write_hdf5
-from tactile_rt.recording.as_lerobot import is_dataset, read_dataset
-from tactile_rt.recording.description import RECOVERED, Description
-from tactile_rt.recording.layout import SAMPLES, Raw, decode_samples, samples_in
-from tactile_rt.recording.lerobot_meta import need_pyarrow
+from tactile_rt.recording.description import Description, seal
+from tactile_rt.recording.layout import DECISIONS, EVENTS, HEALTH
 from tactile_rt.recording.reader import Recording
-from tactile_rt.recording.writer import McapFile
-from tactile_rt.stream import Chunk
+from tactile_rt.stream import ArraySpec, Chunk, concatenate
 
-__all__ = ["chunks_of", "convert", "outputs_of"]
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
-MCAP, HDF5 = ".mcap", (".h5", ".hdf5")
-READERS = {".npz": read_npz, ".csv": read_csv, **dict.fromkeys(HDF5, read_hdf5)}
+__all__ = ["about_text", "convert"]
 
-
-def outputs_of(output: str | Path) -> list[Path]:
-    """The files that `convert` makes for this name."""
-    path = Path(output)
-    return [path, beside(path)] if path.suffix == ".csv" else [path]
+COLUMNS = ("seq", "t_ns", "values", "valid")
+TEXTS = (DECISIONS, EVENTS, HEALTH)
+BLOCK = 1 << 14  # samples that are written at once
+PIECE = 1024  # samples that HDF5 stores together, with a checksum
 
 
-def convert(path: str | Path, output: str | Path, episode: int = 0) -> int:
-    """Write a recording as ``.npz``, ``.csv`` or ``.h5``, or any of these, or an episode of a
-    LeRobot dataset that was made of recordings, as another of them or a recording again.
+def convert(path: str | Path, output: str | Path) -> int:
+    """Write a recording as ``.npz``, ``.csv`` or ``.h5``, whole or not at all.
 
-    All forms hold samples, description, decisions, events and health, and the chunks in which the
-    samples came; raw packets stay behind. They are laid out in
-    docs/reference/recording.md. What is written appears whole or not at all.
+    What they hold is laid out in docs/reference/recording.md; raw packets are in the recording
+    alone.
 
     Returns:
         Number of samples.
 
     Raises:
-        ConfigError: a file of another kind, or an extra is not installed.
-        RecordingError: what is read is damaged, or has no samples.
+        ConfigError: a name of another kind, or an extra is not installed.
+        RecordingError: the recording is damaged, or has no samples.
     """
-    path, output = Path(path), Path(output)
-    _check_kind(path)
-    _check_output(output)
-    if path.suffix == output.suffix == MCAP:
-        raise ConfigError(f"{path} is a recording already: {output} would be no other")
-    about, raws = _read(path, episode)
-    n = 0
+    output = Path(output)
+    write = WRITERS.get(output.suffix)
+    if write is None:
+        raise ConfigError(
+            f"{output} is none of {', '.join(WRITERS)}; recordings are made by `tactile-rt record` "
+            "and, of tables, by `tactile-rt import`"
+        )
+    if write is write_hdf5:
+        need_h5py()
+    recording, n = Recording(path), 0
 
     def fill(file: BinaryIO) -> None:
         nonlocal n
-        n = _write(str(path), about, raws, file, output)
+        n = write(recording, file)
 
-    with closing(raws):
-        write_whole(output, fill)
+    write_whole(output, fill)
     return n
 
 
-def chunks_of(path: str | Path) -> tuple[Description, Generator[Chunk, None, None]]:
-    """What a recording of any form is of, and its chunks, as they were recorded.
+def about_text(about: Description) -> str:
+    """Write what a recording is of as one line of JSON, without its raw packets."""
+    fields = {
+        "tactile_rt": replace(about, wire="").to_metadata(),
+        "session": seal(about.session) if about.session else {},
+        "recovered": about.recovered,
+    }
+    return msgspec.json.encode(fields).decode()
+
+
+def write_csv(recording: Recording, file: BinaryIO) -> int:
+    """Write a line per sample, with empty cells for elements that are not valid."""
+    text = io.TextIOWrapper(file, encoding="utf-8", newline="", write_through=True)
+    lines = csv.writer(text, lineterminator="\n")
+    lines.writerow(_name_columns(recording.spec))
+    n = 0
+    for chunk in _read_blocks(recording):
+        lines.writerows(_write_rows(chunk))
+        n += len(chunk)
+    text.detach()
+    return n
+
+
+def _name_columns(spec: ArraySpec) -> list[str]:
+    of = zip(spec.channels, spec.units, strict=True)
+    channels = [f"{channel} [{unit}]" for channel, unit in of]
+    return ["seq", "t_ns", *(f"{e}.{c}" for e in spec.elements for c in channels)]
+
+
+def _write_rows(chunk: Chunk) -> Iterator[list[Any]]:
+    shown = np.repeat(chunk.valid, chunk.values.shape[2], axis=1)
+    flat = chunk.values.reshape(len(chunk), -1)
+    for seq, t_ns, row, show in zip(chunk.seq, chunk.t_ns, flat, shown, strict=True):
+        # str() of a float32 is the shortest text that reads back as the same number
+        yield [seq, t_ns, *(str(x) if ok else "" for x, ok in zip(row, show, strict=True))]
+
+
+def write_npz(recording: Recording, file: BinaryIO) -> int:
+    """Write all arrays, which are in memory together."""
+    about, whole = recording.description, concatenate(list(_read_blocks(recording)))
+    arrays: dict[str, Any] = {name: getattr(whole, name) for name in COLUMNS}
+    for topic in TEXTS:
+        lines, arrays[f"{topic}_log_ns"] = _read_texts(recording, topic)
+        arrays[topic] = np.frombuffer("".join(f"{x}\n" for x in lines).encode(), np.uint8)
+    arrays |= {
+        "utc_offset_ns": np.int64(about.utc_offset_ns),
+        "spec": np.str_(about.spec.to_json()),
+        "about": np.str_(about_text(about)),
+    }
+    np.savez(file, **arrays)
+    return len(whole)
+
+
+def write_hdf5(recording: Recording, file: BinaryIO) -> int:
+    """Write datasets block by block, with the names and units of the array."""
+    h5py, about, n = need_h5py(), recording.description, 0
+    with _PatientFile(os.dup(file.fileno())) as patient, h5py.File(patient, "w") as made:
+        for block in _read_blocks(recording):
+            for name in COLUMNS:
+                _append(made, name, getattr(block, name), n)
+            n += len(block)
+            patient.check()
+        text = h5py.string_dtype()
+        for topic in TEXTS:
+            lines, log_ns = _read_texts(recording, topic)
+            made.create_dataset(topic, data=lines, dtype=text, shape=(len(lines),))
+            made.create_dataset(f"{topic}_log_ns", data=log_ns)
+        for name in ("elements", "channels", "units"):
+            made.create_dataset(name, data=list(getattr(about.spec, name)), dtype=text)
+        made.create_dataset("about", data=about_text(about), dtype=text)
+        made.attrs.update(
+            frame=about.spec.frame, rate_hz=about.spec.rate_hz, utc_offset_ns=about.utc_offset_ns
+        )
+    return n
+
+
+WRITERS = {".npz": write_npz, ".csv": write_csv, ".h5": write_hdf5, ".hdf5": write_hdf5}
+
+
+def _append(made: Any, name: str, data: NDArray[Any], n: int) -> None:
+    """Append to a dataset that has n rows; without any, make it."""
+    if not n:
+        made.create_dataset(
+            name, data=data, maxshape=(None, *data.shape[1:]), chunks=(PIECE, *data.shape[1:]),
+            fletcher32=True,
+        )  # fmt: skip
+        return
+    made[name].resize(n + len(data), axis=0)
+    made[name][n:] = data
+
+
+def _read_blocks(recording: Recording) -> Iterator[Chunk]:
+    """Read the samples, some `BLOCK` at a time.
 
     Raises:
-        ConfigError: no such file, a file of another kind, or an extra is not installed.
-        RecordingError: it is damaged; the chunks raise it, too.
+        RecordingError: the recording is damaged, or has no samples.
     """
-    path = Path(path)
-    _check_kind(path)
-    about, raws = _read(path)
-    return about, (decode_samples(r.data, about.spec.shape) for r in raws if r.topic == SAMPLES)
+    waiting: list[Chunk] = []
+    n = total = 0
+    for chunk in recording:
+        waiting.append(chunk)
+        n, total = n + len(chunk), total + len(chunk)
+        if n >= BLOCK:
+            yield concatenate(waiting)
+            waiting, n = [], 0
+    if waiting:
+        yield concatenate(waiting)
+    if not total:
+        raise RecordingError(f"{recording.path} has no samples")
 
 
-def _check_kind(path: Path) -> None:
-    """Refuse what is no form of a recording, or needs an extra that is not there."""
-    if is_dataset(path):
-        need_pyarrow()
-    else:
-        _check_output(path)
+def _read_texts(recording: Recording, topic: str) -> tuple[list[str], NDArray[np.int64]]:
+    """Read the messages of a topic, JSON, and the host monotonic time of each, ns."""
+    raws = list(recording.raw(topic))
+    return [raw.data.decode() for raw in raws], np.array([raw.t_ns for raw in raws], np.int64)
 
 
-def _check_output(path: Path) -> None:
-    if path.suffix not in (MCAP, *READERS):
-        raise ConfigError(f"{path} is neither .mcap nor {', '.join(READERS)}")
-    if path.suffix in HDF5:
-        need_h5py()
+def need_h5py() -> Any:
+    """Import the module.
+
+    Raises:
+        ConfigError: the extra is not installed.
+    """
+    try:
+        import h5py
+    except ModuleNotFoundError as error:
+        raise lacking("HDF5 needs", "hdf5", error) from None
+    return h5py
 
 
-def _read(path: Path, episode: int = 0) -> tuple[Description, Generator[Raw, None, None]]:
-    if is_dataset(path):
-        return read_dataset(path, episode)
-    if path.suffix == MCAP:
-        recording = Recording(path)
-        return recording.description, recording.raw(SAMPLES, *TEXTS)
-    if not path.is_file():
-        raise ConfigError(f"no file {path}")
-    return READERS[path.suffix](path)
+class _PatientFile(io.FileIO):
+    """A file that raises what failed when `check` asks, not amid HDF5's writing.
 
+    HDF5 would print dozens of lines for every piece that it cannot write.
+    """
 
-def _write(what: str, about: Description, raws: Iterable[Raw], file: BinaryIO, output: Path) -> int:
-    if output.suffix == ".csv":
-        return write_csv(what, about, raws, file, output)
-    if output.suffix == ".npz":
-        return write_npz(what, about, raws, file)
-    if output.suffix in HDF5:
-        return write_hdf5(what, about, raws, file)
-    made, n = McapFile(file, about), 0
-    if about.recovered:
-        made.note(RECOVERED, {"by": "tactile_rt"})
-    for raw in raws:
-        made.add(raw.topic, raw.data, raw.t_ns)
-        if raw.topic == SAMPLES:
-            n += samples_in(raw.data)
-    made.finish()
-    return n
+    def __init__(self, handle: int) -> None:
+        super().__init__(handle, "r+b")
+        self._failed: OSError | None = None
+
+    def check(self) -> None:
+        """Raise what has failed.
+
+        Raises:
+            OSError: something could not be written.
+        """
+        if self._failed is not None:
+            raise self._failed
+
+    def write(self, data: "ReadableBuffer") -> int:
+        left = memoryview(data).cast("B")
+        size = len(left)
+        try:
+            while left and self._failed is None:
+                left = left[super().write(left) :]
+        except OSError as error:
+            self._failed = error
+        return size
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+        self.check()

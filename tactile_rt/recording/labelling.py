@@ -18,8 +18,8 @@ import msgspec
 from tactile_rt.classifier.model_card import PERIODS_NS
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.errors import ConfigError, ModelError, RecordingError, SpecMismatch
-from tactile_rt.recording.conversion import chunks_of
 from tactile_rt.recording.labels import LABELS, LabelledInterval, label_of_file, read_labels
+from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.touches import RecordedTouch, find_touches
 from tactile_rt.sensor_spec import SensorSpec, channel_limits
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
@@ -162,7 +162,7 @@ def find_labelled(
     """Find the touches in recordings, and what was touched.
 
     Args:
-        recordings: files, of any form.
+        recordings: files.
         intervals: of each recording, and maybe of others.
         pattern: a sweep set or model of the same array, whose sensor and period are taken.
         report: is told how far a recording has been read, s.
@@ -173,15 +173,9 @@ def find_labelled(
         RecordingError: a file is damaged.
         SpecMismatch: recordings of different arrays, or of another than the pattern's.
     """
-    for one in recordings:
-        if one.is_dir():
-            raise ConfigError(
-                f"{one} is a folder: `tactile-rt convert {one} FILE.mcap --episode N` makes a "
-                "recording of an episode of a dataset"
-            )
-    opened = [chunks_of(one) for one in recordings]
+    opened = [Recording(one) for one in recordings]
     sums = _sums(recordings)
-    specs = [about.spec for about, _ in opened]
+    specs = [recording.spec for recording in opened]
     first, whose = specs[0], recordings[0]
     sensor, period_ns = None, max(PERIOD_NS, *(round(NS_PER_S / spec.rate_hz) for spec in specs))
     if pattern is not None:
@@ -196,11 +190,11 @@ def find_labelled(
         raise ConfigError(f"{error}: --like takes it from a sweep set or model") from None
     reasons, silent = _Reasons(), _Reasons()
     met: dict[bytes, Path] = {}  # the recording of each touch, by its numbers
-    for one, (about, chunks) in zip(recordings, opened, strict=True):
+    for one, recording in zip(recordings, opened, strict=True):
         mine, touched = list(intervals.get(one, ())), set()
-        with closing(chunks):
+        with closing(recording.chunks()) as chunks:
             stream = _Counted(one, chunks, report)
-            for touch in find_touches(about.spec, stream.chunks(), period_ns, floor):
+            for touch in find_touches(recording.spec, stream.chunks(), period_ns, floor):
                 found.found[one] += 1
                 onset_s, end_s = (
                     (t - stream.first_ns) / NS_PER_S for t in (touch.onset_ns, touch.end_ns)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tactile_rt.extras import lacking
 from tactile_rt.recording.lerobot_film import VIDEO, CameraFilm
 
-__all__ = ["DATA", "FRAME", "INFO", "Episode", "Statistics", "need_pyarrow", "write_meta"]
+__all__ = ["DATA", "FRAME", "Episode", "Statistics", "need_pyarrow", "write_meta"]
 
 INFO = "meta/info.json"
 DATA = "data/chunk-{:03d}/file-{:03d}.parquet"

@@ -72,7 +72,7 @@ class Recording:
     def __iter__(self) -> Iterator[Chunk]:
         return self.chunks()
 
-    def chunks(self) -> Iterator[Chunk]:
+    def chunks(self) -> Generator[Chunk, None, None]:
         """The chunks, as they were recorded."""
         return self._decoded(SAMPLES, lambda raw: decode_samples(raw.data, self.spec.shape))
 
@@ -135,7 +135,7 @@ class Recording:
                         yield Raw(name, t_ns, plain(name, record.data) if formed else record.data)
                 record = next(records, None)
 
-    def _decoded(self, topic: str, decode: Callable[[Raw], T]) -> Iterator[T]:
+    def _decoded(self, topic: str, decode: Callable[[Raw], T]) -> Generator[T, None, None]:
         for raw in self.raw(topic):
             with _naming(self.path):
                 decoded = decode(raw)

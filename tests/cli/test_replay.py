@@ -134,13 +134,6 @@ def test_a_check_passes(name, further, call, live):
     assert call("replay", path, "--check", "--name", name, "--model", model)[0] == 0
 
 
-def test_a_recording_made_of_arrays_is_checked_as_the_first(call, live, tmp_path):
-    assert call("convert", live[0], tmp_path / "x.npz")[0] == 0
-    assert call("convert", tmp_path / "x.npz", tmp_path / "back.mcap")[0] == 0
-    asked = ("--check", "--name", "left")
-    assert call("replay", tmp_path / "back.mcap", *asked) == call("replay", live[0], *asked)
-
-
 @pytest.mark.parametrize(
     ("nth", "fields", "said"),
     [

@@ -95,14 +95,14 @@ def test_who_is_told_to_leave_leaves_nothing_half_written(
     call("record", SOURCE, tmp_path / "a.mcap")
 
     def write(*arguments):
-        arguments[3].write(b"half")
+        arguments[1].write(b"half")
         try:
             os.kill(os.getpid(), number)
         finally:
             if made_of_it:  # as torch does where it writes a checkpoint
                 raise made_of_it
 
-    monkeypatch.setattr(conversion, "_write", write)
+    monkeypatch.setitem(conversion.WRITERS, ".csv", write)
     before = signal.getsignal(number)
     assert call("convert", tmp_path / "a.mcap", tmp_path / "a.csv") == (128 + number, "", "")
     assert os.listdir(tmp_path) == ["a.mcap"]
@@ -139,7 +139,7 @@ def test_who_is_told_to_leave_where_python_drops_what_is_raised_leaves(
 
     if busy:
         monkeypatch.setattr(threading.Thread, "start", start_slowly)
-    monkeypatch.setattr(conversion, "_write", write)
+    monkeypatch.setitem(conversion.WRITERS, ".csv", write)
     before = sys.unraisablehook
     assert call("convert", tmp_path / "a.mcap", tmp_path / "a.csv") == (128 + number, "", "")
     assert os.listdir(tmp_path) == ["a.mcap"] and taken == []
