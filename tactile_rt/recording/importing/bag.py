@@ -1,4 +1,4 @@
-"""Topics of ROS 1 and ROS 2 bags, by the library rosbags, without ROS; of MCAP files in JSON, too.
+"""Topics of ROS 1 and ROS 2 bags, by the library rosbags, without ROS.
 
 A message is a row, its fields are columns by their paths (``wrench.force.x``, ``data.3``). Messages
 of known types need no more: wrenches, arrays of numbers, magnetic fields and the like, and our own.
@@ -7,8 +7,8 @@ The time is that of the header, where there is one that is set, else that of the
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import partial
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
@@ -19,10 +19,10 @@ from tactile_rt.classifier.array_file import read_array
 from tactile_rt.drivers.codecs.column_guess import guess_columns
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.errors import ConfigError, RecordingError
+from tactile_rt.extras import lacking
 from tactile_rt.files import open_regular
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.account import Import, clock_of, write_chunks
-from tactile_rt.recording.importing.bag_reading import ROS1, OpenBag, open_bag
 from tactile_rt.recording.importing.table import BESIDE, Table, import_table, shown_names
 from tactile_rt.recording.layout import decode_samples
 from tactile_rt.recording.reader import Recording
@@ -35,9 +35,9 @@ from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 __all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag", "proposed_columns"]
 
 SQLITE: Final = b"SQLite format 3\0"
+ROS1: Final = b"#ROSBAG V2.0\n"
 PROBED: Final = 50  # messages whose numbers are looked at
 MOST: Final = 4096  # fields of a message that are columns
-DEEPEST: Final = 16  # of fields in fields
 # What messages are of: columns by the end of the type's name, with {} for the frame's name.
 KNOWN: Final = {
     "geometry_msgs/msg/WrenchStamped": "wrench.force.x={0}.fx:N,wrench.force.y={0}.fy:N,"
@@ -54,7 +54,6 @@ KNOWN: Final = {
     "std_msgs/msg/Float64": "data={0}.value",
 }  # fmt: skip
 NUMBERS: Final = re.compile(r"std_msgs/msg/(?:U?Int(?:8|16|32|64)|Float(?:32|64))MultiArray")
-OTHERWISE: Final = (KeyError, AttributeError, TypeError)
 _NO_NAME: Final = re.compile(r"[^A-Za-z0-9_-]+")
 
 
@@ -74,6 +73,69 @@ class BagTopic:
     type: str
     messages: int
     columns: str
+
+
+@dataclass
+class OpenBag:
+    """A bag that is open.
+
+    Attributes:
+        reader: The bag, as rosbags reads it.
+        notes: What could not be read, a sentence each.
+    """
+
+    reader: Any
+    notes: list[str] = field(default_factory=list)
+
+    def messages(self, topic: str) -> Iterator[tuple[int, bytes, Any]]:
+        """(time in the bag in ns, bytes, message) of each message of a topic; None for a message
+        that is damaged."""
+        which = [c for c in self.reader.connections if c.topic == topic]
+        stored = self.reader.messages(connections=which)
+        while True:
+            try:
+                connection, t_ns, raw = next(stored)
+            except StopIteration:
+                return
+            except Exception as error:  # so it does where a chunk is damaged
+                self.notes.append(f"it is damaged, and read up to there ({_words(error)})")
+                return
+            try:
+                message = self.reader.deserialize(raw, connection.msgtype)
+            except Exception:  # rosbags raises anything on bytes that are no such message
+                message = None
+            yield t_ns, bytes(raw), message
+
+
+@contextmanager
+def open_bag(path: Path) -> Iterator[OpenBag]:
+    """Open a bag of ROS 1 or ROS 2.
+
+    Raises:
+        ConfigError: the extra is not installed.
+        RecordingError: it is damaged, or has lost its end.
+    """
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ModuleNotFoundError as error:
+        raise lacking("bags need", "import", error) from None
+    try:
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
+        reader.open()
+    except Exception as error:  # rosbags and what it reads by raise anything on a damaged bag
+        raise RecordingError(
+            f"{path} cannot be read as a bag: {_words(error):.90}; `rosbag reindex` or "
+            "`mcap recover` mend one without its end"
+        ) from None
+    try:
+        yield OpenBag(reader)
+    finally:
+        reader.close()
+
+
+def _words(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def is_bag(path: Path) -> bool:
@@ -96,13 +158,13 @@ def bag_topics(path: Path) -> list[BagTopic]:
     """
     found = []
     with open_bag(path) as bag:
-        for name, kind in sorted(bag.types.items()):
-            if not bag.counts[name]:
+        for name, about in sorted(bag.reader.topics.items()):
+            if not about.msgcount:
                 continue
-            columns = ""
+            kind, columns = about.msgtype or "", ""
             for message in islice(_whole(bag, name), 1):
                 columns = _columns_of(kind, message)
-            found.append(BagTopic(name, kind, bag.counts[name], columns))
+            found.append(BagTopic(name, kind, about.msgcount, columns))
     return found
 
 
@@ -227,14 +289,13 @@ def _whole(bag: OpenBag, topic: str) -> Iterator[Any]:
 
 def _leaves(value: Any, at: str) -> Iterator[str]:
     if is_dataclass(value):
-        value = {f.name: getattr(value, f.name) for f in fields(value) if f.name != "__msgtype__"}
-    if isinstance(value, dict) and at.count(".") < DEEPEST:
-        for name, one in value.items():
-            yield from _leaves(one, f"{at}.{name}" if at else name)
-    elif isinstance(value, np.ndarray | list | tuple) and at.count(".") < DEEPEST:
+        for f in fields(value):
+            if f.name != "__msgtype__":
+                yield from _leaves(getattr(value, f.name), f"{at}.{f.name}" if at else f.name)
+    elif isinstance(value, np.ndarray | list | tuple):
         for k, one in enumerate(value):
-            yield from _leaves(one, f"{at}.{k}" if at else f"{k}")
-    elif isinstance(value, int | float | np.number) and at:
+            yield from _leaves(one, f"{at}.{k}")
+    elif isinstance(value, int | float | np.number):
         yield at
 
 
@@ -259,30 +320,17 @@ def _row(message: Any, steps: list[list[int | str]]) -> list[Any]:
         value = message
         try:
             for step in path:
-                if isinstance(value, dict):
-                    value = value[str(step)]
-                else:
-                    value = value[step] if isinstance(step, int) else getattr(value, step)
-        except (IndexError, *OTHERWISE):
-            value = np.nan  # a list that is shorter than the first one, JSON of another form
-        row.append(value if isinstance(value, int | float | np.number) else np.nan)
+                value = value[step] if isinstance(step, int) else getattr(value, step)
+        except IndexError:
+            value = np.nan  # a list that is shorter than the first one
+        row.append(value)
     return row
 
 
 def _stamp(message: Any) -> int:
-    """The time of the message's header, or its timestamp in JSON, ns; 0: it has none, or it is not
-    set."""
-    stamp = _of(_of(message, "header"), "stamp") or _of(message, "timestamp")
-    parts = _of(stamp, "sec"), _of(stamp, "nanosec", "nsec")
-    if not all(isinstance(part, int | np.integer) for part in parts):
-        return 0
-    return int(parts[0]) * NS_PER_S + int(parts[1])
-
-
-def _of(value: Any, *names: str) -> Any:
-    """A field by the first of its names that is there; None without."""
-    get = value.get if isinstance(value, dict) else partial(getattr, value)
-    return next((get(name, None) for name in names if get(name, None) is not None), None)
+    """Return the time of the message's header, ns; 0 if it has none, or it is not set."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    return int(stamp.sec) * NS_PER_S + int(stamp.nanosec) if stamp else 0
 
 
 def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str) -> Import:
@@ -309,9 +357,7 @@ def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str) ->
         if chunks and chunk.values.shape[1:] != chunks[0].values.shape[1:]:
             account.corrupt += 1
             continue
-        stamp = message.header.stamp
-        told_ns = int(stamp.sec) * NS_PER_S + int(stamp.nanosec)
-        offset = offset if chunks else (told_ns or t_ns) - int(chunk.t_ns[-1])
+        offset = offset if chunks else (_stamp(message) or t_ns) - int(chunk.t_ns[-1])
         chunks.append(chunk)
         account.intact += 1
     if not chunks:
@@ -330,7 +376,7 @@ def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str) ->
 def _array_in(bag: OpenBag, samples: str) -> ArraySpec | None:
     """What the bag says of the array that the samples of a topic are of, if it does."""
     beside = f"{samples.rpartition('/')[0]}/{ARRAY}"
-    if bag.types.get(beside) != messages.ARRAY:
+    if beside not in bag.reader.topics or bag.reader.topics[beside].msgtype != messages.ARRAY:
         return None
     for _, raw, _ in bag.messages(beside):
         try:
