@@ -46,12 +46,11 @@ def import_file(
 ) -> None:
     """Make a recording of what is on the disk; `tactile-rt sniff` tells how.
 
-    Raw bytes, hexadecimal text, what a terminal logged or a logic analyzer
-    exported, and logs of a CAN bus (candump, asc, blf, trc, SavvyCAN,
-    BUSMASTER) are decoded --as a codec. Tables (CSV, what
-    a board or yarpdatadumper printed) need --columns. Of ROS 1 and ROS 2 bags (the
-    extra "import") wrenches, arrays and our own messages need nothing
-    more. gzip is unpacked.
+    Raw bytes, hexadecimal text, what a terminal logged, and logs of a CAN
+    bus (candump, asc, blf, trc, SavvyCAN) are decoded --as a codec. Tables
+    (CSV, what a board or yarpdatadumper printed) need --columns. Of ROS 1
+    and ROS 2 bags (the extra "import") wrenches, arrays and our own
+    messages need nothing more. gzip is unpacked.
     """
 
     if not log.exists():

@@ -261,20 +261,12 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
         _show(fits, told)
         _import(path, fits[0], told)
         return
-    data, bus = _begins(log, LOOK_BYTES), ""
+    data = _begins(log, LOOK_BYTES)
     fits = sniff_bytes(data, further)
-    lines = [one for one, _ in log.buses.most_common()] if len(log.buses) > 1 else []
-    for one in lines:  # what the device sends and what it is told, say: each by itself
-        data, bus = _begins(read_log(path, bus=one), LOOK_BYTES), one
-        fits = sniff_bytes(data, further)
-        if fits:
-            break
     if fits:
         _show(fits, told)
-        _import(path, fits[0], told, bus)
-    elif log.form not in ("raw", "terminal", "saleae") or not _sniff_text(
-        path, data, log.form, told
-    ):
+        _import(path, fits[0], told)
+    elif log.form not in ("raw", "terminal") or not _sniff_text(path, data, log.form, told):
         told.nothing(f"nothing fits {path}", _hint(data))
 
 
@@ -292,12 +284,11 @@ def _form(form: str) -> str:
     told = {
         "raw": "bytes as they are", "hex": "bytes in hexadecimal", "dump": "a dump of a line",
         "terminal": "lines of text and when each came",
-        "saleae": "bytes that a logic analyzer exported",
     }  # fmt: skip
     return told.get(form, f"a CAN log ({form})")
 
 
-def _import(path: Path, fit: "CodecFit", told: _Told, bus: str = "") -> None:
+def _import(path: Path, fit: "CodecFit", told: _Told) -> None:
     fields = fit.fields
     if not fit.described:
         told.say(
@@ -306,8 +297,7 @@ def _import(path: Path, fit: "CodecFit", told: _Told, bus: str = "") -> None:
         )
         fields["array"] = "FILE.json"
     quoted = shlex.quote(_query(fields)) if len(fields) > 1 else _query(fields)
-    of = f" --bus {shlex.quote(bus)}" if bus else ""
-    told.go_on(f"tactile-rt import {shlex.quote(str(path))} --as {quoted}{of}")
+    told.go_on(f"tactile-rt import {shlex.quote(str(path))} --as {quoted}")
 
 
 def _sniff_text(path: Path, data: bytes, form: str, told: _Told) -> bool:

@@ -1,7 +1,6 @@
-"""One line of a log of text: what `tactile-rt dump`, candump, SavvyCAN, BUSMASTER, slcan adapters,
-Saleae's logic analyzers and dumps in hexadecimal print."""
+"""One line of a log of text: what `tactile-rt dump`, candump, SavvyCAN, slcan adapters, terminals
+and dumps in hexadecimal print."""
 
-import csv
 import re
 from typing import Any, Final
 
@@ -11,10 +10,7 @@ from tactile_rt.drivers.slcan import SlcanDecoder
 from tactile_rt.stream import NS_PER_S
 
 __all__ = [
-    "OF_SALEAE",
     "Found",
-    "SaleaeLines",
-    "of_busmaster",
     "of_candump",
     "of_dump",
     "of_dump_can",
@@ -28,18 +24,12 @@ _CANDUMP: Final = re.compile(
     r"\s*(?:\((?P<t>[^)]*)\)\s*)?(?P<bus>[A-Za-z]\w*)\s+(?:[TR]X\s+\S+\s+\S+\s+)?"
     r"(?:(?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})"
     r"(?:#(?P<fd>#[0-9A-Fa-f])?(?P<rtr>[Rr]\d?)?(?P<hex>(?:[0-9A-Fa-f]{2}\.?)*)(?:\s+[TR])?"
-    r"|\s+\[(?P<n>\d+)\](?:(?P<spaced>(?:\s+[0-9A-Fa-f]{2})*|\s+remote request)"
-    r"|\s+(?P<swapped>[0-9A-Fa-f]{2}(?:`[0-9A-Fa-f]{2})*)|(?P<bits>(?:\s+[01]{8})+))(?:\s+'.*')?)"
+    r"|\s+\[(?P<n>\d+)\](?P<spaced>(?:\s+[0-9A-Fa-f]{2})*|\s+remote request)(?:\s+'.*')?)"
     r"|(?P<error>[0-9A-Fa-f]{8}\s+\[\d+\].*ERRORFRAME.*))\s*"
 )
-_COLOUR: Final = re.compile(r"\x1b\[[0-9;]*m")
 _GVRET: Final = re.compile(  # what SavvyCAN saves
     r"(?P<us>\d+),(?P<id>[0-9A-Fa-f]{3,8}),(?P<extended>true|false),(?:[RT]x,)?(?P<bus>\d+),"
     r"(?P<n>\d+)(?P<hex>(?:,[0-9A-Fa-f]{2})*),*\s*"
-)
-_BUSMASTER: Final = re.compile(
-    r"(?P<t>\d+:\d\d:\d\d):(?P<part>\d{4}) [RT]x (?P<bus>\d+) (?P<id>(?P<hex>0x)?[0-9A-Fa-f]+) "
-    r"(?P<kind>[sx]r?) (?P<n>\d+)(?P<data>(?: +[0-9A-Fa-f]{1,3})*)\s*"
 )
 _SLCAN: Final = re.compile(r"(?:[tr][0-7][0-9A-Fa-f]{2}|[TR][01][0-9A-Fa-f]{7}|[dDbB])[0-9A-Fa-f]+")
 _DUMP: Final = re.compile(
@@ -61,22 +51,14 @@ _HEX: Final = re.compile(
     r"\s*(?:\[?(?P<t>\d+\.\d+)\]?(?:\s*s)?[\s,:;]+)?"
     r"(?P<hex>(?:0x)?[0-9a-fA-F]{2}(?:[\s,]+(?:0x)?[0-9a-fA-F]{2})*|(?:[0-9a-fA-F]{2}){8,})\s*,?\s*"
 )
-# The first lines of what Logic 1 and Logic 2 export of an asynchronous serial line, without quotes.
-OF_SALEAE: Final = ("time [s],value,parity error,framing error", "name,type,start_time,duration,")
-_OF_BYTE: Final = re.compile(
-    r"(?:.* )?\(?0x(?P<hex>[0-9a-fA-F]{1,2})\)?|0b(?P<bits>[01]{1,8})"  # 0x41, A (0x41)
-    r"|'(?P<code>\d{1,3})'|(?P<escape>\\[rnt0])|(?P<comma>COMMA)|(?P<text>[\x20-\x7e]|' ')"
-)
-_ESCAPES: Final = {r"\r": 13, r"\n": 10, r"\t": 9, r"\0": 0}
-_LATEST_S: Final = 1e9
 _ERROR, _EXTENDED = 1 << 29, 0x1FFFFFFF
 
 Found = tuple[str, Any, int | None] | None  # bus, packet (None: an error frame), when, ns
 
 
 def of_candump(line: str) -> Found:
-    """A line of candump, of any of its forms."""
-    found = _CANDUMP.fullmatch(_COLOUR.sub("", line) if "\x1b" in line else line)
+    """A line of candump, as it prints or logs."""
+    found = _CANDUMP.fullmatch(line)
     if found is None:
         return None
     if found["error"]:
@@ -90,10 +72,6 @@ def of_candump(line: str) -> Found:
     remote = found["rtr"] is not None or (found["spaced"] or "").strip() == "remote request"
     text = "" if remote else found["hex"] or found["spaced"] or ""
     data = bytes.fromhex(text.replace(".", ""))
-    if found["swapped"]:
-        data = bytes.fromhex(found["swapped"].replace("`", ""))[::-1]
-    elif found["bits"]:
-        data = bytes(int(b, 2) for b in found["bits"].split())
     if len(data) > 64 or (found["n"] and not remote and int(found["n"]) != len(data)):
         return None
     fd = fd or len(data) > 8
@@ -115,25 +93,6 @@ def of_gvret(line: str) -> Found:
         return None
     frame = CanFrame(number, data, extended, len(data) > 8)
     return found["bus"], [frame], _time(found["us"], NS_PER_S // 1_000_000)
-
-
-def of_busmaster(line: str) -> Found:
-    """A line of a log of BUSMASTER, hexadecimal or decimal, with the time of the day."""
-    found = _BUSMASTER.fullmatch(line)
-    if found is None:
-        return None
-    base = 16 if found["hex"] else 10
-    extended, remote = found["kind"].startswith("x"), found["kind"].endswith("r")
-    try:
-        number, data = int(found["id"], base), bytes(int(b, base) for b in found["data"].split())
-    except ValueError:
-        return None
-    if number > (_EXTENDED if extended else 0x7FF) or len(data) > 64:
-        return None
-    if not remote and len(data) != int(found["n"]):
-        return None
-    frame = CanFrame(number, data, extended, len(data) > 8, remote)
-    return found["bus"], [frame], _time(f"{found['t']}.{found['part']}")
 
 
 def of_slcan(line: str) -> Found:
@@ -182,68 +141,6 @@ def of_hex(line: str) -> Found:
         return "", bytes.fromhex(found["hex"].replace("0x", "").replace(",", " ")), t_ns
     except ValueError:
         return None
-
-
-class SaleaeLines:
-    """Lines that Logic exports of asynchronous serial analyzers, bytes as hexadecimal or ASCII.
-
-    The first line names the columns. Logic 2 names the analyzer of each byte, which is its bus:
-    that of what a device sends, and that of what it is told, say.
-    """
-
-    def __init__(self) -> None:
-        self._at: tuple[int, int, int | None, int | None] | None = None  # time, data, name, type
-        self._zero_ns: int | None = None  # times before a trigger are below 0
-
-    def __call__(self, line: str) -> Found:
-        """A byte, its analyzer and its time; None for what is none."""
-        try:
-            cells = next(csv.reader([line]), [])
-        except csv.Error:
-            return None
-        if self._at is None:
-            names = [cell.strip().lower() for cell in cells]
-            if {"start_time", "data", "name", "type"} <= set(names):
-                at = (names.index(x) for x in ("start_time", "data", "name", "type"))
-                self._at = next(at), next(at), next(at), next(at)
-            else:
-                self._at = 0, 1, None, None
-            return None
-        time, data, name, kind = self._at
-        if len(cells) <= max(time, data, name or 0, kind or 0):
-            return None
-        if kind is not None and cells[kind] != "data":
-            return None
-        byte, t_ns = _byte(cells[data]), _decimal_time(cells[time])
-        if byte is None or t_ns is None:
-            return None
-        if self._zero_ns is None:
-            self._zero_ns = min(t_ns, 0)
-        return "" if name is None else cells[name], bytes((byte,)), t_ns - self._zero_ns
-
-
-def _byte(cell: str) -> int | None:
-    found = _OF_BYTE.fullmatch(cell)
-    if found is None:
-        return None
-    if found["hex"] or found["bits"]:
-        return int(found["hex"] or found["bits"], 16 if found["hex"] else 2)
-    if found["code"]:
-        return int(found["code"]) if int(found["code"]) < 256 else None
-    if found["escape"]:
-        return _ESCAPES[found["escape"]]
-    return ord("," if found["comma"] else found["text"].strip("'") or "'")
-
-
-def _decimal_time(text: str) -> int | None:
-    """Seconds, before a trigger too and as 6.025e-05, or a date; in ns."""
-    if "T" in text:
-        return _time(text)
-    try:
-        seconds = float(text)
-    except ValueError:
-        return None
-    return round(seconds * NS_PER_S) if abs(seconds) < _LATEST_S else None
 
 
 def _time(text: str, unit_ns: int = NS_PER_S) -> int | None:

@@ -7,6 +7,7 @@ Which form a file has is told by how it begins, whatever its name; gzip is unpac
 anywhere and hold lines that are none: what can be read is, and `notes` say what could not.
 """
 
+import gzip
 import logging
 import zlib
 from collections import Counter
@@ -18,10 +19,7 @@ from typing import Any, BinaryIO, Final, cast
 
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.log_lines import (
-    OF_SALEAE,
     Found,
-    SaleaeLines,
-    of_busmaster,
     of_candump,
     of_dump,
     of_dump_can,
@@ -36,10 +34,9 @@ from tactile_rt.stream import NS_PER_S
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 
-SERIAL_FORMS: Final = ("raw", "dump", "hex", "terminal", "saleae")
-CAN_FORMS: Final = (
-    "candump", "dump-can", "slcan", "gvret", "busmaster", "asc", "blf", "trc", "csv", "db",
-)  # fmt: skip
+SERIAL_FORMS: Final = ("raw", "dump", "hex", "terminal")
+OF_PYTHON_CAN: Final = ("asc", "blf", "trc", "csv", "db")
+CAN_FORMS: Final = ("candump", "dump-can", "slcan", "gvret", *OF_PYTHON_CAN)
 FORMS: Final = (*SERIAL_FORMS, *CAN_FORMS)
 PIECE: Final = 256
 HEAD: Final = 16_384  # bytes that tell the form
@@ -50,9 +47,8 @@ GZIP: Final = b"\x1f\x8b"
 # What is neither a log nor a text, by its first bytes, and how it becomes one.
 OTHERS: Final = {
     b"\x93NUMPY": "an array of NumPy: write it as a table, as numpy.savetxt does",
-    b"PK\x03\x04": "a zip archive, as .npz and .xlsx are: write a table of it as text; "
-    "`tactile-rt convert` reads an .npz of ours",
-    b"\x89HDF\r\n": "an HDF5 file: write a table of it as text; `tactile-rt convert` reads ours",
+    b"PK\x03\x04": "a zip archive, as .npz and .xlsx are: write a table of it as text",
+    b"\x89HDF\r\n": "an HDF5 file: write a table of it as text",
     b"MATLAB 5.0": "a file of MATLAB: write a table of it, as writematrix does",
     b"PAR1": "a Parquet file: write a table of it, as DataFrame.to_csv does",
     b"MDF     ": "a measurement file (MDF): asammdf writes its groups as CSV",
@@ -60,13 +56,15 @@ OTHERS: Final = {
     b"\xd4\xc3\xb2\xa1": "a capture of packets (pcap): tshark writes a bus's frames as text",
     b"\n\r\r\n": "a capture of packets (pcapng): tshark writes a bus's frames as text",
 }
-OF_PYTHON_CAN: Final = "timestamp,arbitration_id,extended,remote,error,dlc,data"
-OF_BUSMASTER: Final = "***busmaster"
-OF_SAVVYCAN: Final = "time stamp,id,extended,"
+CSV_HEADER: Final = "timestamp,arbitration_id,extended,remote,error,dlc,data"
+SAVVYCAN_HEADER: Final = "time stamp,id,extended,"
 FALLING: Final = 0.2  # of the times of candump -td are less than the one before
 
+LINES: Final[dict[str, Callable[[str], Found]]] = {
+    "dump": of_dump, "dump-can": of_dump_can, "candump": of_candump, "slcan": of_slcan,
+    "terminal": of_heard, "hex": of_hex, "gvret": of_gvret,
+}  # fmt: skip
 Timed = tuple[Any, int | None]  # a packet, and when it came, ns
-
 
 LogFile = BufferedReader
 
@@ -115,36 +113,25 @@ class LineLog:
             self.notes.append(f"{back} times go back; these packets have the time before")
 
     def _read(self, file: "LogFile") -> Iterator[Timed]:
-        read: Callable[[LogFile], Iterator[Timed]] = {
-            "raw": self._raw, "asc": self._logged, "blf": self._logged, "trc": self._logged,
-            "csv": self._logged, "db": self._logged,
-        }.get(self.form, self._text)  # fmt: skip
-        yield from read(file)
+        if self.form == "raw":
+            while piece := file.read(self.piece):
+                yield piece, None
+        elif self.form in OF_PYTHON_CAN:
+            yield from self._logged(file)
+        else:
+            yield from self._text(file)
         if getattr(file.raw, "broken", False):
             self.notes.append("it is cut short or damaged: what unpacks of it was read")
 
-    # bytes and text
-
-    def _raw(self, file: LogFile) -> Iterator[Timed]:
-        while piece := file.read(self.piece):
-            yield piece, None
-
     def _text(self, file: LogFile) -> Iterator[Timed]:
-        forms: dict[str, Callable[[str], Found]] = {
-            "candump": of_candump, "dump-can": of_dump_can, "dump": of_dump, "hex": of_hex,
-            "gvret": of_gvret, "slcan": of_slcan, "terminal": of_heard,
-            "busmaster": of_busmaster, "saleae": SaleaeLines(),
-        }  # fmt: skip
-        parse = forms[self.form]
-        named = self.form in ("gvret", "saleae")  # the columns, by the first line
-        others, errors, buses = -named, 0, self.buses
+        parse, errors, buses = LINES[self.form], 0, self.buses
+        others = -(self.form == "gvret")  # whose first line names the columns
         apart, now = self.form == "candump" and _times_are_apart(self.path), 0
         with TextIOWrapper(file, "utf-8", "replace") as lines:
             for line in lines:
                 found = parse(line.rstrip("\r\n"))
                 if found is None:
-                    # the head and the end of BUSMASTER's
-                    others += bool(line.strip()) and not line.startswith("***")
+                    others += bool(line.strip())
                     continue
                 bus, packet, t_ns = found
                 if packet is None:
@@ -157,26 +144,23 @@ class LineLog:
                     yield packet, t_ns
         self._tell(others, "line", errors)
 
-    # what python-can reads
-
     def _logged(self, file: LogFile) -> Iterator[Timed]:
+        """Read what python-can does: what it passes over in silence, a note says."""
         from can.io import ASCReader, BLFReader, CSVReader, SqliteReader, TRCReader
 
         logging.getLogger("can").addHandler(logging.NullHandler())  # it tells us, not the terminal
         made: Any
         n, errors, buses = 0, 0, self.buses
-        lines = _Lines(file)
+        lines = _Lines(file, "utf-8", "replace")
         try:
             if self.form == "blf":
                 made = BLFReader(file)
-            elif self.form == "asc":
-                made = ASCReader(cast(Any, lines), relative_timestamp=False)
             elif self.form == "db":
                 made = SqliteReader(self.path)
-            elif self.form == "trc":
-                made = TRCReader(cast(Any, lines))
+            elif self.form == "asc":
+                made = ASCReader(lines, relative_timestamp=False)
             else:
-                made = CSVReader(cast(Any, lines))
+                made = (TRCReader if self.form == "trc" else CSVReader)(lines)
             for message in made:
                 n += 1
                 bus = "" if message.channel is None else str(message.channel)
@@ -192,7 +176,7 @@ class LineLog:
                         )
                     ], round(NS_PER_S * message.timestamp)  # fmt: skip
             told = made.object_count if self.form == "blf" else n
-            if n < told or (self.form == "asc" and not lines.ended):
+            if n < told or (self.form == "asc" and "end triggerblock" not in lines.newest.lower()):
                 of = f" of {told}" if n < told else ""
                 self.notes.append(f"it ends before its end: {n} frames{of} were read")
         except OSError:
@@ -200,21 +184,23 @@ class LineLog:
         except Exception as error:  # python-can raises anything on a file that is cut or damaged
             why = " ".join(str(error).split()) or type(error).__name__
             self.notes.append(f"it is cut short or damaged after {n} frames ({why:.80})")
+        finally:
+            lines.close()
         self._tell(0, "frame", errors)
 
     def _tell(self, others: int, what: str, errors: int) -> None:
-        buses, frames = self.buses, "bytes" if self.wire == "serial" else "frames"
+        buses = self.buses
         if others:
             self.notes.append(f"passed over, no {what} of a {self.form} log: {others}")
         if errors:
             self.notes.append(f"{errors} error frames")
         if self._bus and self._bus not in buses:
             known = ", ".join(sorted(buses)) or "none"
-            self.notes.append(f"no {frames} are of bus {self._bus}; there are those of {known}")
+            self.notes.append(f"no frames are of bus {self._bus}; there are those of {known}")
         elif len(buses) > 1:
             named = ", ".join(f"{bus or 'none'} ({n})" for bus, n in sorted(buses.items()))
             taken = f"those of {self._bus} are taken" if self._bus else "--bus takes those of one"
-            self.notes.append(f"{frames} of several buses: {named}; {taken}")
+            self.notes.append(f"frames of several buses: {named}; {taken}")
 
 
 def read_log(path: Path, form: str = "", bus: str = "") -> LineLog:
@@ -258,58 +244,33 @@ class _Unpacked(RawIOBase):
     """A gzip file, which ends where it is damaged: `broken` says that it does."""
 
     def __init__(self, file: BinaryIO) -> None:
-        self._file, self.broken = file, False
-        self._unpack, self._rest = zlib.decompressobj(31), b""
+        self._file, self._unpacked, self.broken = file, gzip.GzipFile(fileobj=file), False
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, room: Any) -> int:
-        while True:
-            packed = self._rest or self._file.read(1 << 16)
-            if not packed:
-                self.broken = self.broken or not self._unpack.eof
-                return 0
-            try:
-                data = self._unpack.decompress(packed, len(room))
-            except zlib.error:
-                self.broken = True
-                self._rest = b""
-                self._file.seek(0, 2)
-                return 0
-            self._rest = self._unpack.unconsumed_tail or self._unpack.unused_data
-            if self._unpack.eof and self._rest:  # another one follows
-                self._unpack = zlib.decompressobj(31)
-            if data:
-                room[: len(data)] = data
-                return len(data)
+        try:
+            data = self._unpacked.read1(len(room))
+        except (EOFError, gzip.BadGzipFile, zlib.error):
+            self.broken = True
+            return 0
+        room[: len(data)] = data
+        return len(data)
 
     def close(self) -> None:
         self._file.close()
         super().close()
 
 
-class _Lines:
-    """Lines of text, for python-can; whether the last one of a Vector log came."""
+class _Lines(TextIOWrapper):
+    """Lines of text, of which one knows the newest."""
 
-    def __init__(self, file: BufferedReader) -> None:
-        self._file, self.ended = file, False
+    newest = ""
 
-    def __iter__(self) -> Iterator[str]:
-        return self
-
-    def __next__(self) -> str:
-        if line := self.readline():
-            return line
-        raise StopIteration
-
-    def readline(self) -> str:
-        line = self._file.readline().decode("utf-8", "replace")
-        self.ended = self.ended or line.strip().lower() == "end triggerblock"
-        return line
-
-    def close(self) -> None:
-        self._file.close()
+    def __next__(self) -> str:  # type: ignore[override]  # text, of what gives text
+        self.newest = super().__next__()
+        return self.newest
 
 
 def _head(path: Path) -> bytes:
@@ -345,22 +306,15 @@ def _form(path: Path) -> str:
         return "raw"
     if lines[0].startswith(";$FILEVERSION"):
         return "trc"
-    if lines[0].startswith(OF_PYTHON_CAN):
+    if lines[0].startswith(CSV_HEADER):
         return "csv"
-    if lines[0].lower().startswith(OF_BUSMASTER):
-        return "busmaster"
-    if lines[0].lower().startswith(OF_SAVVYCAN):
+    if lines[0].lower().startswith(SAVVYCAN_HEADER):
         return "gvret"
-    if lines[0].lower().replace('"', "").startswith(OF_SALEAE):
-        return "saleae"
     begins = [x.strip().lower() for x in lines[:6]]
     if any(x.startswith("date ") for x in begins) and any(x.startswith("base ") for x in begins):
         return "asc"
-    for form, parse in (
-        ("dump", of_dump), ("dump-can", of_dump_can), ("candump", of_candump), ("slcan", of_slcan),
-        ("terminal", of_heard),
-    ):  # fmt: skip
-        if sum(parse(x) is not None for x in lines) >= MOSTLY * len(lines):
+    for form in ("dump", "dump-can", "candump", "slcan", "terminal"):
+        if sum(LINES[form](x) is not None for x in lines) >= MOSTLY * len(lines):
             return form
     # A table of numbers of two digits is hexadecimal, too: only letters tell that it is bytes.
     hexes = [of_hex(x) for x in lines]

@@ -78,11 +78,3 @@ def test_what_cannot_be_is_one_line(refused, raw, options, why):
 def test_a_log_with_nothing_in_it_is_no_matter_of_its_codec(refused, tmp_path):
     (tmp_path / "can.log").touch()
     assert "can.log is empty" in refused("import", tmp_path / "can.log", "--as", "codec=xela")
-
-
-def test_a_line_that_nobody_exported_is_named(refused, tmp_path):
-    (tmp_path / "uart.csv").write_text(
-        "name,type,start_time,duration,data,error\nRX,data,0.1,8e-06,0xAA,\nTX,data,0.2,8e-06,0x55,\n"
-    )
-    said = refused("import", tmp_path / "uart.csv", "--as", "codec=bota", "--bus", "rx")
-    assert "no bytes are of bus rx; there are those of RX, TX" in said

@@ -69,13 +69,6 @@ FILES = {
         ),
         "--as codec=ascii_line&columns=X%3DS.x:1,Y%3DS.y:1",
     ),
-    "what a logic analyzer heard of both directions": (
-        lambda: b"name,type,start_time,duration,data,error\n" + b"".join(
-            b"TX,data,%.7f,8e-06,0x55,\nRX,data,%.7f,8e-06,0x%02X,\n" % (k / 1e4, k / 1e4, byte)
-            for k, byte in enumerate(spoken("serial", "bota"))
-        ),
-        "--as codec=bota --bus RX",
-    ),
     "units below": (
         lambda: b"Zeit,Fx\n[s],[mN]\n" + b"".join(b"%d,%d\n" % (k, k * k % 7) for k in range(40)),
         "--columns Zeit=time:s,Fx=S.fx:mN",

@@ -104,9 +104,6 @@ LINES = [
     ("(0.1) can0 123#11.22.33 T", 0x123, "112233", 100_000_000),
     ("  slcan0  7FF   [2]  01 02   '..'", 0x7FF, "0102", None),
     ("       1.250 ms  710   [3] 01 02 03", 0x710, "010203", 1_250_000),
-    ("\x1b[32m  can0\x1b[0m  \x1b[1m201\x1b[0m   [2]  \x1b[34m0B 0F\x1b[0m", 0x201, "0b0f", None),
-    ("  can0  201   [3]  03`02`01", 0x201, "010203", None),
-    ("  can0  201   [2]  00001011 00001111", 0x201, "0b0f", None),
     ("t20120B0F", 0x201, "0b0f", None),
     ("T00ABCDEF10B1F2C", 0xABCDEF, "0b", None),
 ]
@@ -156,73 +153,6 @@ def test_a_table_of_python_can_s_is_read(tmp_path):
     ]
     path.write_bytes(path.read_bytes()[:100] + bytes(4000))
     assert list(log.packets()) == [] and len(log.notes) == 1
-
-
-def test_what_busmaster_logged_is_read(tmp_path):
-    path = tmp_path / "bus.log"
-    path.write_text(
-        "***BUSMASTER Ver 3.2.2***\n***PROTOCOL CAN***\n***HEX***\n"
-        "10:00:00:0100 Rx 1 0x100 s 3 00 01 FF \n"
-        "10:00:00:0255 Tx 1 0x18FF0102 x 0 \n"
-        "10:00:00:0300 Rx 1 256 s 2 000 255 \n"
-        "10:00:00:0300 Rx 1 256 s 2 000 256 \n"
-        "10:00:00:0400 Rx 1 0x100 sr 8 \n"
-        "***[STOP LOGGING SESSION]***\n"
-    )
-    log = read_log(path)
-    found = [(frame, t_ns) for frames, t_ns in log.packets() for frame in frames]
-    day = 36_000_000_000_000
-    assert log.form == "busmaster"
-    assert found == [
-        (CanFrame(0x100, b"\x00\x01\xff"), day + 10_000_000),
-        (CanFrame(0x18FF0102, b"", True), day + 25_500_000),
-        (CanFrame(0x100, b"\x00\xff"), day + 30_000_000),
-        (CanFrame(0x100, b"", remote=True), day + 40_000_000),
-    ]
-    assert log.notes == ["passed over, no line of a busmaster log: 1"]
-
-
-LOGIC = [
-    (  # Logic 1, hexadecimal; the second byte with an error is kept: a codec will tell
-        "Time [s],Value,Parity Error,Framing Error\n0.000019680000000,0x5A,,\n"
-        "0.001061440000000,0x00,,Error\n",
-        [("", b"\x5a", 19_680), ("", b"\x00", 1_061_440)],
-    ),
-    (  # Logic 1, ASCII
-        "Time [s],Value,Parity Error,Framing Error\n"
-        "0,o,,\n1,',,\n2,' ',,\n3, ,,\n4,COMMA,,\n5,'13',,\n6,\\n,,\n7,7,,\n",
-        [("", bytes([byte]), k * 10**9) for k, byte in enumerate(b"o'  ,\r\n7")],
-    ),
-    (  # Logic 2 of old, before and after its trigger
-        '"name","type","start_time","duration","data"\n'
-        '"Async Serial","data",-6.025e-05,2.375e-05,0xC8\n'
-        '"Async Serial","data",0.000001,2.375e-05,0x09\n',
-        [("Async Serial", b"\xc8", 0), ("Async Serial", b"\x09", 61_250)],
-    ),
-    (  # Logic 2 of today, with an analyzer of another bus
-        "name,type,start_time,duration,ack,data,error\nRX,data,0.5,8e-06,,A (0x41),\n"
-        "I2C,address,0.6,8e-06,true,,\nTX,data,0.7,8e-06,,0b01000010,\nTX,data,x,8e-06,,0x41,\n"
-        'RX,data,0.8,8e-06,,"\"\"",\nRX,data,0.9,8e-06,,0x141,\n',
-        [("RX", b"A", 500_000_000), ("TX", b"B", 700_000_000), ("RX", b'"', 800_000_000)],
-    ),
-    (
-        "name,type,start_time,duration,data,error\nRX,data,2026-05-04T10:00:00.25Z,8e-06,0x41,\n",
-        [("RX", b"A", 1_777_888_800_250_000_000)],
-    ),
-]  # fmt: skip
-
-
-@pytest.mark.parametrize(("text", "bytes_"), LOGIC)
-def test_what_a_logic_analyzer_exported_is_read(tmp_path, text, bytes_):
-    path = tmp_path / "uart.csv"
-    path.write_text(text)
-    log = read_log(path)
-    assert (log.wire, log.form) == ("serial", "saleae")
-    assert list(log.packets()) == [(byte, t_ns) for _, byte, t_ns in bytes_]
-    for name in {name for name, _, _ in bytes_}:
-        one = read_log(path, bus=name)
-        of_it = [(byte, t_ns) for bus, byte, t_ns in bytes_ if bus == name]
-        assert list(one.packets()) == of_it
 
 
 @pytest.mark.parametrize(

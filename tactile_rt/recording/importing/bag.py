@@ -88,8 +88,7 @@ class OpenBag:
     notes: list[str] = field(default_factory=list)
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes, Any]]:
-        """(time in the bag in ns, bytes, message) of each message of a topic; None for a message
-        that is damaged."""
+        """Read (time in the bag in ns, bytes, message) of a topic; damaged messages are None."""
         which = [c for c in self.reader.connections if c.topic == topic]
         stored = self.reader.messages(connections=which)
         while True:
