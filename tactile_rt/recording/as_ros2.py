@@ -3,8 +3,8 @@
     bag/metadata.yaml    what is in it
     bag/bag_0.mcap       a recording, which `Recording` reads, too; more of them are bag_1.mcap, ...
 
-A recording is a file of a bag as it is; here it is written anew, so that one of layout 1 becomes
-one, and an array of one element gets its wrenches as ``geometry_msgs/msg/WrenchStamped`` besides.
+A recording is a file of a bag as it is; here it is written anew, so that an array of one element
+gets its wrenches as ``geometry_msgs/msg/WrenchStamped`` besides.
 """
 
 from collections.abc import Sequence

@@ -25,8 +25,7 @@ __all__ = [
     "utc_offset_ns",
 ]
 
-LAYOUT_VERSION = 2
-READABLE = ("1", "2")  # 1: topics, samples and texts were not yet those of ROS 2
+LAYOUT_VERSION = "2"
 METADATA, SESSION, SUMMARY, RECOVERED = "tactile_rt", "session", "summary", "recovered"
 
 
@@ -64,7 +63,7 @@ class Description:
         """For the record ``tactile_rt``, sealed; the session's notes have one of their own."""
         return seal(
             {
-                "version": str(LAYOUT_VERSION),
+                "version": LAYOUT_VERSION,
                 "spec": self.spec.to_json(),
                 "utc_offset_ns": str(self.utc_offset_ns),
                 "source": self.source,
@@ -86,10 +85,9 @@ class Description:
             RecordingError: it is damaged, or of another version.
         """
         version = fields.get("version")
-        if version not in READABLE:
+        if version != LAYOUT_VERSION:
             raise RecordingError(
-                f"{what} is a recording of version {version!r}; this release reads "
-                f"{' and '.join(READABLE)}"
+                f"{what} is a recording of version {version!r}; this release reads {LAYOUT_VERSION}"
             )
         plain = unseal(what, fields)
         try:

@@ -26,7 +26,7 @@ __all__ = [
     "decode_samples",
     "encode_packet",
     "encode_samples",
-    "is_message",
+    "is_samples",
     "last_ns",
     "samples_in",
 ]
@@ -136,18 +136,13 @@ def encode_packet(packet: Packet, wire: str) -> bytes:
     return b"".join(parts)
 
 
-def is_message(topic: str, data: bytes, shape: tuple[int, int]) -> bool:
-    """Whether data can be a message of this channel, as far as its length and beginning tell.
+def is_samples(data: bytes, shape: tuple[int, int]) -> bool:
+    """Return whether data can be samples of this shape, by its length and beginning.
 
     Args:
-        topic: the name of the channel.
-        data: the message.
+        data: the message, without its header.
         shape: (element, channel) of the array.
     """
-    if topic == WIRE:
-        return len(data) >= 12 and data[:4] == _CDR
-    if topic != SAMPLES:
-        return topic not in (HEALTH, DECISIONS, EVENTS) or data[:1] == b"{"
     if len(data) < 8 or data[:4] != _CDR:
         return False
     n, (elements, channels) = samples_in(data), shape

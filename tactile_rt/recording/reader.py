@@ -20,10 +20,9 @@ from tactile_rt.recording.layout import (
     Raw,
     decode_packet,
     decode_samples,
-    is_message,
 )
 from tactile_rt.recording.records import MAGIC, read_records
-from tactile_rt.recording.ros2_form import is_in_file_form, name_of, plain
+from tactile_rt.recording.ros2_form import is_in_file_form, name_channel, plain
 from tactile_rt.stream import ArraySpec, Chunk
 
 if TYPE_CHECKING:
@@ -111,15 +110,15 @@ class Recording:
         with _opened(path) as file, _naming(path):
             records = read_records(file)
             about, record = _described(path, records)
-            names: dict[int, tuple[str, bool]] = {}
+            names: dict[int, str] = {}
             due: dict[int, int] = {}
             while record is not None:
                 if isinstance(record, Channel):
-                    names[record.id] = name_of(record.topic)
+                    names[record.id] = name_channel(record.topic)
                 elif isinstance(record, Message):
                     if record.channel_id not in names:
                         raise ValueError(f"a message of no known channel, {record.channel_id}")
-                    name, formed = names[record.channel_id]
+                    name = names[record.channel_id]
                     expected = due.get(record.channel_id, 0)
                     if record.sequence != expected:
                         raise RecordingError(
@@ -127,12 +126,11 @@ class Recording:
                             "`tactile-rt recover` keeps what is whole"
                         )
                     due[record.channel_id] = (expected + 1) % (1 << 32)
-                    is_one = is_in_file_form if formed else is_message
-                    if not is_one(name, record.data, about.spec.shape):
+                    if not is_in_file_form(name, record.data, about.spec.shape):
                         raise ValueError(f"message {expected} of {name} is none")
                     if name in topics:
                         t_ns = record.log_time - about.utc_offset_ns
-                        yield Raw(name, t_ns, plain(name, record.data) if formed else record.data)
+                        yield Raw(name, t_ns, plain(name, record.data))
                 record = next(records, None)
 
     def _decoded(self, topic: str, decode: Callable[[Raw], T]) -> Generator[T, None, None]:

@@ -9,15 +9,12 @@ from typing import TYPE_CHECKING, BinaryIO
 from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.files import open_regular, sync_folder, write_whole
 from tactile_rt.recording.description import METADATA, RECOVERED, SESSION, Description
-from tactile_rt.recording.layout import is_message
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC, read_whole_records
-from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, is_in_file_form, name_of, plain
+from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, is_in_file_form, name_channel, plain
 from tactile_rt.recording.writer import McapFile, check_not_recorded
 
 if TYPE_CHECKING:
-    from mcap.records import Message
-
     from tactile_rt.recording.records import Record
 
 __all__ = ["recover"]
@@ -55,8 +52,8 @@ def recover(path: str | Path, output: str | Path | None = None, force: bool = Fa
         if file.read(len(MAGIC)) != MAGIC:
             raise RecordingError(f"{path} is not an MCAP file, or was cut before it began")
         file.seek(0)
-        about, first, records = _begun(path, _bounded(path, file))
-        write_whole(output, lambda new: _copy(path, records, new, about, first))
+        about, records = _begun(path, _bounded(path, file))
+        write_whole(output, lambda new: _copy(path, records, new, about))
     sync_folder(output.parent)
     return output
 
@@ -77,8 +74,8 @@ def _bounded(path: Path, file: BinaryIO) -> "Iterator[Record]":
         raise RecordingError(f"{path} is no recording: {error}") from None
 
 
-def _begun(path: Path, records: "Iterator[Record]") -> "tuple[Description, bool, Iterator[Record]]":
-    """What the recording is of, whether it is of layout 1, and what follows."""
+def _begun(path: Path, records: "Iterator[Record]") -> "tuple[Description, Iterator[Record]]":
+    """What the recording is of, and what follows."""
     from mcap.records import Metadata
 
     found: dict[str, dict[str, str]] = {}
@@ -91,30 +88,28 @@ def _begun(path: Path, records: "Iterator[Record]") -> "tuple[Description, bool,
     if METADATA not in found:
         raise RecordingError(f"{path}: nothing in it is whole, or it is no recording of tactile-rt")
     about = Description.from_metadata(str(path), found[METADATA], found.get(SESSION, {}), True)
-    return about, found[METADATA]["version"] == "1", records
+    return about, records
 
 
-def _copy(
-    path: Path, records: "Iterator[Record]", new: BinaryIO, about: Description, first: bool
-) -> None:
+def _copy(path: Path, records: "Iterator[Record]", new: BinaryIO, about: Description) -> None:
     from mcap.records import Channel, Message
 
     file = McapFile(new, about)
     file.note(RECOVERED, {"by": "tactile_rt"})
     # A damaged first chunk takes the names of the channels with it, but we number them alike.
     numbered = (name for name, wire in CHANNELS if wire in ("", about.wire))
-    names = {number: (name, not first) for number, name in enumerate(numbered, 1)}
+    names = dict(enumerate(numbered, 1))
     whole, none = False, 0
     for record in records:
         if isinstance(record, Channel):
-            names[record.id] = name_of(record.topic)
+            names[record.id] = name_channel(record.topic)
         elif isinstance(record, Message) and record.channel_id in names:
-            name, formed = names[record.channel_id]
+            name = names[record.channel_id]
             if name == ARRAY:  # written anew
                 continue
-            if (is_in_file_form if formed else is_message)(name, record.data, about.spec.shape):
-                data = plain(name, record.data) if formed else record.data
-                file.add(name, data, _host_ns(record, about))
+            if is_in_file_form(name, record.data, about.spec.shape):
+                t_ns = record.log_time - about.utc_offset_ns
+                file.add(name, plain(name, record.data), t_ns)
                 whole = True
             else:
                 none += 1
@@ -124,7 +119,3 @@ def _copy(
         raise RecordingError(f"{path}: nothing in it is whole")
     file.finish()
     os.fsync(new.fileno())
-
-
-def _host_ns(message: "Message", about: Description) -> int:
-    return message.log_time - about.utc_offset_ns

@@ -2,9 +2,6 @@
 definition is in the file, so that whatever reads ROS 2 reads it.
 
     /tactile/whiskers/samples    tactile_rt_msgs/msg/Samples
-
-A recording of layout 1 had topics such as ``samples``, samples without a header, and all but
-samples and packets as JSON.
 """
 
 from tactile_rt.recording.description import Description
@@ -14,7 +11,7 @@ from tactile_rt.recording.layout import (
     HEALTH,
     SAMPLES,
     WIRE,
-    is_message,
+    is_samples,
     last_ns,
 )
 from tactile_rt.ros2 import messages
@@ -28,7 +25,7 @@ __all__ = [
     "WRENCH",
     "FileForm",
     "is_in_file_form",
-    "name_of",
+    "name_channel",
     "plain",
 ]
 
@@ -75,13 +72,12 @@ class FileForm:
         return messages.event_message(data) if name in TEXTS else data
 
 
-def name_of(topic: str) -> tuple[str, bool]:
-    """The channel of a topic, such as ``samples``, and whether its messages stand as `FileForm`
-    writes them; else as in layout 1, or they are nothing of ours."""
+def name_channel(topic: str) -> str:
+    """Return the channel of a topic, such as ``samples``; another topic as it is."""
     parts = topic.split("/")
     if len(parts) == 4 and parts[:2] == ["", PREFIX]:
-        return parts[3], True
-    return " ".join(topic.split()), False
+        return parts[3]
+    return " ".join(topic.split())
 
 
 def plain(name: str, data: bytes) -> bytes:
@@ -108,9 +104,9 @@ def is_in_file_form(name: str, data: bytes, shape: tuple[int, int]) -> bool:
     """
     if name in TEXTS:
         return data[:4] == CDR and data[-2:] == b"}\0"
-    if name != SAMPLES:
-        return is_message(name, data, shape)
+    if name == WIRE:
+        return len(data) >= 12 and data[:4] == CDR
     try:
-        return is_message(name, messages.unstamped(data), shape)
+        return name != SAMPLES or is_samples(messages.unstamped(data), shape)
     except ValueError:
         return False

@@ -1,9 +1,7 @@
 """What is read is what was written, or named."""
 
-import json
 import time
 from contextlib import closing
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ import pytest
 from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.recording import Recording, recover
 from tactile_rt.sources.opening import open_source
-from tactile_rt.stream import concatenate
 from tactile_rt.testing import cut
 from tests.helpers.recordings import SPEC, all_parts, noise, odd_chunks, write
 
@@ -64,7 +61,7 @@ def newer(path):
         (lambda p: p.write_bytes(b""), RecordingError, "not an MCAP file"),
         (lambda p: p.write_text("seq,t_ns\n"), RecordingError, "not an MCAP file"),
         (foreign, RecordingError, "no recording of tactile-rt"),
-        (newer, RecordingError, "of version '3'; this release reads 1 and 2"),
+        (newer, RecordingError, "of version '3'; this release reads 2"),
     ],
     ids=["missing", "folder", "empty", "text", "another's mcap", "newer"],
 )
@@ -83,48 +80,6 @@ def test_readers_may_stop_early(path):
         next(chunks)
     with open_source(f"replay:{path}") as source:
         source.read()
-
-
-# of a release before
-
-DATA = Path(__file__).parent / "data"
-
-
-def test_a_device_s_recording_made_before_is_read():
-    values = np.random.default_rng(15).normal(size=(40, 2, 3)).astype(np.float32)
-    recording = Recording(DATA / "device.mcap")
-    about = recording.description
-    assert (about.source, about.wire, about.codec) == (
-        "serial:/dev/ttyACM0?codec=native", "serial", "native",
-    )  # fmt: skip
-    assert about.session == {"who": "Ada"}
-    assert recording.spec.channels == ("fx", "fy", "fz")
-    whole = concatenate(list(recording))
-    assert whole.values.tobytes() == values.tobytes()
-    assert [h["state"] for h in recording.health()][-1] == "closed"
-    assert next(recording.packets())[0] is None
-    with open_source(f"replay:{recording.path}?from=wire&speed=0") as source:
-        assert concatenate(list(source)).values.tobytes() == values.tobytes()
-
-
-@pytest.mark.parametrize(("name", "samples"), [("daemon", 40), ("cut", 30)])
-def test_a_daemon_s_recording_made_before_is_read_or_recovered(name, samples, tmp_path):
-    values = np.random.default_rng(16).normal(size=(40, *SPEC.shape)).astype(np.float32)
-    path = DATA / f"{name}.mcap"
-    if name == "cut":
-        with pytest.raises(RecordingError, match="cut short"):
-            Recording(path)
-        path = recover(path, tmp_path / "whole.mcap")
-    recording = Recording(path)
-    assert concatenate(list(recording)).values.tobytes() == values[:samples].tobytes()
-    assert recording.description.session["daemon_source"] == "left"
-    assert recording.description.recovered is (name == "cut")
-    assert [d["step"] for d in recording.decisions()] == [1, 2, 3, 4][: samples // 10]
-    (event,) = recording.events()
-    assert event["reason"] == "unplugged"
-    raw = list(recording.raw("decisions", "events"))
-    assert [r.topic for r in raw].count("events") == 1
-    assert json.loads(raw[0].data) == next(recording.decisions())
 
 
 def test_a_recording_is_read_as_often_as_one_likes(path):

@@ -108,19 +108,6 @@ def test_the_recording_that_is_shipped_is_read_by_both():
     assert len(values) == 30 * 6 * sum(map(len, Recording(DEMO)))
 
 
-@pytest.mark.parametrize("name", ["device", "daemon"])
-def test_a_recording_of_before_becomes_a_bag(name, tmp_path):
-    old, folder = Recording(DATA / f"{name}.mcap"), tmp_path / "bag"
-    assert write_bag([old], folder) == sum(map(len, old))
-    new = Recording(folder / "bag_0.mcap")
-    assert all_parts(new) == all_parts(old) and new.description == old.description
-    assert [list(new.raw(t)) for t in TOPICS] == [list(old.raw(t)) for t in TOPICS]
-    found = by_rosbags(folder)
-    mine = by_mcap_ros2(folder / "bag_0.mcap")
-    assert {t: len(m) for t, m in found.items() if m} == {t: len(m) for t, m in mine.items()}
-    assert set(mine) >= {f"/tactile/{'left' if name == 'daemon' else old.spec.name}/samples"}
-
-
 def test_a_bag_of_several_files_has_a_wrench_for_each_valid_sample(tmp_path):
     (first, chunks), (second, _) = (whole(tmp_path / f"{k}.mcap") for k in range(2))
     assert write_bag([Recording(first), Recording(second)], tmp_path / "bag") == 80

@@ -88,7 +88,7 @@ class OpenBag:
     notes: list[str] = field(default_factory=list)
 
     def messages(self, topic: str) -> Iterator[tuple[int, bytes, Any]]:
-        """Read (time in the bag in ns, bytes, message) of a topic; damaged messages are None."""
+        """Read (time in ns, bytes, message) of a topic; a damaged message is None."""
         which = [c for c in self.reader.connections if c.topic == topic]
         stored = self.reader.messages(connections=which)
         while True:

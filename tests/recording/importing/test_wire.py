@@ -42,32 +42,6 @@ def test_raw_bytes_are_what_the_codec_finds_at_its_rate(tmp_path, name):
     assert (again.equal, again.differing) == (len(chunk), 0) and again.time_ns <= 1000
 
 
-@pytest.mark.parametrize("name", serial_names())
-def test_a_logic_analyzer_heard_the_same(tmp_path, name):
-    """Byte by byte, with another line between: each sample has the time of its last byte."""
-    wire = b"".join(wire_of(make_codec("serial", name, {})))
-    lines = ["name,type,start_time,duration,data,error"]
-    for k, byte in enumerate(wire):
-        lines.append(f"RX,data,{k * 2.5e-05 - 0.01:.9g},2e-05,0x{byte:02X},")
-        lines.append(f"TX,data,{k * 2.5e-05 - 0.01 + 1e-5:.9g},2e-05,0x55,")
-    (tmp_path / "uart.csv").write_text("\n".join(lines) + "\n")
-    codec = make_codec("serial", name, {})
-    expected, ends = [], []
-    for k in range(len(wire)):
-        samples = codec.feed(wire[k : k + 1], 0)
-        if samples is not None:
-            expected.append(samples.values)
-            ends += [k * 25_000] * len(samples)
-    log = read_log(tmp_path / "uart.csv", bus="RX")
-    made = import_wire(log, tmp_path / "out.mcap", {"codec": name})
-    chunk = concatenate(list(Recording(tmp_path / "out.mcap")))
-    assert chunk.values.tobytes() == np.concatenate(expected).tobytes()
-    assert (made.corrupt, made.missing) == (0, 0)
-    if len(set(ends)) == len(ends) and codec.tick_ns is None:  # each in a frame, without a clock
-        assert np.abs(chunk.t_ns - ends).max() <= 1000
-    assert any("those of RX are taken" in note for note in made.notes)
-
-
 def test_half_a_file_is_imported_with_a_note(tmp_path):
     whole = b"".join(wire_of(make_codec("serial", "bota", {})))
     (tmp_path / "raw.bin").write_bytes(whole)
