@@ -80,10 +80,6 @@ def sniff(
 class _Told:
     """What is found, told as it comes, or as JSON at the end.
 
-    Args:
-        target: what is looked at.
-        json: where `Json` says.
-
     Attributes:
         alone: Whether JSON goes to stdout, and nothing else.
     """

@@ -41,13 +41,9 @@ class Sequencer:
 
     Args:
         bits: Width of the device's counter, which wraps at 2^bits; None for a device without one.
-        stats: The account in which losses are counted.
         period_ticks: Nominal time between samples, in ticks of the device's clock; None for a
             device without a clock.
         tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
-
-    Attributes:
-        resets: Number of times that the counter began anew.
     """
 
     def __init__(

@@ -13,9 +13,7 @@ class Entry(NamedTuple):
     """A codec of the catalogue.
 
     Attributes:
-        module: The module that holds it.
         attribute: The name of its class there; of a described frame, its file in `FRAMES`.
-        device: The devices that speak it, in a line.
     """
 
     module: str

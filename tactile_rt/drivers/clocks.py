@@ -61,7 +61,6 @@ class Stamper:
 
     Args:
         codec: The codec of the device, which says what counter and clock there are.
-        spec: What the samples are.
         stats: The account in which losses are counted; deliveries are the reader's to count.
 
     Attributes:

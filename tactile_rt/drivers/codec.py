@@ -52,7 +52,6 @@ class CanFrame(NamedTuple):
         id: Arbitration identifier, of 11 bits, or of 29 if `extended`.
         data: Payload of the frame, 0 to 8 bytes, or up to 64 if `fd`.
         extended: Whether the identifier has 29 bits.
-        fd: Whether this is a frame of CAN FD.
         remote: Whether the frame asks for data (RTR) and carries none.
     """
 
@@ -121,8 +120,6 @@ class WireStats:
     """What came over the wire since the codec was made.
 
     Attributes:
-        intact: Number of frames that passed every check.
-        corrupt: Number of frames that failed a check.
         skipped: Bytes that lay between frames; on CAN, frames with identifiers that are not this
             device's.
         incomplete: Samples of which a part never came, from devices that send samples in parts.
@@ -142,7 +139,6 @@ class Codec(abc.ABC, Generic[Packet]):
 
     Attributes:
         Options: Frozen dataclass of what a URL may set; its docstring explains each field.
-        wire: What the device is attached to: ``serial`` or ``can``.
         count_bits: Width of the device's sample counter; None for a device without one.
         tick_ns: Length of a tick of the device's clock, ns; None for a device that sends no time.
         tick_bits: Width of the device's clock, which wraps at 2^tick_bits.
@@ -150,7 +146,6 @@ class Codec(abc.ABC, Generic[Packet]):
         cannot_detect: The losses and damages that this protocol cannot show, in a sentence.
         spec: What the samples are; None until the device has described itself. Whoever knows it
             beforehand sets it, and the device is then not asked.
-        stats: Counts of the frames that have come so far.
         greeting: What the device says when it is switched on, before anything else.
         measures: Whether the device measures although no host has asked for samples. The device's
             side.

@@ -67,9 +67,7 @@ class DeviceSource(Source):
 
     Args:
         connect: Opens the line; called again after the line was lost.
-        codec: The codec that the device speaks.
         options: How long to wait for what, and what to do when the line is lost.
-        name: Name of the device, for messages.
         codec_options: Options of the codec as the user wrote them, for a recording to tell.
 
     Raises:

@@ -68,7 +68,6 @@ class CanBus:
 
     Attributes:
         name: Name of the network interface, such as ``can0``.
-        up: Whether the interface is up.
         bitrate: Speed of the bus, bit/s; 0 where the kernel does not know it.
         url: The URL to begin with; its codec is left to the user.
     """
@@ -84,9 +83,6 @@ class Finding:
     """One thing looked at.
 
     Attributes:
-        what: What was looked at: a port, a bus, a service.
-        good: Whether everything about it is as it should be.
-        says: What was found, in words.
         do: What the user should do about it; empty when all is good.
     """
 
@@ -144,7 +140,6 @@ def diagnose(
     """Look at permissions, latency timers, CAN states and what else gets in the way.
 
     Args:
-        ports, buses: What there is, from `serial_ports` and `can_buses`.
         sys: Where sysfs is mounted.
         run: Runs a command and returns its output ("" if it fails).
     """

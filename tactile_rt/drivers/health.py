@@ -25,14 +25,12 @@ class Health:
         state: State of the device's stream.
         since_ns: Host time (CLOCK_MONOTONIC) since which the stream is in this state, ns.
         reason: Why the device is not streaming, in words; empty when it is.
-        connections: Number of times that the line has been opened.
         newest_ns: Host time at which the newest sample arrived, ns; 0 before the first.
         drift_ppm: Excess speed of the host's clock over the device's, parts per million; 0 for a
             device that tells no time.
         clock_steps: Number of times that the device's clock jumped or began anew.
         counter_resets: Number of times that the device's sample counter began anew.
         status: What the status bits of the newest sample mean, in words.
-        can_errors: Number of CAN error frames that have come.
         wire: Counts of the frames that came, and of what was wrong with them.
     """
 

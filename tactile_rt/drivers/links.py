@@ -22,10 +22,6 @@ WAIT_S = 0.05  # how soon a line without a descriptor looks for the end of the w
 class Link(abc.ABC, Generic[Packet]):
     """A line to a device; opened when made.
 
-    Attributes:
-        name: Name of the line, for messages.
-        can_errors: Number of CAN error frames that have come so far.
-
     Raises:
         SourceError: it cannot be opened: what and why.
     """
@@ -162,7 +158,6 @@ class CanLink(Link[Sequence[CanFrame]]):
         interface: Name that python-can has for the interface, such as ``socketcan``.
         channel: Which bus of that interface, such as ``can0``.
         bitrate: Speed of the bus, bit/s.
-        fd: Whether to open the bus for CAN FD.
         data_bitrate: Speed of the data phase of CAN FD, bit/s.
     """
 
@@ -249,9 +244,7 @@ class SlcanLink(Link[Sequence[CanFrame]]):
     python-can speaks it too, byte by byte: 5,500 frames/s where a saturated bus carries 9,000.
 
     Args:
-        port: Serial port of the adapter.
         bitrate: Speed of the bus, bit/s.
-        fd: Whether the bus carries CAN FD.
     """
 
     def __init__(self, port: str, bitrate: int, fd: bool = False) -> None:

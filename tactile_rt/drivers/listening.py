@@ -81,9 +81,6 @@ def hear_bus(url: str, seconds: float) -> list[CanFrame]:
     Args:
         url: ``can:INTERFACE:CHANNEL``, with the bus's options.
         seconds: how long to listen, s.
-
-    Raises:
-        ConfigError, SourceError: as `open_line`.
     """
     link: Link[Any] = open_line(url)
     frames: list[CanFrame] = []
@@ -103,12 +100,7 @@ def ask_devices(
     """Each codec whose device must be asked to send, and what then comes: bytes, or frames.
 
     Args:
-        wire: ``serial`` or ``can``.
-        connect: opens the line for a device of this codec.
         seconds: how long to listen after the first sample, s.
-
-    Raises:
-        SourceError: the line cannot be opened.
     """
     connect(_plain(wire)).close()  # told once, not for every codec
     for of, name in CODECS:

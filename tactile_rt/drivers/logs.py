@@ -73,14 +73,9 @@ class LineLog:
     """A log of a serial line or a CAN bus.
 
     Args:
-        path: Path of the file.
-        form: One of `FORMS`.
         bus: Name of the bus whose frames to take, of a log of several; empty for all.
 
     Attributes:
-        path: Path of the file.
-        form: Form of the log, one of `FORMS`.
-        wire: What was logged: ``serial`` or ``can``.
         piece: Bytes of a packet where the log says nothing of packets.
         notes: What could not be read, a sentence each; complete once all packets were read.
         buses: Number of packets of each bus, by its name; complete once all packets were read.
@@ -96,9 +91,6 @@ class LineLog:
     def packets(self) -> Iterator[Timed]:
         """The packets, bytes or a CAN frame each, and when each came, ns; None where the log does
         not say. Times never go back.
-
-        Raises:
-            OSError: the file cannot be read.
         """
         self.notes.clear()
         self.buses.clear()
@@ -207,13 +199,11 @@ def read_log(path: Path, form: str = "", bus: str = "") -> LineLog:
     """A log of a line; raw bytes where it is no other.
 
     Args:
-        path: the file.
         form: one of `FORMS`; empty: as it begins.
         bus: of a CAN log with several, the one to take; empty for all.
 
     Raises:
         ConfigError: no such file, or form.
-        OSError: the file cannot be read.
     """
     if form and form not in FORMS:
         raise ConfigError(f"no form {form!r} of a log: there are {', '.join(FORMS)}")

@@ -40,7 +40,6 @@ class Prepared:
 
     Attributes:
         spec: The array that the samples will be of; None if only the device can tell.
-        open: Function that opens the source.
         told: Whether a device that would have been asked what array it is has been told instead;
             the samples are of that array before any calibration.
     """
@@ -142,8 +141,6 @@ def prepare_serial(target: str, fields: dict[str, str], array: ArraySpec | None 
     """What opens the device on a serial port.
 
     Args:
-        target: the port.
-        fields: the options as written.
         array: of a device that would be asked what it is; it is not asked then.
 
     Raises:
@@ -170,7 +167,6 @@ def prepare_can(target: str, fields: dict[str, str], array: ArraySpec | None = N
 
     Args:
         target: interface and channel, ``socketcan:can0``.
-        fields: the options as written.
         array: of a device that would be asked what it is; it is not asked then.
 
     Raises:
@@ -213,7 +209,6 @@ def open_line(url: str) -> Link[Any]:
 
     Raises:
         ConfigError: another scheme, or a wrong option.
-        SourceError: it cannot be opened.
     """
     scheme, target, fields = split_url(url)
     fields = {"codec": "", **fields}
@@ -249,11 +244,6 @@ def _prepared(
     """Reads the file that the calibration is described in; what it returns opens the line.
 
     Args:
-        connect: opens the line.
-        codec: of the device.
-        options: of the device.
-        name: of the device, for messages.
-        fields: all options as written.
         array: of a device that would be asked what it is; None: it is asked.
     """
     written = {k: v for k, v in fields.items() if k in codec.Options.__dataclass_fields__}

@@ -50,8 +50,6 @@ class SlcanDecoder:
 
     Attributes:
         corrupt: Number of lines that were neither a frame nor an answer.
-        acks: Number of commands that were answered with OK.
-        bells: Number of commands that were answered with an error.
         replies: The last 16 answers to V, N and F, without their end of line.
     """
 
@@ -197,7 +195,6 @@ class SlcanAdapter:
             chooses.
 
     Attributes:
-        open: Whether the host has opened the channel.
         hears: Whether frames come through: the channel is open, and at the bus's bit rate.
         flags: Status that F reports and clears: bit 3 is a data overrun, bit 7 a bus error.
         data_bitrate: Speed of CAN FD's data phase, bit/s, once the host has set it.

@@ -58,15 +58,10 @@ class CodecFit:
     """A codec that fits.
 
     Attributes:
-        wire: What the device is attached to, ``serial`` or ``can``.
-        codec: Name of the codec.
         options: The codec's options besides their defaults.
-        intact: Number of frames that passed every check.
-        corrupt: Number of frames that failed one.
         samples: Number of samples; of a device that has not described itself 0.
         explained: Part of the bytes, or of the bus's frames, that is of this device's frames.
         proof: Part of damaged frames that the codec notices, 0 to 1.
-        described: Whether the array that the samples are of is known.
         likely: Whether there are frames and, of a device that has told all that it must, samples.
     """
 
@@ -93,7 +88,6 @@ def sniff_bytes(data: bytes, further: Sequence[Tried] = ()) -> list[CodecFit]:
     Args:
         data: bytes as they came, cut anywhere; the first 64 kB are looked at, and where nothing
             fits them, the second half of these.
-        further: codecs with options to try besides those that need none.
 
     Raises:
         ConfigError: one of `further` cannot be.
@@ -126,7 +120,6 @@ def sniff_frames(frames: Sequence[CanFrame], further: Iterable[Tried] = ()) -> l
 
     Args:
         frames: as they came; other devices may be on the bus.
-        further: codecs with options to try besides those that need none.
 
     Raises:
         ConfigError: one of `further` cannot be.

@@ -59,12 +59,9 @@ def write_dataset(
     """Write recordings of one array as the episodes of a dataset; the number of samples.
 
     Args:
-        recordings: An episode each.
         folder: To make; one that is there is replaced.
-        fps: Rows a second.
         task: What was done, in words, of all episodes; empty: what the note ``task`` of each
             recording says, or its array's name.
-        films: What cameras saw, of one recording.
 
     Raises:
         ConfigError: An extra is missing, or a film is of no use.

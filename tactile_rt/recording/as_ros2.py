@@ -38,11 +38,7 @@ def write_bag(recordings: Sequence[Recording], folder: Path) -> int:
     """Write them; the number of samples.
 
     Args:
-        recordings: As the files of one bag, in this order.
         folder: To make; one that is there is replaced.
-
-    Raises:
-        RecordingError: One is damaged.
     """
     n = 0
     with whole_folder(folder) as made:

@@ -47,7 +47,6 @@ class RecordedModel:
         file: The path that the model's file had.
         sha256: The SHA-256 of the file, in hexadecimal; empty: the recording does not tell.
         table: The model's table ``[[model]]`` in the configuration.
-        engine: The name of the engine that ran it.
     """
 
     name: str
@@ -84,11 +83,7 @@ def live_model(
     """The model that decided live; None: none did.
 
     Args:
-        what: the recording, for messages.
-        about: what it is of.
         name: of the model; empty: the only one, or the one that `model` is.
-        model: a file that is to decide now.
-        check: whether there must be one.
 
     Raises:
         ConfigError: there is none of that name, or there are several.
@@ -194,7 +189,6 @@ def samples_given(chunk: Chunk, skips: Sequence[Fields]) -> Chunk | None:
     """The samples of a chunk that reached the model live; None: no one did.
 
     Args:
-        chunk: as recorded.
         skips: as `Recording.skips` gives them; where samples were lost, the model had none of them.
     """
     kept = np.ones(len(chunk), bool)

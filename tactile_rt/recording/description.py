@@ -34,17 +34,14 @@ class Description:
     """What a recording is of.
 
     Attributes:
-        spec: The array of the samples.
         utc_offset_ns: UTC less the host's monotonic time when the recording began, ns.
         source: The URL of the source that was recorded, or the device's name.
         wire: ``serial`` or ``can``; empty where the source is no device, so that there are no
             packets.
         codec: The name of the codec that the device spoke; empty without a device.
         codec_options: The options of the codec, as in a URL; paths are absolute.
-        clock: ``host`` or ``device``: whose time the samples have.
         calibration: The calibration of the samples, not of the packets; None: the samples are as
             the codec gave them.
-        session: The notes of whoever recorded, by name.
         recovered: Whether the file was made whole after an interruption, and may have gaps.
     """
 

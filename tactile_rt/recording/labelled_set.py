@@ -47,11 +47,7 @@ def write_set(
 
     Args:
         folder: where to; a set that is there is replaced.
-        touches: what is in it.
         shares: of the objects of each category, for training, validation and test.
-        seed: of the split.
-        options: with which the command made it, for provenance.
-        finish: is called with the folder before it takes its name.
 
     Raises:
         ConfigError: no touch can be used, or shares that cannot be.

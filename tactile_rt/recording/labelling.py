@@ -51,10 +51,7 @@ class LabelledTouch:
     """A touch that is used.
 
     Attributes:
-        touch: The samples of the touch, and its flaw.
-        recording: The path of the recording that it is in.
         onset_s: The time of its onset, seconds since the first sample of the recording.
-        interval: The interval that tells what was touched.
     """
 
     touch: RecordedTouch
@@ -68,12 +65,9 @@ class LabelledTouches:
     """The touches of some recordings that can be used, and what could not.
 
     Attributes:
-        spec: The array of the recordings.
         period_ns: The sample period of the touches, ns.
         sensor: The description of the array's sensor; None: it has none.
-        used: The touches, in the order of the recordings.
         sums: The sha256 of each recording's file.
-        found: The number of touches of each recording.
         left_out: The lines that tell what could not be used, or should be known.
     """
 
@@ -90,7 +84,6 @@ def intervals_beside(recordings: Sequence[Path], labels: Path | None = None) -> 
     """What was touched when, as a file says it.
 
     Args:
-        recordings: which.
         labels: the file; None: ``labels.csv`` beside each recording.
 
     Raises:
@@ -162,8 +155,6 @@ def find_labelled(
     """Find the touches in recordings, and what was touched.
 
     Args:
-        recordings: files.
-        intervals: of each recording, and maybe of others.
         pattern: a sweep set or model of the same array, whose sensor and period are taken.
         report: is told how far a recording has been read, s.
 
@@ -234,7 +225,6 @@ class _Counted:
 
     Attributes:
         first_ns: The stream time of the first sample, ns.
-        lost: The number of samples that the sequence numbers leave out.
     """
 
     def __init__(

@@ -51,7 +51,6 @@ class LabelledInterval:
     """A part of a recording in which one thing is touched.
 
     Attributes:
-        label: The kind of thing.
         start_s, end_s: Seconds since the recording's first sample; the end is not in it.
         object: The name of the one thing of this kind; empty: it is not told.
         where: File and line, for messages; empty: not out of a file.
@@ -81,7 +80,6 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Label
     """The intervals of a file by recording, also of recordings that are not asked for.
 
     Args:
-        path: the CSV file.
         recordings: those asked for; the paths of these are keys as they are given here.
 
     Raises:
@@ -134,16 +132,13 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> str:
     begins, so that it spoils no other.
 
     Args:
-        path: the CSV file.
         recording: name of the recording, relative to the file's folder.
-        interval: what to say of it.
 
     Returns:
         The line, without its end.
 
     Raises:
         ConfigError: a name that cannot be, times out of order, or a file with other columns.
-        OSError: the file cannot be written.
     """
     for what, name in (("label", interval.label), ("object", interval.object)):
         if why := check_name(name, empty=what == "object"):
@@ -176,7 +171,6 @@ def check_appendable(path: Path) -> None:
 
     Raises:
         ConfigError: it has other columns.
-        OSError: it cannot be read.
     """
     with path.open("rb") as file:
         columns = _cells(file.readline(LONGEST_LINE))
@@ -192,9 +186,6 @@ def drop_torn_label(path: Path) -> bool:
 
     A line that lacks nothing but its end stays: an editor may have left it so; so does what was
     never written by `append_label`, which `read_labels` tells.
-
-    Raises:
-        OSError: the file is none, or cannot be read or written.
     """
     with open_regular(path) as file:
         data = file.read()
@@ -211,11 +202,7 @@ def drop_torn_label(path: Path) -> bool:
 
 
 def lines_of(path: Path) -> list[str]:
-    """The lines of a file with their ends, as `read_labels` counts them; what is no text, too.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """The lines of a file with their ends, as `read_labels` counts them; what is no text, too."""
     return path.read_bytes().decode(errors="surrogateescape").splitlines(keepends=True)
 
 
@@ -223,12 +210,8 @@ def remove_label(path: Path, line: str) -> None:
     """Take a line of a file away, the last of several; it is there or not, never half.
 
     Args:
-        path: the CSV file.
         line: without its end, as `append_label` gave it or `lines_of`; where it is not there,
             nothing is taken away.
-
-    Raises:
-        OSError: the file cannot be read or written.
     """
     lines = lines_of(path)
     there = [k for k, text in enumerate(lines) if text.rstrip("\r\n") == line]
@@ -248,7 +231,6 @@ def check_name(name: str, empty: bool = False) -> str:
     """Why a text cannot be a label or an object's name, which become names of files; "": it can.
 
     Args:
-        name: the text.
         empty: whether it may be empty.
     """
     if not name:

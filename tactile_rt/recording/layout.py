@@ -45,7 +45,6 @@ class Raw:
     """One message of a recording, as it stands in the file.
 
     Attributes:
-        topic: The name of its channel, e.g. ``samples``.
         t_ns: The time under which it was recorded, host monotonic time, ns.
         data: The bytes of the encoded message.
     """
@@ -89,11 +88,7 @@ def decode_samples(data: bytes, shape: tuple[int, int]) -> Chunk:
     """The chunk in a message.
 
     Args:
-        data: the message.
         shape: (element, channel) of the array.
-
-    Raises:
-        ValueError: it is not such a message.
     """
     elements, channels = shape
     n = samples_in(data)
@@ -150,11 +145,7 @@ def is_samples(data: bytes, shape: tuple[int, int]) -> bool:
 
 
 def decode_packet(data: bytes, wire: str) -> Packet:
-    """The raw packet in a message.
-
-    Raises:
-        ValueError: it is not such a message.
-    """
+    """The raw packet in a message."""
     if len(data) < 12 or data[:4] != _CDR:
         raise ValueError(f"{len(data)} bytes are not a packet")
     opened, n = struct.unpack_from("<?3xI", data, 4)

@@ -26,7 +26,6 @@ class CameraFilm:
     """A film and when it was taken.
 
     Attributes:
-        name: The name of the camera.
         path: The file of the film, in any form that FFmpeg reads.
         begin_s: The time of the film's first frame after the recording's first sample, s; below 0
             it was before.

@@ -53,10 +53,6 @@ class Episode:
 
     Attributes:
         index: The number of the episode, from 0.
-        rows: The number of rows.
-        first: The number of rows of all episodes before it.
-        task: What was done, in words.
-        task_index: The number of that task.
         statistics: The statistics of each feature, as `Statistics.found` gives them.
     """
 
@@ -72,7 +68,6 @@ class Episode:
 
         Args:
             frame: (row,) Their numbers within the episode.
-            fps: Rows a second.
         """
         return {
             "timestamp": (frame / fps).astype(np.float32),

@@ -45,13 +45,6 @@ class Recording:
     Every iteration opens the file, and reads it from its beginning. Where damage is met, what comes
     before it has been given out.
 
-    Args:
-        path: of the file, MCAP.
-
-    Attributes:
-        path: The path of the file.
-        description: What the recording is of.
-
     Raises:
         ConfigError: there is no such file, or the extra is not installed.
         RecordingError: it is no recording, unfinished, damaged, or of another version. All that

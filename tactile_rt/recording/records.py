@@ -48,9 +48,6 @@ _CHUNK = struct.Struct("<QQQII")  # and the name of the compression, the data's 
 def read_records(file: BinaryIO) -> "Iterator[Record]":
     """What is in a file that was written to its end, until damage is met.
 
-    Args:
-        file: an MCAP file, at its beginning.
-
     Raises:
         ValueError: damage, or more than a recording has.
     """
@@ -59,9 +56,6 @@ def read_records(file: BinaryIO) -> "Iterator[Record]":
 
 def read_whole_records(file: BinaryIO) -> "Iterator[Record]":
     """What is whole in a file that was cut off or damaged, also behind a hole.
-
-    Args:
-        file: an MCAP file, at its beginning.
 
     Raises:
         ValueError: there is more in it than a recording has.

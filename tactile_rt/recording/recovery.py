@@ -28,7 +28,6 @@ def recover(path: str | Path, output: str | Path | None = None, force: bool = Fa
     Args:
         path: of a recording that was cut short (a killed process, a full disk) or damaged.
         output: where to; None: beside it, as ``NAME.recovered.mcap``.
-        force: whether to replace a file that is there.
 
     Returns:
         The new file; `path` itself if it is whole.

@@ -23,8 +23,6 @@ class Redecoded:
     """Recorded samples beside those that the packets decode to.
 
     Attributes:
-        recorded: The number of samples that were recorded.
-        decoded: The number of samples that the packets decode to.
         equal: The number of samples of both whose values and validity are the same, bit for bit.
         differing: The number of samples of both whose values or validity are not the same.
         validity: The number of differing samples in which an element is valid in one of both alone.
@@ -70,7 +68,6 @@ def compare_decoding(path: str | Path, options: Mapping[str, str] | None = None)
     """Decode a recording's packets again, and compare with its samples.
 
     Args:
-        path: the recording.
         options: ``codec`` and the codec's own, as in a ``replay:`` URL; None: as recorded.
 
     Raises:

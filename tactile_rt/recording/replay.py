@@ -65,17 +65,12 @@ def open_replay(target: str, fields: dict[str, str]) -> Source:
 
     Raises:
         ConfigError: no such file, a wrong option, or the extra is not installed.
-        RecordingError: the file is damaged.
     """
     return prepare_replay(target, fields).open()
 
 
 def prepare_replay(target: str, fields: dict[str, str]) -> Prepared:
-    """What opens a recording, or one object of a sweep set, as a stream.
-
-    Raises:
-        ConfigError, RecordingError: as `open_replay`.
-    """
+    """What opens a recording, or one object of a sweep set, as a stream."""
     path, what = Path(target), f"replay:{target}"
     if not target:
         raise ConfigError("replay: needs a file, e.g. replay:run.mcap, replay:data/SET/mug-1.npz")
@@ -182,14 +177,9 @@ class ReplaySource(Source):
     nothing.
 
     Args:
-        spec: what the samples are.
         timed: makes the chunks and when they are due, ns; what is lost is counted in its argument.
         speed: times the recorded pace; 0: at once.
-        calibrated: whether the samples were calibrated before they were recorded.
         loop: whether to begin again at the end, with numbers and times that go on.
-
-    Attributes:
-        calibrated: Whether the samples were calibrated before they were recorded.
     """
 
     live = False

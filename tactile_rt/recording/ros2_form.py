@@ -45,11 +45,7 @@ TEXTS = (HEALTH, DECISIONS, EVENTS)
 
 
 class FileForm:
-    """How the messages of one recording stand in its file.
-
-    Args:
-        about: What it is of.
-    """
+    """How the messages of one recording stand in its file."""
 
     def __init__(self, about: Description) -> None:
         self._spec, self._offset_ns = about.spec, about.utc_offset_ns
@@ -81,11 +77,7 @@ def name_channel(topic: str) -> str:
 
 
 def plain(name: str, data: bytes) -> bytes:
-    """What was given to `FileForm.encode`.
-
-    Raises:
-        ValueError: It is no such message.
-    """
+    """What was given to `FileForm.encode`."""
     if name == SAMPLES:
         return messages.unstamped(data)
     if name in TEXTS:
@@ -98,8 +90,6 @@ def is_in_file_form(name: str, data: bytes, shape: tuple[int, int]) -> bool:
     length, beginning and end tell.
 
     Args:
-        name: The channel.
-        data: The message.
         shape: (element, channel) of the array.
     """
     if name in TEXTS:

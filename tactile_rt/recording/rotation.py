@@ -29,8 +29,6 @@ class Rotation:
     """The files of one recording, named by the UTC at which each was begun.
 
     Attributes:
-        folder: The folder in which the files are.
-        stem: The name with which all files begin.
         mb: The size beyond which the next file begins, MB; 0: whatever the size.
         seconds: The time after which the next file begins, s; 0: never.
     """

@@ -16,8 +16,6 @@ class Extent(NamedTuple):
     """How much of a recording there is, up to some moment.
 
     Attributes:
-        samples: The number of samples.
-        packets: The number of raw packets.
         newest_ns: The host monotonic time of the newest sample, ns; 0 if there is none.
     """
 

@@ -65,8 +65,6 @@ def find_touches(
     """The touches of a stream, in their order.
 
     Args:
-        spec: the array of the stream.
-        chunks: the stream, as it came.
         period_ns: of the samples of a touch, ns.
         floor: (channel,) smallest sigma of the detector, SI.
     """

@@ -63,12 +63,7 @@ class McapFile:
 
     Args:
         file: to write; not closed with this.
-        about: what it is of.
         further: channels besides those of a recording, and the ROS 2 message of each.
-
-    Attributes:
-        about: The description of what the file is of.
-        counts: The number of messages of each channel so far.
     """
 
     def __init__(
@@ -131,11 +126,8 @@ class WriterStats:
     """What became of what was to be recorded.
 
     Attributes:
-        samples: The number of samples that were written.
-        packets: The number of raw packets that were written.
         dropped_samples: The number of samples that were not written: the disk was slow or full.
         dropped_packets: The number of raw packets that were not written, for the same reason.
-        bytes: The size of the file when it was last flushed.
     """
 
     samples: int = 0
@@ -149,17 +141,13 @@ class RecordingWriter:
     """A recording of a source, written by the thread that calls.
 
     Args:
-        path: of the file.
         source: what is recorded, for its health and losses; it is not read here.
-        about: what the recording is of.
         prelude: packets in which a device described itself, and their arrivals, ns: it must be
             understood from every file.
         dropped: samples and packets that could not be recorded before.
-        force: whether to replace a file that is there.
         syncer: what syncs the file; None: the thread that calls.
 
     Attributes:
-        path: The path of the file.
         begun_ns: The host monotonic time at which the file was begun, ns.
         stats: The counts so far; `dropped_samples` and `dropped_packets` are the caller's to keep.
         flushed: The extent that the operating system has, which a kill of the process leaves.
@@ -171,7 +159,6 @@ class RecordingWriter:
     Raises:
         FileExistsError: there is such a file.
         ConfigError: it is to be replaced, and is being recorded right now.
-        OSError: it cannot be written.
     """
 
     def __init__(

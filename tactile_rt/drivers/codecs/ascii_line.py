@@ -72,9 +72,6 @@ class AsciiLineOptions:
 class AsciiLine(SerialCodec):
     """Numbers printed in lines: capacitive skins, lab whiskers, sketches for a serial plotter.
 
-    Args:
-        options: The columns, and how the board is started and stopped.
-
     Raises:
         ConfigError: the file or a column is wrong.
     """

@@ -95,8 +95,6 @@ class ArrayTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
     Attributes:
         version: Version of the file's format.
-        name: Name of the array.
-        frame: Name of the mount frame.
         rate_hz: Rate at which the device sends samples, Hz.
         elements: The place of each element, by name. Elements without a grid get their row and
             column from their names if all are named like whiskers, A0 to Z99; else they stand in
@@ -116,12 +114,9 @@ class LineMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=T
     Attributes:
         columns: The columns of a line, in order or with their names, as the module's docstring
             says.
-        name: Name of the array.
         pattern: Regular expression that a sample matches; its named groups are the names.
         record: Text with which the first line of a sample begins, if a sample has several lines
             and no names.
-        start: Text to send so that the board begins.
-        stop: Text to send so that the board ends.
         poll: Text to send for each sample; without one the board prints by itself.
     """
 
@@ -182,7 +177,6 @@ def parse_column(word: str, where: str) -> Column:
 
     Args:
         word: The column as a user writes it; see the module's docstring.
-        where: The place where the word stands, for the message.
 
     Raises:
         ConfigError: not of that form, an unknown unit, a scale that is none.
@@ -215,26 +209,13 @@ def parse_column(word: str, where: str) -> Column:
 
 
 def parse_columns(words: Iterable[str], where: str) -> tuple[Column, ...]:
-    """The columns of a line, from its words; one with a range is several.
-
-    Args:
-        words: The columns as a user writes them.
-        where: The place where the words stand, for the message.
-
-    Raises:
-        ConfigError: as `parse_column` and `expand_columns`.
-    """
+    """The columns of a line, from its words; one with a range is several."""
     each = [word for text in words for word in expand_columns(text, where)]
     return tuple(parse_column(word, f"{where}[{i}]") for i, word in enumerate(each))
 
 
 def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> ArraySpec:
     """The array that the columns make up, elements and channels as they first come.
-
-    Args:
-        mapping: Names and poses of the elements.
-        columns: The parsed columns of a line.
-        where: The place where the columns stand, for messages.
 
     Raises:
         ConfigError: a column is missing, doubled or of another unit, or a pose of no element.

@@ -63,7 +63,6 @@ def fields(line: str, words_are_names: bool = False) -> list[str]:
     two commas with nothing between them is one, too (``nan``).
 
     Args:
-        line: the line.
         words_are_names: whether a name may be several words, ``one reading: 5``.
     """
     text = (_NAMES if words_are_names else _NAME).sub(" ", _ARROW.sub(" ", in_seconds(line)))

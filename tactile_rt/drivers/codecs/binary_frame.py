@@ -68,15 +68,10 @@ class DescribedFrame(SerialCodec):
     """Frames of one length; counter, clock, status and checksum if they have one.
 
     Args:
-        mapping: what a frame is, and what the host sends.
-        where: the place of that description, for what is raised.
         rate_hz: rate at which the device sends, or is asked, Hz; 0 for that of the description.
 
     Raises:
         ConfigError: the frame cannot be so; names place and key.
-
-    Attributes:
-        frame: The frame as it was described.
     """
 
     cannot_detect = (

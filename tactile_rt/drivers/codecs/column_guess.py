@@ -76,7 +76,6 @@ def guess_columns(
     Args:
         names: what stands above the columns; empty without.
         rows: cells of some rows, None for what is no number.
-        dated: which columns hold dates or times of day.
     """
     width = len(names) or max((len(r) for r in rows), default=0)
     series = [_column(rows, k) for k in range(width)]
@@ -102,9 +101,6 @@ def guess_columns(
 def guess_line_columns(data: bytes) -> tuple[list[str], int, int] | None:
     """The columns of what a board prints: (words, lines that are samples, lines); None: there are
     none. Words have names where numbers do.
-
-    Args:
-        data: what came, cut anywhere.
     """
     first, *lines = data.decode("utf-8", "replace").replace("\r", "\n").split("\n")
     label = _LABELLED.match(first)

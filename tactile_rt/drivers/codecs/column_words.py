@@ -27,10 +27,6 @@ _LONGEST_GROUP: Final = 12  # words that are looked for as a group
 def expand_columns(text: str, where: str = "columns") -> tuple[str, ...]:
     """The columns of a list, one word each.
 
-    Args:
-        text: the list, between commas.
-        where: what is told where it is wrong.
-
     Raises:
         ConfigError: a quote or parenthesis that is not closed, ranges of a group that are not of
             one length, or too many columns.

@@ -28,10 +28,6 @@ _RANGE = re.compile(r"(\d+)\s*-\s*(\d+)")
 def check_dbc(file: str, text: str) -> None:
     """Refuse what no CAN bus can carry, and more than a sensor has.
 
-    Args:
-        file: the file, for the message.
-        text: what is in it.
-
     Raises:
         ConfigError: one line with the file and the message or signal.
     """

@@ -38,8 +38,6 @@ class Signal:
     """Where a number is in a frame's data.
 
     Attributes:
-        message: Name of the message that the signal is part of.
-        name: Name of the signal in the DBC file.
         start: The signal's lowest bit, counted from the lowest bit of byte 0; if `big`, the highest
             bit, counted from the highest of byte 0.
         length: Width of the signal, in bits.
@@ -86,7 +84,6 @@ class FramePart:
     """A frame that every sample has: a message, with these values of its multiplexers.
 
     Attributes:
-        id: CAN identifier of the message.
         extended: Whether the identifier has 29 bits.
         length: Length of the message's data, bytes.
         when: The multiplexers in the message, and the values of each that make a frame this part.
@@ -109,7 +106,6 @@ class DbcMapping:
     """How a sample is put together.
 
     Attributes:
-        spec: What the samples are.
         parts: The frames of a sample, in the order in which the device sends them.
         cells: The signal of each of (element * channel) values, and the parts that each is in.
         gain: Scale of each value, (element, channel), SI units per raw count.
@@ -117,7 +113,6 @@ class DbcMapping:
         counter: The signal that counts samples, and the parts that have it; None if there is none.
             The same holds for `time` and `status`.
         tick_ns: Length of a tick of `time`, ns; None if the device sends no time.
-        invalid: Bits of the status that make a sample invalid.
         commands: What the host sends and when: (command, frame, identifier of the answer).
     """
 

@@ -34,7 +34,6 @@ class EndFinder:
     endings between were damaged, and the last frame is whole.
 
     Args:
-        end: how each frame ends.
         size: length of a frame with its ending, bytes.
         stats: the account in which frames and bytes are counted.
     """
@@ -96,7 +95,6 @@ class StrideFinder:
     can measure.
 
     Args:
-        end: how each frame ends.
         size: length of a frame with its ending, bytes.
         possible: of (n, size) bytes, which of these n the device can have sent.
         stats: the account in which frames and bytes are counted.

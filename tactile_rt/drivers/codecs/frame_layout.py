@@ -146,19 +146,12 @@ def _within(raw: Row, limits: tuple[float, float] | None) -> NDArray[np.bool_]:
 class FrameLayout:
     """A mapping, checked, as a codec wants it.
 
-    Args:
-        mapping: contents of the file.
-        path: of the file, for what is raised.
-
     Raises:
         ConfigError: the frame cannot be so; names file and key.
 
     Attributes:
-        mapping: The contents of the file.
-        spec: What the samples are.
         sync, ends: The bytes with which a frame begins and ends.
         between: A pattern of what else comes between frames.
-        blocks: The numbers that are measured.
         count, time, status: The place of each of these; None without it.
         meanings: What the bits of the status mean, by their number.
         check_at, check_first: Offsets of the checksum, and of the first byte that it covers.

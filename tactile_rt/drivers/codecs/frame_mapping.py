@@ -36,7 +36,6 @@ class Checksum(_Table, frozen=True, kw_only=True):
     """``[checksum]``
 
     Attributes:
-        name: Name of the checksum, one of `frame_layout.CHECKSUMS`.
         at: Offset of the checksum; -1 for the last bytes before `ends`.
         first: Offset of the first byte that it covers.
         order: Byte order of the checksum; empty for that of the file.
@@ -54,14 +53,12 @@ class Values(_Table, frozen=True, kw_only=True):
 
     Attributes:
         at: Offset of the first number.
-        type: Type of the numbers.
         channels: Names of the channels; ``-`` for numbers that are not delivered, of which
             `possible` and `valid` are looked at.
         elements: Names of the elements; a whole number n for ``T0`` to ``Tn-1``, two for the rows
             (``A``, ``B``, ...) and columns (``A0``, ``A1``, ...) of a matrix.
         unit: Unit of a one times `scale`; empty for the unit that the channels' names say.
         scale: What a one stands for in `unit`, of all channels or of each in turn.
-        offset: What a zero stands for in `unit`.
         stride: Bytes from one element to the next, if other numbers lie between; 0 for none. (By
             channel: from one channel to the next.)
         possible: The least and the largest number that the device can send, as they are in the
@@ -149,7 +146,6 @@ class FrameMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=
         sync: The bytes with which each frame begins; empty for frames that only end alike.
         usually: Bytes with which a frame mostly begins, where a sync of one or two bytes is no
             evidence that damaged bytes were a frame.
-        values: The numbers that are measured.
         baud: Speed of the line, bit/s.
         usb: Whether the device is attached by USB itself, so that the speed means nothing.
         parity: Parity of the line: ``N``, ``E`` or ``O``.
@@ -158,11 +154,8 @@ class FrameMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=
         between: What else the device sends between frames, answers for example, in hexadecimal
             where ``..`` stands for any byte, or ``text:...``.
         checksum: The frame's checksum, if it has one.
-        count: The number of the sample, if it is there.
         time: The device's clock, if it is there.
         status: The device's status, if it is there.
-        start: What the host sends so that the device begins.
-        stop: What the host sends so that the device ends.
         poll: What the host sends for each sample; empty if the device sends by itself.
     """
 

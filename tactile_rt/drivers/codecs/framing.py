@@ -85,7 +85,6 @@ class ByteBuffer:
         """Drop all before the first `sync` (or what may become one); return how many bytes.
 
         Args:
-            sync: How a frame begins.
             keep: How many bytes at the beginning are not looked at.
         """
         at = self.data.find(sync, keep)
@@ -111,7 +110,6 @@ class FrameFinder:
     How damage is counted is told at the head of this module.
 
     Args:
-        sync: How a frame begins.
         size: Length of a frame, bytes.
         good: Tells of `size` bytes that begin with `sync` whether they are an intact frame.
         between: What else the device sends between frames.
@@ -250,9 +248,6 @@ class Rounds(Generic[T]):
 
     A round ends with part n - 1, or when a part comes that is not after the one before. Nothing
     tells that a round was lost whole, or that two halves of two rounds were.
-
-    Args:
-        parts: The number of parts, n.
     """
 
     def __init__(self, parts: int) -> None:
@@ -271,7 +266,6 @@ class Rounds(Generic[T]):
 
         Args:
             index: Which part has come, from 0 to n - 1.
-            part: What the frame carried.
         """
         # CAN may deliver a frame twice when its end is disturbed
         if self._n > 1 and self._newest == (index, part):

@@ -41,11 +41,7 @@ def sample_parts(head: bytes, body: bytes) -> list[bytes] | None:
 
 
 class SampleParts:
-    """Samples out of headers and parts, of the newest sample only.
-
-    Args:
-        stats: The account in which frames are counted.
-    """
+    """Samples out of headers and parts, of the newest sample only."""
 
     def __init__(self, stats: WireStats) -> None:
         self._stats = stats
@@ -195,8 +191,6 @@ def cut_description(kind: int, text: bytes, size: int) -> list[bytes]:
     """The data of the frames that carry a description.
 
     Args:
-        kind: Type of the message.
-        text: The description as JSON.
         size: The most data that a frame carries, bytes.
     """
     whole = len(text).to_bytes(2, "little") + text + zlib.crc32(text).to_bytes(4, "little")

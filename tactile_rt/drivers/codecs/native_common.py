@@ -65,7 +65,6 @@ class DeviceDescription:
     """What a native device says of itself.
 
     Attributes:
-        spec: The array that the device is.
         scale: SI units per count of int16, by channel.
     """
 
@@ -83,7 +82,6 @@ class DeviceDescription:
         """A description with scales for these largest readings, and +-pi rad.
 
         Args:
-            spec: The array that the device is.
             range_n: Largest force that an int16 can tell, N.
             range_nm: Largest moment that an int16 can tell, N m.
             range_si: Largest reading in any other unit that an int16 can tell.

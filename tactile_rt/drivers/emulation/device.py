@@ -124,15 +124,11 @@ class EmulatedSerial(EmulatedDevice):
     has no such speed, unless an option ``baud`` tells one; with ``baud=0`` none has.
 
     Args:
-        source: What the device measures.
-        codec: Name of the codec that it speaks.
         link: A symbolic link to the port, so that the port has the same name when it is plugged
             in again; None: /dev/pts/N.
         options: Options of the codec, and ``baud``, as in a URL.
-        faults: What goes wrong on the line.
         pace: ``realtime``, or ``fast``: every sample is sent as soon as it is read, over a line
             without a speed.
-        emulator: Further options of `Emulator`.
     """
 
     wire = "serial"

@@ -45,8 +45,6 @@ class Emulator:
     Args:
         codec: The codec that the device speaks. Without a `spec` it takes that of the source; else
             see `fit`. It also remembers what hosts have commanded.
-        source: What the device measures.
-        endpoint: The line that the device is plugged into.
         faults: What goes wrong; the schedule is used up.
         log: What was done to each sample: a record of each (17 bytes) if asked for, else counts
             only.

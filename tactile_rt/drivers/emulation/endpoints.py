@@ -31,7 +31,6 @@ class Endpoint(abc.ABC, Generic[Packet]):
     """The device's end of a line.
 
     Attributes:
-        wire: What the line is: ``serial`` or ``can``.
         address: What a host opens, the beginning of a source's URL; known once plugged in.
     """
 
@@ -64,7 +63,6 @@ class Endpoint(abc.ABC, Generic[Packet]):
         """Send, at once or as the host reads; False: nobody hears, or there is no room.
 
         Args:
-            packet: The packet to send.
             answer: Whether this answers a command: there is always room for that.
         """
 
@@ -218,8 +216,6 @@ class BusEndpoint(Endpoint[Sequence[CanFrame]]):
     """A device on a bus of python-can.
 
     Args:
-        name: ``INTERFACE:CHANNEL``, e.g. ``virtual:test``.
-        fd: Whether to open the bus for CAN FD.
         bitrate: Speed of the bus, bit/s, where the interface sets it.
 
     Raises:

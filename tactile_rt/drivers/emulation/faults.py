@@ -137,16 +137,7 @@ class Fault:
 
 
 class FaultSchedule:
-    """Which fault hits which sample; the same seed and times give the same faults.
-
-    Args:
-        faults: The faults that may happen.
-        seed: Seed of the random times and of `random`.
-
-    Attributes:
-        faults: The faults that may happen.
-        random: Random numbers for whoever carries the faults out.
-    """
+    """Which fault hits which sample; the same seed and times give the same faults."""
 
     def __init__(self, faults: tuple[Fault, ...] | list[Fault], seed: int = 0) -> None:
         self.faults = tuple(faults)
@@ -219,12 +210,7 @@ class Fate(IntEnum):
 
 
 class DeviceLog:
-    """What a device did with each of its samples.
-
-    Attributes:
-        counts: Number of samples by fate.
-        duplicated: Number of packets that were sent beyond one per sample.
-    """
+    """What a device did with each of its samples."""
 
     def __init__(self, kept: bool = True) -> None:
         self.counts: Counter[Fate] = Counter()

@@ -45,8 +45,6 @@ class Pty:
             hears it.
 
     Attributes:
-        path: Path of the terminal, once plugged in.
-        heard: Whether a host has the terminal open.
         queued: Number of bytes written and not yet passed on.
         lock: The lock that is held wherever the terminal's state is used.
     """

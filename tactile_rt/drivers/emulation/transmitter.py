@@ -27,17 +27,12 @@ class Transmitter:
     """Samples to packets to an endpoint, with faults on the way; in one thread at a time.
 
     Args:
-        codec: The codec that the device speaks.
-        endpoint: The line that the packets go to.
         faults: What goes wrong; None for nothing.
-        log: The record of what becomes of each sample.
-        clock: The clock of the device.
         start_count: First value of the device's counter.
 
     Attributes:
         end_ns: Time at which the stream ends, on the source's clock, ns; nothing goes wrong just
             before.
-        away: Whether a fault has the device pulled out.
     """
 
     def __init__(

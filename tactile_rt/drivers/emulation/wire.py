@@ -68,7 +68,6 @@ def misheard(data: bytes, spoken: int, heard: int) -> bytes:
     It looks at the line in the middle of its own bits, from the edge of each start bit on.
 
     Args:
-        data: what is sent.
         spoken: the speed at which it is sent, bit/s.
         heard: the speed that the receiver is set to, bit/s.
     """

@@ -23,13 +23,9 @@ class Import:
     """What became of a file that was imported.
 
     Attributes:
-        samples: The number of samples in the recording.
-        intact: The number of frames, lines or messages that were whole.
-        corrupt: The number of frames, lines or messages that were damaged.
         missing: The number of samples that never came, by the device's counter.
         seconds: The time from the first sample to the last, s.
         rate_hz: The nominal sample rate of the recording, Hz.
-        notes: What a user should know of it, a sentence each.
     """
 
     samples: int = 0
@@ -60,14 +56,10 @@ def write_chunks(
 
     Args:
         output: the file to write; it is there whole or not at all.
-        about: what it is of.
-        chunk: all samples.
         account: what became of the file; samples, seconds and rate are filled in.
-        what: the file that was read, for messages.
 
     Raises:
         RecordingError: no sample is valid.
-        OSError: it cannot be written.
     """
     if not chunk.valid.any():
         raise RecordingError(f"{what}: no number of a measurement in {len(chunk)} lines")

@@ -62,9 +62,7 @@ class BagTopic:
     """A topic of a bag.
 
     Attributes:
-        name: Name of the topic.
         type: Type of the topic's messages.
-        messages: Number of messages in the topic.
         columns: What each is a sample of, in the words of ``--columns``; empty where only a user
             can tell.
     """
@@ -80,7 +78,6 @@ class OpenBag:
     """A bag that is open.
 
     Attributes:
-        reader: The bag, as rosbags reads it.
         notes: What could not be read, a sentence each.
     """
 
@@ -153,7 +150,6 @@ def bag_topics(path: Path) -> list[BagTopic]:
 
     Raises:
         ConfigError: the extra is not installed.
-        RecordingError: the bag is damaged.
     """
     found = []
     with open_bag(path) as bag:
@@ -173,7 +169,6 @@ def proposed_columns(path: Path, topic: BagTopic) -> str:
 
     Raises:
         ConfigError: the extra is not installed.
-        RecordingError: the bag is damaged.
     """
     with open_bag(path) as bag:
         paths = [p for p in _paths(bag, topic) if not p.startswith(BESIDE)]
@@ -196,7 +191,6 @@ def import_bag(
     """Write a topic of a bag as a recording.
 
     Args:
-        path: the bag.
         output: the recording; it is there whole or not at all.
         topic: its name; empty where only one can be a recording.
         columns: which fields of a message are what, or a TOML file of it; empty for what is known
@@ -207,7 +201,6 @@ def import_bag(
     Raises:
         ConfigError: no such topic, columns that cannot be, or the extra is not installed.
         RecordingError: the bag is damaged, or holds no sample.
-        OSError: a file cannot be read or written.
     """
     if path.is_file() and path.suffix == ".mcap" and _is_ours(path):
         raise ConfigError(f"{path} is a recording already: `tactile-rt replay` and run take it")

@@ -51,12 +51,8 @@ class CsvForm:
 
     Attributes:
         delimiter: What stands between cells; a space stands for any of spaces and tabs.
-        comma: Whether numbers have a decimal comma.
         names: Names of the columns; empty for a table without.
         units: What stands below the names, a unit each; empty for a table without.
-        first: Number of lines before the first row.
-        width: Number of cells of a row.
-        lines: Number of lines of text that are one row.
     """
 
     delimiter: str
@@ -76,13 +72,9 @@ def csv_form(
     Args:
         path: the file; gzip is unpacked.
         delimiter: what stands between cells, if it is told: a character, tab or space.
-        decimal: ``,`` or ``.``, if it is told.
-        skip: lines to pass over at the beginning.
-        lines: lines of text that are one row.
 
     Raises:
         RecordingError: its lines are no table of numbers.
-        OSError: it cannot be read.
     """
     with open_log_file(path) as file, _text(file) as text:
         head = list(islice(_joined(text, skip, lines), LOOKED_AT))
@@ -114,11 +106,7 @@ def csv_form(
 
 
 def read_table(path: Path, form: CsvForm) -> Table:
-    """The rows of a table.
-
-    Raises:
-        OSError: the file cannot be read.
-    """
+    """The rows of a table."""
     table = Table(path, form.names, ())
     table.rows = _rows(table, form)
     return table

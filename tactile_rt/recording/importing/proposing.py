@@ -22,10 +22,7 @@ class ProposedColumns:
     """What may be in the columns of a file.
 
     Attributes:
-        columns: The columns in words.
         table: Whether the file is to be read as a table; else as what a board prints.
-        timed: Whether one of the columns is a time.
-        said: What the file is, for the user.
     """
 
     columns: str
@@ -51,15 +48,7 @@ def line_columns(data: bytes) -> tuple[str, int] | None:
 
 
 def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
-    """The columns of a file of text; None where it has none.
-
-    Args:
-        path: the file.
-        data: how it begins.
-
-    Raises:
-        OSError: it cannot be read.
-    """
+    """The columns of a file of text; None where it has none."""
     try:
         form = csv_form(path)
     except RecordingError:
@@ -75,11 +64,7 @@ def propose_columns(path: Path, data: bytes) -> ProposedColumns | None:
 
 
 def propose_line_columns(data: bytes) -> ProposedColumns | None:
-    """The columns of what a board printed; None where it printed no samples.
-
-    Args:
-        data: how that begins.
-    """
+    """The columns of what a board printed; None where it printed no samples."""
     told = line_columns(data)
     if told is None:
         return None

@@ -50,7 +50,6 @@ class Table:
     """Rows as they are read.
 
     Attributes:
-        path: Path of the file that they are in.
         names: Names of the columns; empty for a table without.
         rows: The rows, each with as many cells as there are columns: texts or numbers.
         times_ns: The times of the rows that were read so far, ns, of a table that has times beside
@@ -118,7 +117,6 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     """Write rows of numbers as a recording.
 
     Args:
-        table: the rows.
         output: the recording; it is there whole or not at all.
         columns: what is in which column: words, or the path of a TOML file.
         rate_hz: rate of the samples, Hz; 0: by their times.
@@ -126,7 +124,6 @@ def import_table(table: Table, output: Path, columns: str, rate_hz: float = 0.0)
     Raises:
         ConfigError: the columns cannot be, or nothing tells the time.
         RecordingError: there is no row of numbers.
-        OSError: a file cannot be read or written.
     """
     mapping = mapping_of(columns, table.path.stem)
     where = columns if columns.endswith(".toml") else "--columns"
@@ -254,11 +251,7 @@ def _whole(cell: Any) -> int:
 
 
 def _time(cell: Any, column: Column) -> int:
-    """A time in ns, exactly where it is written in decimals.
-
-    Raises:
-        ValueError: it is none.
-    """
+    """A time in ns, exactly where it is written in decimals."""
     unit = NS[column.kind]
     if isinstance(cell, int | np.integer):
         text = str(int(cell))

@@ -39,7 +39,6 @@ def import_wire(
     """Decode a log, and write samples and packets as a recording.
 
     Args:
-        log: what was logged.
         output: the recording; it is there whole or not at all.
         fields: ``codec`` and its options, as in a URL, also ``array``.
         rate_hz: rate of the samples, Hz; 0 for the codec's.
@@ -47,7 +46,6 @@ def import_wire(
     Raises:
         ConfigError: no such codec or option, or a device that describes itself did not.
         RecordingError: there is no whole sample.
-        OSError: a file cannot be read or written.
     """
     codec, about = _prepared(log, fields, rate_hz)
     if log.form == "raw":
