@@ -1,9 +1,9 @@
 """Any board that prints numbers; a file, or a few words, say which number is what.
 
 Numbers stand at their places in a line, between spaces, tabs, commas, semicolons and brackets; or
-after their names, in one line, in several, or in JSON; or where a regular expression says. Lines
-end with a carriage return, a line feed or both. The first line after joining is not believed, for
-it may have lost its beginning; banners and headers are known by their words.
+after their names, in one line, in several, or in JSON. Lines end with a carriage return, a line
+feed or both. The first line after joining is not believed, for it may have lost its beginning;
+banners and headers are known by their words.
 """
 
 import re
@@ -109,8 +109,7 @@ class AsciiLine(SerialCodec):
                 self.tick_bits = c.bits
                 if c.kind in ("s", "iso"):
                     self.tick_bits, self._per_tick = NEVER_WRAPS, 1e-6 / c.scale
-        self._names, self._pattern = _names(mapping, columns, where)
-        self._record = mapping.record
+        self._names = _find_names(columns, where)
         self._start = (options.start or mapping.start).encode()
         self._stop = (options.stop or mapping.stop).encode()
         self._poll = (options.poll or mapping.poll).encode()
@@ -144,7 +143,6 @@ class AsciiLine(SerialCodec):
         self._damaged = 0
         self._open: dict[int, float] = {}  # of a sample of several lines: what has come
         self._begun = False  # not in the middle of it
-        self._lines: list[str] = []
         self._open_ns = 0
 
     def commands(self, command: Command) -> tuple[Step[bytes], ...]:
@@ -180,10 +178,8 @@ class AsciiLine(SerialCodec):
         return packets
 
     def _printed_line(self, words: list[str]) -> str:
-        if self._pattern is not None:
-            raise ConfigError("a board that a pattern describes cannot be emulated: give columns")
         if self._names is None:
-            return self._record + " " * bool(self._record) + ",".join(words)
+            return ",".join(words)
         said: dict[str, Any] = {}
         for column, word in zip(self._columns, words, strict=True):
             *path, last = column.label.split(".")
@@ -224,37 +220,23 @@ class AsciiLine(SerialCodec):
             if joined:
                 self._refuse()
             return
-        if self._names is None and self._pattern is None and not self._record:
+        if self._names is None:
             words = line.translate(_SPACES).split()
             if len(words) == self._width and _PLAIN.fullmatch(line) and b",," not in line:
                 try:
-                    self._take([float(word) for word in words], len(line), t_ns)
+                    self._take([float(word) for word in words], t_ns)
                     return
                 except ValueError:  # 1-2, say
                     pass
         text = line.decode("utf-8", "replace")
-        if self._names is not None and self._pattern is None:
+        if self._names is not None:
             self._gather(text, t_ns)
-            return
-        if self._record and text.lstrip().startswith(self._record):
-            if self._lines:
-                self._refused(" ".join(self._lines))
-            self._lines = [text.lstrip().removeprefix(self._record)]
-        elif self._record and not self._lines:
-            self.stats.skipped += len(text)
-            self.complaint = f"line {quoted(text)} does not begin with {self._record!r}"
-            return
+        elif (row := self._row(text)) is not None:
+            self._take(row, t_ns)
         else:
-            self._lines.append(text)
-        whole = "\n".join(self._lines)
-        row = self._row(whole)
-        if row is not None:
-            self._lines = []
-            self._take(row, len(whole), t_ns)
-        elif not self._record or len(whole) > self._longest:
-            self._refused(whole)
+            self._refused(text)
 
-    def _take(self, row: list[float], length: int, t_ns: int) -> None:
+    def _take(self, row: list[float], t_ns: int) -> None:
         """A row is a sample, if what counts in it is a whole number, and the time a time."""
         count = row[self._count] if self.count_bits is not None else 0.0
         ticks = row[self._time] / self._per_tick if self.tick_ns is not None else 0.0
@@ -268,13 +250,7 @@ class AsciiLine(SerialCodec):
             self._refuse()
 
     def _row(self, text: str) -> list[float] | None:
-        """The numbers of a sample, by their places or by the pattern."""
-        if self._pattern is not None:
-            found = self._pattern.search(text)
-            if found is None:
-                return None
-            said = found.groupdict()
-            return [_or_nan(said[c.label]) if c.label else NAN for c in self._columns]
+        """The numbers of a sample, by their places."""
         for words_are_names in (False, True):
             words = fields(text, words_are_names)
             if text.rstrip().endswith((",", ";")) and len(words) == self._width - 1:
@@ -328,13 +304,12 @@ class AsciiLine(SerialCodec):
             absent = [c.label for i, c in enumerate(self._columns) if i not in came]
             self.complaint = f"{', '.join(map(repr, absent))} did not come"
         if 2 * len(came) >= self._width:
-            self._take([came.get(i, NAN) for i in range(self._width)], 0, self._open_ns)
+            self._take([came.get(i, NAN) for i in range(self._width)], self._open_ns)
         else:
             self._refuse()
 
     def _refused(self, text: str) -> None:
         """Count a line that is no sample as what it is, and say why it is none."""
-        self._lines = []
         words = fields(text)
         numbers = [w for w in words if number(w) is not None]
         if words:
@@ -348,8 +323,6 @@ class AsciiLine(SerialCodec):
         if sum(not c.isprintable() or c == "\ufffd" for c in text) * 8 > len(text):
             return "what comes is not text: wrong baud rate?"
         line = f"line {quoted(text.strip())}"
-        if self._pattern is not None:
-            return f"{line} does not match the pattern"
         for k, (column, word) in enumerate(zip(self._columns, words, strict=False)):
             if number(word) is None and column.kind != "-":
                 name = f"{column.element}.{column.channel}" if column.element else column.kind
@@ -377,29 +350,13 @@ class AsciiLine(SerialCodec):
         return Samples(values, np.isfinite(values).all(axis=2), arrived, damaged, count, ticks)
 
 
-def _or_nan(word: str | None) -> float:
-    found = number(fields(word)[0]) if word and fields(word) else None
-    return NAN if found is None else found
-
-
-def _names(
-    mapping: LineMapping, columns: tuple[Column, ...], where: str
-) -> tuple[Names | None, re.Pattern[str] | None]:
-    """How numbers are found, if not by their places."""
+def _find_names(columns: tuple[Column, ...], where: str) -> Names | None:
+    """Return what finds numbers by their names; None where places tell."""
     labels = {c.label: i for i, c in enumerate(columns) if c.label}
-    pattern = None
-    if mapping.pattern:
-        try:
-            pattern = re.compile(mapping.pattern, re.DOTALL)
-        except re.error as error:
-            raise ConfigError(f"{where}: pattern: {error}") from None
-        for label in labels:
-            if label not in pattern.groupindex:
-                raise ConfigError(f"{where}: pattern has no group (?P<{label}>...)")
-    if not labels and not pattern:
-        return None, None
+    if not labels:
+        return None
     if len(labels) != len(columns):
         told = [c.label for c in columns]
         what = next((f"{t!r} stands there twice" for t in told if t and told.count(t) > 1), "")
         raise ConfigError(f"{where}: " + (what or "give all columns a name, NAME=COLUMN, or none"))
-    return Names(labels), pattern
+    return Names(labels)

@@ -114,16 +114,11 @@ class LineMapping(ArrayTable, frozen=True, forbid_unknown_fields=True, kw_only=T
     Attributes:
         columns: The columns of a line, in order or with their names, as the module's docstring
             says.
-        pattern: Regular expression that a sample matches; its named groups are the names.
-        record: Text with which the first line of a sample begins, if a sample has several lines
-            and no names.
         poll: Text to send for each sample; without one the board prints by itself.
     """
 
     columns: tuple[str, ...]
     name: str = "ascii_line"
-    pattern: str = ""
-    record: str = ""
     start: str = ""
     stop: str = ""
     poll: str = ""

@@ -21,7 +21,6 @@ MOST: Final = 100_000  # columns of a line
 _RANGE: Final = re.compile(r"\{(\d{1,6})\.\.(\d{1,6})\}")
 _NUMBER: Final = re.compile(r"\d{1,6}")
 _NOTHING: Final = re.compile(r"-\d+")
-_LONGEST_GROUP: Final = 12  # words that are looked for as a group
 
 
 def expand_columns(text: str, where: str = "columns") -> tuple[str, ...]:
@@ -51,26 +50,19 @@ def expand_columns(text: str, where: str = "columns") -> tuple[str, ...]:
 
 
 def compress_columns(words: Sequence[str]) -> str:
-    """The shortest list that `expand_columns` makes these words of."""
+    """Write words as a list for `expand_columns`, with a range for words that count up."""
     quoted = [_quoted(word) for word in words]
-    shapes = [_NUMBER.split(word) for word in quoted]
-    numbers = [[int(x) for x in _NUMBER.findall(word)] for word in quoted]
     parts: list[str] = []
     at = 0
-    while at < len(words):
-        size, times, steps = _longest_group(shapes, numbers, at)
-        if times < 2:
-            parts.append(quoted[at])
-            at += 1
-            continue
-        group = [_ranged(quoted[at + i], steps[i], times) for i in range(size)]
-        text = group[0] if size == 1 else f"({','.join(group)})"
-        if expand_columns(text) == tuple(words[at : at + size * times]):
-            parts.append(text)
-            at += size * times
-        else:  # numbers of one width for a part of them
-            parts.append(quoted[at])
-            at += 1
+    while at < len(quoted):
+        n = 1
+        while at + n < len(quoted) and _counts_up(quoted[at], quoted[at + n], n):
+            n += 1
+        text = _ranged(quoted[at], quoted[at + n - 1], n)
+        if expand_columns(text) != tuple(words[at : at + n]):  # of numbers of one width, say
+            text, n = quoted[at], 1
+        parts.append(text)
+        at += n
     return ",".join(parts)
 
 
@@ -115,39 +107,23 @@ def _at(word: str, k: int) -> str:
     return _RANGE.sub(number, word)
 
 
-def _longest_group(
-    shapes: Sequence[list[str]], numbers: Sequence[list[int]], at: int
-) -> tuple[int, int, list[list[bool]]]:
-    """How many words from here make a group, how often it comes, and which numbers go up."""
-    best: tuple[int, int, list[list[bool]]] = (1, 1, [])
-    for size in range(1, min(_LONGEST_GROUP, (len(shapes) - at) // 2) + 1):
-        steps: list[list[bool]] = []
-        for i in range(at, at + size):
-            up = [b - a for a, b in zip(numbers[i], numbers[i + size], strict=False)]
-            if shapes[i] != shapes[i + size] or not set(up) <= {0, 1} or 1 not in up:
-                break
-            steps.append([u == 1 for u in up])
-        if len(steps) < size:
-            continue
-        times = 2
-        while at + (times + 1) * size <= len(shapes) and all(
-            shapes[at + i + times * size] == shapes[at + i]
-            and numbers[at + i + times * size]
-            == [n + times * up for n, up in zip(numbers[at + i], steps[i], strict=True)]
-            for i in range(size)
-        ):
-            times += 1
-        if size * times > best[0] * best[1]:
-            best = size, times, steps
-    return best
+def _counts_up(first: str, other: str, n: int) -> bool:
+    """Return whether the other is the first with numbers that are n more, or the same."""
+    steps = {
+        int(b) - int(a)
+        for a, b in zip(_NUMBER.findall(first), _NUMBER.findall(other), strict=False)
+    }
+    return _NUMBER.split(first) == _NUMBER.split(other) and n in steps and steps <= {0, n}
 
 
-def _ranged(word: str, up: list[bool], times: int) -> str:
-    """The word with a range for each number that goes up."""
-    goes = iter(up)
+def _ranged(first: str, last: str, n: int) -> str:
+    """Write the first word with a range for each number that differs in the last."""
+    if n == 1:
+        return first
+    ends = iter(_NUMBER.findall(last))
 
     def number(found: re.Match[str]) -> str:
-        n, width = int(found[0]), len(found[0])
-        return f"{{{found[0]}..{n + times - 1:0{width}d}}}" if next(goes) else found[0]
+        end = next(ends)
+        return found[0] if end == found[0] else f"{{{found[0]}..{end}}}"
 
-    return _NUMBER.sub(number, word)
+    return _NUMBER.sub(number, first)

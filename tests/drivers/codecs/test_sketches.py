@@ -181,38 +181,12 @@ def test_a_missing_number_costs_its_element_and_not_the_sample() -> None:
     assert named.complaint == "'w' did not come"
 
 
-def test_a_pattern_says_where_the_numbers_are(tmp_path) -> None:
-    path = tmp_path / "board.toml"
-    path.write_text(
-        "columns = ['a=A0.fx', 'b=A0.fy', 'n=count:8']\n"
-        "pattern = '#(?P<n>\\d+) p(?P<a>[-\\d.]+)q(?P<b>[-\\d.]*)'\n"
-    )
-    codec = AsciiLine(AsciiLineOptions(mapping=str(path)))
-    samples = codec.feed(b"\nhello\n#7 p1.5q-2 !\n#8 p1q\n#9 p.q1\n", T0)
-    assert samples.values[0].tolist() == [[1.5, -2.0]] and samples.count.tolist() == [7, 8, 9]
-    assert samples.valid.ravel().tolist() == [True, False, False]
-    assert codec.feed(b"p1q2\n", T0) is None
-    assert codec.complaint == "line 'p1q2' does not match the pattern"
-
-
-def test_a_sample_of_several_lines_without_names(tmp_path) -> None:
-    path = tmp_path / "board.toml"
-    path.write_text("columns = ['count', 'A0.fx', 'A0.fy', 'B0.fx', 'B0.fy']\nrecord = 'Sample'\n")
-    codec = AsciiLine(AsciiLineOptions(mapping=str(path)))
-    lines = b"9 9\nSample 1\n 0.5 1.5\n 2.5 3.5\n\nSample 2\n 1 2\nSample 3\n 1 2\n 3 4\n"
-    samples = codec.feed(b"\n" + lines, T0)
-    assert samples.count.tolist() == [1, 3] and samples.damaged.tolist() == [0, 1]
-    assert samples.values[0].tolist() == [[0.5, 1.5], [2.5, 3.5]]
-
-
 @pytest.mark.parametrize(
     "text, message",
     [
         ("columns = ['x=A0.fx', 'A0.fy']", "give all columns a name, NAME=COLUMN, or none"),
         ("columns = ['x=A0.fx', 'x=A0.fy']", "'x' stands there twice"),
         ("columns = ['=A0.fx']", "columns[0]: '=A0.fx' has no name before ="),
-        ("columns = ['x=A0.fx']\npattern = '('", "pattern: missing ), unterminated subpattern"),
-        ("columns = ['x=A0.fx']\npattern = 'a'", "pattern has no group (?P<x>...)"),
     ],
 )
 def test_mistakes_are_named(tmp_path, text, message) -> None:
