@@ -73,13 +73,6 @@ FILES = {
         lambda: b"Zeit,Fx\n[s],[mN]\n" + b"".join(b"%d,%d\n" % (k, k * k % 7) for k in range(40)),
         "--columns Zeit=time:s,Fx=S.fx:mN",
     ),
-    "seconds and the rest": (
-        lambda: b"".join(
-            b"%d,%d,ft,%d\n" % (1_700_000_000 + k // 4, k % 4 * 250_000_000, k * k % 7)
-            for k in range(40)
-        ),
-        "--columns time:s,time:ns,-,T0.value",
-    ),
     "columns that are there in turn, or never": (
         lambda: b"t,a,b,c\n" + b"".join(
             b"0.%02d,%s,\n" % (k, b"%d," % k if k % 2 else b",%d" % k) for k in range(40)

@@ -26,8 +26,7 @@ Rows = Sequence[Sequence[float | None]]
 
 _TIME: Final = re.compile(
     r"(?:%|.*[._ ])?"
-    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed|x_value"
-    r"|zeit|zeitstempel|temps|tiempo|tempo|tijd|tid)"
+    r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed)"
     r"(?:[_ ]?(?:s|sec|ms|us|µs|ns|nsec))?", re.IGNORECASE,
 )  # fmt: skip
 _COUNT: Final = re.compile(
@@ -83,18 +82,17 @@ def guess_columns(
     time = _place_time(names, series, dated)
     if time is not None:
         kinds[time[0]] = time[1]
-        if _is_part_of_a_second(series, time[0] + 1):
-            kinds[time[0] + 1] = "time:ns"
     count = _place_count(names, series, kinds)
     if count is not None:
         kinds[count] = "count"
-    for k, name in enumerate(
-        names
-    ):  # times and counts beside those, and what never changes in a log
-        if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _is_index(name, series[k])):
+    for k, name in enumerate(names):  # times and counts beside those
+        if not kinds[k] and (_TIME.fullmatch(_bare(name)) or _COUNT.fullmatch(_bare(name))):
             kinds[k] = "-"
     measured = [k for k, kind in enumerate(kinds) if not kind]
-    words = _by_names(names, series, measured) if names else _by_places(measured)
+    if names:
+        words = _by_names(names, measured)
+    else:
+        words = {k: f"T{i}.value" for i, k in enumerate(measured)}
     return [words.get(k, kinds[k] or "-") for k in range(width)], time is not None
 
 
@@ -240,14 +238,8 @@ def _place_time(
 ) -> tuple[int, str] | None:
     for k in sorted(dated):
         return k, "time:iso"
-    for k in range(len(series)):
-        if _is_part_of_a_second(series, k + 1):
-            return k, "time:s"
-    known = [k for k, name in enumerate(names) if _TIME.fullmatch(_bare(name))] or [
-        k
-        for k, name in enumerate(names)
-        if _IN_SECONDS.search(name)  # of any language
-    ]
+    known = [k for k, name in enumerate(names) if _TIME.fullmatch(_bare(name))]
+    known = known or [k for k, name in enumerate(names) if _IN_SECONDS.search(name)]
     for k in [*known, *(() if known else range(len(series)))]:
         v = series[k]
         if v is None or len(v) < 2 or not np.isfinite(v).all():
@@ -267,14 +259,6 @@ def _place_time(
 def _is_utc(v: NDArray[np.float64]) -> bool:
     """Whether these are times from 1970 on, of 2001 to 2065, in s, ms, us or ns."""
     return any(1e9 * unit <= v[0] <= v[-1] <= 3e9 * unit for unit in (1, 1e3, 1e6, 1e9))
-
-
-def _is_part_of_a_second(series: Sequence[NDArray[np.float64] | None], k: int) -> bool:
-    """Whether these are the nanoseconds of the seconds in the column before, as ROS has it."""
-    if k >= len(series) or (v := series[k]) is None or (seconds := series[k - 1]) is None:
-        return False
-    whole = np.isfinite(v).all() and (v % 1 == 0).all() and (seconds % 1 == 0).all()
-    return bool(whole and _is_utc(seconds) and 0 <= v.min() and 1e6 < v.max() < 1e9)
 
 
 def _time_unit(name: str, v: NDArray[np.float64]) -> str:
@@ -309,21 +293,7 @@ def _place_count(
     return None
 
 
-def _is_index(name: str, v: NDArray[np.float64] | None) -> bool:
-    """Whether this is a number of something, which goes up but counts no samples."""
-    if v is None or not _COUNT.fullmatch(_bare(name)):
-        return False
-    steps = np.diff(v[np.isfinite(v)])
-    return bool(len(steps)) and bool((steps >= 0).all())
-
-
-def _by_places(measured: Sequence[int]) -> dict[int, str]:
-    return {k: f"T{i}.value" for i, k in enumerate(measured)}
-
-
-def _by_names(
-    names: Sequence[str], series: Sequence[NDArray[np.float64] | None], measured: Sequence[int]
-) -> dict[int, str]:
+def _by_names(names: Sequence[str], measured: Sequence[int]) -> dict[int, str]:
     """Element, channel and unit of each; those alone of which every element has all channels."""
     parsed = {k: _parsed(names[k]) for k in measured}
     known = {k: p for k, p in parsed.items() if p[1]}

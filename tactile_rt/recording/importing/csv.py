@@ -28,12 +28,6 @@ LOOKED_AT: Final = 200  # lines
 ENOUGH: Final = 0.5  # of the lines that are looked at are rows
 DELIMITERS: Final = (";", "\t", ",", "|", " ")
 NAMES: Final = {"tab": "\t", "space": " ", "comma": ",", "semicolon": ";"}
-REMARKED: Final = (
-    "comment",
-    "comments",
-    "remark",
-    "note",
-)  # a last column that is hardly ever there
 REMARKS: Final = ("#", "%", "//")
 LONGEST: Final = 1 << 20  # characters of a line
 _COMMA: Final = re.compile(r"\s*[+-]?\d+,\d+(?:[eE][+-]?\d+)?\s*")
@@ -243,8 +237,6 @@ def _names(
             cells = cells[1:] if cells[:1] == ["%"] else cells
         if len(cells) == width - 1 and delimiter != " " and text.rstrip().endswith(delimiter):
             cells.append("")
-        if len(cells) == width + 1 and cells[-1].lower() in REMARKED:
-            del cells[-1]
         words = [c for c in cells if c and not _is_number(c)]
         numbers = sum(map(_is_number, cells))
         if len(cells) != width or 2 * len(words) < width or 2 * numbers >= width:

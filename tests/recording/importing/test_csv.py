@@ -36,10 +36,6 @@ WRITTEN = {
     "units without brackets": (
         "t;x;y\ns;mN;mN\n", "{s:.2f};{a};{b}\n", "t=time:s,x=S.fx:mN,y=S.fy:mN",
     ),
-    "LabVIEW": (
-        "Samples\t60\t60\t\nX0\t0.0\t0.0\n***End_of_Header***\t\nX_Value\tFx\tFy\tComment\n",
-        "{s:.2f}\t{a}\t{b}\n", "X_Value=time:s,Fx=S.fx:mN,Fy=S.fy:mN",
-    ),
     "above it": (
         "Sensor: ATI mini40\nRate, 100\n\nt,x,y\n", "{s:.2f},{a},{b}\n",
         "t=time:s,x=S.fx:mN,y=S.fy:mN",
