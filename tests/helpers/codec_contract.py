@@ -149,6 +149,21 @@ class CodecContract:
                 usable = stacked(samples, "valid").all(axis=1)
                 assert (near <= allowed).all(axis=(2, 3)).any(axis=1)[usable].all()
 
+    def test_it_finds_back_after_any_damage(self, sent: tuple[Any, np.ndarray]) -> None:
+        wire, signal = sent
+        draw = random.Random(6)
+        exact = self.case.make().wire == "serial" and not self.case.resync
+        for _ in range(40 if exact else 0):
+            codec = self.case.make()
+            for packet in mutations(wire, draw, 500):
+                codec.feed(packet, T0)
+            samples = decode(codec, wire)
+            values, least = stacked(samples, "values"), len(signal) - 2
+            assert values is not None and len(values) >= least
+            off = np.abs(values[-least:] - signal[len(signal) - least :].astype(np.float32))
+            near = off <= np.asarray(self.case.tolerance) + 1e-6 * np.abs(signal[-least:])
+            assert (near.all(axis=2) | ~stacked(samples, "valid")[-least:]).all()
+
     def test_no_input_raises_or_piles_up(self, sent: tuple[Any, np.ndarray]) -> None:
         wire, _ = sent
         codec = self.case.make()

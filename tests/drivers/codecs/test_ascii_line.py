@@ -1,6 +1,5 @@
 """Boards that print numbers."""
 
-import random
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from tests.helpers.codec_contract import (
     CodecContract,
     chunk_of,
     decode,
-    mutations,
     stacked,
 )
 
@@ -205,18 +203,6 @@ def test_any_numbers_with_any_separators(
     assert samples is not None
     assert np.array_equal(samples.values.reshape(-1, 4), np.array(rows, np.float32))
     assert codec.stats.corrupt == codec.stats.skipped == 0
-
-
-def test_it_finds_back_after_any_damage() -> None:
-    clean = signal(20)
-    wire = b"".join(ascii_line().encode(chunk_of(ascii_line(), clean)))
-    draw = random.Random(6)
-    for _ in range(40):
-        codec = ascii_line()
-        for packet in mutations(wire, draw, 500):
-            codec.feed(packet, T0)
-        values = stacked(decode(codec, wire), "values")
-        assert np.array_equal(values[-20:], clean.astype(np.float32))
 
 
 BAD_COLUMNS = [

@@ -206,9 +206,3 @@ def test_its_even_parity_does_not_lock_a_pty() -> None:
     finally:
         os.close(master)
         os.close(slave)
-
-
-@pytest.mark.parametrize("wrong", [{"slave": 0}, {"rate_hz": -1.0}])
-def test_options_are_checked(wrong: dict[str, float]) -> None:
-    with pytest.raises(ConfigError, match="must be"):
-        ati(**wrong)

@@ -7,7 +7,6 @@ import pytest
 
 from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.ati_can import AtiCan, AtiCanOptions
-from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 RESOLUTION = [290 / 32767 / 2] * 3 + [10 / 32767 / 2] * 3
@@ -142,16 +141,6 @@ def test_what_is_no_reply_is_refused() -> None:
         CanFrame(0x7F8, b"\x09\x01"), CanFrame(0x7F3, bytes(8)),
     ]  # fmt: skip
     assert host.feed(wrong, T0) is None and host.stats.corrupt == 5
-
-
-def test_mistakes_are_named() -> None:
-    for wrong, message in (
-        ({"base": 0x80}, "base must be from 0 to 0x7f, not 0x80"),
-        ({"calibration": 16}, "calibration must be from 0 to 15, or -1, not 16"),
-        ({"rate_hz": -1}, "rate_hz must be positive, not -1"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            ati(**wrong)
 
 
 def test_what_another_host_asks_is_no_damage() -> None:

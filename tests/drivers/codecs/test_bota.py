@@ -7,7 +7,6 @@ import pytest
 
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.bota import Bota, BotaOptions
-from tactile_rt.errors import ConfigError
 from tactile_rt.stream import Chunk
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
@@ -148,12 +147,3 @@ def test_what_has_no_value_is_sent_as_invalid() -> None:
     assert not samples.valid.any() and np.isfinite(samples.values).all()
     # what is not finite is no measurement, whatever the status says
     assert not Bota(BotaOptions()).feed(wire([np.nan] + [0] * 5), T0).valid.any()
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [({"sinc": 20}, "sinc must be 51 to 512"), ({"baud": 1_000_000}, "baud must be one of 9600")],
-)
-def test_wrong_options(options: dict[str, int], says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
-        BotaOptions(**options)

@@ -5,7 +5,6 @@ import pytest
 
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.ft300 import Ft300, Ft300Options
-from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 
@@ -111,8 +110,3 @@ def test_the_beginning_may_stand_in_a_frame() -> None:
     assert frame.startswith(b"\x20\x4e" * 7)
     samples = decode(host, frame[6:] + 20 * frame)
     assert sum(map(len, samples)) == 20 and host.stats.corrupt == 0
-
-
-def test_wrong_options() -> None:
-    with pytest.raises(ConfigError, match="slave must be a Modbus address, 1 to 247, not 0"):
-        Ft300Options(slave=0)

@@ -10,7 +10,6 @@ from tactile_rt.drivers.codecs.optoforce import (
     OptoForceOptions,
     OptoForceSerial,
 )
-from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import (
     T0,
     CodecCase,
@@ -223,23 +222,6 @@ def test_a_device_on_can_is_configured() -> None:
     assert host.feed(answer, T0) is None
     assert len(host.feed(join(device, device.encode(chunk_of(device, counts(1, 3)))), T0)) == 40
     assert host.stats.corrupt == host.stats.incomplete == 0
-
-
-@pytest.mark.parametrize(
-    ("options", "says"),
-    [
-        ({"model": "5d"}, "model must be one of 3d, 4x3d, 6d"),
-        ({"rate_hz": 200}, "rate_hz must be one of 1000, 333, 100, 30, 10, not 200"),
-        ({"filter_hz": 1.0}, "filter_hz must be one of 0, 500, 150, 50, 15, 5, 1.5, not 1"),
-        ({"counts": "1,2"}, "counts must be 3 numbers"),
-        ({"counts": "1,2,x"}, "counts must be numbers"),
-        ({"counts": "1,2,0"}, "counts must be positive"),
-        ({"host_id": "0x800"}, "host_id must be 0 to 0x7ff, not '0x800'"),
-    ],
-)
-def test_wrong_options(options: dict[str, str], says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
-        OptoForceCanOptions(**options)
 
 
 def test_each_sensor_may_have_its_own_sensitivity() -> None:

@@ -7,7 +7,6 @@ import pytest
 
 from tactile_rt.drivers.codec import Command
 from tactile_rt.drivers.codecs.tsf85 import Tsf85, Tsf85Options
-from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 # By hand from the format: taxel k of finger 0 counts k, of finger 1 256 + k; then one packet with
@@ -139,12 +138,3 @@ def test_the_commands() -> None:
     assert device.streaming
     device.respond(host.commands(Command.STOP)[0].send + bytes.fromhex("9a006100"))
     assert not device.streaming and device.polled == 1
-
-
-@pytest.mark.parametrize(
-    ("wrong", "why"),
-    [({"signals": "all"}, "signals"), ({"fingers": 3}, "fingers"), ({"period_ms": 0}, "1 to 255")],
-)
-def test_options_are_checked(wrong: dict[str, object], why: str) -> None:
-    with pytest.raises(ConfigError, match=why):
-        tsf85(**wrong)

@@ -1,11 +1,9 @@
 """XELA uSkin patches."""
 
 import numpy as np
-import pytest
 
 from tactile_rt.drivers.codec import CanFrame, Command
 from tactile_rt.drivers.codecs.xela import Xela, XelaOptions
-from tactile_rt.errors import ConfigError
 from tests.helpers.codec_contract import T0, CodecCase, CodecContract, chunk_of, decode, stacked
 
 
@@ -83,13 +81,3 @@ def test_other_frames() -> None:
     ]
     assert host.feed([*foreign, CanFrame(0x710, bytes(6))], T0) is None
     assert host.stats.skipped == 3 and host.stats.corrupt == 1
-
-
-def test_mistakes_are_named() -> None:
-    for wrong, message in (
-        ({"board": 256}, "board must be from 0 to 255, not 256"),
-        ({"first_id": 0x7F1}, "first_id must be from 0 to 0x7f0, not 0x7f1"),
-        ({"rate_hz": 0}, "rate_hz must be positive"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            xela(**wrong)
