@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 NOTHING = 1  # exit code: nothing fits
 SHOWN = 6  # fits
+DESCRIBE = "frames of one length can be described: codec=binary_frame"
 GUESSED_HZ = 100  # where nothing tells the time
 
 
@@ -133,8 +134,7 @@ def _sniff_port(
     told: _Told,
 ) -> None:
     from tactile_rt.drivers.links import SerialLink
-    from tactile_rt.drivers.listening import ask_devices, hear_port, line_speeds
-    from tactile_rt.drivers.sniffing import sniff_bytes
+    from tactile_rt.drivers.sniffing import ask_devices, hear_port, line_speeds, sniff_bytes
     from tactile_rt.recording.importing.proposing import line_columns
 
     speeds = [(b, "N") for b in bauds] if bauds else line_speeds()
@@ -184,13 +184,12 @@ def _sniff_port(
         told.nothing(
             f"nothing came from {port}", "" if ask else "try --ask: it may have to be started"
         )
-    told.nothing(f"nothing fits what came from {port}", _hint(max((d for _, d in texts), key=len)))
+    told.nothing(f"nothing fits what came from {port}", DESCRIBE)
 
 
 def _sniff_bus(url: str, seconds: float, further: "list[Tried]", ask: bool, told: _Told) -> None:
-    from tactile_rt.drivers.listening import ask_devices, hear_bus
     from tactile_rt.drivers.opening import open_line
-    from tactile_rt.drivers.sniffing import sniff_frames
+    from tactile_rt.drivers.sniffing import ask_devices, hear_bus, sniff_frames
 
     frames = hear_bus(url, seconds)
     fits = sniff_frames(frames, further)
@@ -263,7 +262,7 @@ def _sniff_file(path: Path, further: "list[Tried]", told: _Told) -> None:
         _show(fits, told)
         _import(path, fits[0], told)
     elif log.form not in ("raw", "terminal") or not _sniff_text(path, data, log.form, told):
-        told.nothing(f"nothing fits {path}", _hint(data))
+        told.nothing(f"nothing fits {path}", DESCRIBE)
 
 
 def _begins(log: "LineLog", n: int) -> bytes:
@@ -386,13 +385,6 @@ def _show_identifiers(frames: "list[Any]", told: _Told) -> None:
     counts = Counter((f.id, f.extended, len(f.data)) for f in frames)
     for (number, extended, length), n in counts.most_common(12):
         told.say(f"{number:0{8 if extended else 3}X}  {n} frames of {length} bytes")
-
-
-def _hint(data: bytes) -> str:
-    from tactile_rt.drivers.sniffing import frame_hint
-
-    hint = frame_hint(data)
-    return f"{hint}: describe one for codec=binary_frame" if hint else ""
 
 
 def _query(fields: dict[str, str]) -> str:

@@ -11,26 +11,33 @@ bus two identifiers in a row prove little; there it counts that a sensor hardly 
 most that it can.
 """
 
+import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.drivers.catalogue import CODECS
-from tactile_rt.drivers.codec import CanFrame, Codec, Samples, codec_class
-from tactile_rt.drivers.opening import make_codec
-from tactile_rt.errors import ConfigError
+from tactile_rt.drivers.codec import CanFrame, Codec, Command, Samples, codec_class
+from tactile_rt.drivers.device_source import DeviceOptions, DeviceSource
+from tactile_rt.drivers.links import Link, SerialLink
+from tactile_rt.drivers.opening import make_codec, open_line
+from tactile_rt.errors import ConfigError, SourceError
+from tactile_rt.stream import EndOfStream
 
 __all__ = [
     "LOOK_BYTES",
     "LOOK_FRAMES",
-    "NEEDS_A_FILE",
     "CodecFit",
     "Tried",
-    "frame_hint",
+    "ask_devices",
+    "hear_bus",
+    "hear_port",
+    "line_speeds",
     "sniff_bytes",
     "sniff_frames",
 ]
@@ -47,9 +54,13 @@ COMPLETE: Final = 0.5  # of the samples
 BORNE: Final = 0.9  # of the full scale: a load is less, but for a blow
 DAMAGE_EVERY: Final = 24  # bytes
 NEEDS_A_FILE: Final = ("mapping", "columns")  # options without which there is no such codec
-LENGTHS: Final = range(4, 1025)  # bytes of a frame that nobody has described
-HINT_BYTES: Final = 16_384
+# Of boards that print, besides those that codecs name.
+SPEEDS: Final = (9600, 57600, 230_400, 38_400, 250_000, 500_000)
+FIRST_S: Final = 2.5  # for a board that begins anew when its port is opened
+START_S: Final = 0.6  # for a device that was asked
+MOST_BYTES: Final = 262_144
 
+Heard = tuple[int, str, bytes]  # baud, parity, what came
 Tried = tuple[str, Mapping[str, str]]  # codec, options
 
 
@@ -136,37 +147,6 @@ def sniff_frames(frames: Sequence[CanFrame], further: Iterable[Tried] = ()) -> l
     return _ranked(fits)
 
 
-def frame_hint(data: bytes) -> str:
-    """What can be told of frames of one length that no codec knows; empty: nothing.
-
-    Bytes that are the same in every frame show its length, and the longest run of them how it
-    begins, or ends.
-    """
-    raw = np.frombuffer(data[:HINT_BYTES], np.uint8)
-    if not len(raw) or (raw == raw[0]).mean() > 0.9:
-        return ""
-    for length in LENGTHS:
-        n = len(raw) // length
-        if n < 8:
-            break
-        rows = raw[: n * length].reshape(n, length)
-        usual = np.median(rows, axis=0).astype(np.uint8)
-        same = (rows == usual).mean(axis=0) > 0.9
-        if not 2 <= same.sum() < length:
-            continue
-        doubled = np.concatenate([same, same])
-        run, best, begin = 0, 0, 0
-        for k in range(2 * length):
-            run = run + 1 if doubled[k] else 0
-            if run > best and run <= length:
-                best, begin = run, k - run + 1
-        if best < 2:
-            continue
-        mark = bytes(usual[(begin + k) % length] for k in range(best))
-        return f"frames of {length} bytes, it seems, with {mark.hex(' ').upper()} in each"
-    return ""
-
-
 def _candidates(
     wire: str, further: Iterable[Tried], seen: Collection[int]
 ) -> Iterable[tuple[str, dict[str, str]]]:
@@ -237,3 +217,117 @@ def _ranked(fits: list[CodecFit]) -> list[CodecFit]:
         )  # fmt: skip
 
     return sorted(fits, key=worth, reverse=True)
+
+
+# what comes over a line that nobody knows anything about
+
+
+def line_speeds() -> list[tuple[int, str]]:
+    """(baud, parity) of every serial codec, the most usual first, then of other boards."""
+    found: list[tuple[int, str]] = []
+    for wire, name in CODECS:
+        if wire != "serial":
+            continue
+        try:
+            kind = codec_class(wire, name)
+            codec: Any = kind if set(NEEDS_A_FILE) & set(
+                kind.Options.__dataclass_fields__
+            ) else make_codec(wire, name, {})  # fmt: skip
+        except ConfigError:
+            continue  # what it needs is not installed
+        found.append((codec.baud, codec.parity))
+    usual = sorted(set(found), key=lambda speed: (-found.count(speed), speed))
+    return usual + [(s, "N") for s in SPEEDS if (s, "N") not in usual]
+
+
+def hear_port(
+    port: str, seconds: float, speeds: list[tuple[int, str]], dtr: bool = True
+) -> Iterator[Heard]:
+    """What comes over a serial port at each of these speeds; it is opened once.
+
+    Args:
+        port: the port.
+        seconds: how long to listen at each, s.
+        speeds: (baud, parity) of each.
+        dtr: whether to assert DTR, at which many boards begin anew.
+
+    Raises:
+        SourceError: it cannot be opened, or is gone.
+    """
+    link = SerialLink(port, *speeds[0], dtr)
+    try:
+        wait = FIRST_S
+        for k, (baud, parity) in enumerate(speeds):
+            if k:
+                link.retune(baud, parity)
+            found = link.receive(wait)
+            wait = seconds
+            data = bytearray(found[0] if found else b"")
+            end = time.monotonic() + seconds
+            while found and (left := end - time.monotonic()) > 0 and len(data) < MOST_BYTES:
+                more = link.receive(left)
+                data += more[0] if more else b""
+            yield baud, parity, bytes(data)
+    finally:
+        link.close()
+
+
+def hear_bus(url: str, seconds: float) -> list[CanFrame]:
+    """The frames that come over a CAN bus.
+
+    Args:
+        url: ``can:INTERFACE:CHANNEL``, with the bus's options.
+        seconds: how long to listen, s.
+    """
+    link: Link[Any] = open_line(url)
+    frames: list[CanFrame] = []
+    try:
+        end = time.monotonic() + seconds
+        while (left := end - time.monotonic()) > 0:
+            found = link.receive(left)
+            frames += found[0] if found else ()
+    finally:
+        link.close()
+    return frames
+
+
+def ask_devices(
+    wire: str, connect: Callable[[Codec[Any]], Link[Any]], seconds: float
+) -> Iterator[tuple[Codec[Any], Any]]:
+    """Each codec whose device must be asked to send, and what then comes: bytes, or frames.
+
+    Args:
+        seconds: how long to listen after the first sample, s.
+    """
+    connect(make_codec(wire, "native", {})).close()  # told once, not for every codec
+    for of, name in CODECS:
+        if of != wire:
+            continue
+        try:
+            kind = codec_class(wire, name)
+            if set(NEEDS_A_FILE) & set(kind.Options.__dataclass_fields__):
+                continue
+            codec = make_codec(wire, name, {})
+        except ConfigError:
+            continue
+        if not codec.polls and not codec.commands(Command.START):
+            continue
+        heard: list[Any] = []
+        try:
+            with DeviceSource(
+                lambda codec=codec: connect(codec), codec,  # type: ignore[misc]
+                DeviceOptions(name, start_s=START_S, reconnect=False), name,
+            ) as source:  # fmt: skip
+                source.tap(partial(_keep, heard))
+                end = time.monotonic() + seconds
+                while (left := end - time.monotonic()) > 0:
+                    source.read(left)
+        except (SourceError, EndOfStream):
+            continue
+        packets = [p for p in heard if p is not None]
+        whole: Any = b"".join(packets) if wire == "serial" else [f for p in packets for f in p]
+        yield codec, whole
+
+
+def _keep(heard: list[Any], packet: Any, t_ns: int) -> None:
+    heard.append(packet)

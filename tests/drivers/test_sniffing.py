@@ -11,7 +11,7 @@ from tactile_rt.drivers.catalogue import CODECS
 from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.codecs.column_guess import guess_line_columns
 from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
-from tactile_rt.drivers.sniffing import frame_hint, sniff_bytes, sniff_frames
+from tactile_rt.drivers.sniffing import sniff_bytes, sniff_frames
 from tactile_rt.errors import ConfigError
 from tactile_rt.sources.opening import open_source
 from tactile_rt.stream import EndOfStream
@@ -131,7 +131,6 @@ def test_a_car_has_no_sensor():
 def test_nothing_fits_random_bytes(size):
     data = random.Random(size).randbytes(size)
     assert sniff_bytes(data) == [] and guess_line_columns(data) is None
-    assert frame_hint(data) == ""
 
 
 @pytest.mark.parametrize(
@@ -154,9 +153,3 @@ def test_nothing_fits_random_frames():
 def test_a_codec_to_try_is_refused_before_anything_is_fed():
     with pytest.raises(ConfigError, match="no serial codec 'botta'"):
         sniff_bytes(b"abcdef", [("botta", {})])
-
-
-def test_frames_that_nobody_has_described_have_a_length_and_a_mark():
-    draw = random.Random(3)
-    frames = b"".join(b"\xa5\x5a" + draw.randbytes(11) for _ in range(80))
-    assert frame_hint(frames[4:]) == "frames of 13 bytes, it seems, with A5 5A in each"

@@ -36,7 +36,7 @@ STEP = np.array([0.5] + [9.80665 / 32768] * 3 + [np.deg2rad(125) / 32768] * 3) *
 
 
 class TestTaxels(CodecContract):
-    case = CodecCase(tsf85, taxels, checked=False)
+    case = CodecCase(tsf85, taxels, checked=False, settles=False)
 
 
 class TestOneFingerOfAnOlderFirmware(CodecContract):
