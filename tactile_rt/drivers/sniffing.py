@@ -243,7 +243,7 @@ def line_speeds() -> list[tuple[int, str]]:
 def hear_port(
     port: str, seconds: float, speeds: list[tuple[int, str]], dtr: bool = True
 ) -> Iterator[Heard]:
-    """What comes over a serial port at each of these speeds; it is opened once.
+    """Listen to a serial port, which is opened once, at each of these speeds.
 
     Args:
         port: the port.
@@ -294,7 +294,7 @@ def hear_bus(url: str, seconds: float) -> list[CanFrame]:
 def ask_devices(
     wire: str, connect: Callable[[Codec[Any]], Link[Any]], seconds: float
 ) -> Iterator[tuple[Codec[Any], Any]]:
-    """Each codec whose device must be asked to send, and what then comes: bytes, or frames.
+    """Start the device of each codec that waits for it; return what then comes.
 
     Args:
         seconds: how long to listen after the first sample, s.

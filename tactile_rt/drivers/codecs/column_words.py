@@ -108,7 +108,7 @@ def _at(word: str, k: int) -> str:
 
 
 def _counts_up(first: str, other: str, n: int) -> bool:
-    """Return whether the other is the first with numbers that are n more, or the same."""
+    """Return whether numbers of the other are n more, or the same."""
     steps = {
         int(b) - int(a)
         for a, b in zip(_NUMBER.findall(first), _NUMBER.findall(other), strict=False)

@@ -7,10 +7,11 @@ The time is that of the header, where there is one that is set, else that of the
 
 import re
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from itertools import islice
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -23,6 +24,7 @@ from tactile_rt.extras import lacking
 from tactile_rt.files import open_regular
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.account import Import, clock_of, write_chunks
+from tactile_rt.recording.importing.mending import mend_bag
 from tactile_rt.recording.importing.table import BESIDE, Table, import_table, shown_names
 from tactile_rt.recording.layout import decode_samples
 from tactile_rt.recording.reader import Recording
@@ -116,18 +118,25 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         from rosbags.typesys import Stores, get_typestore
     except ModuleNotFoundError as error:
         raise lacking("bags need", "import", error) from None
-    try:
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
-        reader.open()
-    except Exception as error:  # rosbags and what it reads by raise anything on a damaged bag
-        raise RecordingError(
-            f"{path} cannot be read as a bag: {_words(error):.90}; `rosbag reindex` or "
-            "`mcap recover` mend one without its end"
-        ) from None
-    try:
-        yield OpenBag(reader)
-    finally:
-        reader.close()
+    with ExitStack() as stack:
+        notes: list[str] = []
+        store = get_typestore(Stores.LATEST)
+        reader = None
+        try:
+            reader = stack.enter_context(AnyReader([path], default_typestore=store))
+        except Exception as error:  # rosbags and what it reads by raise anything on a damaged bag
+            why = _words(error)
+            notes = [f"its end is missing or damaged ({why}): what is whole before it was read"]
+            new = Path(stack.enter_context(TemporaryDirectory())) / "mended.mcap"
+            if path.suffix == ".mcap" and mend_bag(path, new):
+                with suppress(Exception):  # as above
+                    reader = stack.enter_context(AnyReader([new], default_typestore=store))
+            if reader is None:
+                raise RecordingError(
+                    f"{path} cannot be read as a bag: {why:.90}; `rosbag reindex` or "
+                    "`ros2 bag reindex` mend one without its end"
+                ) from None
+        yield OpenBag(reader, notes)
 
 
 def _words(error: Exception) -> str:

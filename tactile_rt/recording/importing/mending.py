@@ -1,0 +1,86 @@
+"""A bag of ROS 2 that was cut short, copied as far as it is whole.
+
+An MCAP file that has lost its end has no index, which every library reads first. Its records are
+still there one after the other, also those of a chunk that is cut short.
+"""
+
+import struct
+from collections.abc import Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from tactile_rt.files import open_regular
+from tactile_rt.recording.records import MAGIC
+
+__all__ = ["mend_bag"]
+
+LARGEST: Final = 1 << 30  # bytes of a record, and of what a chunk unpacks to
+SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 3, 4, 5, 6, 15
+TIMES_AND_SUM: Final = 8 + 8 + 8 + 4  # bytes of a chunk before the name of its compression
+
+
+def mend_bag(path: Path, new: Path) -> int:
+    """Copy the messages that are whole, with an index; return their number."""
+    from mcap.data_stream import ReadDataStream
+    from mcap.records import Channel, Message, Schema
+    from mcap.writer import Writer
+
+    schemas: dict[int, int] = {}
+    channels: dict[int, int] = {}
+    n = 0
+    with open_regular(path) as file, new.open("wb") as made:
+        file.seek(len(MAGIC))
+        writer = Writer(made)
+        writer.start(profile="ros2")
+        try:
+            for opcode, data in _split_records(file):
+                stream = ReadDataStream(BytesIO(data))
+                if opcode == SCHEMA:
+                    told = Schema.read(stream)
+                    schemas[told.id] = writer.register_schema(told.name, told.encoding, told.data)
+                elif opcode == CHANNEL:
+                    one = Channel.read(stream)
+                    channels[one.id] = writer.register_channel(
+                        one.topic, one.message_encoding, schemas[one.schema_id], one.metadata
+                    )
+                elif opcode == MESSAGE:
+                    message = Message.read(stream, len(data))
+                    writer.add_message(
+                        channels[message.channel_id], message.log_time, message.data,
+                        message.publish_time, message.sequence,
+                    )  # fmt: skip
+                    n += 1
+        except Exception:  # damaged from here on: anything may be raised of such bytes
+            pass
+        writer.finish()  # type: ignore[no-untyped-call]
+    return n
+
+
+def _split_records(file: BinaryIO) -> Iterator[tuple[int, bytes]]:
+    """Read (opcode, record) of all records before the summary, also those in chunks."""
+    while len(head := file.read(9)) == 9:
+        opcode, length = struct.unpack("<BQ", head)
+        data = file.read(min(length, LARGEST))
+        if opcode == DATA_END:
+            return
+        if opcode == CHUNK:  # how much it says that it holds is not what is there
+            yield from _split_records(BytesIO(_unpack_chunk(data)))
+        elif len(data) == length:
+            yield opcode, data
+
+
+def _unpack_chunk(data: bytes) -> bytes:
+    """Unpack what is in a chunk, as far as it is there."""
+    (n,) = struct.unpack_from("<I", data, TIMES_AND_SUM)
+    begin = TIMES_AND_SUM + 4 + n
+    kind, packed = data[TIMES_AND_SUM + 4 : begin], data[begin + 8 :]
+    if not kind:
+        return packed
+    if kind == b"zstd":
+        import zstandard
+
+        return bytes(zstandard.ZstdDecompressor().stream_reader(packed).read(LARGEST))
+    import lz4.frame
+
+    return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, LARGEST))
