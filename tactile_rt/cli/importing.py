@@ -38,9 +38,6 @@ def import_file(
     lines: Annotated[
         int, typer.Option(min=1, max=1000, help="Of a table: lines of text that are one row.")
     ] = 1,
-    array: Annotated[
-        str, typer.Option(help="Of samples of ours in a bag: a file that says what they are of.")
-    ] = "",
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
     json: Json = None,
 ) -> None:
@@ -73,7 +70,7 @@ def import_file(
         if is_bag(log):
             if decoded_as:
                 raise ConfigError(f"{log} is a bag: its messages are no bytes of a codec; no --as")
-            made = import_bag(log, output, topic, columns, rate, array)
+            made = import_bag(log, output, topic, columns, rate)
         elif decoded_as and columns:
             raise ConfigError("give --as, for what a device spoke, or --columns, for a table")
         elif decoded_as:

@@ -16,7 +16,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from tactile_rt.classifier.array_file import read_array
 from tactile_rt.drivers.codecs.column_guess import guess_columns
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.errors import ConfigError, RecordingError
@@ -195,7 +194,6 @@ def import_bag(
     topic: str = "",
     columns: str = "",
     rate_hz: float = 0.0,
-    array: str = "",
 ) -> Import:
     """Write a topic of a bag as a recording.
 
@@ -205,7 +203,6 @@ def import_bag(
         columns: which fields of a message are what, or a TOML file of it; empty for what is known
             of the type.
         rate_hz: rate of the samples, Hz; 0: by their times.
-        array: a file of the array that samples of ours are of, which a bag does not tell.
 
     Raises:
         ConfigError: no such topic, columns that cannot be, or the extra is not installed.
@@ -216,9 +213,7 @@ def import_bag(
     chosen = _chosen(path, bag_topics(path), topic, columns)
     with open_bag(path) as bag:
         if chosen.type == messages.SAMPLES and not columns:
-            return _own(path, bag, chosen, output, array)
-        if array:
-            raise ConfigError(f"--array is for samples of ours, not for {chosen.type}")
+            return _own(path, bag, chosen, output)
         paths = _paths(bag, chosen)
         if not paths:
             raise RecordingError(f"{path}: no message of {chosen.name} is whole and holds a number")
@@ -334,10 +329,10 @@ def _stamp(message: Any) -> int:
     return int(stamp.sec) * NS_PER_S + int(stamp.nanosec) if stamp else 0
 
 
-def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str) -> Import:
+def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path) -> Import:
     """Samples of ours in a bag of others: bit for bit."""
     account = Import(notes=bag.notes)
-    told = read_array(Path(array)) if array else _array_in(bag, topic.name)
+    told = _array_in(bag, topic.name)
     chunks: list[Chunk] = []
     offset = 0
     for t_ns, raw, message in bag.messages(topic.name):
@@ -347,7 +342,7 @@ def _own(path: Path, bag: OpenBag, topic: BagTopic, output: Path, array: str) ->
         shape = int(message.elements), int(message.channels)
         if told is not None and shape != told.shape:
             raise ConfigError(
-                f"{array or 'the array in the bag'} is of {told.shape[0]} x {told.shape[1]}, "
+                f"{path}: its array is of {told.shape[0]} x {told.shape[1]}, "
                 f"{topic.name} of {shape[0]} x {shape[1]}"
             )
         try:

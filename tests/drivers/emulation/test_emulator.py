@@ -110,18 +110,6 @@ def test_every_sample_comes_as_it_is_over_a_pty() -> None:
     assert (device.log.t_ns // 1000).tolist() == host.ticks.tolist()
 
 
-def test_pyserial_reads_it_too() -> None:
-    with native(300) as device, serial.Serial(device.endpoint.pty.path, timeout=0.1) as port:
-        codec = NativeSerial(NativeOptions())
-        port.write(codec.commands(Command.START)[0].send + codec.commands(Command.START)[1].send)
-        counts: list[int] = []
-        end = time.monotonic() + PATIENCE_S
-        while len(counts) < 300 and time.monotonic() < end:
-            samples = codec.feed(port.read(port.in_waiting or 1), 0)
-            counts += [] if samples is None else samples.count.tolist()
-        assert counts == list(range(300))
-
-
 def test_a_device_in_real_time_is_never_early() -> None:
     with native(200, pace="realtime") as device:
         host = Host(device.endpoint.pty.path)

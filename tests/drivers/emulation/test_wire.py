@@ -3,7 +3,6 @@
 import time
 from contextlib import contextmanager
 
-import can
 import minimalmodbus
 import numpy as np
 import optoforce
@@ -13,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_rt.drivers.catalogue import CODECS
-from tactile_rt.drivers.codec import CanFrame, Command, codec_class
+from tactile_rt.drivers.codec import CanFrame, codec_class
 from tactile_rt.drivers.codecs.ft300 import Ft300, Ft300Options
 from tactile_rt.drivers.emulation.device import EmulatedCan, EmulatedSerial
 from tactile_rt.drivers.emulation.faults import Fault, FaultSchedule
@@ -286,24 +285,3 @@ def test_bota_says_that_it_has_begun():
             assert emulated.codec.commanded_hz == pytest.approx(200.0)
             host.read_until(b"\xaa")
             assert len(host.read(370)) == 370
-
-
-def test_python_can_reads_frames_behind_an_slcan_adapter():
-    with open_source("synthetic:") as opened, EmulatedCan(opened, "xela") as emulated:
-        with can.Bus(
-            channel=emulated.port.removeprefix("slcan:"),
-            interface="slcan",
-            bitrate=1_000_000,
-            sleep_after_open=0.0,
-        ) as bus:
-            for step in emulated.codec.commands(Command.START):
-                for frame in step.send:
-                    bus.send(
-                        can.Message(
-                            arbitration_id=frame.id, data=frame.data, is_extended_id=frame.extended
-                        )
-                    )
-            first = bus.recv(PATIENCE_S)
-            frames = [bus.recv(5.0) for _ in range(64)] if first else []
-    assert frames and all(frame is not None and frame.dlc == 7 for frame in frames)
-    assert len({frame.arbitration_id for frame in frames}) > 8

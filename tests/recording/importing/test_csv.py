@@ -25,14 +25,8 @@ def rows(form: str) -> str:
 
 
 WRITTEN = {
-    "plain": ("time,Fx,Fy\n", "{s:.2f},{a},{b}\n", "time=time:s,Fx=S.fx:mN,Fy=S.fy:mN"),
-    "by places": ("", "{s:.2f},{a},{b}\n", "time:s,S.fx:mN,S.fy:mN"),
-    "semicolons": ("t;x;y\n", "{s:.2f};{a};{b};\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
-    "tabs": ("t\tx\ty\n", "{s:.2f}\t{a}\t{b}\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
     "numpy": ("# t x y\n", "{s:.18e} {a:.18e} {b:.18e}\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
     "yarpdatadumper": ("", "{k} {s:.6f} {a} {b} \n", "count,time:s,S.fx:mN,S.fy:mN"),
-    "quoted": ('"t","x, N","y"\n', '"{s:.2f}","{a}","{b}"\n', 't=time:s,"x, N"=S.fx:mN,y=S.fy:mN'),
-    "units below": ("t,x,y\n[s],[mN],[mN]\n", "{s:.2f},{a},{b}\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
     "units without brackets": (
         "t;x;y\ns;mN;mN\n", "{s:.2f};{a};{b}\n", "t=time:s,x=S.fx:mN,y=S.fy:mN",
     ),
@@ -40,7 +34,6 @@ WRITTEN = {
         "Sensor: ATI mini40\nRate, 100\n\nt,x,y\n", "{s:.2f},{a},{b}\n",
         "t=time:s,x=S.fx:mN,y=S.fy:mN",
     ),
-    "Windows": ("\ufefft,x,y\r\n", "{s:.2f},{a},{b}\r\n", "t=time:s,x=S.fx:mN,y=S.fy:mN"),
     "rostopic -p": (
         "%time,field.wrench.force.x,field.wrench.force.y\n", "{s:.2f},{a},{b}\n",
         "%time=time:s,field.wrench.force.x=S.fx:mN,field.wrench.force.y=S.fy:mN",
@@ -99,15 +92,6 @@ def test_a_time_of_seconds_and_the_rest(tmp_path):
 def test_names_from_windows(tmp_path):
     (tmp_path / "t.csv").write_bytes(("t;T (\u00b0C)\n" + rows("{k};{b}\n")).encode("cp1252"))
     assert csv_form(tmp_path / "t.csv").names == ("t", "T (\u00b0C)")
-
-
-@pytest.mark.parametrize("delimiter", [";", "\t", " "])
-def test_a_decimal_comma(tmp_path, delimiter):
-    text = rows("{s:.2f}D{a}D{b:.2f}\n").replace(".", ",").replace("D", delimiter)
-    (tmp_path / "t.csv").write_text(text)
-    made, chunk, _ = imported(tmp_path / "t.csv", "time:s,S.fx,S.fy")
-    assert made.samples == N
-    assert chunk.values[7, 0].tolist() == [0, 1.75]
 
 
 def test_a_decimal_comma_between_commas_is_quoted(tmp_path):
