@@ -3,12 +3,12 @@
 import json
 import warnings
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from tactile_rt.calibration import Calibration
+from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.recording import Description, Recording
 from tactile_rt.recording.as_ros2 import write_bag
 from tactile_rt.recording.layout import encode_samples
@@ -22,9 +22,6 @@ pytest.importorskip("mcap_ros2")
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
-
-DATA = Path(__file__).parent / "data"
-TOPICS = ("samples", "wire", "decisions", "events", "health")
 
 
 def by_rosbags(path):
@@ -80,7 +77,15 @@ def test_each_channel_of_a_device_s_recording_is_read_by_both(make, path):
     for found in (one, other):
         values = np.concatenate([np.array(m.values, np.float32) for m in found[f"{base}/samples"]])
         assert values.tobytes() == b"".join(c.values.tobytes() for c in chunks)
-        assert len(found[f"{base}/wire"]) == len(list(recording.packets()))
+        for message, (packet, _) in zip(found[f"{base}/wire"], recording.packets(), strict=True):
+            assert message.opened == (packet is None)
+            if make is FakeSerial:
+                assert bytes(message.data) == (packet or b"")
+                continue
+            frames = [
+                CanFrame(f.id, bytes(f.data), f.extended, f.fd, f.remote) for f in message.frames
+            ]
+            assert frames == list(packet or ())
         (array,) = found[f"{base}/array"]
         assert tuple(array.elements) == recording.spec.elements
         assert [json.loads(m.json)["state"] for m in found[f"{base}/health"]][-1] == "closed"
@@ -88,7 +93,7 @@ def test_each_channel_of_a_device_s_recording_is_read_by_both(make, path):
 
 
 def test_each_channel_of_a_daemon_s_recording_is_read_by_both(path):
-    whole(path)
+    _, chunks = whole(path)
     for found in (by_rosbags(path), by_mcap_ros2(path)):
         assert {t: len(m) for t, m in found.items()} == {
             f"/tactile/finger_1/{name}": n
@@ -97,6 +102,14 @@ def test_each_channel_of_a_daemon_s_recording_is_read_by_both(path):
         }  # fmt: skip
         assert found["/tactile/finger_1/decisions"][2].label == "m\u00fcg"
         assert found["/tactile/finger_1/decisions"][2].step == 2
+        for message, chunk in zip(found["/tactile/finger_1/samples"], chunks, strict=True):
+            stamp = message.header.stamp
+            at_ns = 1_700_000_000_000_000_000 + int(chunk.t_ns[-1])
+            assert stamp.sec * 10**9 + stamp.nanosec == at_ns
+            assert message.header.frame_id == "tip"
+            assert list(message.t_ns) == chunk.t_ns.tolist()
+            assert list(message.seq) == chunk.seq.tolist()
+            assert list(message.valid) == chunk.valid.ravel().tolist()
         assert found["/tactile/finger_1/events"][0].touching
         assert found["/tactile/finger_1/health"][0].state == "closed"
 
