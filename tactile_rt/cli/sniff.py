@@ -277,7 +277,7 @@ def _begins(log: "LineLog", n: int) -> bytes:
 
 def _form(form: str) -> str:
     told = {
-        "raw": "bytes as they are", "hex": "bytes in hexadecimal", "dump": "a dump of a line",
+        "raw": "bytes as they are", "hex": "bytes in hexadecimal",
         "terminal": "lines of text and when each came",
     }  # fmt: skip
     return told.get(form, f"a CAN log ({form})")

@@ -1,5 +1,5 @@
-"""One line of a log of text: what `tactile-rt dump`, candump, SavvyCAN, slcan adapters, terminals
-and dumps in hexadecimal print."""
+"""One line of a log of text: what candump, SavvyCAN, slcan adapters, terminals and dumps in
+hexadecimal print."""
 
 import re
 from typing import Any, Final
@@ -12,8 +12,6 @@ from tactile_rt.stream import NS_PER_S
 __all__ = [
     "Found",
     "of_candump",
-    "of_dump",
-    "of_dump_can",
     "of_gvret",
     "of_heard",
     "of_hex",
@@ -32,13 +30,6 @@ _GVRET: Final = re.compile(  # what SavvyCAN saves
     r"(?P<n>\d+)(?P<hex>(?:,[0-9A-Fa-f]{2})*),*\s*"
 )
 _SLCAN: Final = re.compile(r"(?:[tr][0-7][0-9A-Fa-f]{2}|[TR][01][0-9A-Fa-f]{7}|[dDbB])[0-9A-Fa-f]+")
-_DUMP: Final = re.compile(
-    r" *(?P<t>\d+\.\d{3}) ms  (?P<hex>[0-9a-f]{2}(?: [0-9a-f]{2}){0,15}) *  .*"
-)
-_DUMP_CAN: Final = re.compile(
-    r" *(?P<t>\d+\.\d{3}) ms  (?P<id>[0-9A-F]{3}|[0-9A-F]{8}) (?P<kind>[RF ]) \[(?P<n>\d+)\]"
-    r" ?(?P<hex>(?:[0-9a-f]{2} ?)*)"
-)
 _HEARD: Final = re.compile(  # the Arduino IDE; CoolTerm, Tera Term and the like
     r"(?P<arduino>\d\d:\d\d:\d\d\.\d+) -> (?P<a>.*)"
     r"|\[(?P<t>(?:\d{4}-\d\d-\d\d[ T])?\d\d:\d\d:\d\d[.,]\d+)\]:? ?(?P<b>.*)"
@@ -101,24 +92,6 @@ def of_slcan(line: str) -> Found:
         return None
     frames = SlcanDecoder().feed(line.encode("ascii") + b"\r")
     return ("", frames, None) if frames else None
-
-
-def of_dump(line: str) -> Found:
-    """A line of `tactile-rt dump` of a serial line."""
-    found = _DUMP.fullmatch(line)
-    if found is None:
-        return None
-    return "", bytes.fromhex(found["hex"]), _time(found["t"], NS_PER_S // 1000)
-
-
-def of_dump_can(line: str) -> Found:
-    """A line of `tactile-rt dump` of a CAN bus."""
-    found = _DUMP_CAN.fullmatch(line)
-    if found is None:
-        return None
-    kind, data = found["kind"], bytes.fromhex(found["hex"])
-    frame = CanFrame(int(found["id"], 16), data, len(found["id"]) == 8, kind == "F", kind == "R")
-    return "", [frame], _time(found["t"], NS_PER_S // 1000)
 
 
 def of_heard(line: str) -> Found:

@@ -1,6 +1,6 @@
 """What somebody kept of a line: bytes, hexadecimal text, or a log of a CAN bus, as packets again.
 
-    log = read_log(Path("can.log"))       # candump, asc, blf, ...; bytes, `tactile-rt dump`, hex
+    log = read_log(Path("can.log"))       # candump, asc, blf, ...; bytes, hex
     for packet, t_ns in log.packets(): ...  # t_ns is None where the log has no times
 
 Which form a file has is told by how it begins, whatever its name; gzip is unpacked. Logs end
@@ -21,8 +21,6 @@ from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.drivers.log_lines import (
     Found,
     of_candump,
-    of_dump,
-    of_dump_can,
     of_gvret,
     of_heard,
     of_hex,
@@ -34,9 +32,9 @@ from tactile_rt.stream import NS_PER_S
 
 __all__ = ["CAN_FORMS", "FORMS", "LineLog", "open_log_file", "read_log"]
 
-SERIAL_FORMS: Final = ("raw", "dump", "hex", "terminal")
+SERIAL_FORMS: Final = ("raw", "hex", "terminal")
 OF_PYTHON_CAN: Final = ("asc", "blf", "trc", "csv", "db")
-CAN_FORMS: Final = ("candump", "dump-can", "slcan", "gvret", *OF_PYTHON_CAN)
+CAN_FORMS: Final = ("candump", "slcan", "gvret", *OF_PYTHON_CAN)
 FORMS: Final = (*SERIAL_FORMS, *CAN_FORMS)
 PIECE: Final = 256
 HEAD: Final = 16_384  # bytes that tell the form
@@ -61,7 +59,7 @@ SAVVYCAN_HEADER: Final = "time stamp,id,extended,"
 FALLING: Final = 0.2  # of the times of candump -td are less than the one before
 
 LINES: Final[dict[str, Callable[[str], Found]]] = {
-    "dump": of_dump, "dump-can": of_dump_can, "candump": of_candump, "slcan": of_slcan,
+    "candump": of_candump, "slcan": of_slcan,
     "terminal": of_heard, "hex": of_hex, "gvret": of_gvret,
 }  # fmt: skip
 Timed = tuple[Any, int | None]  # a packet, and when it came, ns
@@ -303,7 +301,7 @@ def _form(path: Path) -> str:
     begins = [x.strip().lower() for x in lines[:6]]
     if any(x.startswith("date ") for x in begins) and any(x.startswith("base ") for x in begins):
         return "asc"
-    for form in ("dump", "dump-can", "candump", "slcan", "terminal"):
+    for form in ("candump", "slcan", "terminal"):
         if sum(LINES[form](x) is not None for x in lines) >= MOSTLY * len(lines):
             return form
     # A table of numbers of two digits is hexadecimal, too: only letters tell that it is bytes.
