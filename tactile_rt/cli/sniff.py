@@ -320,7 +320,7 @@ def _sniff_bag(path: Path, told: _Told) -> None:
     from rich.table import Table
 
     from tactile_rt.recording import Recording
-    from tactile_rt.recording.importing.bag import bag_topics, proposed_columns
+    from tactile_rt.recording.importing.bag import bag_topics
     from tactile_rt.ros2 import messages
 
     try:
@@ -340,16 +340,7 @@ def _sniff_bag(path: Path, told: _Told) -> None:
         print_table(table)
     known = [t for t in topics if t.columns or t.type == messages.SAMPLES]
     if not known:
-        proposed = [(columns, t.name) for t in topics if (columns := proposed_columns(path, t))]
-        if not proposed:
-            told.nothing(f"{path}: no message holds a number")
-        columns, name = max(proposed, key=lambda one: len(one[0]))
-        told.say(f"of no topic is known what is what; {name}: names and units are for you to say")
-        told.go_on(
-            f"tactile-rt import {shlex.quote(str(path))} --topic {shlex.quote(name)} --columns "
-            f"{shlex.quote(columns)}"
-        )
-        return
+        told.nothing(f"{path}: of no topic is known what is what", "say it with --columns")
     best = max(known, key=lambda t: t.messages)
     only = "" if len(known) == 1 else f" --topic {shlex.quote(best.name)}"
     told.go_on(f"tactile-rt import {shlex.quote(str(path))}{only}")

@@ -16,7 +16,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from tactile_rt.drivers.codecs.column_guess import guess_columns
 from tactile_rt.drivers.codecs.column_words import compress_columns
 from tactile_rt.errors import ConfigError, RecordingError
 from tactile_rt.extras import lacking
@@ -24,7 +23,7 @@ from tactile_rt.files import open_regular
 from tactile_rt.recording.description import Description
 from tactile_rt.recording.importing.account import Import, clock_of, write_chunks
 from tactile_rt.recording.importing.mending import mend_bag
-from tactile_rt.recording.importing.table import BESIDE, Table, import_table, shown_names
+from tactile_rt.recording.importing.table import Table, import_table, shown_names
 from tactile_rt.recording.layout import decode_samples
 from tactile_rt.recording.reader import Recording
 from tactile_rt.recording.records import MAGIC
@@ -33,11 +32,10 @@ from tactile_rt.ros2 import messages
 from tactile_rt.settings import nearest
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, concatenate
 
-__all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag", "proposed_columns"]
+__all__ = ["BagTopic", "bag_topics", "import_bag", "is_bag"]
 
 SQLITE: Final = b"SQLite format 3\0"
 ROS1: Final = b"#ROSBAG V2.0\n"
-PROBED: Final = 50  # messages whose numbers are looked at
 MOST: Final = 4096  # fields of a message that are columns
 # What messages are of: columns by the end of the type's name, with {} for the frame's name.
 KNOWN: Final = {
@@ -171,23 +169,6 @@ def bag_topics(path: Path) -> list[BagTopic]:
     return found
 
 
-def proposed_columns(path: Path, topic: BagTopic) -> str:
-    """Columns for messages of a type that is not known, for a user to look at and change; empty
-    where they hold no numbers.
-
-    Raises:
-        ConfigError: the extra is not installed.
-    """
-    with open_bag(path) as bag:
-        paths = [p for p in _paths(bag, topic) if not p.startswith(BESIDE)]
-        first = islice(_table(path, bag, topic, paths).rows, PROBED)
-        rows = [[float(cell) for cell in row] for row in first if row]
-    words, _ = guess_columns(paths, rows)
-    return compress_columns(
-        [f"{p}={w}" for p, w in zip(paths, words, strict=True) if "." in w and "time" not in w]
-    )
-
-
 def import_bag(
     path: Path,
     output: Path,
@@ -239,7 +220,7 @@ def _chosen(path: Path, topics: list[BagTopic], topic: str, columns: str) -> Bag
     what = (
         "name one with --topic"
         if fitting
-        else (f"of none is known what is what: `tactile-rt sniff {path}` proposes --columns")
+        else "of none is known what is what: give --topic, and --columns tells"
     )
     raise ConfigError(f"{path} has the topics {told}: {what}")
 

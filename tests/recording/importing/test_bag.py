@@ -9,7 +9,7 @@ import pytest
 
 from tactile_rt.errors import ConfigError, RecordingError, TactileError
 from tactile_rt.recording import Recording
-from tactile_rt.recording.importing.bag import bag_topics, import_bag, is_bag, proposed_columns
+from tactile_rt.recording.importing.bag import bag_topics, import_bag, is_bag
 from tactile_rt.recording.layout import encode_samples
 from tactile_rt.ros2 import messages
 from tactile_rt.ros2.definitions import schema_text
@@ -208,21 +208,19 @@ def test_a_robot_does_not_load_the_library():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
-def test_columns_are_proposed_for_messages_that_nobody_knows(tmp_path):
+def test_a_message_that_nobody_knows_is_told_with_its_fields(tmp_path):
     store = get_typestore(Stores.ROS2_HUMBLE)
-    text = "std_msgs/Header header\nint32[4] taxels\nstring said\n"
-    store.register(get_types_from_msg(text, "mine/msg/Skin"))
-    time, header, skin = (
-        store.types[n]
-        for n in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header", "mine/msg/Skin")
-    )
+    store.register(get_types_from_msg("int32[4] taxels\nstring said\n", "mine/msg/Skin"))
+    skin = store.types["mine/msg/Skin"]
     with Writer2(tmp_path / "skin", version=9) as writer:
         topic = writer.add_connection("/skin", "mine/msg/Skin", typestore=store)
         for k in range(20):
-            message = skin(header(time(k, 0), "palm"), np.arange(4, dtype=np.int32) + k * k % 7, "")
+            message = skin(np.arange(4, dtype=np.int32) + k, "")
             writer.write(topic, k, store.serialize_cdr(message, "mine/msg/Skin"))
-    (found,) = bag_topics(tmp_path / "skin")
-    columns = proposed_columns(tmp_path / "skin", found)
-    assert columns == "taxels.{0..3}=taxels_{0..3}.value:1"
+    with pytest.raises(ConfigError, match=r"of none is known what is what: give --topic"):
+        import_bag(tmp_path / "skin", tmp_path / "out.mcap")
+    with pytest.raises(ConfigError, match=r"e\.g\. .*; its fields are taxels\.\{0\.\.3\}"):
+        import_bag(tmp_path / "skin", tmp_path / "out.mcap", "/skin")
+    columns = "taxels.{0..3}=T{0..3}.value:1"
     made = import_bag(tmp_path / "skin", tmp_path / "out.mcap", columns=columns)
     assert made.samples == 20
