@@ -61,8 +61,8 @@ def test_a_second_of_every_codec_cut_anywhere_is_known(wire, name, descriptions)
     part = came[draw.randrange(1, len(came) // 8) : len(came) - draw.randrange(1, 9)]
     if name == "ascii_line":
         assert sniff_bytes(part) == []
-        words, samples, _ = guess_line_columns(part)
-        assert words == ["T0.value", "T1.value", "T2.value", "T3.value"] and samples > 70
+        words = guess_line_columns(part)
+        assert words == ["T0.value", "T1.value", "T2.value", "T3.value"]
         return
     fits = (sniff_bytes if wire == "serial" else sniff_frames)(part, further)
     assert fits and fits[0].codec == name and fits[0].corrupt <= 3, fits  # those that were cut

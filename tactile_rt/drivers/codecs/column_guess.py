@@ -8,6 +8,7 @@ unit is made up: a number of which nobody says what it is in keeps its own (1).
 import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from typing import Any, Final
 
 import msgspec
@@ -96,10 +97,8 @@ def guess_columns(
     return [words.get(k, kinds[k] or "-") for k in range(width)], time is not None
 
 
-def guess_line_columns(data: bytes) -> tuple[list[str], int, int] | None:
-    """The columns of what a board prints: (words, lines that are samples, lines); None: there are
-    none. Words have names where numbers do.
-    """
+def guess_line_columns(data: bytes) -> list[str] | None:
+    """Guess the columns of what a board prints, by names where numbers have them."""
     first, *lines = data.decode("utf-8", "replace").replace("\r", "\n").split("\n")
     label = _LABELLED.match(first)
     if label and any(line.startswith(label[1]) for line in lines):  # whole; it may begin a sample
@@ -107,29 +106,22 @@ def guess_line_columns(data: bytes) -> tuple[list[str], int, int] | None:
     lines = [x for x in lines[:-1] if x.strip()][:LOOKED_AT]
     if len(lines) < LEAST or _unprintable(lines):
         return None
-    for guess in (_of_objects, _of_places, _of_labels):
-        if (found := guess(lines)) is not None:
-            return found
-    return None
+    return _of_objects(lines) or _of_places(lines) or _of_labels(lines)
 
 
-def _of_objects(lines: list[str]) -> tuple[list[str], int, int] | None:
+def _of_objects(lines: list[str]) -> list[str] | None:
     """Lines of JSON."""
     said = []
     for line in lines:
-        if line.lstrip()[:1] != "{":
-            continue
-        try:
-            said.append(msgspec.json.decode(line))
-        except (msgspec.DecodeError, UnicodeEncodeError):
-            continue
+        with suppress(msgspec.DecodeError, UnicodeEncodeError):
+            said.append(msgspec.json.decode(line, type=dict[str, Any]))
     if len(said) < MOSTLY * len(lines):
         return None
     each = [dict(_numbers(one, "")) for one in said]
-    return _named(each, len(lines))
+    return _named(each)
 
 
-def _of_labels(lines: list[str]) -> tuple[list[str], int, int] | None:
+def _of_labels(lines: list[str]) -> list[str] | None:
     """Numbers after their names, in one line or in several."""
     each: list[dict[str, float]] = []
     used = 0
@@ -152,10 +144,10 @@ def _of_labels(lines: list[str]) -> tuple[list[str], int, int] | None:
             each.append(found)
     if used < MOSTLY * len(lines):
         return None
-    return _named(each, len(lines))
+    return _named(each)
 
 
-def _named(each: list[dict[str, float]], lines: int) -> tuple[list[str], int, int] | None:
+def _named(each: list[dict[str, float]]) -> list[str] | None:
     often = Counter(name for one in each for name in one)
     names = [name for name, n in often.items() if n >= MOSTLY * len(each)]
     if not names or len(each) < LEAST:
@@ -164,10 +156,10 @@ def _named(each: list[dict[str, float]], lines: int) -> tuple[list[str], int, in
     words, _ = guess_columns(names, rows)
     told = [f"{name}={w}" for name, w in zip(names, words, strict=True) if w != "-"]
     whole = sum(all(cell is not None for cell in row) for row in rows)
-    return (told, whole, lines) if _measures(words) and whole >= MOSTLY * len(each) else None
+    return told if _measures(words) and whole >= MOSTLY * len(each) else None
 
 
-def _of_places(lines: list[str]) -> tuple[list[str], int, int] | None:
+def _of_places(lines: list[str]) -> list[str] | None:
     """Numbers at their places between spaces, commas and the like."""
     cut = [fields(line) for line in lines]
     width, often = Counter(len(c) for c in cut).most_common(1)[0]
@@ -181,14 +173,14 @@ def _of_places(lines: list[str]) -> tuple[list[str], int, int] | None:
         return None
     if sum(_NAMED.search(line) is not None for line, _ in same) > len(same) / 2 and width > 1:
         labelled = _of_labels(lines)  # names tell more than places
-        if labelled is not None and len(labelled[0]) >= len(numeric) - 1:
+        if labelled is not None and len(labelled) >= len(numeric) - 1:
             return labelled
     dated = {k for k in numeric if all(_is_date(line, c[k]) for line, c in same[:20])}
     words, _ = guess_columns((), rows, dated)
     if not _measures(words):
         return None
     varied = {tuple(row) for row in rows}
-    return (words, often, len(lines)) if len(varied) > 1 or width > 1 else None
+    return words if len(varied) > 1 or width > 1 else None
 
 
 def _measures(words: Iterable[str]) -> bool:

@@ -37,7 +37,7 @@ def line_columns(data: bytes) -> tuple[str, int] | None:
     guess = guess_line_columns(data) or guess_line_columns(data[len(data) // 2 :])
     if guess is None:
         return None
-    columns = compress_columns(guess[0])
+    columns = compress_columns(guess)
     try:
         codec = make_codec("serial", "ascii_line", {"columns": columns})
     except ConfigError:
