@@ -3,8 +3,9 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -15,6 +16,9 @@ from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, print_table, told_as_json
 from tactile_rt.errors import ConfigError
 from tactile_rt.settings import take_sets
+
+if TYPE_CHECKING:
+    from tactile_rt.models.alignment.results import Results
 
 align = typer.Typer(help="Compare a model with recordings of barrel cortex.", no_args_is_help=True)
 app.add_typer(align, name="align")
@@ -146,9 +150,10 @@ def score_models(
         check_output(file)
     given = _performances(performance, len(models))
     with needing_torch():
-        from tactile_rt.models.alignment.benchmark_file import load_benchmark
+        if html:
+            import matplotlib  # noqa: F401
+        from tactile_rt.models.alignment.benchmark import load_benchmark
         from tactile_rt.models.alignment.loading import check_models, load_layers, load_untrained
-        from tactile_rt.models.alignment.report import write_page
         from tactile_rt.models.alignment.results import (
             ModelResult,
             model_result,
@@ -165,13 +170,13 @@ def score_models(
                 layers, own = load_layers(path, felt)
                 layers = replace(layers, name=name)
                 before = load_untrained(path, felt, seed) if untrained else None
-                done.append(model_result(frozen, layers, before, told or own)[0])
+                done.append(model_result(frozen, layers, before, told or own))
                 update(advance=1)
     results = results_of(frozen, felt, done)
     if html:
-        write_page(results, html)
+        _write_report(results, html)
     for model in done:
-        if model.score is None:
+        if not isfinite(model.score):
             typer.echo(f"{model.name}: no score: {_why_none(results)}", err=True)
     if not told_as_json(results, json):
         _show_scores(results)
@@ -185,14 +190,15 @@ def write_report(
     """Write one self-contained page of some scores on the same benchmark."""
     import msgspec
 
+    from tactile_rt.models.alignment.benchmark import benchmark_sha256
     from tactile_rt.models.alignment.loading import told_apart
-    from tactile_rt.models.alignment.report import write_page
     from tactile_rt.models.alignment.results import read_results
 
     check_output(out)
     read = [read_results(path) for path in scores]
-    for path, one in zip(scores, read, strict=True):
-        if one.benchmark.sha256 != read[0].benchmark.sha256 or one.input != read[0].input:
+    of = [(benchmark_sha256(one.benchmark), one.input) for one in read]
+    for path, used in zip(scores, of, strict=True):
+        if used != of[0]:
             raise ConfigError(
                 f"{path} was scored on another benchmark or other stimuli than {scores[0]}"
             )
@@ -202,7 +208,7 @@ def write_report(
         msgspec.structs.replace(model, name=name)
         for (model, _), name in zip(found, names, strict=True)
     )
-    write_page(msgspec.structs.replace(read[0], models=models), out)
+    _write_report(msgspec.structs.replace(read[0], models=models), out)
     Console(stderr=True).print(f"{out}", highlight=False)
 
 
@@ -226,7 +232,7 @@ def decode_stimuli(
     check_output(json)
     with needing_torch():
         from tactile_rt.models.alignment.animal_means import animal_means
-        from tactile_rt.models.alignment.benchmark_file import load_strict
+        from tactile_rt.models.alignment.benchmark import load_strict
         from tactile_rt.models.alignment.decoding import (
             decode,
             decode_paper,
@@ -276,9 +282,17 @@ def needing_torch() -> Iterator[None]:
         raise needs("train", error) from None
 
 
+def _write_report(results: "Results", path: Path) -> None:
+    with needing_torch():
+        from tactile_rt.models.alignment.html_page import write_page
+        from tactile_rt.models.alignment.report import report_page
+
+        write_page(report_page(results), path)
+
+
 def _why_none(results: Any) -> str:
     b = results.benchmark
-    reliable = sum(b.reliable[: len(b.a2a)])
+    reliable = len(b.reliable)
     if b.protocol == "strict" and reliable < 2:
         return (
             f"the benchmark has {reliable} reliable animal, and a layer is chosen on the others: "
@@ -314,10 +328,10 @@ def _show_scores(results: Any) -> None:
             _said(model.untrained.score) if model.untrained else "",
             max(set(chosen), key=chosen.count) if chosen else "-",
         )
-    raw, b = results.raw, results.benchmark
+    raw, a2a = results.raw, results.benchmark.a2a
     table.add_row("raw sensor input", f"{_said(raw.score)} ± {_said(raw.sem)}", _said(raw.p, 4))
-    table.add_row("animal to animal", f"{_said(b.a2a_mean)} ± {_said(b.a2a_sem)}")
-    table.add_row("its highest", _said(b.a2a_highest))
+    table.add_row("animal to animal", f"{_said(a2a.mean)} ± {_said(a2a.sem)}")
+    table.add_row("its highest", _said(a2a.highest))
     print_table(table)
 
 
@@ -333,5 +347,5 @@ def _show_decoded(rows: list[tuple[str, str, Any]]) -> None:
     print_table(table)
 
 
-def _said(value: float | None, digits: int = 2) -> str:
-    return "-" if value is None or value != value else f"{value:.{digits}f}"
+def _said(value: float, digits: int = 2) -> str:
+    return f"{value:.{digits}f}" if isfinite(value) else "-"

@@ -146,9 +146,10 @@ def write_board(
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     if html:
-        from tactile_rt.models.alignment.board_page import write_board_page
+        from tactile_rt.models.alignment.board_page import board_page
+        from tactile_rt.models.alignment.html_page import write_page
 
-        write_board_page(made, html)
+        write_page(board_page(made), html)
     if not told_as_json(made, json):
         _show(made)
 
@@ -233,23 +234,20 @@ def _named(text: str) -> tuple[str, Path]:
 
 
 def _show(board: "Alignments") -> None:
+    from tactile_rt.models.alignment.html_page import format_number
+
     places = dict.fromkeys((c.dataset, c.part) for c in board.columns)
     for dataset, part in places:
         columns = [k for k, c in enumerate(board.columns) if (c.dataset, c.part) == (dataset, part)]
         heads = [board.columns[k].metric for k in columns]
         table = Table(Column("", overflow="fold"), *heads, title=f"{dataset}, {part}: shares of "
                       "what noise permits")  # fmt: skip
-        for r, row in enumerate(board.rows):
-            cells = [board.cell(r, k) for k in columns]
+        for row, cells in zip(board.rows, board.cells, strict=True):
             name = f"  {row.name}" if row.kind == "untrained" else row.name
-            table.add_row(name, *(_said(c.score) for c in cells))
+            table.add_row(name, *(format_number(cells[k].score) for k in columns))
         table.add_section()
-        table.add_row("ceiling", *(_said(board.columns[k].ceiling) for k in columns))
+        table.add_row("ceiling", *(format_number(board.columns[k].ceiling) for k in columns))
         table.add_row(
             "animals", *(f"{board.columns[k].usable}/{board.columns[k].animals}" for k in columns)
         )
         print_table(table)
-
-
-def _said(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"

@@ -79,7 +79,7 @@ def _gate(
     if baseline is not None and benchmark is None:
         raise ConfigError("--baseline needs the --benchmark that it was scored on")
     with needing_torch():
-        from tactile_rt.models.alignment.benchmark_file import load_strict
+        from tactile_rt.models.alignment.benchmark import load_strict
         from tactile_rt.models.alignment.fidelity import export_layers, fidelity_check
         from tactile_rt.models.alignment.gate import Check, exit_code, neural_checks
         from tactile_rt.models.alignment.loading import check_models, load_layers

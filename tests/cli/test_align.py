@@ -47,7 +47,7 @@ def test_score_report_and_a_baseline(call, frozen, tmp_path):
     other = tmp_path / "other.json"
     other.write_bytes(scores.read_bytes())
     assert call("align", "report", scores, other, "--out", again)[0] == 0
-    assert "Fit of the layers of mouse44 (other.json)" in again.read_text()
+    assert "<h3>mouse44 (other.json) <small>score" in again.read_text()
     # The model is no worse than itself; random geometries are no match for it, though.
     told = tmp_path / "gate.json"
     code, out, _ = call(
@@ -240,7 +240,7 @@ def test_build_from_the_published_layout(call, tmp_path):
     arguments = ("--protocol", "paper-code", "--bootstraps", 20, "--out", out)
     code, _, err = call("align", "build", source, *arguments)
     assert code == 0 and "animals are reliable" in err
-    assert json.loads(out.read_text())["protocol"] == "paper-code"
+    assert json.loads(out.read_text())["benchmark"]["protocol"] == "paper-code"
 
 
 def test_mistakes_are_one_line(call, frozen, tmp_path):
@@ -251,7 +251,10 @@ def test_mistakes_are_one_line(call, frozen, tmp_path):
         (("score", MODEL, *benchmark, "--performance", "0.4,0.5"), "--performance is 1 numbers"),
         (("score", MODEL, *benchmark, "--performance", "90"), "from 0 to 1"),
         (("score", MODEL, *benchmark, "--html", tmp_path / "x" / "p.html"), "no folder"),
-        (("report", frozen / "6.json", "--out", tmp_path / "p.html"), "has no scores"),
+        (
+            ("report", frozen / "6.json", "--out", tmp_path / "p.html"),
+            "not of `tactile-rt align score",
+        ),
         (("build", tmp_path / "none", "--out", tmp_path / "b.json"), "none"),
         (("decode", MODEL, "--stimuli", tmp_path / "none.npz"), "no file"),
     ):

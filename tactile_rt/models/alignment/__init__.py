@@ -5,7 +5,7 @@ reliability   split halves, Spearman-Brown, the correction for noise
 neural, nwb, nwb_parts, published   recordings: from NWB files, and in the published layout
 strict, canonical, pooling, paper_code, building
                          the two protocols: recordings -> a frozen benchmark
-benchmark, benchmark_file   the frozen benchmark and its file
+benchmark, json_file     the frozen benchmark and its file
 scoring, statistics      a model's layers -> score, exact p-value
 stimuli_input, layers, activations, onnx_taps, onnx_activations, responses_file, loading
                           a model -> its layers
@@ -22,8 +22,6 @@ from tactile_rt.models.alignment.benchmark import (
     Consistency,
     Frozen,
     Target,
-)
-from tactile_rt.models.alignment.benchmark_file import (
     benchmark_sha256,
     load_benchmark,
     save_benchmark,

@@ -1,27 +1,39 @@
 """A frozen benchmark: what scoring a model needs, without any animal's raw data.
 
 A deterministic model's score against an animal is r_xy times a factor that depends on the animal
-alone, so 15 numbers and that factor per animal are enough.
+alone, so 15 numbers and that factor per animal are enough. Its file is JSON with a hash of the
+content: one of another version, or changed by hand, is refused.
 """
 
+import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from pathlib import Path
 
+import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from tactile_rt.models.alignment.rdm import STIMULI
+from tactile_rt.errors import ConfigError
+from tactile_rt.models.alignment.json_file import Floats, Number, encode, read_json, write_json
+from tactile_rt.models.alignment.rdm import PAIRS, STIMULI
 
-__all__ = ["PROTOCOLS", "Benchmark", "Consistency", "Frozen", "Target"]
-
-Floats = NDArray[np.float64]
+__all__ = [
+    "PROTOCOLS",
+    "Benchmark",
+    "Consistency",
+    "Frozen",
+    "Target",
+    "benchmark_sha256",
+    "check_benchmark",
+    "load_benchmark",
+    "load_strict",
+    "save_benchmark",
+]
 
 PROTOCOLS = ("strict", "paper-code")
 
 
-@dataclass(frozen=True, eq=False)
-class Frozen:
+class Frozen(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
     """An RDM and how far it can be relied on.
 
     Attributes:
@@ -35,17 +47,15 @@ class Frozen:
     """
 
     rdm: Floats
-    reliability: float
-    factor: float
+    reliability: Number
+    factor: Number
     units: int
 
 
-@dataclass(frozen=True, eq=False)
-class Target:
+class Target(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
     """What models are compared to: an animal, or all of them pooled.
 
     Attributes:
-        name: The name of the animal, or of the pool of all animals.
         chosen: The RDM that the protocol scores on; for strict, it is made of reliable units only.
         unfiltered: The RDM of all units, without the protocol's filter.
         reliable: Whether the target is reliable enough to count in a mean over animals.
@@ -61,8 +71,7 @@ class Target:
     sha256: str
 
 
-@dataclass(frozen=True, eq=False)
-class Consistency:
+class Consistency(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
     """How well animals predict each other.
 
     Attributes:
@@ -83,7 +92,7 @@ class Consistency:
     @property
     def mean(self) -> float:
         """Mean of the pooled scores; NaN without any."""
-        return _or_nan(self.pooled, np.mean)
+        return self._reduce(np.mean)
 
     @property
     def sem(self) -> float:
@@ -96,11 +105,14 @@ class Consistency:
     @property
     def highest(self) -> float:
         """Highest pooled score."""
-        return _or_nan(self.pooled, np.max)
+        return self._reduce(np.max)
+
+    def _reduce(self, reduce: Callable[[Floats], np.floating]) -> float:
+        finite = self.pooled[np.isfinite(self.pooled)]
+        return float(reduce(finite)) if finite.size else math.nan
 
 
-@dataclass(frozen=True, eq=False)
-class Benchmark:
+class Benchmark(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
     """A frozen benchmark.
 
     Attributes:
@@ -135,6 +147,68 @@ class Benchmark:
         return tuple(target for target in self.targets if target.reliable)
 
 
-def _or_nan(values: Floats, reduce: Callable[[Floats], np.floating]) -> float:
-    finite = values[np.isfinite(values)]
-    return float(reduce(finite)) if finite.size else math.nan
+# 3: the benchmark stands beside its hash.
+class _File(
+    msgspec.Struct, tag_field="kind", tag="tactile_rt benchmark 3", forbid_unknown_fields=True
+):
+    benchmark: Benchmark
+    sha256: str
+
+
+def benchmark_sha256(benchmark: Benchmark) -> str:
+    """Hash of a benchmark's content, as its file carries it."""
+    return hashlib.sha256(encode(benchmark)).hexdigest()
+
+
+def save_benchmark(benchmark: Benchmark, path: Path) -> None:
+    """Write a benchmark as JSON, whole or not at all."""
+    write_json(_File(benchmark, benchmark_sha256(benchmark)), path)
+
+
+def load_benchmark(path: Path) -> Benchmark:
+    """Read a benchmark.
+
+    Raises:
+        ConfigError: no such file, another version, a field that is wrong, or changed content.
+    """
+    file = read_json(path, _File, "tactile-rt align build")
+    if file.sha256 != benchmark_sha256(file.benchmark):
+        raise ConfigError(f"{path}: changed since it was built: build it again")
+    check_benchmark(file.benchmark, path)
+    return file.benchmark
+
+
+def load_strict(path: Path) -> Benchmark:
+    """Read a benchmark of the protocol whose stimuli have names, as gate and decoder need.
+
+    Raises:
+        ConfigError: as `load_benchmark`; or the benchmark is of the other protocol.
+    """
+    benchmark = load_benchmark(path)
+    if benchmark.protocol != "strict":
+        raise ConfigError(
+            f"{path} is of protocol {benchmark.protocol}, whose stimuli stand in the order of "
+            "their first appearance, another in each session: build with protocol strict"
+        )
+    return benchmark
+
+
+def check_benchmark(benchmark: Benchmark, path: Path) -> None:
+    """Check what the types of a benchmark's fields cannot.
+
+    Raises:
+        ConfigError: no such protocol, other stimuli, or tables that do not fit.
+    """
+    if benchmark.protocol not in PROTOCOLS:
+        raise ConfigError(f"{path}: no protocol {benchmark.protocol!r}: {', '.join(PROTOCOLS)}")
+    if benchmark.stimuli != STIMULI:
+        raise ConfigError(f"{path}: stimuli {benchmark.stimuli}, not {STIMULI}")
+    for target in benchmark.all_targets:
+        if not target.chosen.rdm.shape == target.unfiltered.rdm.shape == (len(PAIRS),):
+            raise ConfigError(f"{path}: target {target.name}: an RDM has {len(PAIRS)} entries")
+    a2a = benchmark.a2a
+    number = len(a2a.animals)
+    if a2a.animals != tuple(t.name for t in benchmark.targets) or not (
+        a2a.pooled.shape == (number,) and a2a.pairwise.shape == (number, number)
+    ):
+        raise ConfigError(f"{path}: a2a and the targets are not of the same animals")

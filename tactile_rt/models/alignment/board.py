@@ -5,16 +5,14 @@ board tells no maximum. What it is to be read against stands in rows of the same
 themselves, each network before its training, and another animal.
 """
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from pathlib import Path
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
-from tactile_rt.errors import ConfigError
-from tactile_rt.files import write_whole
 from tactile_rt.models.alignment.datasets import NeuralDataset
+from tactile_rt.models.alignment.json_file import Floats, Number
 from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.metrics import METRICS, Measure, find_metric
 from tactile_rt.models.alignment.metrics.halves import LONGEST, bins_of, means_of, sessions_of
@@ -31,18 +29,13 @@ __all__ = [
     "BoardDataset",
     "BoardRow",
     "joined",
-    "read_board",
     "traces_of",
     "traces_of_stimuli",
     "with_cells",
-    "write_board",
 ]
 
-Floats = NDArray[np.float64]
 Traces = Mapping[str, Floats]  # by layer, (6, step, unit), NaN where input cannot reach
 
-KIND = "tactile_rt alignment board"
-VERSION = 1
 ANOTHER = "another animal"
 
 
@@ -74,7 +67,7 @@ class BoardColumn(msgspec.Struct, frozen=True):
         metric: The name of the metric.
         animals: The number of animals with units of that part.
         usable: The number of animals whose noise is low enough to be corrected for.
-        ceiling: The mean over these of the value that a perfect model is expected to reach; None
+        ceiling: The mean over these of the value that a perfect model is expected to reach; NaN
             without any.
     """
 
@@ -83,26 +76,23 @@ class BoardColumn(msgspec.Struct, frozen=True):
     metric: str
     animals: int
     usable: int
-    ceiling: float | None
+    ceiling: Number
 
 
 class BoardCell(msgspec.Struct, frozen=True):
     """A row's value in a column.
 
     Attributes:
-        row, column: The places of the row and the column in the board.
-        score: The mean over animals of the value as a share of the ceiling; None without any.
-        sem: The standard error of that mean; None with fewer than two animals.
+        score: The mean over animals of the value as a share of the ceiling; NaN without any.
+        sem: The standard error of that mean; NaN with fewer than two animals.
         value: The mean over animals before the division by the ceiling.
         layer: The name of the layer that was chosen most often.
     """
 
-    row: int
-    column: int
-    score: float | None
-    sem: float | None
-    value: float | None
-    layer: str
+    score: Number = math.nan
+    sem: Number = math.nan
+    value: Number = math.nan
+    layer: str = ""
 
 
 class BoardDataset(msgspec.Struct, frozen=True):
@@ -126,35 +116,22 @@ class BoardDataset(msgspec.Struct, frozen=True):
     notes: tuple[str, ...]
 
 
-class Alignments(msgspec.Struct, frozen=True):
+class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt board 2"):
     """A whole board.
 
     Attributes:
         rows: The models and what they are read against.
         columns: The datasets' parts under every metric.
-        cells: The values, in any order.
+        cells: (row, column) The values.
         datasets: The datasets of the columns.
         metrics: What each metric is, in a line, by its name.
     """
 
     rows: tuple[BoardRow, ...]
     columns: tuple[BoardColumn, ...]
-    cells: tuple[BoardCell, ...]
+    cells: tuple[tuple[BoardCell, ...], ...]
     datasets: tuple[BoardDataset, ...]
     metrics: dict[str, str]
-    kind: str = KIND
-    version: int = VERSION
-
-    def cell(self, row: int, column: int) -> BoardCell:
-        """The cell at a place.
-
-        Raises:
-            KeyError: there is none.
-        """
-        for cell in self.cells:
-            if (cell.row, cell.column) == (row, column):
-                return cell
-        raise KeyError((row, column))
 
 
 def traces_of(layers: Layers) -> Traces:
@@ -203,89 +180,44 @@ def with_cells(
     from threadpoolctl import threadpool_limits
 
     columns: list[BoardColumn] = []
-    cells: list[BoardCell] = []
+    cells: list[list[BoardCell]] = [[] for _ in range(len(rows) + 1)]
     # Matrices are small: more threads wait for each other, on a busy machine for minutes.
     with threadpool_limits(1):
         for done, (part, metric) in enumerate((p, m) for p in parts for m in metrics):
             targets = part_of(animals, part)
-            measures = [find_metric(metric)(target) for target in targets]
-            usable = [k for k, measure in enumerate(measures) if measure.usable]
-            ceilings = np.array([measures[k].ceiling for k in usable])
+            measured = [(target, find_metric(metric)(target)) for target in targets]
+            usable = [(target, measure) for target, measure in measured if measure.usable]
+            measures = [measure for _, measure in usable]
+            ceiling = float(np.mean([m.ceiling for m in measures])) if measures else math.nan
             columns.append(
-                BoardColumn(dataset.name, part, metric, len(targets), len(usable),
-                            _number(ceilings.mean()) if usable else None)
-            )  # fmt: skip
-            for row, (_, traces) in enumerate(rows):
-                cells.append(_cell(row, done, traces, [measures[k] for k in usable]))
-            others = [(targets[k], measures[k]) for k in usable]
-            cells.append(_another(len(rows), done, others))
+                BoardColumn(dataset.name, part, metric, len(targets), len(usable), ceiling)
+            )
+            for row, (_, traces) in zip(cells, rows, strict=False):
+                row.append(_cell(traces, measures))
+            cells[-1].append(_another(usable))
             progress((done + 1) / (len(parts) * len(metrics)))
     card = BoardDataset(
-        name=dataset.name,
-        title=dataset.title,
-        citation=dataset.citation,
-        license=dataset.license,
-        url=dataset.url,
-        size=dataset.size,
-        about=dataset.about,
+        **{key: getattr(dataset, key) for key in BoardDataset.__struct_fields__[:7]},
         animals=tuple(a.name for a in animals),
         units=sum(s.rates.shape[1] for a in animals for s in a.sessions),
         notes=tuple(notes),
     )
     said = {name: METRICS[name][1] if name in METRICS else "of another package" for name in metrics}
     named = (*(row for row, _ in rows), BoardRow(ANOTHER, "animal"))
-    return Alignments(named, tuple(columns), tuple(cells), (card,), said)
+    return Alignments(named, tuple(columns), tuple(map(tuple, cells)), (card,), said)
 
 
 def joined(boards: Sequence[Alignments]) -> Alignments:
     """Boards of the same rows side by side."""
-    columns: list[BoardColumn] = []
-    cells: list[BoardCell] = []
-    for board in boards:
-        cells += [
-            msgspec.structs.replace(cell, column=cell.column + len(columns)) for cell in board.cells
-        ]
-        columns += board.columns
     return msgspec.structs.replace(
         boards[0],
-        columns=tuple(columns),
-        cells=tuple(cells),
+        columns=tuple(column for board in boards for column in board.columns),
+        cells=tuple(sum(rows, ()) for rows in zip(*(b.cells for b in boards), strict=True)),
         datasets=tuple(one for board in boards for one in board.datasets),
     )
 
 
-def write_board(board: Alignments, path: Path) -> None:
-    """Write it whole or not at all, as JSON."""
-    text = msgspec.json.format(msgspec.json.encode(board), indent=1)
-    write_whole(path, lambda file: file.write(text + b"\n"))
-
-
-def read_board(path: Path) -> Alignments:
-    """Read what `write_board` wrote.
-
-    Raises:
-        ConfigError: not there, damaged, or of another version.
-    """
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
-    try:
-        head = msgspec.json.decode(raw)
-        if not isinstance(head, dict) or head.get("kind") != KIND:
-            raise ConfigError(f"{path} has no board: write one with `tactile-rt align board`")
-        if head.get("version") != VERSION:
-            raise ConfigError(
-                f"{path} has a board of version {head.get('version')!r}, not {VERSION}"
-            )
-        return msgspec.json.decode(raw, type=Alignments)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(
-            f"{path} is damaged, or not what `tactile-rt align board --json` wrote: {error}"
-        ) from None
-
-
-def _cell(row: int, column: int, traces: Traces, measures: Sequence[Measure]) -> BoardCell:
+def _cell(traces: Traces, measures: Sequence[Measure]) -> BoardCell:
     """A model's cell: of each animal the layer that is best on the others."""
     values = np.array([[m.fit(trace) for m in measures] for trace in traces.values()])
     values = values.reshape(len(traces), len(measures))
@@ -293,21 +225,15 @@ def _cell(row: int, column: int, traces: Traces, measures: Sequence[Measure]) ->
     shares = values[there] / [m.ceiling for m in measures]
     scores, best = held_out(shares)
     if not np.isfinite(scores).any():
-        return BoardCell(row, column, None, None, None, "")
+        return BoardCell()
     names = [tuple(traces)[k] for k in there]
     chosen = [names[k] for k in best]
     raw = values[there][best, np.arange(len(measures))]
-    return BoardCell(
-        row,
-        column,
-        _number(scores.mean()),
-        _number(standard_error(scores)),
-        _number(raw.mean()),
-        max(set(chosen), key=chosen.count),
-    )
+    layer = max(set(chosen), key=chosen.count)
+    return BoardCell(float(scores.mean()), standard_error(scores), float(raw.mean()), layer)
 
 
-def _another(row: int, column: int, animals: Sequence[tuple[Animal, Measure]]) -> BoardCell:
+def _another(animals: Sequence[tuple[Animal, Measure]]) -> BoardCell:
     """The cell of animals as models of each other: each measured by all others, one at a time."""
     scores, raw = [], []
     for target, measure in animals:
@@ -317,9 +243,8 @@ def _another(row: int, column: int, animals: Sequence[tuple[Animal, Measure]]) -
             scores.append(float(there.mean()) / measure.ceiling)
             raw.append(float(there.mean()))
     if not scores:
-        return BoardCell(row, column, None, None, None, "")
-    sem = standard_error(scores)
-    return BoardCell(row, column, _number(np.mean(scores)), _number(sem), _number(np.mean(raw)), "")
+        return BoardCell()
+    return BoardCell(float(np.mean(scores)), standard_error(scores), float(np.mean(raw)))
 
 
 def _as_layer(animal: Animal) -> Floats:
@@ -327,7 +252,3 @@ def _as_layer(animal: Animal) -> Floats:
     sessions = sessions_of(animal)
     means = means_of(sessions, bins_of(sessions))
     return np.repeat(means, LONGEST, axis=1) if means.shape[1] == 1 else means
-
-
-def _number(value: float | np.floating) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -1,8 +1,9 @@
 """From recordings to a frozen benchmark."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
+
+from msgspec.structs import replace
 
 from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.alignment.benchmark import PROTOCOLS, Benchmark

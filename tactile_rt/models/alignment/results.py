@@ -3,71 +3,35 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError
-from tactile_rt.files import write_whole
-from tactile_rt.models.alignment.benchmark import Benchmark
-from tactile_rt.models.alignment.benchmark_file import benchmark_sha256
+from tactile_rt.models.alignment.benchmark import Benchmark, benchmark_sha256, check_benchmark
 from tactile_rt.models.alignment.gate import neural_checks
+from tactile_rt.models.alignment.json_file import Floats, Number, read_json
 from tactile_rt.models.alignment.layers import Layers
-from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, normalised, rdm
+from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, normalised
 from tactile_rt.models.alignment.scoring import Score, score
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 
-__all__ = [
-    "AlignmentControl",
-    "BenchmarkResult",
-    "ModelResult",
-    "Results",
-    "baseline_of",
-    "model_result",
-    "read_results",
-    "results_of",
-    "write_results",
-]
-
-VERSION = 1
-# None in the file where there is no value; what is larger cannot be drawn.
-Number = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)] | None
+__all__ = ["ModelResult", "Results", "baseline_of", "model_result", "read_results", "results_of"]
 
 
-class AlignmentControl(msgspec.Struct, frozen=True):
-    """What a score is compared with: raw sensor input, or an untrained network.
+class ModelResult(Score, frozen=True, eq=False, kw_only=True):
+    """Everything that is shown of a model: its score, and fields as in `layers.Layers`.
 
     Attributes:
-        name: The name of the control, as a report prints it.
-        layers: The names of the layers that were scored.
-        corrected: (layer, target) Correlations corrected for noise.
-        score, sem, p: Score, standard error and p value of the control, as `scoring.Score` has a
-            model's.
-    """
-
-    name: str
-    layers: tuple[str, ...]
-    corrected: tuple[tuple[Number, ...], ...]
-    score: Number
-    sem: Number
-    p: Number
-
-
-class ModelResult(msgspec.Struct, frozen=True):
-    """Everything that is shown of a model; fields as in `scoring.Score` and `layers.Layers`.
-
-    Attributes:
-        rdms: (layer, 15) The dissimilarities of the 15 pairs of stimuli in each layer.
         units: (layer,) The number of units in each layer.
-        performance: The accuracy on the task, 0 to 1; None if no accuracy is known.
+        performance: The accuracy on the task, 0 to 1; NaN if no accuracy is known.
         performance_of: The words that say what that accuracy was measured on.
-        untrained: The network before its training as a control, where there is one.
+        untrained: The score of the network before its training, where there is one.
         groups: The groups that the model belongs to, by what they divide models by: encoder,
             attender, objective, augmentation, masking; without those that are not known.
         turing: The verdict of the gate's NeuroAI Turing test: pass, fail or inconclusive; empty
-            under paper-code, and in files that were written without it.
+            under paper-code.
         turing_why: The reason for that verdict, and what the test would find in this benchmark.
     """
 
@@ -75,90 +39,39 @@ class ModelResult(msgspec.Struct, frozen=True):
     sha256: str
     precision: str
     parameters: int
-    layers: tuple[str, ...]
     first: tuple[int, ...]
     units: tuple[int, ...]
-    rdms: tuple[tuple[Number, ...], ...]
-    corrected: tuple[tuple[Number, ...], ...]
-    unfiltered: tuple[tuple[Number, ...], ...]
-    chosen: tuple[str, ...]
-    per_target: tuple[Number, ...]
-    score: Number
-    sem: Number
-    p: Number
-    null_95: Number
-    performance: Number = None
+    performance: Number = math.nan
     performance_of: str = ""
-    untrained: AlignmentControl | None = None
+    untrained: Score | None = None
     notes: tuple[str, ...] = ()
-    groups: dict[str, str] = {}
+    groups: dict[str, str] = msgspec.field(default_factory=dict)
     turing: str = ""
     turing_why: str = ""
 
 
-class BenchmarkResult(msgspec.Struct, frozen=True):
-    """What is shown of the benchmark; (target, 15) RDMs and a factor and a reliability each."""
-
-    protocol: str
-    sha256: str
-    targets: tuple[str, ...]
-    reliable: tuple[bool, ...]
-    factors: tuple[Number, ...]
-    reliabilities: tuple[Number, ...]
-    rdms: tuple[tuple[Number, ...], ...]
-    a2a_mean: Number
-    a2a_sem: Number
-    a2a_highest: Number
-    a2a: dict[str, Number]
-    notes: tuple[str, ...] = ()
-
-
-class Results(msgspec.Struct, frozen=True):
+class Results(
+    msgspec.Struct, frozen=True, eq=False, tag_field="kind", tag="tactile_rt alignment scores 2"
+):
     """One file of scores.
 
     Attributes:
-        stimuli, pairs: Names along the axes of the RDMs: six stimuli, fifteen pairs.
-        input: The file name and the SHA-256 sum of the stimuli's loads.
         raw: The control that no model is needed for: the readings of the sensors themselves.
+        input: The file name and the SHA-256 sum of the stimuli's loads.
     """
 
-    benchmark: BenchmarkResult
+    benchmark: Benchmark
     models: tuple[ModelResult, ...]
-    raw: AlignmentControl
-    raw_rdm: tuple[Number, ...]
+    raw: Score
     input: dict[str, str]
-    stimuli: tuple[str, ...] = STIMULI
-    kind: str = "tactile_rt alignment scores"
-    version: int = VERSION
 
 
 def results_of(
     benchmark: Benchmark, stimuli: StimuliInput, models: Sequence[ModelResult]
 ) -> Results:
     """Scores of models on one benchmark, the sensors themselves beside them."""
-    targets = benchmark.all_targets
-    raw = stimuli.raw()
-    a2a = benchmark.a2a
-    return Results(
-        benchmark=BenchmarkResult(
-            protocol=benchmark.protocol,
-            sha256=benchmark_sha256(benchmark),
-            targets=tuple(t.name for t in targets),
-            reliable=tuple(bool(t.reliable) for t in targets),
-            factors=_numbers([t.chosen.factor for t in targets]),
-            reliabilities=_numbers([t.chosen.reliability for t in targets]),
-            rdms=_table([t.chosen.rdm for t in targets]),
-            a2a_mean=_number(a2a.mean),
-            a2a_sem=_number(a2a.sem),
-            a2a_highest=_number(a2a.highest),
-            a2a=dict(zip(a2a.animals, _numbers(a2a.pooled), strict=True)),
-            notes=benchmark.notes,
-        ),
-        models=tuple(models),
-        raw=_control("raw sensor input", score(benchmark, {"raw": raw})),
-        raw_rdm=_numbers(rdm(raw)),
-        input={"file": stimuli.name, "sha256": stimuli.sha256},
-    )
+    raw = score(benchmark, {"raw": stimuli.raw()})
+    return Results(benchmark, tuple(models), raw, {"file": stimuli.name, "sha256": stimuli.sha256})
 
 
 def model_result(
@@ -166,40 +79,30 @@ def model_result(
     layers: Layers,
     untrained: Layers | None = None,
     performance: tuple[float, str] | None = None,
-) -> tuple[ModelResult, Score]:
+) -> ModelResult:
     """Score a model."""
     patterns = layers.patterns
     made = score(benchmark, patterns)
     # The test takes stimuli by their names, which paper-code has lost.
     checks = neural_checks(made, benchmark) if benchmark.protocol == "strict" else ()
     test = next((check for check in checks if check.name == "turing"), None)
+    accuracy, measured_on = performance or (math.nan, "")
     return ModelResult(
+        **{name: getattr(made, name) for name in Score.__struct_fields__},
         name=layers.name,
         sha256=layers.sha256,
         precision=layers.precision,
         parameters=layers.parameters,
-        layers=made.layers,
         first=tuple(int(layers.first[n]) for n in patterns),
         units=tuple(p.shape[1] for p in patterns.values()),
-        rdms=_table([rdm(p) for p in patterns.values()]),
-        corrected=_table(made.corrected),
-        unfiltered=_table(made.unfiltered),
-        chosen=made.chosen,
-        per_target=_numbers(made.per_target),
-        score=_number(made.score),
-        sem=_number(made.sem),
-        p=_number(made.p),
-        null_95=_number(made.null_95),
-        performance=performance[0] if performance else None,
-        performance_of=performance[1] if performance else "",
-        untrained=(
-            _control(untrained.name, score(benchmark, untrained.patterns)) if untrained else None
-        ),
+        performance=accuracy,
+        performance_of=measured_on,
+        untrained=score(benchmark, untrained.patterns) if untrained else None,
         notes=(*layers.notes, *_without_rdm(patterns)),
         groups=_groups(layers),
         turing=test.verdict if test else "",
         turing_why=test.why if test else "",
-    ), made
+    )
 
 
 def _without_rdm(patterns: Mapping[str, NDArray[np.float64]]) -> Iterator[str]:
@@ -218,77 +121,43 @@ def _without_rdm(patterns: Mapping[str, NDArray[np.float64]]) -> Iterator[str]:
         )
 
 
-def write_results(results: Results, path: Path) -> None:
-    """Write them whole or not at all, as JSON."""
-    text = msgspec.json.format(msgspec.json.encode(results), indent=1)
-    write_whole(path, lambda file: file.write(text + b"\n"))
-
-
 def read_results(path: Path) -> Results:
-    """Read what `write_results` wrote.
+    """Read scores from the JSON that `tactile-rt align score` writes.
 
     Raises:
         ConfigError: not there, damaged, or of another version.
     """
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
-    try:
-        head = msgspec.json.decode(raw)
-        if not isinstance(head, dict) or head.get("kind") != "tactile_rt alignment scores":
-            raise ConfigError(f"{path} has no scores: write some with `tactile-rt align score`")
-        if head.get("version") != VERSION:
-            raise ConfigError(
-                f"{path} has scores of version {head.get('version')!r}, not {VERSION}"
-            )
-        results = msgspec.json.decode(raw, type=Results)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(
-            f"{path} is damaged, or not what `tactile-rt align score --json` wrote: {error}"
-        ) from None
-    for what, fits in _fitting(results):
-        if not fits:
-            raise ConfigError(f"{path} is damaged: the tables of {what} do not fit")
+    results = read_json(path, Results, "tactile-rt align score --json")
+    check_benchmark(results.benchmark, path)
+    targets = tuple(t.name for t in results.benchmark.all_targets)
+    _check_score(results.raw, targets, ("raw",), f"{path} is damaged: raw sensor input")
+    for model in results.models:
+        where = f"{path} is damaged: {model.name}"
+        _check_score(model, targets, model.layers, where)
+        if not len(model.units) == len(model.first) == len(model.layers):
+            raise ConfigError(f"{where}: units and layers do not fit")
+        if model.untrained is not None:
+            _check_score(model.untrained, targets, model.untrained.layers, where)
     return results
 
 
-def _fitting(results: Results) -> Iterator[tuple[str, bool]]:
-    """Whose tables they are, and whether they are of the sizes that the types cannot say."""
-    benchmark, raw = results.benchmark, results.raw
-    targets = len(benchmark.targets)
-    told = (benchmark.reliable, benchmark.factors, benchmark.reliabilities)
-    yield (
-        "the benchmark",
-        {len(values) for values in told} <= {targets}
-        and _is_table(benchmark.rdms, targets, len(PAIRS))
-        and set(benchmark.a2a) == set(benchmark.targets[: len(benchmark.a2a)])
-        and results.stimuli == STIMULI,
-    )
-    yield (
-        raw.name,
-        raw.layers == ("raw",)
-        and _is_table(raw.corrected, 1, targets)
-        and len(results.raw_rdm) == len(PAIRS),
-    )
-    for model in results.models:
-        layers, before = len(model.layers), model.untrained
-        yield (
-            model.name,
-            len(model.units) == len(model.first) == layers
-            and len(model.per_target) == len(model.chosen) == targets
-            and _is_table(model.rdms, layers, len(PAIRS))
-            and _is_table(model.corrected, layers, targets)
-            and _is_table(model.unfiltered, layers, targets)
-            and (before is None or _is_table(before.corrected, len(before.layers), targets)),
-        )
+def _check_score(
+    made: Score, targets: tuple[str, ...], layers: tuple[str, ...], where: str
+) -> None:
+    """Check the shapes of the tables of a score."""
+    shape = (len(layers), len(targets))
+    if not (
+        made.layers == layers
+        and made.targets == targets
+        and made.rdms.shape == (len(layers), len(PAIRS))
+        and made.r.shape == made.corrected.shape == made.unfiltered.shape == shape
+        and made.per_target.shape == (len(targets),)
+        and len(made.chosen) == len(made.reliable) == len(targets)
+    ):
+        raise ConfigError(f"{where}: the tables do not fit")
 
 
-def _is_table(rows: Sequence[Sequence[Number]], number: int, width: int) -> bool:
-    return len(rows) == number and all(len(row) == width for row in rows)
-
-
-def baseline_of(path: Path, benchmark: Benchmark, stimuli: StimuliInput) -> NDArray[np.float64]:
+def baseline_of(path: Path, benchmark: Benchmark, stimuli: StimuliInput) -> Floats:
     """RDMs (layer, 15) of the one model in a file of scores on this benchmark and these stimuli.
 
     Raises:
@@ -297,25 +166,14 @@ def baseline_of(path: Path, benchmark: Benchmark, stimuli: StimuliInput) -> NDAr
     results = read_results(path)
     if len(results.models) != 1:
         raise ConfigError(f"{path} has {len(results.models)} models; a baseline is one")
-    if results.benchmark.sha256 != benchmark_sha256(benchmark):
+    if benchmark_sha256(results.benchmark) != benchmark_sha256(benchmark):
         raise ConfigError(f"{path} was scored on another benchmark: score the baseline on this one")
     if results.input.get("sha256") != stimuli.sha256:
         raise ConfigError(
             f"{path} was scored on other stimuli ({results.input.get('file', 'not named')}) than "
             f"{stimuli.name}: score the baseline on these"
         )
-    return np.array(results.models[0].rdms, dtype=np.float64)
-
-
-def _control(name: str, made: Score) -> AlignmentControl:
-    return AlignmentControl(
-        name=name,
-        layers=made.layers,
-        corrected=_table(made.corrected),
-        score=_number(made.score),
-        sem=_number(made.sem),
-        p=_number(made.p),
-    )
+    return results.models[0].rdms
 
 
 def _groups(layers: Layers) -> dict[str, str]:
@@ -326,16 +184,3 @@ def _groups(layers: Layers) -> dict[str, str]:
         for key, value in told.items()
         if value is not None
     }
-
-
-def _number(value: float) -> Number:
-    return float(value) if math.isfinite(value) else None
-
-
-def _numbers(values: ArrayLike) -> tuple[Number, ...]:
-    array: NDArray[np.float64] = np.asarray(values, dtype=np.float64)
-    return tuple(_number(v) for v in array.tolist())
-
-
-def _table(rows: ArrayLike) -> tuple[tuple[Number, ...], ...]:
-    return tuple(_numbers(row) for row in np.asarray(rows, dtype=np.float64))

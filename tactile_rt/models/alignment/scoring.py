@@ -1,13 +1,14 @@
 """Scores of a model's layers against a frozen benchmark."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
+import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.benchmark import Benchmark
+from tactile_rt.models.alignment.json_file import Floats, Number
 from tactile_rt.models.alignment.rdm import PAIRS, STIMULI, pearson, rdm
 from tactile_rt.models.alignment.statistics import (
     held_out,
@@ -19,15 +20,11 @@ from tactile_rt.models.alignment.statistics import (
 
 __all__ = ["Score", "layer_rdms", "score", "score_rdms"]
 
-Floats = NDArray[np.float64]
 
-
-@dataclass(frozen=True, eq=False)
-class Score:
+class Score(msgspec.Struct, frozen=True, eq=False):
     """How well a model's layers fit a benchmark's targets.
 
     Attributes:
-        protocol: The name of the protocol of the benchmark.
         layers: The names of the layers, in the order of the layer axis.
         targets: The names of the targets; for paper-code the pooled animals are the last.
         rdms: (layer, 15) The RDM of each layer.
@@ -42,9 +39,9 @@ class Score:
         score: The score: for strict, the mean of `per_target`; for paper-code, the highest of
             `corrected`.
         sem: The standard error of the score over targets.
-        null: (720,) The score for every relabelling of the stimuli, choices of layers made anew.
-        p: The share of `null` that reaches the score, at least 1/720.
-        null_95: The 95th percentile of `null`, which chance alone exceeds once in twenty times.
+        p: The share of the 720 relabellings of the stimuli, layers chosen anew, that reach the
+            score, at least 1/720.
+        null_95: The 95th percentile of their scores, which chance exceeds once in twenty times.
     """
 
     protocol: str
@@ -54,14 +51,13 @@ class Score:
     r: Floats
     corrected: Floats
     unfiltered: Floats
-    reliable: NDArray[np.bool_]
+    reliable: tuple[bool, ...]
     chosen: tuple[str, ...]
     per_target: Floats
-    score: float
-    sem: float
-    null: Floats
-    p: float
-    null_95: float
+    score: Number
+    sem: Number
+    p: Number
+    null_95: Number
 
 
 def layer_rdms(layers: Mapping[str, ArrayLike]) -> Floats:
@@ -131,12 +127,11 @@ def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> S
         r=r,
         corrected=corrected,
         unfiltered=unfiltered,
-        reliable=reliable,
+        reliable=tuple(reliable.tolist()),
         chosen=tuple(names[i] if i >= 0 else "" for i in chosen.tolist()),
         per_target=per_target,
         score=test.statistic,
         sem=standard_error(per_target) if strict else _published_error(per_target),
-        null=test.null,
         p=test.p,
         null_95=test.percentile_95,
     )

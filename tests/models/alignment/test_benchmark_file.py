@@ -2,10 +2,10 @@
 
 import json
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment import benchmark_sha256, load_benchmark, save_benchmark, score
@@ -62,9 +62,10 @@ def test_a_benchmark_comes_back_as_it_was(benchmark, path):
 
 def test_it_is_small_and_holds_no_rates(path):
     assert path.stat().st_size < 12_000
-    assert set(json.loads(path.read_text())) == {
-        "schema", "protocol", "stimuli", "bootstraps", "seed", "targets", "pooled", "a2a",
-        "sources", "notes", "sha256",
+    whole = json.loads(path.read_text())
+    assert set(whole) == {"kind", "benchmark", "sha256"}
+    assert set(whole["benchmark"]) == {
+        "protocol", "stimuli", "bootstraps", "seed", "targets", "pooled", "a2a", "sources", "notes",
     }  # fmt: skip
 
 
@@ -77,10 +78,9 @@ def test_a_changed_file_is_refused(path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"schema": 1}, "schema 1, and this release reads 2"),
-        ({"targets": 3}, r"Expected `array`.*\$\.targets"),
+        ({"kind": "tactile_rt benchmark 2"}, r"of this release.*benchmark 2.*\$\.kind"),
+        ({"benchmark": {"protocol": "strict", "targets": 3}}, r"Expected `array`.*\$.*targets"),
         ({"colour": "red"}, "unknown field `colour`"),
-        ({"schema": None}, r"\$\.schema"),
     ],
 )
 def test_a_file_of_another_kind_says_where(path, change, message):
@@ -114,7 +114,7 @@ def test_a_file_that_contradicts_itself_is_refused(benchmark, path, change, mess
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"{", b"\xff\xfe", b"[1]"])
 def test_what_is_no_benchmark_is_refused(tmp_path, content):
     (tmp_path / "b.json").write_bytes(content)
-    with pytest.raises(ConfigError, match="not an alignment benchmark"):
+    with pytest.raises(ConfigError, match="not of `tactile-rt align build`"):
         load_benchmark(tmp_path / "b.json")
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 import pytest
+from msgspec.structs import replace as change
 from scipy import stats
 
 from tactile_rt.models.alignment.gate import (
@@ -78,14 +79,14 @@ def test_a_random_model_fails(world):
 
 def test_what_chance_may_have_done_is_inconclusive(world):
     benchmark, aligned, _ = world
-    assert codes(neural_checks(changed_to(aligned, p=0.06), benchmark))["turing"] == INCONCLUSIVE
+    assert codes(neural_checks(change(aligned, p=0.06), benchmark))["turing"] == INCONCLUSIVE
 
 
 def test_a_model_without_an_rdm_is_inconclusive(world):
     benchmark, aligned, _ = world
-    flat = changed_to(aligned, rdms=np.full((2, 15), np.nan))
+    flat = change(aligned, rdms=np.full((2, 15), np.nan))
     assert codes(neural_checks(flat, benchmark))["turing"] == INCONCLUSIVE
-    one = changed_to(aligned, rdms=np.stack([aligned.rdms[0], np.full(15, np.nan)]))
+    one = change(aligned, rdms=np.stack([aligned.rdms[0], np.full(15, np.nan)]))
     assert codes(neural_checks(one, benchmark))["turing"] == PASS
 
 
@@ -156,7 +157,7 @@ def written(path, encoder, attender, decoder, width=1 / 32, trained=True):
     model = TactileClassifier(card.array, config).eval()
     if trained:
         stir(model)
-    plain = msgspec.structs.replace(card, provenance={}, figures={}, embeddings=None)
+    plain = change(card, provenance={}, figures={}, embeddings=None)
     export_step(model, plain, path)
     return model
 
@@ -209,7 +210,7 @@ def test_a_window_gives_the_layers_of_its_step(exported):
     reference, path = exported
     card = load_model(path)[1]
     window = window_graph(onnx.load(path), card.state)
-    text = msgspec.json.encode(msgspec.structs.replace(card, kind="window", state=(), probe=()))
+    text = msgspec.json.encode(change(card, kind="window", state=(), probe=()))
     onnx.helper.set_model_props(window, {METADATA_KEY: text.decode()})
     other = path.with_name("window.onnx")
     onnx.save(window, other)
@@ -335,9 +336,9 @@ def test_a_small_difference_misses_single_precision_but_not_int8(exported):
         n: (t + 1e-4 * np.abs(t).max() * rng.normal(size=t.shape[2:])).astype(np.float32)
         for n, t in same.traces.items()
     }
-    other = changed_to(same, traces=moved)
+    other = replace(same, traces=moved)
     assert fidelity_check(reference, other)[0].code == FAIL
-    assert fidelity_check(reference, changed_to(other, precision="int8"))[0].code == PASS
+    assert fidelity_check(reference, replace(other, precision="int8"))[0].code == PASS
 
 
 def test_the_shipped_model_is_as_it_says(exported):
@@ -347,12 +348,6 @@ def test_the_shipped_model_is_as_it_says(exported):
     rows = compare(layers, layers)
     assert all(row.kept and row.difference == 0 for row in rows)
     assert all(row.pearson == pytest.approx(1) for row in rows)  # every layer tells them apart
-
-
-def changed_to(record, **changes):
-    from dataclasses import replace
-
-    return replace(record, **changes)
 
 
 def test_an_rdm_that_says_nothing_is_not_compared():

@@ -1,0 +1,64 @@
+"""Files of the alignment: JSON of structs, arrays as lists and NaN as null, written whole."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, get_origin
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from tactile_rt.errors import ConfigError
+from tactile_rt.files import write_whole
+
+__all__ = ["Floats", "Number", "encode", "read_json", "write_json"]
+
+Floats = NDArray[np.float64]
+T = TypeVar("T")
+LARGEST = 1e12  # beyond it nothing can be drawn
+
+if TYPE_CHECKING:
+    Number = float
+else:
+
+    class Number(np.float64):
+        """A field that is NaN where its file has null."""
+
+
+def encode(value: Any) -> bytes:
+    """Encode structs as JSON: arrays as lists, null for what is not finite."""
+    return msgspec.json.encode(value, enc_hook=_to_plain)
+
+
+def write_json(value: Any, path: Path) -> None:
+    """Write structs as JSON, whole or not at all."""
+    text = msgspec.json.format(encode(value), indent=1)
+    write_whole(path, lambda out: out.write(text + b"\n"))
+
+
+def read_json(path: Path, kind: type[T], made_by: str) -> T:
+    """Read what `write_json` wrote of a struct whose tag names its kind and version.
+
+    Raises:
+        ConfigError: not there, damaged, or of another kind or version.
+    """
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=kind, dec_hook=_from_plain)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(
+            f"{path} is damaged, or not of `{made_by}` of this release: {error}"
+        ) from None
+
+
+def _to_plain(value: np.ndarray | np.generic) -> Any:
+    return value.tolist()
+
+
+def _from_plain(kind: Any, value: Any) -> Any:
+    numbers = np.array(value, dtype=np.float64)
+    if (np.abs(numbers) > LARGEST).any():
+        raise ValueError(f"numbers are at most {LARGEST:g}")
+    if get_origin(kind) is np.ndarray:
+        return numbers
+    return kind(numbers)
