@@ -4,6 +4,8 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
+
 from bench.models.training_speed import training_speed
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.evidence.classification import evaluate_model
@@ -25,7 +27,7 @@ def run(quick: bool) -> list[Record]:
     quote; the full run makes the very test set that the model's card names.
     """
     _, card = load_model(shipped_model())
-    recipe = recipe_of_set(card.provenance["sweep_set"], card.classes)
+    recipe = recipe_of_set(card.provenance["sweep_set"])
     if quick:
         recipe = _few(recipe)
     splits = [s for s in ("test", WITHHELD) if describe_set(recipe).split.get(s)]
@@ -41,6 +43,6 @@ def _few(recipe: SweepRecipe) -> SweepRecipe:
     per_withheld = min(1, recipe.objects.per_withheld)
     return replace(
         recipe,
-        objects=replace(recipe.objects, test=1, per_withheld=per_withheld),
+        objects=msgspec.structs.replace(recipe.objects, test=1, per_withheld=per_withheld),
         sweeps=replace(recipe.sweeps, draws=QUICK_DRAWS),
     )

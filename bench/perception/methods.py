@@ -24,7 +24,7 @@ from tactile_rt.models import evaluation
 from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.models.svm import PENALTIES, fit_margins, window_features
+from tactile_rt.models.svm import PENALTIES, fit, window_features
 from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.loop import train
 from tactile_rt.sim_backend.datasets import recipes
@@ -192,11 +192,11 @@ def _svm(taught: str, training: SweepSet, validation: SweepSet) -> Method:
     classes = len(training.manifest.categories)
 
     def candidate(penalty: float) -> Callable[..., Floats]:
-        margins = fit_margins(x[usable], training.sweeps.labels[usable], penalty, classes)
+        machine = fit(x[usable], training.sweeps.labels[usable], penalty)
 
         def posteriors(sweeps: SweepSet, disturbance: Disturbance) -> Floats:
             features, found = window_features(sweeps, disturbance)
-            return _softmax(margins(features), found)
+            return _softmax(machine.margins(features, classes), found)
 
         return posteriors
 

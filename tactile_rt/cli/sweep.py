@@ -132,5 +132,5 @@ def _recipe(folder: Path, name: str | None, sets: list[str]) -> "SweepRecipe":
         manifest = SweepManifest.read(folder)
         if manifest.recorded:
             raise ConfigError(f"{folder} is made of recordings, by `tactile-rt label`")
-        return recipe_of_set(manifest.recipe, manifest.categories, sets)
+        return recipe_of_set(manifest.recipe, sets)
     return read_recipe(name or DEFAULT_RECIPE, sets=sets)

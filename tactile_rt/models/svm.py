@@ -3,7 +3,7 @@
 Two questions want one. Does a network beat it on the very windows that it sees? `fit_svm` answers
 that: the machine takes the same onsets, tare and compression, and validation chooses its penalty.
 And can a set be learnt from at all? The card of a sweep set asks that with features and a penalty
-of its own (`tactile_rt.sim_backend.datasets.separability`), and is handed `fit` by the command:
+of its own (`tactile_rt.sim_backend.datasets.card_survey`), and is handed `fit` by the command:
 simulation and networks do not know of each other.
 
 Standardising the features only makes the machine worse, so nothing here does.
@@ -24,92 +24,64 @@ if TYPE_CHECKING:
     from tactile_rt.models.datasets import SweepSet
     from tactile_rt.models.disturbances import Disturbance
 
-__all__ = ["PENALTIES", "FittedSVM", "Predict", "fit", "fit_margins", "fit_svm", "window_features"]
+__all__ = ["PENALTIES", "FittedSVM", "fit", "fit_svm", "window_features"]
 
 MOST_PAIRED = 8000  # sweeps whose kernel, 8 bytes a pair, is kept: half a gigabyte
 PENALTIES = (1.0, 10.0, 100.0, 300.0)  # C
 
-Predict = Callable[[NDArray[np.float32]], NDArray[Any]]  # (sweep, feature) -> (sweep,) labels
-
-
-def fit(features: NDArray[np.float32], labels: NDArray[Any], penalty: float) -> Predict:
-    """Fit one machine.
-
-    Args:
-        features: (sweep, feature) of the sweeps to learn from.
-        labels: (sweep,) classes, as numbers or names.
-        penalty: C.
-
-    Returns:
-        The machine's decisions: (sweep, feature) to (sweep,) labels.
-    """
-    machine, seen = _machine(features, labels, penalty)
-
-    def predict(others: NDArray[np.float32]) -> NDArray[Any]:
-        found: NDArray[Any] = machine.predict(seen(others))
-        return found
-
-    return predict
-
-
-def fit_margins(
-    features: NDArray[np.float32], labels: NDArray[np.int64], penalty: float, classes: int
-) -> Predict:
-    """Fit one machine that says how far it is from each decision.
-
-    Args:
-        features, penalty: as `fit` takes them.
-        labels: (sweep,) numbers below `classes`.
-        classes: how many there are, with those that no sweep is of.
-
-    Returns:
-        (sweep, feature) to (sweep, class), one class against all others; -inf of a class that no
-        sweep was of.
-    """
-    machine, seen = _machine(features, labels, penalty)
-
-    def margins(others: NDArray[np.float32]) -> NDArray[Any]:
-        found = np.full((len(others), classes), -np.inf)
-        distance = machine.decision_function(seen(others))
-        if distance.ndim == 1:  # of two classes: from the second
-            distance = np.column_stack([-distance, distance])
-        found[:, machine.classes_] = distance
-        return found
-
-    return margins
-
-
-def _machine(
-    features: NDArray[np.float32], labels: NDArray[Any], penalty: float
-) -> tuple[SVC, Callable[[NDArray[np.float32]], NDArray[np.float32]]]:
-    """A fitted machine, and what it wants to be given for (sweep, feature)."""
-    # Of its own gamma, "scale". The kernel is a product of matrices, which libsvm by itself works
-    # out pair by pair: dozens of times slower where there are thousands of features.
-    gamma = 1.0 / (features.shape[1] * float(features.var()) or 1.0)
-    if len(features) > MOST_PAIRED:
-        return SVC(C=penalty, gamma=gamma).fit(features, labels), lambda others: others
-    machine = SVC(C=penalty, kernel="precomputed")
-    machine.fit(rbf_kernel(features, gamma=gamma), labels)
-    return machine, lambda others: rbf_kernel(others, features, gamma)
-
 
 @dataclass(frozen=True)
 class FittedSVM:
-    """The machine of the penalty that validation chose.
+    """A fitted machine; called with (sweep, feature) values, it decides their (sweep,) labels.
 
     Attributes:
-        predict: The machine's decisions, from (sweep, feature) values to (sweep,) labels.
+        machine: The machine of scikit-learn.
+        kernel: From (sweep, feature) values to what the machine takes.
         how: A sentence for reports that says how the machine was made.
     """
 
-    predict: Predict
-    how: str
+    machine: SVC
+    kernel: Callable[[NDArray[np.float32]], NDArray[np.float32]]
+    how: str = ""
+
+    def __call__(self, features: NDArray[np.float32]) -> NDArray[Any]:
+        """Decide labels."""
+        found: NDArray[Any] = self.machine.predict(self.kernel(features))
+        return found
+
+    def margins(self, features: NDArray[np.float32], classes: int) -> NDArray[np.float64]:
+        """Distances from the decision for each of `classes` numbers, against all others.
+
+        Returns:
+            (sweep, class); -inf of a class that no sweep was of.
+        """
+        found = np.full((len(features), classes), -np.inf)
+        distance = self.machine.decision_function(self.kernel(features))
+        if distance.ndim == 1:  # of two classes: from the second
+            distance = np.column_stack([-distance, distance])
+        found[:, self.machine.classes_] = distance
+        return found
 
     def hits(self, data: "SweepSet") -> NDArray[np.bool_]:
         """(sweep,) whether each is right; one without an onset is not."""
         x, usable = window_features(data)
-        right: NDArray[np.bool_] = (self.predict(x) == data.sweeps.labels) & usable
+        right: NDArray[np.bool_] = (self(x) == data.sweeps.labels) & usable
         return right
+
+
+def fit(
+    features: NDArray[np.float32], labels: NDArray[Any], penalty: float, how: str = ""
+) -> FittedSVM:
+    """Fit one machine to (sweep, feature) values and (sweep,) labels, at penalty C."""
+    # Of its own gamma, "scale". The kernel is a product of matrices, which libsvm by itself works
+    # out pair by pair: dozens of times slower where there are thousands of features.
+    gamma = 1.0 / (features.shape[1] * float(features.var()) or 1.0)
+    if len(features) > MOST_PAIRED:
+        machine = SVC(C=penalty, gamma=gamma).fit(features, labels)
+        return FittedSVM(machine, lambda others: others, how)
+    machine = SVC(C=penalty, kernel="precomputed")
+    machine.fit(rbf_kernel(features, gamma=gamma), labels)
+    return FittedSVM(machine, lambda others: rbf_kernel(others, features, gamma), how)
 
 
 def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
@@ -122,8 +94,10 @@ def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
     if len(set(train.sweeps.labels[usable].tolist())) < 2:
         raise ConfigError("a support vector machine needs touches of two categories to learn from")
     tried = [
-        FittedSVM(
-            fit(x[usable], train.sweeps.labels[usable], c),
+        fit(
+            x[usable],
+            train.sweeps.labels[usable],
+            c,
             f"same onsets, tare, clipping and signed log; {train.timing.steps} steps of mean load; "
             f"C = {c:g} of {', '.join(f'{p:g}' for p in PENALTIES)} by validation",
         )

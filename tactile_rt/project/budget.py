@@ -110,7 +110,7 @@ def sized(recipe: SweepRecipe, budget: Budget) -> SweepRecipe:
     """The recipe with the budget's numbers of objects and sweeps."""
     objects = recipe.objects
     if budget.test:
-        objects = replace(
+        objects = msgspec.structs.replace(
             objects,
             per_category=budget.per_category,
             validation=budget.validation,

@@ -41,8 +41,7 @@ def here(monkeypatch):
 
 
 def made(folder):
-    manifest = SweepManifest.read(folder)
-    return recipe_of_set(manifest.recipe, manifest.categories)
+    return recipe_of_set(SweepManifest.read(folder).recipe)
 
 
 def test_a_set_is_made_gone_on_with_described_and_checked(call, recipe, tmp_path):
@@ -80,8 +79,8 @@ def test_a_set_is_made_gone_on_with_described_and_checked(call, recipe, tmp_path
             ("--set", "objects.per_category=2"),
             "2 objects cannot be split with 4 for validation and 12 for test",
         ),
-        (("--set", "sweeps.draws=0"), "sweeps.draws must be at least 1, not 0"),
-        (("--set", "objects.validation=0"), "objects.validation must be a whole number"),
+        (("--set", "sweeps.draws=0"), "sweeps: draws must be at least 1, not 0"),
+        (("--set", "objects.validation=0"), "objects: validation must be a whole number"),
         (("--set", "objects=2"), "objects is a table of keys, not 2"),
         (("--set", "contacs=true"), "--set contacs=true: no key 'contacs'; did you mean contacts?"),
         (("--set", "objects.tset=1"), "objects has no key 'tset'; did you mean test?"),

@@ -9,7 +9,7 @@ pytest.importorskip("sklearn")
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.svm import fit, fit_margins, fit_svm
+from tactile_rt.models.svm import fit, fit_svm
 from tests.helpers.tiny_sweeps import write_tiny_set
 
 
@@ -24,9 +24,10 @@ def blobs(classes: list[int], n: int = 60) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.parametrize("classes", [[0, 1, 2, 5], [1, 3]])
 def test_the_largest_margin_is_the_decision(classes: list[int]) -> None:
     x, y = blobs(classes)
-    margins = fit_margins(x, y, 10.0, classes=7)(x)
+    machine = fit(x, y, 10.0)
+    margins = machine.margins(x, classes=7)
     assert margins.shape == (len(x), 7)
-    assert np.mean(margins.argmax(axis=1) == fit(x, y, 10.0)(x)) > 0.99
+    assert np.mean(margins.argmax(axis=1) == machine(x)) > 0.99
     missing = [k for k in range(7) if k not in classes]
     assert np.isneginf(margins[:, missing]).all()
     assert np.isfinite(margins[:, classes]).all()

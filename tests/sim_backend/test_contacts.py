@@ -18,9 +18,8 @@ from tactile_rt.sim_backend.arrays.files import load_array
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps, simulate_sweep
 from tactile_rt.sim_backend.datasets.recipe_files import recipe_from_dict
 from tactile_rt.sim_backend.datasets.recipes import (
-    Between,
-    Each,
     ObjectChoice,
+    Range,
     SweepChoice,
     SweepRecipe,
 )
@@ -35,7 +34,7 @@ PLAIN = SweepRecipe(
     lead_ms=45,
     length_ms=270,
     objects=ObjectChoice(categories=("mug",), per_category=3, validation=1, test=1),
-    sweeps=SweepChoice(yaw_deg=Between(0, 360), gap_mm=Between(0.5, 1), draws=2),
+    sweeps=SweepChoice(yaw_deg=Range((0, 360)), gap_mm=Range((0.5, 1)), draws=2),
 )
 RECIPE = replace(PLAIN, contacts=True)
 
@@ -163,7 +162,7 @@ def test_contacts_survive_the_journal(tmp_path: Path) -> None:
 
 
 def test_a_miss_touches_nothing() -> None:
-    grid = replace(RECIPE, sweeps=SweepChoice(distance_mm=Each((60.0,))))
+    grid = replace(RECIPE, sweeps=SweepChoice(distance_mm=Range(each=(60.0,))))
     record = simulate_sweep(grid, make_object("mug", 0), 0)
     assert record.contacts is not None and np.isnan(record.contacts).all()
 

@@ -1,17 +1,13 @@
-"""The card of a sweep set: what is in it, measured, with pictures, for whoever may use it.
+"""The card of a sweep set: what is in it, measured, with a picture, for whoever may use it.
 
 README.md       for reading
-card.json       the same numbers
-card.png        forces, which whiskers are touched, what was drawn, what can be told apart
-examples.png    a sweep of some categories
+card.png        forces, and a sweep of some categories
 """
 
 import math
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import msgspec
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
@@ -19,14 +15,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from tactile_rt.files import write_whole
-from tactile_rt.sim_backend.datasets.card_survey import Card, survey
-from tactile_rt.sim_backend.datasets.separability import Fit, Separability
+from tactile_rt.sim_backend.datasets.card_survey import Card, Fit, Separability, survey
 from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["write_card"]
 
-EXAMPLES = 12
+COLUMNS, EXAMPLES = 4, 12
 FAINTEST = 5000  # times below what networks believe is where a picture begins
 PREFIXES = {0: "", -1: "m", -2: "u", -3: "n", -4: "p"}
 PAPER = (
@@ -40,7 +35,6 @@ def write_card(folder: Path, fit: Fit) -> Card:
     """Write the card of a set, or of what there is of it, into its folder.
 
     Args:
-        folder: the set's.
         fit: fits a support vector machine, as `models.svm.fit`.
 
     Raises:
@@ -48,21 +42,13 @@ def write_card(folder: Path, fit: Fit) -> Card:
     """
     manifest = SweepManifest.read(folder)
     card, examples = survey(folder, fit)
-    spec, period_ms = manifest.spec, manifest.period_ns * 1e-6
-    write_whole(folder / "card.png", lambda file: _draw_card(card, spec, file))
-    if examples:
-        write_whole(
-            folder / "examples.png",
-            lambda file: _draw_examples(examples, period_ms, spec, card, file),
-        )
-    numbers = msgspec.json.format(msgspec.json.encode(asdict(card)), indent=1)
-    write_whole(folder / "card.json", lambda file: file.write(numbers))
-    text = _text(folder.resolve().name, manifest, card)
+    write_whole(folder / "card.png", lambda file: _draw_card(card, examples, manifest, file))
+    text = _write_text(folder.resolve().name, manifest, card)
     write_whole(folder / "README.md", lambda file: file.write(text.encode()))
     return card
 
 
-def _text(name: str, manifest: SweepManifest, card: Card) -> str:
+def _write_text(name: str, manifest: SweepManifest, card: Card) -> str:
     recipe, period_ms = manifest.recipe, manifest.period_ns * 1e-6
     sweeps = sum(sum(split.values()) for split in card.sweeps.values())
     objects = sum(sum(split.values()) for split in card.objects.values())
@@ -85,12 +71,11 @@ def _text(name: str, manifest: SweepManifest, card: Card) -> str:
         ),
         "## What is felt",
         _felt(card),
-        "![forces, whiskers touched, draws, separability](card.png)",
+        "![forces, and one sweep of some categories](card.png)",
         "Share of the sweeps in which each whisker is touched, on the array's grid (%):",
         _coverage(card, manifest.spec),
         "## Can it be learnt from?",
         _separability(card.separability),
-        "![one sweep of some categories](examples.png)" if card.whiskers_touched else "",
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 
@@ -170,29 +155,45 @@ def _separability(found: list[Separability]) -> str:
     if not found:
         return "Not checked: there are no training and test sweeps of two categories."
     rows = [
-        (
-            f"{s.classes} ({', '.join(s.of) if s.of else f'any, {s.subsets} choices'})",
-            f"{100 * s.accuracy:.1f}" + ("" if s.of else f" +- {100 * s.spread:.1f}"),
-            f"{100 * s.chance:.0f}",
-        )
+        (", ".join(s.classes), f"{100 * s.accuracy:.1f}", f"{100 / len(s.classes):.0f}")
         for s in found
     ]
     return (
         "Support vector machines (RBF) on the first second of contact, tested on objects that "
-        "they never saw, as Chung et al. (2025) check their sets; the named classes are the ones "
-        "nearest to theirs (cups, microwaves, chairs, trains). Spread over choices of classes.\n\n"
+        "they never saw, as Chung et al. (2025) check their sets, of the classes that come nearest "
+        "to theirs (cups, microwaves, chairs, trains).\n\n"
         + _table(("classes", "right (%)", "chance (%)"), rows)
     )
 
 
-def _draw_card(card: Card, spec: ArraySpec, file: BinaryIO) -> None:
-    """Draw forces, coverage, counts and separability as a PNG."""
-    figure = Figure(figsize=(11, 7.6), layout="constrained")
-    axes = figure.subplots(2, 2)
-    _draw_loads(axes[0, 0], card)
-    _draw_coverage(axes[0, 1], card, spec)
-    _draw_counts(axes[1, 0], card)
-    _draw_separability(axes[1, 1], card)
+def _draw_card(
+    card: Card, examples: dict[str, NDArray[np.float32]], manifest: SweepManifest, file: BinaryIO
+) -> None:
+    """Draw forces, and the load of a sweep of some categories, as a PNG."""
+    spread = np.linspace(0, len(examples) - 1, min(len(examples), EXAMPLES)).round().astype(int)
+    chosen = [sorted(examples)[i] for i in spread]
+    rows = -(-len(chosen) // COLUMNS)
+    figure = Figure(figsize=(11, 3.6 + 2.4 * rows), layout="constrained")
+    heights = [3.6, 2.4 * rows] if rows else [3.6]
+    faintest = card.clip / FAINTEST
+    above, *below = figure.subfigures(len(heights), 1, height_ratios=heights, squeeze=False).flat
+    _draw_loads(above.subplots(), card)
+    if below:
+        axes = below[0].subplots(rows, COLUMNS, squeeze=False, sharex=True)
+        for panel in axes.flat[len(chosen) :]:
+            panel.set_axis_off()
+        norm = LogNorm(faintest, card.clip)
+        spec, grid = manifest.spec, manifest.spec.grid
+        firsts = [i for i, (row, _) in enumerate(grid) if i == 0 or grid[i - 1][0] != row]
+        for panel, name in zip(axes.flat, chosen, strict=False):
+            load = np.maximum(examples[name].T, faintest)
+            span = (0, load.shape[1] * manifest.period_ns * 1e-6, len(load) - 0.5, -0.5)
+            image = panel.imshow(
+                load, norm=norm, aspect="auto", extent=span, interpolation="nearest", cmap="magma"
+            )
+            panel.set_title(f"{name}, ms", fontsize=9)
+            panel.set_yticks(firsts, [spec.elements[i] for i in firsts], fontsize=7)
+        below[0].colorbar(image, ax=axes, label=f"load at the base ({card.unit})", shrink=0.8)
     figure.savefig(file, dpi=100, format="png")
 
 
@@ -208,85 +209,3 @@ def _draw_loads(axes: Axes, card: Card) -> None:
     axes.set_xlabel(f"largest load of a touched whisker in a sweep ({card.unit})")
     axes.set_ylabel("whiskers x sweeps")
     axes.legend(fontsize=8)
-
-
-def _draw_coverage(axes: Axes, card: Card, spec: ArraySpec) -> None:
-    grid = np.full(spec.grid_shape, np.nan)
-    for cell, name in zip(spec.grid, spec.elements, strict=True):
-        grid[cell] = 100 * card.coverage[name]
-    axes.imshow(grid, cmap="Blues", vmin=0, vmax=100, aspect="auto")
-    for cell, name in zip(spec.grid, spec.elements, strict=True):
-        colour = "white" if grid[cell] > 55 else "black"
-        axes.text(
-            cell[1], cell[0], f"{name}\n{grid[cell]:.0f}", ha="center", va="center", color=colour,
-            fontsize=8,
-        )  # fmt: skip
-    axes.set_xticks(range(spec.grid_shape[1]))
-    axes.set_yticks(range(spec.grid_shape[0]))
-    axes.set_xlabel("column")
-    axes.set_ylabel("row")
-    axes.set_title("share of the sweeps that touch each whisker (%)", fontsize=10)
-
-
-def _draw_counts(axes: Axes, card: Card) -> None:
-    names = sorted({c for split in card.sweeps.values() for c in split})
-    left = np.zeros(len(names))
-    for split, counts in card.sweeps.items():
-        here = np.array([counts.get(c, 0) for c in names])
-        axes.barh(names, here, left=left, label=split)
-        left += here
-    axes.invert_yaxis()
-    axes.tick_params(axis="y", labelsize=7 if len(names) < 40 else 3)
-    axes.set_xlabel("sweeps")
-    axes.legend(fontsize=8, ncols=len(card.sweeps), loc="lower center", bbox_to_anchor=(0.5, 1))
-
-
-def _draw_separability(axes: Axes, card: Card) -> None:
-    for k, s in enumerate(card.separability):
-        axes.bar(
-            k, 100 * s.accuracy, yerr=None if s.of else 100 * s.spread, capsize=4,
-            color="tab:orange" if s.of else "tab:blue",
-        )  # fmt: skip
-        axes.hlines(100 * s.chance, k - 0.4, k + 0.4, color="black", linestyle="--")
-    labels = [
-        f"{s.classes}:\n" + ("\n".join(s.of) if s.of else f"any\n({s.subsets} choices)")
-        for s in card.separability
-    ]
-    axes.set_xticks(range(len(labels)), labels, fontsize=8)
-    axes.set_ylim(0, 106)
-    axes.set_ylabel("decided rightly (%), unseen objects")
-    axes.set_title("support vector machines; dashed: chance", fontsize=10)
-
-
-def _draw_examples(
-    examples: dict[str, NDArray[np.float32]],
-    period_ms: float,
-    spec: ArraySpec,
-    card: Card,
-    file: BinaryIO,
-) -> None:
-    """Draw the load (sample, element) of one sweep of each of some categories as a PNG."""
-    spread = np.linspace(0, len(examples) - 1, min(len(examples), EXAMPLES)).round().astype(int)
-    chosen = [sorted(examples)[i] for i in spread]
-    columns = min(4, len(chosen))
-    rows = -(-len(chosen) // columns)
-    figure = Figure(figsize=(11, 0.6 + 2.4 * rows), layout="constrained")
-    axes = figure.subplots(rows, columns, squeeze=False)
-    faintest = card.clip / FAINTEST
-    norm = LogNorm(faintest, card.clip)
-    for at, panel in enumerate(axes.flat):
-        if at >= len(chosen):
-            panel.set_axis_off()
-            continue
-        load = np.maximum(examples[chosen[at]].T, faintest)
-        span = (0, load.shape[1] * period_ms, len(load) - 0.5, -0.5)
-        image = panel.imshow(
-            load, norm=norm, aspect="auto", extent=span, interpolation="nearest", cmap="magma"
-        )
-        panel.set_title(chosen[at], fontsize=9)
-        firsts = [i for i, (row, _) in enumerate(spec.grid) if i == 0 or spec.grid[i - 1][0] != row]
-        panel.set_yticks(firsts, [spec.elements[i] for i in firsts], fontsize=7)
-    for panel in axes[-1]:
-        panel.set_xlabel("time (ms)", fontsize=8)
-    figure.colorbar(image, ax=axes, label=f"load at the base ({card.unit})", shrink=0.8)
-    figure.savefig(file, dpi=100, format="png")

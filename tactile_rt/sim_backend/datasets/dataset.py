@@ -68,7 +68,9 @@ def describe_set(recipe: SweepRecipe) -> SweepManifest:
     morphology = repr(heads if len(heads) > 1 else heads[0])
     # Said in full: a later release may know more categories.
     withheld, outliers = objects.withheld, recipe.objects.outliers
-    chosen = replace(recipe.objects, categories=objects.categories, withheld=withheld)
+    chosen = msgspec.structs.replace(
+        recipe.objects, categories=objects.categories, withheld=withheld
+    )
     of_meshes = () if recipe.objects.generated else ("manifold3d",)
     packages = ("mujoco", "numpy", "scipy", "trimesh", *of_meshes)
     return SweepManifest(

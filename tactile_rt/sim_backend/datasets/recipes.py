@@ -27,10 +27,11 @@ one of the profiles cannot simulate, which are drawn again).
 """
 
 import zlib
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, field, fields
 from itertools import product
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 
 from tactile_rt.errors import ConfigError
@@ -47,10 +48,9 @@ __all__ = [
     "PARAMETERS",
     "SHAPES",
     "VARIED_SHAPES",
-    "Between",
     "Choice",
-    "Each",
     "ObjectChoice",
+    "Range",
     "SweepChoice",
     "SweepRecipe",
 ]
@@ -60,51 +60,77 @@ GENERATED = (SHAPES, VARIED_SHAPES)  # sources of objects; any other is a folder
 MOST_OBJECTS = 100_000
 LARGEST = 1e4  # of any of the sweep's parameters: beyond it is a slip of the pen
 POSITIVE = ("size_mm", "speed_mm_s")  # of the sweep's parameters; a gap may also be 0
-LATER = ("surface_friction", "shake_g", "shake_hz")  # parameters that older sets do not name
 LONGEST_MS = 600_000.0
 STEEPEST = 10.0  # peak of an interval: beyond it all is in the middle
+OF_SHAPES = {"per_category": 60, "validation": 4, "test": 12}
+OF_A_FOLDER = {"per_category": 0, "validation": 0.1, "test": 0.1}  # all; the published 8 : 1 : 1
+
+Text = Annotated[str, msgspec.Meta(min_length=1)]
 
 
-@dataclass(frozen=True)
-class Between:
-    """Drawn from an interval.
+class Range(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Several values of a sweep's parameter: an interval to draw from, or each of some.
 
     Attributes:
-        low, high: The ends of the interval.
-        peak: The power to which the distance from the middle, drawn evenly in half intervals, is
-            raised: 1 draws evenly, and at 3 half of what is drawn is in the middle eighth.
+        between: The ends of the interval, the lower first.
+        each: Every one of these values is taken, with every one of the other parameters'.
         once: Whether all combinations of a draw share one value; else every sweep has its own.
         plus: Every one of these values is added, with every one of the other parameters'.
+        peak: The power to which the distance from the middle, drawn evenly in half intervals, is
+            raised: 1 draws evenly, and at 3 half of what is drawn is in the middle eighth.
+
+    Raises:
+        ConfigError: neither an interval nor values, ends in the wrong order, or a peak out of
+            range.
     """
 
-    low: float
-    high: float
+    between: tuple[float, ...] = ()
+    each: tuple[float, ...] = ()
     once: bool = False
     plus: tuple[float, ...] = ()
     peak: float = 1.0
 
+    def __post_init__(self) -> None:
+        alone = not (self.once or self.plus or self.between) and self.peak == 1
+        if not (alone if self.each else len(self.between) == 2):
+            raise ConfigError(
+                "expected a number, { between = [low, high] } (with once = true or plus = "
+                "[a number, ...]) or { each = [a number, ...] }"
+            )
+        if self.between and not self.between[0] <= self.between[1]:
+            low, high = self.between
+            raise ConfigError(f"between has its lower end first, not {low:g}, {high:g}")
+        if not 1 <= self.peak <= STEEPEST:
+            raise ConfigError(f"peak must be from 1 to {STEEPEST:g}, not {self.peak:g}")
+
+    @property
+    def combined(self) -> tuple[float, ...]:
+        """The values that are combined with the other parameters'."""
+        return self.each or self.plus
+
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """The values that may be taken, or the least and greatest of them."""
+        if self.each:
+            return self.each
+        more = self.plus or (0.0,)
+        return self.between[0] + min(more), self.between[1] + max(more)
+
     def draw(self, rng: np.random.Generator) -> float:
-        """A value."""
+        """Draw a value of the interval."""
+        low, high = self.between
         if self.peak == 1:
-            return float(rng.uniform(self.low, self.high))
+            return float(rng.uniform(low, high))
         away = float(rng.uniform(-1, 1))
-        half = (self.high - self.low) / 2
-        return self.low + half + half * float(np.copysign(abs(away) ** self.peak, away))
+        half = (high - low) / 2
+        return low + half + half * float(np.copysign(abs(away) ** self.peak, away))
 
 
-@dataclass(frozen=True)
-class Each:
-    """Every one of these values, with every one of the other parameters'."""
-
-    values: tuple[float, ...]
+Choice = float | Range
 
 
-Choice = float | Between | Each
-
-
-@dataclass(frozen=True)
-class ObjectChoice:
-    """Which objects, and who is held out.
+class ObjectChoice(msgspec.Struct, frozen=True):
+    """The objects of a set, which are held out, and how meshes become pieces.
 
     Attributes:
         source: The origin of the objects: "shapes" (the parametric ones, each kind of one plan),
@@ -124,42 +150,61 @@ class ObjectChoice:
             out; empty: none.
         only_source: Objects of a folder from this source only, all of them held out for a test,
             without those that are like one from elsewhere; empty: of all sources.
-        mesh: The way in which meshes become pieces, of a folder of them.
+        surface_error_mm, max_pieces, hull, up: As `MeshDetail` has them.
+
+    Raises:
+        ConfigError: values that cannot be, or contradict each other.
     """
 
-    source: str = SHAPES
+    source: Text = msgspec.field(name="from", default=SHAPES)
     categories: tuple[str, ...] = ()
     withheld: tuple[str, ...] = ()
     outliers: tuple[str, ...] = ()
-    per_category: int = 60
-    validation: float = 4
-    test: float = 12
+    # None where nothing is said: then as `OF_SHAPES` or `OF_A_FOLDER` has it.
+    per_category: int = None  # type: ignore[assignment]
+    validation: float = None  # type: ignore[assignment]
+    test: float = None  # type: ignore[assignment]
     per_withheld: int = 0
     without_source: str = ""
     only_source: str = ""
-    mesh: MeshDetail = STANDARD
+    surface_error_mm: float = STANDARD.surface_error_mm
+    max_pieces: int = STANDARD.max_pieces
+    hull: bool = STANDARD.hull
+    up: str = STANDARD.up
 
     @property
     def generated(self) -> bool:
         """Whether the objects are parametric ones and not a folder's."""
         return self.source in GENERATED
 
-    def check(self) -> None:
-        """Raise a ConfigError for values that cannot be."""
+    @property
+    def mesh(self) -> MeshDetail:
+        """The way in which meshes become pieces."""
+        return MeshDetail(**{f.name: getattr(self, f.name) for f in fields(MeshDetail)})
+
+    def __post_init__(self) -> None:
+        for name, usual in (OF_SHAPES if self.generated else OF_A_FOLDER).items():
+            if getattr(self, name) is None:
+                msgspec.structs.force_setattr(self, name, usual)
+        _ = self.mesh  # which checks it
+        for key in ("categories", "withheld", "outliers"):
+            names = getattr(self, key)
+            if twice := [n for i, n in enumerate(names) if n in names[:i]]:
+                raise ConfigError(f"{key}: {twice[0]!r} is there twice; remove one")
         for key, others in (("withheld", "categories"), ("outliers", "categories withheld")):
             for other in others.split():
                 if both := sorted(set(getattr(self, key)) & set(getattr(self, other))):
-                    raise ConfigError(f"objects.{key}: {both[0]!r} is also one of the {other}")
+                    raise ConfigError(f"{key}: {both[0]!r} is also one of the {other}")
         whole = self.generated
         if self.per_withheld < 0:
-            raise ConfigError(f"objects.per_withheld must be 0 or more, not {self.per_withheld}")
+            raise ConfigError(f"per_withheld must be 0 or more, not {self.per_withheld}")
         for name in ("per_category", "validation", "test"):
             value = getattr(self, name)
             if not value <= MOST_OBJECTS:
-                raise ConfigError(f"objects.{name} must be at most {MOST_OBJECTS}, not {value:g}")
+                raise ConfigError(f"{name} must be at most {MOST_OBJECTS}, not {value:g}")
             if value < 0 or (whole and value < 1) or (value >= 1 and value != int(value)):
                 kinds = "a whole number" if whole else "a whole number, or a fraction below 1"
-                raise ConfigError(f"objects.{name} must be {kinds}, at least 1, not {value:g}")
+                raise ConfigError(f"{name} must be {kinds}, at least 1, not {value:g}")
 
 
 @dataclass(frozen=True)
@@ -167,7 +212,7 @@ class SweepChoice:
     """How every object is swept: see `sweep.Sweep` for the parameters.
 
     Attributes:
-        draws: The number of sweeps of every combination of the `Each` values.
+        draws: The number of sweeps of every combination of the `each` values.
         held_out_draws: The number of further sweeps of each combination, marked by a `draw` of
             `draws` and above.
         least_whiskers: The least number of whiskers that can reach the object as it goes by; sweeps
@@ -193,43 +238,27 @@ class SweepChoice:
     held_out_draws: int = 0
     least_whiskers: int = 1
 
-    def check(self) -> None:
-        """Raise a ConfigError for values that cannot be."""
-        if self.draws < 1:
-            raise ConfigError(f"sweeps.draws must be at least 1, not {self.draws}")
-        if self.held_out_draws < 0:
-            raise ConfigError(f"sweeps.held_out_draws must be 0 or more, not {self.held_out_draws}")
-        if self.least_whiskers < 1:
-            raise ConfigError(
-                f"sweeps.least_whiskers must be at least 1, not {self.least_whiskers}"
-            )
+    def __post_init__(self) -> None:
+        for name, fewest in (("draws", 1), ("held_out_draws", 0), ("least_whiskers", 1)):
+            if getattr(self, name) < fewest:
+                bound = f"at least {fewest}" if fewest else "0 or more"
+                raise ConfigError(f"{name} must be {bound}, not {getattr(self, name)}")
         for name in PARAMETERS:
             choice = getattr(self, name)
-            if isinstance(choice, Between) and not choice.low <= choice.high:
-                raise ConfigError(
-                    f"sweeps.{name}: between has its lower end first, not {choice.low:g}, "
-                    f"{choice.high:g}"
-                )
-            if isinstance(choice, Between) and not 1 <= choice.peak <= STEEPEST:
-                raise ConfigError(
-                    f"sweeps.{name}: peak must be from 1 to {STEEPEST:g}, not {choice.peak:g}"
-                )
-            ends = _ends(choice)
+            ends = choice.ends if isinstance(choice, Range) else (choice,)
             least = min(ends)
             if (name in POSITIVE and least <= 0) or (name == "gap_mm" and least < 0):
                 bound = "0 or more" if name == "gap_mm" else "positive"
-                raise ConfigError(f"sweeps.{name} must be {bound}, not {least:g}")
+                raise ConfigError(f"{name} must be {bound}, not {least:g}")
             for value in ends:
                 if not abs(value) <= LARGEST:
-                    raise ConfigError(f"sweeps.{name} must be within +-{LARGEST:g}, not {value:g}")
-                try:
-                    Sweep(**{name: value})
-                except ConfigError as error:
-                    raise ConfigError(f"sweeps.{error}") from None
+                    raise ConfigError(f"{name} must be within +-{LARGEST:g}, not {value:g}")
+                Sweep(**{name: value})
 
     def combinations(self) -> list[dict[str, float]]:
-        """The `Each` and `plus` values, in every combination; the last varies fastest."""
-        each = {n: _each(getattr(self, n)) for n in PARAMETERS if _each(getattr(self, n))}
+        """Every combination of the values that are combined; the last varies fastest."""
+        ranges = {n: c for n in PARAMETERS if isinstance(c := getattr(self, n), Range)}
+        each = {name: chosen.combined for name, chosen in ranges.items() if chosen.combined}
         return [dict(zip(each, values, strict=True)) for values in product(*each.values())]
 
     def __len__(self) -> int:
@@ -238,7 +267,7 @@ class SweepChoice:
     @property
     def keeps_misses(self) -> bool:
         """Whether a sweep that misses the array stays: all combinations are to be there."""
-        return any(_each(getattr(self, n)) for n in PARAMETERS)
+        return self.combinations() != [{}]
 
     def draw_index(self, index: int) -> int:
         """Which draw of its combination sweep `index` of an object is, from 0."""
@@ -250,40 +279,21 @@ class SweepChoice:
         Args:
             rng: of this sweep.
             index: of the object's sweeps.
-            shared: in the same state for all sweeps of a draw, see `Between.once`.
+            shared: in the same state for all sweeps of a draw, see `Range.once`.
         """
         values = self.combinations()[index // (self.draws + self.held_out_draws)]
         for name in PARAMETERS:
             choice = getattr(self, name)
-            if isinstance(choice, Between):
+            if not isinstance(choice, Range):
+                values[name] = float(choice)
+            elif choice.between:
                 drawn = choice.draw(shared if choice.once else rng)
                 values[name] = drawn + (values[name] if choice.plus else 0.0)
-            elif not isinstance(choice, Each):
-                values[name] = float(choice)
         return Sweep(**values)
 
 
 COUNTS = ("draws", "held_out_draws", "least_whiskers")
 PARAMETERS = tuple(f.name for f in fields(SweepChoice) if f.name not in COUNTS)
-
-
-def _each(choice: Choice) -> tuple[float, ...]:
-    """What of a choice is combined with the other parameters' values."""
-    if isinstance(choice, Between):
-        return choice.plus
-    return choice.values if isinstance(choice, Each) else ()
-
-
-def _ends(choice: Choice) -> tuple[float, ...]:
-    """What may be drawn, or the ends of it."""
-    if isinstance(choice, Between):
-        more = choice.plus or (0.0,)
-        return choice.low + min(more), choice.high + max(more)
-    return choice.values if isinstance(choice, Each) else (choice,)
-
-
-OBJECTS, SWEEPS = ObjectChoice(), SweepChoice()
-PERFECT, UNVARIED, USUAL_FAULTS = SensorModel(), Randomisation(), SensorFaults()
 
 
 @dataclass(frozen=True)
@@ -313,23 +323,38 @@ class SweepRecipe:
         ConfigError: values that cannot be, or contradict each other.
     """
 
-    name: str = "unnamed"
-    array: str = "mouse"
-    profile: str = "realtime"
+    name: Text = "unnamed"
+    array: Text = "mouse"
+    profile: Text = "realtime"
     seed: int = 0
     period_ms: float = 9.0  # five of them make one network step (Chung et al. 2025)
     lead_ms: float = 216.0
     length_ms: float = 1476.0  # 22 network steps from onset and to spare
     contacts: bool = False
     every_nth: bool = False
-    objects: ObjectChoice = OBJECTS
-    sweeps: SweepChoice = SWEEPS
-    sensor: SensorModel = PERFECT
-    randomisation: Randomisation = UNVARIED
-    faults: SensorFaults = USUAL_FAULTS
+    objects: ObjectChoice = field(default_factory=ObjectChoice)
+    sweeps: SweepChoice = field(default_factory=SweepChoice)
+    sensor: SensorModel = field(default_factory=SensorModel)
+    randomisation: Randomisation = field(default_factory=Randomisation)
+    faults: SensorFaults = field(default_factory=SensorFaults)
 
     def __post_init__(self) -> None:
-        _check_recipe(self)
+        if self.profile not in PROFILES:
+            raise ConfigError(no_such("profile", self.profile, tuple(PROFILES)))
+        if self.seed < 0:
+            raise ConfigError(f"seed must be 0 or more, not {self.seed}")
+        if self.period_ms < SAMPLE_MS:
+            raise ConfigError(
+                f"period_ms must be {SAMPLE_MS:g} or more, the simulator's own, not "
+                f"{self.period_ms}"
+            )
+        if not self.length_ms <= LONGEST_MS:
+            raise ConfigError(f"length_ms must be at most {LONGEST_MS:g}, not {self.length_ms:g}")
+        if not 0 <= self.lead < self.samples:
+            raise ConfigError(
+                f"length_ms ({self.length_ms:g}) must exceed lead_ms ({self.lead_ms:g}), which "
+                "must be 0 or more"
+            )
 
     @property
     def period_ns(self) -> int:
@@ -363,72 +388,6 @@ class SweepRecipe:
         return [self.seed, zlib.crc32(name.encode()), index, *([stream] if stream else [])]
 
     def to_dict(self) -> dict[str, Any]:
-        """As a recipe file has it; `recipe_files.recipe_from_dict` takes it back."""
-        objects = {
-            key: list(value) if isinstance(value, tuple) else value
-            for key, value in asdict(self.objects).items()
-            if key != "mesh" and (value or not key.endswith(("_source", "outliers")))
-        } | self.objects.mesh.differing()
-        # unsaid what sets of older releases did not know, where it changes nothing
-        sweeps = {
-            name: _written(getattr(self.sweeps, name))
-            for name in PARAMETERS
-            if name not in LATER or getattr(self.sweeps, name) != getattr(SweepChoice, name)
-        }
-        least = self.sweeps.least_whiskers
-        top = {f.name: getattr(self, f.name) for f in fields(self)}
-        faults = _differing_from_default(self.faults)
-        # unsaid, as in sets of releases that knew of none
-        flags = {key: getattr(self, key) for key in ("contacts", "every_nth")}
-        for key, told in (*flags.items(), ("faults", faults)):
-            if not told:
-                del top[key]
-        return {
-            **top,
-            "objects": {"from": objects.pop("source"), **objects},
-            "sweeps": {
-                "draws": self.sweeps.draws,
-                "held_out_draws": self.sweeps.held_out_draws,
-                **({"least_whiskers": least} if least > 1 else {}),
-                **sweeps,
-            },
-            "sensor": _differing_from_default(self.sensor),
-            "randomisation": _differing_from_default(self.randomisation),
-            **({"faults": faults} if faults else {}),
-        }
-
-
-def _differing_from_default(
-    settings: SensorModel | Randomisation | SensorFaults,
-) -> dict[str, float]:
-    default = type(settings)()
-    return {k: v for k, v in asdict(settings).items() if v != getattr(default, k)}
-
-
-def _written(choice: Choice) -> Any:
-    if isinstance(choice, Between):
-        written: dict[str, Any] = {"between": [choice.low, choice.high]}
-        written |= {"once": True} if choice.once else {}
-        written |= {"peak": choice.peak} if choice.peak != 1 else {}
-        return written | ({"plus": list(choice.plus)} if choice.plus else {})
-    return {"each": list(choice.values)} if isinstance(choice, Each) else choice
-
-
-def _check_recipe(recipe: SweepRecipe) -> None:
-    if recipe.profile not in PROFILES:
-        raise ConfigError(no_such("profile", recipe.profile, tuple(PROFILES)))
-    if recipe.seed < 0:
-        raise ConfigError(f"seed must be 0 or more, not {recipe.seed}")
-    if recipe.period_ms < SAMPLE_MS:
-        raise ConfigError(
-            f"period_ms must be {SAMPLE_MS:g} or more, the simulator's own, not {recipe.period_ms}"
-        )
-    if not recipe.length_ms <= LONGEST_MS:
-        raise ConfigError(f"length_ms must be at most {LONGEST_MS:g}, not {recipe.length_ms:g}")
-    if not 0 <= recipe.lead < recipe.samples:
-        raise ConfigError(
-            f"length_ms ({recipe.length_ms:g}) must exceed lead_ms ({recipe.lead_ms:g}), which "
-            "must be 0 or more"
-        )
-    recipe.objects.check()
-    recipe.sweeps.check()
+        """Write it in full as a recipe file has it; `recipe_files.recipe_from_dict` reads it."""
+        plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(self))
+        return plain

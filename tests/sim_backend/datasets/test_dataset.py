@@ -30,9 +30,8 @@ from tactile_rt.sim_backend.datasets.inventory import check_sums
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe, recipe_of_set
 from tactile_rt.sim_backend.datasets.recipe_objects import ShapeObjects
 from tactile_rt.sim_backend.datasets.recipes import (
-    Between,
-    Each,
     ObjectChoice,
+    Range,
     SweepChoice,
     SweepRecipe,
 )
@@ -55,7 +54,7 @@ RECIPE = SweepRecipe(
     lead_ms=45,
     length_ms=225,
     objects=ObjectChoice(categories=("mug",), per_category=3, validation=1, test=1),
-    sweeps=SweepChoice(yaw_deg=Between(0, 360), gap_mm=Between(0.5, 1), draws=2),
+    sweeps=SweepChoice(yaw_deg=Range((0, 360)), gap_mm=Range((0.5, 1)), draws=2),
 )
 NAMES = ["mug-0", "mug-1", "mug-2"]
 
@@ -140,17 +139,12 @@ def described(parameters: dict[str, Any]) -> Sweep:
 
 
 def test_any_single_sweep_can_be_made_again_alone(finished: Path) -> None:
-    recipe = recipe_of_set(*recipe_and_categories(finished))
+    recipe = recipe_of_set(SweepManifest.read(finished).recipe)
     record = simulate_sweep(recipe, load_object("mug-2"), 1)
     assert np.array_equal(record.values, read_sweeps(finished, "test").values[1])
     stored = {key: values[1] for key, values in read_object(finished, "mug-2")[1].items()}
     assert stored.pop("geometry") == fingerprint(make_object("mug", 2))
     assert record.parameters == stored
-
-
-def recipe_and_categories(folder: Path) -> tuple[dict, tuple[str, ...]]:
-    manifest = SweepManifest.read(folder)
-    return manifest.recipe, manifest.categories
 
 
 def test_a_fingerprint_tells_shapes_apart() -> None:
@@ -219,13 +213,13 @@ def test_a_finished_set_gets_a_lost_manifest_back(finished: Path, tmp_path: Path
 def test_a_point_of_a_grid_that_misses_stays_and_a_draw_is_repeated() -> None:
     target = make_object("mug", 0)
     beyond = replace(
-        RECIPE, length_ms=90, sweeps=SweepChoice(distance_mm=Each((5.5, 60.0)), gap_mm=0.1)
+        RECIPE, length_ms=90, sweeps=SweepChoice(distance_mm=Range(each=(5.5, 60.0)), gap_mm=0.1)
     )
     near, far = (simulate_sweep(beyond, target, i) for i in range(2))
     assert (near.parameters["touches"], far.parameters["touches"]) == (True, False)
     assert near.values.any() and not far.values.any()
 
-    half = replace(beyond, sweeps=SweepChoice(distance_mm=Between(-20, 60), draws=6))
+    half = replace(beyond, sweeps=SweepChoice(distance_mm=Range((-20, 60)), draws=6))
     draws = [simulate_sweep(half, target, i) for i in range(6)]
     assert all(d.parameters["touches"] for d in draws)
     firsts = [
@@ -266,7 +260,7 @@ def test_what_a_profile_cannot_simulate_is_drawn_again_or_marked(
     assert not record.parameters["unstable"]
 
     seen.clear()
-    grid = replace(recipe, sweeps=SweepChoice(yaw_deg=Each((0.0, 30.0)), gap_mm=0.1))
+    grid = replace(recipe, sweeps=SweepChoice(yaw_deg=Range(each=(0.0, 30.0)), gap_mm=0.1))
     record = simulate_sweep(grid, target, 1)
     assert (seen, record.parameters["yaw_deg"]) == ([30.0], 30.0)
     assert record.parameters["unstable"] and record.parameters["touches"]
@@ -501,7 +495,7 @@ from tactile_rt.sim_backend.datasets.recipe_files import recipe_of_set
 import msgspec
 if __name__ == "__main__":
     folder, recipe, engine = sys.argv[1:]
-    recipe = recipe_of_set(msgspec.json.decode(recipe), ())
+    recipe = recipe_of_set(msgspec.json.decode(recipe))
     for _ in make_sweeps(recipe, Path(folder), 2, engine=engine):
         pass
 """
