@@ -184,7 +184,7 @@ def test_the_command(archive, tmp_path, monkeypatch, call):
         (("000231", tmp_path / "other"), "the server says 404"),
         (("000231",), "name a folder"),
         (("000231", small, "--session", "none"), "no session of 2 is of none"),
-        (("000013", small), "000013 cannot be fetched"),
+        (("example", small), "example cannot be fetched"),
         (("00231", small), "did you mean 000231"),
     ):
         code, _, err = call("align", "fetch", *arguments)

@@ -80,7 +80,6 @@ class NeuralDataset:
 # name: where the dataset is
 DATASETS = {
     "000231": f"{__name__}.rodgers:DANDI_000231",
-    "000013": f"{__name__}.hires:DANDI_000013",
     "example": f"{__name__}.rodgers:EXAMPLE",
 }
 
