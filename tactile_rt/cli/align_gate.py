@@ -99,7 +99,6 @@ def _gate(
             checks.append(check)
             rows += found
         if frozen is not None:
-            # As `align score` has them: a reference names further layers, for test 4 alone.
             patterns = load_layers(model, felt)[0].patterns
             checks = [*neural_checks(score(frozen, patterns), frozen, before), *checks]
     code = exit_code(checks)

@@ -69,28 +69,6 @@ def test_the_gate_without_neural_data(call):
     assert out.startswith("fidelity: pass")
 
 
-def test_a_reference_does_not_change_what_is_scored(call, frozen, tmp_path):
-    """A file that lost its layers' names has further ones by it, for the test of the export."""
-    import onnx
-
-    model, bare = onnx.load(MODEL), tmp_path / "bare.onnx"
-    names = {t.name: f"w{i}" for i, t in enumerate(model.graph.initializer)}
-    for tensor in model.graph.initializer:
-        tensor.name = names[tensor.name]
-    for node in model.graph.node:
-        node.input[:] = [names.get(name, name) for name in node.input]
-    onnx.save(model, bare)
-    found = []
-    for reference in ((), ("--reference", MODEL)):
-        _, out, err = call(
-            "align", "gate", bare, "--benchmark", frozen / "6.json", *reference, "--json", "-"
-        )
-        assert err == ""
-        found.append(json.loads(out))
-    assert found[1]["checks"][: len(found[0]["checks"])] == found[0]["checks"]
-    assert "decoder.fc1" in {tap["layer"] for tap in found[1]["taps"]}
-
-
 def test_a_baseline_of_other_stimuli_is_no_baseline(call, frozen, tmp_path):
     arrays = dict(np.load(SHIPPED))
     np.savez(tmp_path / "felt.npz", **arrays | {"values": 1.1 * arrays["values"]})

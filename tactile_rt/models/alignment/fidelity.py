@@ -81,23 +81,18 @@ def fidelity_check(reference: Layers, exported: Layers) -> tuple[Check, tuple[La
 
 
 def export_layers(path: Path, stimuli: StimuliInput, reference: Layers) -> Layers:
-    """Layers of an ONNX file for a comparison: those whose names are lost are found by value.
+    """Read the layers of an ONNX file for a comparison with a reference.
 
     Raises:
         ModelError, ConfigError: as `onnx_activations.onnx_layers`.
     """
-    from tactile_rt.models.alignment.onnx_activations import nearest_taps, onnx_layers
+    from tactile_rt.models.alignment.onnx_activations import onnx_layers
 
     exported, _ = onnx_layers(path, stimuli)
-    lost = {k: v for k, v in reference.traces.items() if k not in exported.traces}
-    traces = exported.traces
-    if found := nearest_taps(path, stimuli, lost) if lost else {}:
-        more, _ = onnx_layers(path, stimuli, found)
-        traces = {**traces, **{k: more.traces[k] for k in found if k in more.traces}}
     # The reference knows from which step on a layer counts; of a file that is found by what differs
     # in it, which in a network that hardly responds is less than single precision can tell.
-    known = {k: step for k, step in reference.first.items() if k in traces}
-    return replace(exported, traces=traces, first={**exported.first, **known})
+    known = {k: step for k, step in reference.first.items() if k in exported.traces}
+    return replace(exported, first={**exported.first, **known})
 
 
 def _compared(name: str, a: np.ndarray, b: np.ndarray, precision: str) -> LayerFidelity:

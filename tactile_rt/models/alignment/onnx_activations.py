@@ -23,14 +23,13 @@ from tactile_rt.errors import ModelError, TactileError
 from tactile_rt.models.alignment.layers import Layers, first_difference, table
 from tactile_rt.models.alignment.onnx_taps import (
     GRU_LAYERS,
-    float_tensors,
     named_taps,
     precision_of,
     step_graph,
 )
 from tactile_rt.models.alignment.stimuli_input import STEPS, StimuliInput
 
-__all__ = ["nearest_taps", "onnx_layers", "with_outputs"]
+__all__ = ["onnx_layers", "with_outputs"]
 
 Floats = NDArray[np.float32]
 TOKENS = 2  # of a GPT attender's step, the action token last
@@ -38,15 +37,8 @@ REASON = 120  # characters of what onnxruntime says
 TAP = "tap:"  # prefix of the outputs that are added
 
 
-def onnx_layers(
-    path: Path, stimuli: StimuliInput, taps: Mapping[str, str] | None = None
-) -> tuple[Layers, ModelCard]:
-    """Layers of a step or window file, and its card.
-
-    Args:
-        path: of the file.
-        stimuli: the input.
-        taps: tensors by layer; found by the names of parameters unless given.
+def onnx_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, ModelCard]:
+    """Read the layers of a step or window file, and its card.
 
     Raises:
         ModelError: not there, damaged, or not a model of this package.
@@ -54,7 +46,7 @@ def onnx_layers(
     """
     with _readable(path):
         plain, card, model = _opened(path, stimuli)
-        taps = named_taps(model) if taps is None else taps
+        taps = named_taps(model)
         tensors = list(dict.fromkeys(taps.values()))
         logits, _ = _run(plain, stimuli, card, ())
         session = _session(with_outputs(model, tensors))
@@ -81,44 +73,6 @@ def onnx_layers(
         training=table(card.provenance.get("training")),
         notes=tuple(notes),
     ), card
-
-
-def nearest_taps(path: Path, stimuli: StimuliInput, wanted: Mapping[str, Floats]) -> dict[str, str]:
-    """For layers whose names are lost, the tensor of the same size that is nearest in value.
-
-    Args:
-        path: of a file.
-        stimuli: the input.
-        wanted: by layer, (6, step, unit) as computed elsewhere.
-
-    Returns:
-        Tensors by layer; a layer for which no tensor has the size is missing.
-
-    Raises:
-        ModelError, ConfigError: as `onnx_layers`.
-    """
-    with _readable(path):
-        _, card, model = _opened(path, stimuli)
-        names = float_tensors(model)
-        # One stimulus and the last step tell them apart, and of all tensors that is much already.
-        session = _session(with_outputs(model, names))
-        _, found = _run(session, stimuli, card, names, (0,), (STEPS - 1,))
-    taps: dict[str, str] = {}
-    for layer, trace in wanted.items():
-        goal = trace[0, -1]
-        candidates = {
-            name: _trace(layer, values)[0, -1]
-            for name, values in found.items()
-            if values.dtype == np.float32
-        }
-        far = {
-            name: float(np.abs(values - goal).max())
-            for name, values in candidates.items()
-            if values.shape == goal.shape
-        }
-        if far:
-            taps[layer] = min(far, key=far.__getitem__)
-    return taps
 
 
 def with_outputs(model: onnx.ModelProto, tensors: Iterable[str]) -> onnx.ModelProto:
@@ -188,8 +142,6 @@ def _run(
     loads: StimuliInput,
     card: ModelCard,
     tensors: Sequence[str],
-    stimuli: Sequence[int] = range(6),
-    keep: Sequence[int] = range(STEPS),
 ) -> tuple[Floats, dict[str, Floats]]:
     """Logits (stimulus, step, class) and tensors (stimulus, step, ...).
 
@@ -201,7 +153,7 @@ def _run(
     states = [f"{s.name}_next" for s in card.state]
     logits: list[Floats] = []
     found: dict[str, list[Floats]] = {name: [] for name in tensors}
-    for i in stimuli:
+    for i in range(len(loads.samples)):
         feed: dict[str, NDArray[Any]] = {
             "offset": loads.offset[i : i + 1],
             "sigma": loads.sigma[i : i + 1],
@@ -212,18 +164,18 @@ def _run(
             first, *rest = session.run(["logits", *wanted], feed)
             logits.append(first[0])
             for name, values in zip(tensors, rest, strict=True):
-                found[name].append(values[list(keep)])
+                found[name].append(values)
             continue
         steps: list[list[Floats]] = []
         for t in range(STEPS):
             feed["samples"] = loads.samples[i : i + 1, t]
             out = session.run(["logits", *wanted, *states], feed)
-            steps.append(out[: 1 + len(wanted)] if t in keep else out[:1])
+            steps.append(out[: 1 + len(wanted)])
             following = out[1 + len(wanted) :]
             feed |= {s.name: v for s, v in zip(card.state, following, strict=True)}
         logits.append(np.concatenate([step[0] for step in steps]))
         for k, name in enumerate(tensors):
-            found[name].append(np.stack([steps[t][1 + k] for t in keep]))
+            found[name].append(np.stack([step[1 + k] for step in steps]))
     return np.stack(logits), {name: np.stack(values) for name, values in found.items()}
 
 

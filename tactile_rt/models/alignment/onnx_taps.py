@@ -12,7 +12,7 @@ import onnx
 
 from tactile_rt.models.alignment.layers import PARTS
 
-__all__ = ["GRU_LAYERS", "float_tensors", "named_taps", "precision_of", "step_graph"]
+__all__ = ["GRU_LAYERS", "named_taps", "precision_of", "step_graph"]
 
 QUANTISED = {"MatMulInteger", "ConvInteger", "DynamicQuantizeLinear", "QLinearMatMul",
              "QLinearConv", "DequantizeLinear", "MatMulNBits", "MatMulIntegerToFloat"}  # fmt: skip
@@ -103,24 +103,6 @@ def named_taps(model: onnx.ModelProto) -> dict[str, str]:
     return dict(
         sorted(taps.items(), key=lambda item: (part(item[0].split(".")[0]), place[item[1]]))
     )
-
-
-def float_tensors(model: onnx.ModelProto) -> list[str]:
-    """Every tensor that depends on the graph's inputs and may be of floats.
-
-    Quantisation forgets types; only the runtime knows them then.
-    """
-    graph, _ = step_graph(model)
-    other = {
-        v.name
-        for v in (*graph.value_info, *graph.output)
-        if v.type.tensor_type.elem_type not in (0, onnx.TensorProto.FLOAT)
-    }
-    driven = {i.name for i in graph.input}
-    for node in graph.node:
-        if driven.intersection(node.input):
-            driven.update(node.output)
-    return [o for n in graph.node for o in n.output if o and o in driven - other]
 
 
 def precision_of(model: onnx.ModelProto) -> str:

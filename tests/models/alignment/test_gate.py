@@ -271,31 +271,14 @@ def test_a_gpt_of_weights_in_16_bits_passes(tmp_path, precision):
     assert fidelity_check(reference, layers)[0].code == PASS
 
 
-def test_an_untrained_network_s_export_passes(tmp_path):
-    """Its norms are all alike, and one to the exporter, under the last one's name."""
+def test_layers_that_are_alike_in_an_export_are_not_compared_and_it_says_so(tmp_path):
+    """An untrained network's norms are one to the exporter, under the last one's name."""
     path = tmp_path / "step.onnx"
     model = written(path, "gru", "gpt", "linear", trained=False)
-    assert "attender.norm" not in onnx_layers(path, FELT)[0].traces
     reference = network_layers(model, FELT)
     check, rows = fidelity_check(reference, export_layers(path, FELT, reference))
-    assert check.code == PASS
-    assert {"attender.block0", "attender.norm"} <= {row.layer for row in rows}
-
-
-def test_layers_whose_names_are_lost_are_found_by_value(exported):
-    reference, path = exported
-    model = onnx.load(path)
-    names = {t.name: f"w{i}" for i, t in enumerate(model.graph.initializer)}
-    for tensor in model.graph.initializer:
-        tensor.name = names[tensor.name]
-    for node in model.graph.node:
-        node.input[:] = [names.get(name, name) for name in node.input]
-    other = path.with_name("nameless.onnx")
-    onnx.save(model, other)
-    assert "decoder.fc1" not in onnx_layers(other, FELT)[0].traces
-    check, rows = fidelity_check(reference, export_layers(other, FELT, reference))
-    assert check.code == PASS
-    assert "decoder.fc1" in {row.layer for row in rows}
+    assert check.code == PASS and "layers could not be compared" in check.why
+    assert "attender.block0" not in {row.layer for row in rows}
 
 
 def test_an_int8_export_passes_and_a_damaged_one_fails(exported, quantised, tmp_path):
