@@ -148,19 +148,6 @@ def test_a_set_without_is_as_before(tmp_path: Path) -> None:
         list(make_sweeps(RECIPE, tmp_path, processes=1))
 
 
-def test_contacts_survive_the_journal(tmp_path: Path) -> None:
-    from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord
-
-    contacts = np.array([[0.01, np.nan]], dtype=np.float32)
-    values = np.ones((1, 2, 6), dtype=np.float32)
-    with Journal(tmp_path, "mug-0") as journal:
-        journal.append(0, SweepRecord(values, {}, contacts))
-        journal.append(1, SweepRecord(values, {}))
-    with Journal(tmp_path, "mug-0") as journal:
-        assert np.array_equal(journal.records[0].contacts, contacts, equal_nan=True)
-        assert journal.records[1].contacts is None
-
-
 def test_a_miss_touches_nothing() -> None:
     grid = replace(RECIPE, sweeps=SweepChoice(distance_mm=Range(each=(60.0,))))
     record = simulate_sweep(grid, make_object("mug", 0), 0)

@@ -1,8 +1,8 @@
 """Making a sweep set: many objects, each swept past the array several times with drawn parameters.
 
 Every sweep depends on its recipe, object and index alone, so a set does not depend on who makes
-it, in which order, or how often that was interrupted. An object is one task: its finished sweeps
-go to a journal at once, and become its file when all are there.
+it, in which order, or how often that was interrupted. An object is one task, and becomes a file
+when all of its sweeps are there.
 """
 
 import hashlib
@@ -24,8 +24,7 @@ from tactile_rt.sensor_spec import LOADS
 from tactile_rt.settings import no_such
 from tactile_rt.sim_backend.arrays.files import load_animals
 from tactile_rt.sim_backend.datasets.engines import ENGINES, run_processes, run_ray
-from tactile_rt.sim_backend.datasets.inventory import write_sums, written_sum
-from tactile_rt.sim_backend.datasets.journal import Journal, SweepRecord, remove_leftovers
+from tactile_rt.sim_backend.datasets.inventory import remove_leftovers, write_sums, written_sum
 from tactile_rt.sim_backend.datasets.recipe_objects import MeshObjects, ShapeObjects, choose_objects
 from tactile_rt.sim_backend.datasets.recipes import SweepRecipe
 from tactile_rt.sim_backend.mujoco_world import CONTACT_CHANNELS, contact_distances
@@ -162,8 +161,7 @@ def finished_objects(folder: Path, names: Sequence[str]) -> list[str]:
 
 def _refuse_strays(folder: Path, manifest: SweepManifest) -> None:
     """Without its manifest a folder's sweeps may be another set's: take them for no one's."""
-    strays = (f for n in manifest.names() for f in (f"{n}.npz", f"{n}.part"))
-    if (folder / MANIFEST).exists() or not any((folder / f).exists() for f in strays):
+    if (folder / MANIFEST).exists() or not any(has_object(folder, n) for n in manifest.names()):
         return
     text = msgspec.json.format(msgspec.json.encode(manifest), indent=1)
     if written_sum(folder, MANIFEST) != hashlib.sha256(text).hexdigest():
@@ -171,6 +169,21 @@ def _refuse_strays(folder: Path, manifest: SweepManifest) -> None:
             f"{folder} holds sweeps but no {MANIFEST} that says what made them: choose another "
             "folder (a finished set goes on with the options that began it)"
         )
+
+
+@dataclass(frozen=True)
+class SweepRecord:
+    """One finished sweep.
+
+    Attributes:
+        values: The (sample, element, channel) loads of the sweep, SI.
+        parameters: The parameters that the sweep was made with, by name.
+        contacts: The (sample, element) contacts, see `Sweeps`; None when they are not kept.
+    """
+
+    values: NDArray[np.float32]
+    parameters: dict[str, float]
+    contacts: NDArray[np.float32] | None = None
 
 
 @dataclass(frozen=True)
@@ -185,18 +198,16 @@ class _Work:
             raise ConfigError(
                 f"{self.folder} is not there on every machine: a cluster needs a shared file system"
             )
-        with Journal(self.folder, name) as journal:
-            if not has_object(self.folder, name):  # as another run may have, while we waited
-                try:
-                    target = self._objects.load(name)
-                except ConfigError as error:
-                    journal.remove()
-                    return str(error)
-                for index in range(len(self.recipe.sweeps)):
-                    if index not in journal.records:
-                        journal.append(index, simulate_sweep(self.recipe, target, index))
-                _write(self.folder, name, journal, target)
-            journal.remove()
+        if has_object(self.folder, name):  # as another run may have made it meanwhile
+            return None
+        try:
+            target = self._objects.load(name)
+        except ConfigError as error:
+            return str(error)
+        records = [
+            simulate_sweep(self.recipe, target, index) for index in range(len(self.recipe.sweeps))
+        ]
+        _write(self.folder, name, records, target)
         return None
 
     @cached_property
@@ -204,10 +215,8 @@ class _Work:
         return choose_objects(self.recipe.objects)
 
 
-def _write(folder: Path, name: str, journal: Journal, target: TactileObject) -> None:
-    records = [journal.records[i] for i in sorted(journal.records)]
+def _write(folder: Path, name: str, records: Sequence[SweepRecord], target: TactileObject) -> None:
     parameters: dict[str, NDArray[Any]] = {
-        # The type is said: it must not depend on whether a record came out of the journal.
         key: np.array([r.parameters[key] for r in records], dtype=KINDS.get(key, np.float64))
         for key in records[0].parameters
     }

@@ -4,6 +4,7 @@ Neither reads the loads. The checksums are written as the program sha256sum writ
 """
 
 import hashlib
+import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +22,18 @@ from tactile_rt.sweep_set import (
     read_skipped,
 )
 
-__all__ = ["SUMS", "Tally", "check_sums", "tally", "write_sums", "written_sum"]
+__all__ = [
+    "SUMS",
+    "Tally",
+    "check_sums",
+    "remove_leftovers",
+    "tally",
+    "write_sums",
+    "written_sum",
+]
 
 SUMS = "SHA256SUMS"
+STALE_S = 60  # no file of a set takes as long to write
 
 
 @dataclass(frozen=True)
@@ -80,6 +90,14 @@ def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
                 f"{path} is damaged ({reason}): delete it and sweep again"
             ) from None
     return Tally(len(there) * sweeps, misses, unstable, len(read_skipped(folder)))
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what killed processes left half-written: hidden files that no one is filling."""
+    names = (MANIFEST, SKIPPED, SUMS, "*.npz")
+    for path in (path for name in names for path in folder.glob(f".{name}.*")):
+        if time.time() - path.stat().st_mtime > STALE_S:
+            path.unlink(missing_ok=True)
 
 
 def write_sums(folder: Path) -> None:

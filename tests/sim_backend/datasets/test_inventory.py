@@ -1,5 +1,6 @@
 """What is told of a set once it is made: what of it is no use."""
 
+import os
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 pytest.importorskip("mujoco")
 
 from tactile_rt.errors import RecordingError
-from tactile_rt.sim_backend.datasets.inventory import Tally, tally
+from tactile_rt.sim_backend.datasets.inventory import Tally, remove_leftovers, tally
 from tactile_rt.sweep_set import object_path, write_object, write_skipped
 
 
@@ -40,3 +41,14 @@ def test_a_damaged_object_is_named(folder: Path) -> None:
     object_path(folder, "b").write_bytes(b"PK")
     with pytest.raises(RecordingError, match=r"b\.npz is damaged .*: delete it and sweep again"):
         tally(folder, ["a", "b"], 2)
+
+
+def test_leftovers_are_removed_once_no_one_writes_them(tmp_path: Path) -> None:
+    stale = [tmp_path / name for name in (".mug-0.npz.ab12", ".manifest.json.ef")]
+    kept = [tmp_path / name for name in (".bowl-0.npz.cd34", ".SHA256SUMS.gh", ".hidden", "a.npz")]
+    for path in (*stale, *kept):
+        path.touch()
+    for path in (*stale, *kept[2:]):
+        os.utime(path, (0, 0))
+    remove_leftovers(tmp_path)
+    assert sorted(tmp_path.iterdir()) == sorted(kept)
