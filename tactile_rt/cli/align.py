@@ -231,8 +231,8 @@ def decode_stimuli(
     """Decode shape and distance of the stimuli from every layer, with permutation chance."""
     check_output(json)
     with needing_torch():
-        from tactile_rt.models.alignment.animal_means import animal_means
         from tactile_rt.models.alignment.benchmark import load_strict
+        from tactile_rt.models.alignment.building import animal_means
         from tactile_rt.models.alignment.decoding import (
             decode,
             decode_paper,

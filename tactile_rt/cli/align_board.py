@@ -167,8 +167,8 @@ def _board(
     from tactile_rt.models.alignment.datasets import find_dataset
     from tactile_rt.models.alignment.loading import check_models, told_apart
     from tactile_rt.models.alignment.metrics import find_metric, metric_names
+    from tactile_rt.models.alignment.selection import part_of
     from tactile_rt.models.alignment.stimuli_input import read_stimuli
-    from tactile_rt.models.alignment.targets import part_of
 
     metrics = list(dict.fromkeys(metric or metric_names()))
     for name in metrics:

@@ -8,8 +8,8 @@ import pytest
 
 from tactile_rt.classifier.model_file import METADATA_KEY, read_model, shipped_model
 from tactile_rt.models.alignment import save_benchmark
+from tactile_rt.models.alignment.neural import write_published
 from tactile_rt.models.alignment.paper_code import freeze_paper_code
-from tactile_rt.models.alignment.published import write_published
 from tactile_rt.models.alignment.stimuli_input import SHIPPED
 from tactile_rt.models.alignment.strict import freeze_strict
 from tests.helpers import brains

@@ -17,9 +17,9 @@ from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.metrics import METRICS, Measure, find_metric
 from tactile_rt.models.alignment.metrics.halves import LONGEST, bins_of, means_of, sessions_of
 from tactile_rt.models.alignment.neural import Animal
+from tactile_rt.models.alignment.selection import part_of
 from tactile_rt.models.alignment.statistics import held_out, standard_error
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
-from tactile_rt.models.alignment.targets import part_of
 
 __all__ = [
     "ANOTHER",

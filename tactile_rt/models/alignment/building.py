@@ -1,27 +1,36 @@
 """From recordings to a frozen benchmark."""
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import numpy as np
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.alignment.benchmark import PROTOCOLS, Benchmark
 from tactile_rt.models.alignment.clock import CLOCKS, WARNING, ContactResponse, said_of
-from tactile_rt.models.alignment.copies import refuse_copies
-from tactile_rt.models.alignment.neural import NeuralSession, by_animal, published_layout
+from tactile_rt.models.alignment.neural import (
+    NeuralSession,
+    by_animal,
+    published_layout,
+    read_published,
+)
 from tactile_rt.models.alignment.nwb import Reading, find_nwb, read_nwb
 from tactile_rt.models.alignment.paper_code import freeze_paper_code
-from tactile_rt.models.alignment.published import read_published
 from tactile_rt.models.alignment.rdm import STIMULI
-from tactile_rt.models.alignment.reliability import BOOTSTRAPS, SEED
+from tactile_rt.models.alignment.reliability import BOOTSTRAPS, SEED, trial_mean
 from tactile_rt.models.alignment.selection import Selection
 from tactile_rt.models.alignment.strict import freeze_strict
 
-__all__ = ["build", "checked_sessions"]
+__all__ = ["animal_means", "build", "checked_sessions", "refuse_copies"]
 
 # Of the time that a build takes; the rest is bootstraps.
 READING = 0.8
+# Of two copies of a session.
+MOST = 0.5  # of the smaller one's trials or units
+FEWEST = 3  # of trials or units that say something
 
 
 def build(
@@ -199,3 +208,81 @@ def _check_reliable(made: Benchmark) -> None:
             for t in made.targets
         )
         raise ConfigError(f"no animal is reliable enough to score on; reliabilities: {found}")
+
+
+def refuse_copies(sessions: Sequence[NeuralSession]) -> None:
+    """Refuse recordings that hold a session twice, in another sorting or order, or units less.
+
+    Two copies of a session would be split into the same halves and agree with each other perfectly.
+    Two sessions are copies if they share most of their trials (when each began, and its stimulus),
+    or most of their units (how often which rate came with which stimulus), whatever the order.
+
+    Raises:
+        ConfigError: naming two sessions that are copies.
+    """
+    trials = [_count_trials(session) for session in sessions]
+    units = [_count_units(session) for session in sessions]
+    for j, later in enumerate(sessions):
+        for i, earlier in enumerate(sessions[:j]):
+            if _share_most(units[i], units[j]):
+                how = ""
+            elif _share_most(trials[i], trials[j]):
+                how = " with other units"
+            else:
+                continue
+            raise ConfigError(
+                f"sessions {earlier.name} and {later.name} hold the same trials{how}: "
+                "give one of them"
+            )
+
+
+def _share_most(one: Counter[bytes], other: Counter[bytes]) -> bool:
+    fewer = min(one.total(), other.total())
+    return fewer >= FEWEST and (one & other).total() > MOST * fewer
+
+
+def _count_trials(session: NeuralSession) -> Counter[bytes]:
+    """Count trials by when they began, to a ms, and their stimulus."""
+    if session.begin is None:
+        return Counter()
+    began = np.round(session.begin * 1e3).astype(np.int64)
+    return Counter(row.tobytes() for row in np.stack([began, session.stimulus], axis=1))
+
+
+def _count_units(session: NeuralSession) -> Counter[bytes]:
+    """Count units by their rates, sorted within stimuli; three rates at least."""
+    found: Counter[bytes] = Counter()
+    for rates in session.rates.T:
+        if len(np.unique(rates)) >= FEWEST:
+            order = np.lexsort((rates, session.stimulus))
+            found[session.stimulus[order].tobytes() + rates[order].tobytes()] += 1
+    return found
+
+
+def animal_means(path: Path) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
+    """Read the mean responses (6, unit) of animals, and notes on what was left out.
+
+    Args:
+        path: rates in the published layout, ``.npz``, as their authors publish them, mistakes
+            included (`neural.published_layout`); or an NWB file, or a folder of them.
+
+    Raises:
+        ConfigError: recordings that cannot be used, and why.
+    """
+    if path.suffix == ".npz":
+        return {name: trial_mean(rates) for name, rates in read_published(path).items()}, []
+    sessions, notes = checked_sessions(find_nwb([path]))
+    means = {}
+    for animal in by_animal(sessions):
+        whole = [s for s in animal.sessions if s.trials.min() > 0]
+        if not whole:
+            notes.append(f"animal {animal.name} left out: no session has every stimulus")
+            continue
+        means[animal.name] = np.concatenate(
+            [
+                np.stack([s.rates[s.stimulus == k].mean(axis=0) for k in range(len(STIMULI))])
+                for s in whole
+            ],
+            axis=1,
+        )
+    return means, notes

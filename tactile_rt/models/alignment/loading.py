@@ -1,18 +1,28 @@
 """Layers of any model file: a checkpoint, an ONNX file, or responses computed elsewhere."""
 
+import hashlib
 import re
 from collections.abc import Sequence
 from itertools import count
 from pathlib import Path
 
+import numpy as np
+
 from tactile_rt.classifier.model_file import read_model
 from tactile_rt.errors import ConfigError, ModelError
-from tactile_rt.models.alignment.layers import Layers
-from tactile_rt.models.alignment.responses_file import RESPONSES, responses_layers
+from tactile_rt.models.alignment.layers import PARTS, Layers
+from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
 from tactile_rt.models.checkpoint_files import describe_checkpoint
 
-__all__ = ["check_models", "load_layers", "load_untrained", "told_apart"]
+__all__ = [
+    "RESPONSES",
+    "check_models",
+    "load_layers",
+    "load_untrained",
+    "responses_layers",
+    "told_apart",
+]
 
 CHECKPOINT, BEST = ".pt", "best.pt"
 OF_GRID = "point.json"  # what a grid leaves in a run's folder, which is named for its rate
@@ -131,3 +141,64 @@ def _accuracy(figures: object) -> tuple[float, str] | None:
         if isinstance(value, int | float) and 0 <= value <= 1:
             return float(value), key.replace("_", " ").replace("top1", "top-1")
     return None
+
+
+RESPONSES = ".npz"
+NUMBERS = "fiu"
+LARGEST = np.finfo(np.float32).max
+
+
+def responses_layers(path: Path) -> Layers:
+    """Layers of a file of responses.
+
+    Args:
+        path: ``.npz``; each array is a layer, (6, unit) or (6, step, unit), its stimuli in the
+            order of `STIMULI`. A layer whose name does not begin with ``encoder.``, ``attender.``
+            or ``decoder.`` is one of the encoder's.
+
+    Raises:
+        ConfigError: no such file, an array that is no layer, by name, or two that are one layer.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    traces = {}
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            for name in archive.files:
+                array = archive[name]
+                if (
+                    array.dtype.kind not in NUMBERS
+                    or array.ndim not in (2, 3)
+                    or array.shape[0] != len(STIMULI)
+                    or 0 in array.shape
+                    or array.shape[-1] < 2
+                    or not (np.abs(array) <= LARGEST).all()
+                ):
+                    raise ConfigError(
+                        f"{path}: array {name} ({array.dtype}, {array.shape}) is no layer: finite "
+                        f"numbers ({len(STIMULI)} stimuli, 2 or more units)"
+                    )
+                part, dot, _ = name.partition(".")
+                full = name if dot and part in PARTS else f"encoder.{name}"
+                if full in traces:
+                    short = full.removeprefix("encoder.")
+                    raise ConfigError(f"{path}: arrays {short} and {full} are one layer: name one")
+                traces[full] = (array if array.ndim == 3 else array[:, None]).astype(np.float32)
+    except ConfigError:
+        raise
+    except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"{path}: no archive of arrays ({reason})") from None
+    if not traces:
+        raise ConfigError(f"{path}: has no array, so no layer")
+    return Layers(
+        name=path.stem,
+        traces=traces,
+        first=dict.fromkeys(traces, 0),
+        logits=np.zeros((len(STIMULI), 1, 0), dtype=np.float32),
+        parameters=0,
+        sha256=hashlib.sha256(content).hexdigest(),
+        notes=("responses computed elsewhere",),
+    )

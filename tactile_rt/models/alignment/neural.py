@@ -1,8 +1,10 @@
 """Recordings as both protocols take them: animals, their sessions, rates and stimuli per trial."""
 
 import hashlib
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +12,16 @@ from numpy.typing import NDArray
 from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.alignment.rdm import STIMULI
 
-__all__ = ["Animal", "NeuralSession", "by_animal", "pad", "published_layout", "rates_sha256"]
+__all__ = [
+    "Animal",
+    "NeuralSession",
+    "by_animal",
+    "pad",
+    "published_layout",
+    "rates_sha256",
+    "read_published",
+    "write_published",
+]
 
 Floats = NDArray[np.float64]
 
@@ -134,3 +145,52 @@ def rates_sha256(arrays: Mapping[str, NDArray[np.generic]]) -> str:
         digest.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()
+
+
+# The published code saved this option of `numpy.savez` as if it were an animal.
+NOT_AN_ANIMAL = "allow_pickle"
+LARGEST = 1 << 30  # bytes; the published ones have some tens of millions
+
+
+def read_published(path: Path) -> dict[str, Floats]:
+    """Rates of every animal, (row, 6, unit), NaN-padded; see `neural.published_layout`.
+
+    The published file has an entry ``allow_pickle``, an option that was saved as if it were an
+    animal: it is passed over, and nothing is ever unpickled.
+
+    The stimulus axis has no names in such a file, so only protocol paper-code can use it.
+
+    Raises:
+        ConfigError: not such a file.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(member.file_size for member in archive.infolist())
+        if size > LARGEST:
+            raise ValueError(f"it would be {size} bytes")
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files if name != NOT_AN_ANIMAL}
+    except FileNotFoundError:
+        raise ConfigError(f"no file {path}") from None
+    except Exception as error:  # numpy and zipfile raise a dozen unrelated types for a bad file
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"{path}: not an npz file of numbers ({reason})") from None
+    if not arrays:
+        raise ConfigError(f"{path}: holds no animal")
+    for name, array in arrays.items():
+        if array.ndim != 3 or array.shape[1] != len(STIMULI) or array.dtype.kind not in "fiu":
+            raise ConfigError(
+                f"{path}: {name} is {array.dtype} {array.shape}, not numbers "
+                f"(row, {len(STIMULI)} stimuli, unit)"
+            )
+        if array.shape[0] < 2 or array.shape[2] < 2:
+            raise ConfigError(f"{path}: {name} {array.shape} has fewer than two rows or units")
+        if np.isinf(array).any():
+            raise ConfigError(f"{path}: {name} holds an infinite rate")
+    return {name: array.astype(np.float64) for name, array in arrays.items()}
+
+
+def write_published(rates: dict[str, Floats], path: Path) -> None:
+    """Write rates in this layout."""
+    with path.open("wb") as file:
+        np.savez_compressed(file, **rates)  # type: ignore[arg-type]

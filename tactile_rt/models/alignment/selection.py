@@ -1,15 +1,17 @@
 """Which recordings and which of their units a benchmark is made of."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.models.alignment.neural import Animal, NeuralSession
+from tactile_rt.settings import no_such
 
-__all__ = ["CELLS", "LAYERS_UM", "TASKS", "Selection"]
+__all__ = ["CELLS", "LAYERS_UM", "TARGET_PARTS", "TASKS", "Selection", "part_of"]
 
 TASKS = ("discrimination", "detection")
 CELLS = ("excitatory", "inhibitory")
@@ -113,3 +115,52 @@ def _depths(text: str) -> tuple[float, float]:
             f"depth {text!r} is neither a layer ({', '.join(LAYERS_UM)}) nor a range in um, 419-626"
         )
     return depths
+
+
+TARGET_PARTS = ("all", *LAYERS_UM, *CELLS)
+
+
+def part_of(animals: Sequence[Animal], part: str) -> tuple[Animal, ...]:
+    """Keep the units of one part of cortex; animals without any are left out.
+
+    A mouse's borders differ from those of `LAYERS_UM`, and what lies at a border is what its depth
+    says.
+
+    Raises:
+        ConfigError: no such part.
+    """
+    if part not in TARGET_PARTS:
+        raise ConfigError(no_such("part of cortex", part, TARGET_PARTS))
+    if part == "all":
+        return tuple(animals)
+    kept = []
+    for animal in animals:
+        sessions = tuple(cut for s in animal.sessions if (cut := _cut_session(s, part)) is not None)
+        if sessions:
+            kept.append(replace(animal, sessions=sessions))
+    return tuple(kept)
+
+
+def _cut_session(session: NeuralSession, part: str) -> NeuralSession | None:
+    chosen = _choose_units(session, part)
+    if chosen is None or not chosen.any():
+        return None
+    return replace(
+        session,
+        rates=session.rates[:, chosen],
+        course=None if session.course is None else session.course[..., chosen],
+        depth=None if session.depth is None else session.depth[chosen],
+        inhibitory=None if session.inhibitory is None else session.inhibitory[chosen],
+    )
+
+
+def _choose_units(session: NeuralSession, part: str) -> NDArray[np.bool_] | None:
+    """Find the units of a part, (unit,); None where that is not known."""
+    if part in CELLS:
+        if session.inhibitory is None:
+            return None
+        return session.inhibitory if part == "inhibitory" else ~session.inhibitory
+    if session.depth is None:
+        return None
+    low, high = LAYERS_UM[part]
+    return (session.depth >= low) & (session.depth < high)

@@ -23,8 +23,7 @@ from tactile_rt.errors import ConfigError, name_some
 from tactile_rt.models.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.models.alignment.canonical import canonical
 from tactile_rt.models.alignment.neural import Animal, NeuralSession, rates_sha256
-from tactile_rt.models.alignment.pooling import Moments, moments_of
-from tactile_rt.models.alignment.rdm import CONSTANT, STIMULI, normalised, pearson
+from tactile_rt.models.alignment.rdm import CONSTANT, STIMULI, UPPER, normalised, pearson
 from tactile_rt.models.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
 
 __all__ = [
@@ -32,8 +31,10 @@ __all__ = [
     "MINIMUM_TRIALS",
     "MINIMUM_UNITS",
     "Divided",
+    "Moments",
     "divided",
     "freeze_strict",
+    "moments_of",
 ]
 
 Floats = NDArray[np.float64]
@@ -42,6 +43,37 @@ MINIMUM_RELIABILITY = 0.5  # of a unit, and of an animal's RDM
 MINIMUM_TRIALS = 4  # of every stimulus in a session: two halves of two halves
 TIE = 1e-9
 MINIMUM_UNITS = 5  # of an RDM: with fewer its correlations are mostly 1 or -1
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Sums over units of responses to six stimuli.
+
+    Attributes:
+        units: (...) The number of units that the sums run over.
+        sums: (..., 6) The sum over units of the response to each stimulus.
+        products: (..., 6, 6) The sum over units of the products of the responses to two stimuli.
+    """
+
+    units: Floats
+    sums: Floats
+    products: Floats
+
+    def __add__(self, other: "Moments") -> "Moments":
+        return Moments(
+            self.units + other.units, self.sums + other.sums, self.products + other.products
+        )
+
+    def rdm(self) -> Floats:
+        """RDMs (..., 15); NaN where a stimulus's response is the same in all units."""
+        units = np.maximum(self.units, 1)[..., None]
+        mean = self.sums / units
+        covariance = self.products - units[..., None] * mean[..., :, None] * mean[..., None, :]
+        variance = np.diagonal(covariance, axis1=-2, axis2=-1)
+        scale = np.diagonal(self.products, axis1=-2, axis2=-1)
+        deviation = np.sqrt(np.where(variance > np.sqrt(CONSTANT) * scale, variance, np.nan))
+        correlation = covariance / (deviation[..., :, None] * deviation[..., None, :])
+        return np.asarray(1 - correlation[..., UPPER[0], UPPER[1]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,3 +292,22 @@ def _sum(pools: Sequence[_Pool]) -> _Pool:
     for pool in pools[1:]:
         total = total + pool
     return total
+
+
+def moments_of(patterns: Floats, counted: NDArray[np.bool_] | None = None) -> Moments:
+    """Moments of responses (..., 6, unit).
+
+    Args:
+        patterns: the responses.
+        counted: (..., unit) which units count; default: all.
+    """
+    if counted is None:
+        units = np.full(patterns.shape[:-2], float(patterns.shape[-1]))
+    else:
+        units = counted.sum(axis=-1, dtype=np.float64)
+        patterns = np.where(counted[..., None, :], patterns, 0.0)
+    return Moments(
+        units=units,
+        sums=patterns.sum(axis=-1),
+        products=np.matmul(patterns, np.swapaxes(patterns, -1, -2)),
+    )

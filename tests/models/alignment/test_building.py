@@ -12,7 +12,7 @@ import pytest
 from tactile_rt.errors import ConfigError
 from tactile_rt.extras import install_extra
 from tactile_rt.models.alignment import build
-from tactile_rt.models.alignment.published import read_published, write_published
+from tactile_rt.models.alignment.neural import read_published, write_published
 from tests.helpers.brains import geometry, padded
 from tests.helpers.nwb_sessions import write_session
 

@@ -9,8 +9,8 @@ import pytest
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.clock import CLOCKS
+from tactile_rt.models.alignment.neural import read_published, write_published
 from tactile_rt.models.alignment.nwb import WINDOWS, read_session
-from tactile_rt.models.alignment.published import read_published, write_published
 from tests.helpers.nwb_sessions import write_session
 
 pytest.importorskip("h5py", reason="h5py reads the files")

@@ -16,8 +16,7 @@ from tactile_rt.models.alignment.metrics.geometry import cka, cosine, rsa, time_
 from tactile_rt.models.alignment.metrics.halves import bins_of, divisions, half_means, means_of
 from tactile_rt.models.alignment.metrics.linear import predicted
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
-from tactile_rt.models.alignment.selection import LAYERS_UM
-from tactile_rt.models.alignment.targets import part_of
+from tactile_rt.models.alignment.selection import LAYERS_UM, part_of
 from tests.helpers import brains
 
 NAMES = tuple(METRICS)

@@ -7,7 +7,7 @@ import pytest
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment import build
-from tactile_rt.models.alignment.copies import refuse_copies
+from tactile_rt.models.alignment.building import refuse_copies
 from tactile_rt.models.alignment.neural import NeuralSession
 from tactile_rt.models.alignment.nwb import read_nwb, read_session
 from tactile_rt.models.alignment.selection import Selection
