@@ -17,7 +17,6 @@ from tactile_rt.models.alignment.benchmark import Benchmark
 from tactile_rt.models.alignment.example import Brain, gains
 from tactile_rt.models.alignment.gate import FAIL, INCONCLUSIVE, PASS, mice_of, regression, turing
 from tactile_rt.models.alignment.neural import Animal, NeuralSession
-from tactile_rt.models.alignment.rdm import normalised, rdm
 from tactile_rt.models.alignment.scoring import Score, layer_rdms, score_rdms
 from tactile_rt.models.alignment.strict import freeze_strict
 
@@ -48,7 +47,6 @@ def run(quick: bool = False) -> list[Record]:
     rounds, models = (8, 2) if quick else (200, 4)
     found = _gate(BRAIN, SEED, rounds, models)
     records = [*_score(5 if quick else 20), *_bars(found), *_damage(found)]
-    records += _limits(2 if quick else 12, 400 if quick else 1500)
     for k, (name, (brain, what)) in enumerate(OTHERS.items(), start=1):
         records += _other(name, what, _gate(brain, SEED + k, rounds // 4, models))
     return records
@@ -258,45 +256,6 @@ def _damage(found: _Found) -> list[Record]:
                        f"test 2 fails {found.share(kind):.0f} %")
             )  # fmt: skip
     return records
-
-
-def _limits(geometries: int, draws: int) -> list[Record]:
-    """What the best linear test of an RDM finds that knows the geometry and all variances."""
-    found = {False: [], True: []}  # type: dict[bool, list[list[float]]]
-    for k in range(geometries):
-        rng = np.random.default_rng([SEED - 1, k])
-        shared = BRAIN.geometry(rng)
-
-        def many(lost: float, noisy: bool, rng=rng, shared=shared) -> Floats:  # type: ignore[no-untyped-def]
-            made = [
-                _recorded(BRAIN, rng, f) if noisy else BRAIN.model(rng, f)[LAST]
-                for f in (BRAIN.features(rng, shared, lost) for _ in range(2 * draws))
-            ]
-            return normalised(rdm(np.stack(made)))
-
-        for noisy in found:
-            mice = many(0.0, noisy)
-            found[noisy].append([_caught(mice, many(lost, False)) for lost in LOST[:2]])
-    records = []
-    for noisy, rates in found.items():
-        for lost, rate in zip(LOST[:2], 100 * np.mean(rates, axis=0), strict=True):
-            records.append(
-                Record(f"align.limit_{100 * lost:.0f}{'_recorded' * noisy}", float(rate), "%", "",
-                       f"lost {lost:.0%}: found by the best linear test that passes 90 % of the "
-                       f"mice {'as recorded' if noisy else 'without noise'}, told the truth",
-                       f"{geometries} geometries, {draws} RDMs to learn from")
-            )  # fmt: skip
-    return records
-
-
-def _caught(mice: Floats, damaged: Floats) -> float:
-    """Share of damaged models below the 10th percentile of mice, by Fisher's discriminant."""
-    (learn, test), (other, found) = np.split(mice, 2), np.split(damaged, 2)
-    spread = np.cov(learn.T) + np.cov(other.T)
-    weight = np.linalg.lstsq(
-        spread + 1e-6 * np.trace(spread) * np.eye(15), learn.mean(0) - other.mean(0), rcond=None
-    )[0]
-    return float((found @ weight < np.percentile(test @ weight, 10)).mean())
 
 
 def _other(name: str, what: str, found: _Found) -> list[Record]:

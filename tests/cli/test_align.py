@@ -209,18 +209,6 @@ def test_the_row_of_animals_as_published(call, tmp_path):
     assert code == 2 and "no file" in err
 
 
-def test_build_from_the_published_layout(call, tmp_path):
-    rng = np.random.default_rng(0)
-    patterns = brains.geometry(rng)
-    rates = {f"animal-{i}": brains.padded(rng, patterns=patterns) for i in range(3)}
-    source, out = tmp_path / "rates.npz", tmp_path / "benchmark.json"
-    write_published(rates, source)
-    arguments = ("--protocol", "paper-code", "--bootstraps", 20, "--out", out)
-    code, _, err = call("align", "build", source, *arguments)
-    assert code == 0 and "animals are reliable" in err
-    assert json.loads(out.read_text())["benchmark"]["protocol"] == "paper-code"
-
-
 def test_mistakes_are_one_line(call, frozen, tmp_path):
     benchmark = ("--benchmark", frozen / "6.json")
     for arguments, said in (
@@ -259,18 +247,3 @@ def test_an_array_without_a_layer_s_name_is_refused(refused, frozen, tmp_path):
     np.save(tmp_path / "x.npy", np.ones((6, 20)))
     said = refused("align", "score", tmp_path / "x.npy", "--benchmark", frozen / "6.json")
     assert "in an .npz" in said
-
-
-def test_an_example_is_built_from_and_scored(call, tmp_path):
-    pytest.importorskip("h5py")
-    brain, out = tmp_path / "brain", tmp_path / "scores.json"
-    code, _, err = call("align", "example", brain, "--set", "mice=3", "--set", "trials=12")
-    assert code == 0 and "another-mouse.npz" in err and "align build" in err
-    code, _, err = call(
-        "align", "build", brain / "recordings", "--out", brain / "b.json", "--bootstraps", 5
-    )
-    assert code == 0 and "animals are reliable" in " ".join(err.split())
-    model = brain / "models" / "another-mouse.npz"
-    code, text, _ = call("align", "score", model, "--benchmark", brain / "b.json", "--json", out)
-    assert code == 0 and "another-mouse" in text
-    assert call("align", "example", brain)[0] == 2

@@ -75,7 +75,6 @@ class Consistency(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=T
     """How well animals predict each other.
 
     Attributes:
-        animals: The names of the animals, in the order of the axes.
         pooled: (animal,) The score of all other animals' units pooled against each animal; NaN
             where there is none.
         pairwise: (animal, animal) The score of a row's animal against a column's; NaN on the
@@ -117,13 +116,10 @@ class Benchmark(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=Tru
 
     Attributes:
         protocol: The name of the protocol, ``strict`` or ``paper-code``.
-        targets: The animals that models are compared to.
         pooled: All animals as one target, which paper-code scores on as well; None under strict.
         a2a: The animal-to-animal consistency, which a model cannot be expected to exceed.
         bootstraps, seed: Number and seed of the random divisions of the trials.
         sources: The names of the files that were read.
-        notes: Remarks on what was left out and why, a line each.
-        stimuli: The names of the stimuli along the stimulus axis.
     """
 
     protocol: str

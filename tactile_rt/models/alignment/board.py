@@ -43,12 +43,10 @@ class BoardRow(msgspec.Struct, frozen=True):
     """What is compared with the recordings.
 
     Attributes:
-        name: The name of the row, as the board prints it.
         kind: The kind of row: ``model``, ``untrained``, ``input`` (the sensors' readings) or
             ``animal``.
         sha256: The SHA-256 sum of the model's file, hex; empty for what has no file.
         parameters: The count of numbers that the model is made of; 0 where there are none.
-        notes: Remarks on what could not be had and why, a line each.
     """
 
     name: str
@@ -62,9 +60,7 @@ class BoardColumn(msgspec.Struct, frozen=True):
     """Part of a dataset under a metric.
 
     Attributes:
-        dataset: The name of the dataset.
         part: The part of cortex, such as ``all`` or ``L4``.
-        metric: The name of the metric.
         animals: The number of animals with units of that part.
         usable: The number of animals whose noise is low enough to be corrected for.
         ceiling: The mean over these of the value that a perfect model is expected to reach; NaN
@@ -99,9 +95,7 @@ class BoardDataset(msgspec.Struct, frozen=True):
     """Where a dataset comes from; attributes as in `datasets.NeuralDataset`, and what was read.
 
     Attributes:
-        animals: The names of the animals that were read.
         units: The number of units of all animals together.
-        notes: Remarks on what was left out and why, a line each.
     """
 
     name: str
@@ -121,9 +115,7 @@ class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt 
 
     Attributes:
         rows: The models and what they are read against.
-        columns: The datasets' parts under every metric.
         cells: (row, column) The values.
-        datasets: The datasets of the columns.
         metrics: What each metric is, in a line, by its name.
     """
 
@@ -166,11 +158,7 @@ def with_cells(
 
     Args:
         rows: each with its layers for this dataset's conditions.
-        dataset: what the animals are of.
-        animals: as they were read.
         parts: of cortex, from `targets.TARGET_PARTS`.
-        metrics: by name.
-        notes: on what was left out.
         progress: called with the share done, 0 to 1.
 
     Raises:

@@ -47,7 +47,6 @@ def build(
     Args:
         inputs: NWB files and folders of them; or, for paper-code, one published ``.npz``.
         protocol: ``strict`` or ``paper-code``.
-        bootstraps, seed: of the splits.
         progress: called with the share done, 0 to 1.
         selection: which sessions and units of NWB files are kept; None for all.
         clock: spike times are on the ``session``'s clock, as NWB has it and strict by default, or
@@ -125,7 +124,6 @@ def checked_sessions(
     """Sessions of NWB files whose clock is the one that contacts show, and none of them twice.
 
     Args:
-        files: one per session.
         strict: rates count from first contact, and sessions of another clock are left out; else
             from the start of the trial, and a note warns of them.
         progress: called with the share done, 0 to 1.

@@ -42,7 +42,6 @@ class ContactResponse:
     """How the rates of a session, or of several, change with contact.
 
     Attributes:
-        session: The name of the session.
         shift_s: What was subtracted from the stored spike times, in s.
         histogram: (100,) The number of spikes of all units in each ms from 40 ms before to 60 ms
             after contact.
@@ -111,7 +110,6 @@ def contact_response(
     """How a session's rates change with contact.
 
     Args:
-        session: its name.
         spikes: (spike,) stored times of each unit in s, finite.
         contacts: (contact,) times when contacts begin in s, finite and sorted.
         shift_s: is subtracted from the stored times.

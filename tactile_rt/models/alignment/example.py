@@ -42,7 +42,6 @@ class Brain:
     """Who is recorded, and how much of it is shared.
 
     Attributes:
-        mice: The number of mice.
         sessions: The number of sessions of each mouse; each records units of its own.
         units: The number of units in each session.
         trials: The number of trials of each of the six stimuli in each session.

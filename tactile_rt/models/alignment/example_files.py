@@ -55,7 +55,6 @@ def write_example(
 
     Args:
         folder: is made; it must not be there yet.
-        brain: who is recorded.
         seed: of every random number in it, 0 or more.
         progress: called with the share done, 0 to 1.
 

@@ -45,7 +45,6 @@ class Check:
     """One test and how it went.
 
     Attributes:
-        name: The name of the test, as a report prints it.
         code: The outcome of the test: `PASS`, `FAIL` or `INCONCLUSIVE`.
         why: The reason for the outcome, in a line with the figures.
     """

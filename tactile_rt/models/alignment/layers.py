@@ -18,7 +18,6 @@ class Layers:
     """What a model's layers do while an array whisks the six stimuli.
 
     Attributes:
-        name: The name of the model, as a report prints it.
         traces: The responses of each layer, by name: (6, step, unit) float32.
         first: The first step that input can reach, by the name of the layer.
         logits: (6, step, class) The model's output, float32.
@@ -27,7 +26,6 @@ class Layers:
         sha256: The SHA-256 sum of the model's file, hex; empty for a network in memory.
         network: The configuration of the network, as far as it is known.
         training: The configuration of the training, as far as it is known.
-        notes: Remarks on what could not be had and why, a line each.
     """
 
     name: str

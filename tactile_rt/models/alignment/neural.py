@@ -31,8 +31,6 @@ class NeuralSession:
     """One recording of one animal.
 
     Attributes:
-        animal: The name of the animal that was recorded.
-        name: The name of the session.
         rates: (trial, unit) Firing rates in spikes per second, in the order of the trials.
         stimulus: (trial,) The stimulus of each trial, as an index into `STIMULI`.
         course: (trial, bin, unit) Firing rates in spikes per second in bins of 45 ms from the

@@ -61,8 +61,6 @@ class Reading(NamedTuple):
     """What a file holds.
 
     Attributes:
-        session: The session with the units that were selected.
-        notes: Remarks on what was left out and why, a line each.
         task: The task of the mouse, ``discrimination`` or ``detection``.
         response: The change of the rates with contact; None without contacts to tell by.
     """
@@ -106,7 +104,6 @@ def read_nwb(
     """Sessions of NWB files.
 
     Args:
-        files: one per session.
         window: rates count from first ``contact`` or from the ``start`` of the trial, to choice.
         progress: called with the share done, 0 to 1, after every unit.
         clock: spike times are on the ``session``'s clock, or the ``recording``'s.

@@ -79,7 +79,6 @@ def with_outputs(model: onnx.ModelProto, tensors: Iterable[str]) -> onnx.ModelPr
     """A copy whose tensors are outputs too, ``tap:`` and their name; of a window for every step.
 
     Args:
-        model: a step or a window.
         tensors: names in the graph of the step.
     """
     copy = onnx.ModelProto()

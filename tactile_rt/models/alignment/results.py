@@ -24,7 +24,6 @@ class ModelResult(Score, frozen=True, eq=False, kw_only=True):
     """Everything that is shown of a model: its score, and fields as in `layers.Layers`.
 
     Attributes:
-        units: (layer,) The number of units in each layer.
         performance: The accuracy on the task, 0 to 1; NaN if no accuracy is known.
         performance_of: The words that say what that accuracy was measured on.
         untrained: The score of the network before its training, where there is one.

@@ -25,7 +25,6 @@ class Score(msgspec.Struct, frozen=True, eq=False):
     """How well a model's layers fit a benchmark's targets.
 
     Attributes:
-        layers: The names of the layers, in the order of the layer axis.
         targets: The names of the targets; for paper-code the pooled animals are the last.
         rdms: (layer, 15) The RDM of each layer.
         r: (layer, target) Correlations before the correction for noise.

@@ -33,7 +33,6 @@ class StimuliInput:
         sigma: (6, element, channel) The noise at rest, float32, N and N m: the smallest that is
             assumed of a sensor. The tare is zero, for the whiskers rest before they whisk.
         elements, channels, units: Names along the last two axes, and the unit of each channel.
-        name: The name of the file that the loads were read from.
         sha256: The SHA-256 sum of the samples, hex.
     """
 

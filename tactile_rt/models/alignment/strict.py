@@ -128,7 +128,6 @@ def freeze_strict(
     Args:
         animals: whose rates count from first contact to choice.
         bootstraps: the number of divisions of the trials; each is used in both directions.
-        seed: of the divisions.
         progress: called with the share done, 0 to 1.
 
     Raises:

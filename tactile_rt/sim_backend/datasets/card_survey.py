@@ -57,7 +57,6 @@ class Features:
 
     Attributes:
         values: The (sweep, feature) features, see `window_features`.
-        categories: The (sweep,) names of the categories.
     """
 
     values: NDArray[np.float32]
@@ -146,7 +145,6 @@ def survey(folder: Path, fit: Fit) -> tuple[Card, dict[str, NDArray[np.float32]]
     """Measure a set: the objects that are there.
 
     Args:
-        folder: the set's.
         fit: fits a support vector machine, as `models.svm.fit`.
 
     Returns:

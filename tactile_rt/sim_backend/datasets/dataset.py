@@ -102,7 +102,6 @@ def make_sweeps(
     """Make a sweep set, or what is missing of it; yields each object's name as it is finished.
 
     Args:
-        recipe: what to make.
         folder: where; on a cluster, a file system that all of its machines share.
         processes: how many at a time; None: one per core.
         splits: only these; none for all.
@@ -245,11 +244,6 @@ def simulate_sweep(recipe: SweepRecipe, target: TactileObject, index: int) -> Sw
 
     A drawn sweep that misses the array, that too few whiskers reach or that turns unstable is drawn
     again, up to 20 times; one of the combinations of given values stays.
-
-    Args:
-        recipe: the set.
-        target: the object.
-        index: which of the object's sweeps.
 
     Returns:
         (sample, element, channel) values, SI, and the parameters of `sweep.Sweep` with `draw`, the

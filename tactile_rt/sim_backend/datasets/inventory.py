@@ -68,8 +68,6 @@ def tally(folder: Path, names: Iterable[str], sweeps: int) -> Tally:
     """Count what there is of these objects.
 
     Args:
-        folder: the set.
-        names: objects.
         sweeps: of each of them.
 
     Raises:

@@ -71,7 +71,6 @@ def recipe_of_set(recipe: dict[str, Any], sets: Sequence[str] = ()) -> SweepReci
     """The recipe that a set's manifest or a model's card holds.
 
     Args:
-        recipe: as stored.
         sets: ``key=value`` each, as `read_recipe` takes them.
 
     Raises:

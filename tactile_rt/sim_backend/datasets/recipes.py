@@ -301,7 +301,6 @@ class SweepRecipe:
     """How a sweep set is made.
 
     Attributes:
-        name: The name of the set.
         array: The name or file of the array, see `files.load_animals`.
         profile: The name of the simulation profile, one of `world.PROFILES`.
         seed: The seed of the drawn parameters, 0 or more.
@@ -311,8 +310,6 @@ class SweepRecipe:
         contacts: Whether to store where along each whisker it touches, beside the loads.
         every_nth: Whether to store every n-th of the simulator's samples as it is, with what that
             aliases, as the paper does; else they go through the live stream's resampler.
-        objects: The choice of what is swept.
-        sweeps: The choice of how each object is swept.
         sensor: What the sensors make of the loads; perfect ones unless it says otherwise.
         randomisation: The way the array of each sweep differs from its description; not at all
             unless it says so.

@@ -139,30 +139,6 @@ def test_its_models_are_read_as_models(written):
     assert layers.patterns["encoder.layer3"].shape == (6, 200)
 
 
-def test_responses_of_others(tmp_path):
-    path = tmp_path / "mine.npz"
-    rng = np.random.default_rng(0)
-    traces = rng.normal(size=(6, 4, 3))
-    np.savez(path, hidden=traces, **{"decoder.out": rng.normal(size=(6, 2))})
-    layers, _ = load_layers(path, None)
-    assert set(layers.traces) == {"encoder.hidden", "decoder.out"}
-    np.testing.assert_allclose(layers.patterns["encoder.hidden"], traces.mean(axis=1), atol=1e-6)
-    for wrong, said in (
-        ({"a": np.zeros((5, 3))}, "array a .* is no layer"),
-        ({"a": np.full((6, 3), np.nan)}, "array a .* is no layer"),
-        ({"a": np.array([None] * 6)}, "no archive of arrays"),
-        ({}, "has no array"),
-    ):
-        np.savez(path, **wrong)
-        with pytest.raises(ConfigError, match=said):
-            check_models([path])
-    path.write_bytes(b"PK nonsense")
-    with pytest.raises(ConfigError, match="no archive of arrays"):
-        check_models([path])
-    with pytest.raises(ConfigError, match="cannot be read"):
-        check_models([tmp_path / "none.npz"])
-
-
 def test_a_brain_that_cannot_be(tmp_path):
     for wrong in ({"mice": 0}, {"trials": 0}, {"private": 1.5}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):

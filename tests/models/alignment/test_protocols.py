@@ -64,24 +64,6 @@ def test_the_order_of_appearance_destroys_what_animals_share():
     assert published.a2a.mean < 0.3
 
 
-def test_neither_the_order_of_trials_nor_of_sessions_nor_of_animals_matters():
-    rng = np.random.default_rng(2)
-    made = animals(rng, number=3, sessions=3, noise=3)
-    shuffled = []
-    for animal in rng.permutation(np.array(made, dtype=object)):
-        sessions = []
-        for one in rng.permutation(np.array(animal.sessions, dtype=object)):
-            order = rng.permutation(len(one.stimulus))
-            sessions.append(replace(one, rates=one.rates[order], stimulus=one.stimulus[order]))
-        shuffled.append(Animal(animal.name, tuple(sessions)))
-    one, other = freeze_strict(made, BOOTSTRAPS), freeze_strict(shuffled, BOOTSTRAPS)
-    np.testing.assert_array_equal(one.a2a.pooled, other.a2a.pooled)
-    for a, b in zip(one.targets, other.targets, strict=True):
-        assert (a.name, a.sha256, a.chosen.factor) == (b.name, b.sha256, b.chosen.factor)
-        np.testing.assert_array_equal(a.chosen.rdm, b.chosen.rdm)
-        np.testing.assert_array_equal(a.unfiltered.rdm, b.unfiltered.rdm)
-
-
 def test_sessions_without_a_spike_are_no_copies_of_each_other():
     rng = np.random.default_rng(3)
     made = []
@@ -302,17 +284,6 @@ def test_too_few_reliable_units_make_no_rdm():
     assert target.chosen.units <= 4
     assert not target.reliable
     assert np.isnan(target.chosen.factor)
-
-
-def test_progress_ends_at_one():
-    shares = []
-    freeze_strict(animals(np.random.default_rng(0), number=2), 5, progress=shares.append)
-    assert shares == [0.5, 1.0]
-    shares.clear()
-    rng = np.random.default_rng(0)
-    freeze_paper_code({"a": padded(rng), "b": padded(rng)}, 5, progress=shares.append)
-    assert shares == sorted(shares)
-    assert shares[-1] == 1.0
 
 
 def test_layers_are_chosen_on_the_other_animals():

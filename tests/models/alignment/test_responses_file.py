@@ -26,7 +26,25 @@ def test_no_layer_takes_the_place_of_another(tmp_path, names):
         responses_layers(tmp_path / "a.npz")
 
 
-def test_what_single_precision_cannot_hold_is_refused(tmp_path):
-    np.savez(tmp_path / "a.npz", x=np.full((6, 4), 1e300))
-    with pytest.raises(ConfigError, match=r"array x .* is no layer: finite"):
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"x": np.full((6, 4), 1e300)}, r"array x .* is no layer: finite"),
+        ({"a": np.zeros((5, 3))}, "array a .* is no layer"),
+        ({"a": np.full((6, 3), np.nan)}, "array a .* is no layer"),
+        ({"a": np.array([None] * 6)}, "no archive of arrays"),
+        ({}, "has no array"),
+    ],
+)
+def test_what_is_no_layer_is_refused(tmp_path, arrays, said):
+    np.savez(tmp_path / "a.npz", **arrays)
+    with pytest.raises(ConfigError, match=said):
         responses_layers(tmp_path / "a.npz")
+
+
+def test_what_is_no_archive_is_refused(tmp_path):
+    (tmp_path / "a.npz").write_bytes(b"PK nonsense")
+    with pytest.raises(ConfigError, match="no archive of arrays"):
+        responses_layers(tmp_path / "a.npz")
+    with pytest.raises(ConfigError, match="cannot be read"):
+        responses_layers(tmp_path / "none.npz")

@@ -1,5 +1,4 @@
 import sys
-import tomllib
 from dataclasses import fields, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -488,14 +487,6 @@ def test_no_such_recipe(tmp_path: Path) -> None:
     (tmp_path / "bytes.toml").write_bytes(b"\xff\xfe")
     with pytest.raises(ConfigError, match=r"bytes\.toml:1: not UTF-8 text"):
         read_recipe(str(tmp_path / "bytes.toml"))
-
-
-def test_a_stored_recipe_can_be_written_as_toml_again() -> None:
-    """It has only what TOML knows: no null."""
-    raw = read_recipe("paper-highvar-lowfi").to_dict()
-    assert None not in raw.values()
-    assert tomllib.loads("a = { each = [1.0] }")["a"].keys() == {"each"}
-    assert raw["sweeps"]["height_mm"] == {"each": [-3.0, 0.0, 3.0]}
 
 
 def test_without_a_distance_it_is_that_of_the_array(tmp_path: Path) -> None:

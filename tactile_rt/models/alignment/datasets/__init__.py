@@ -28,10 +28,8 @@ class DatasetContents:
     """What was read of a dataset.
 
     Attributes:
-        animals: The animals, each a target of its own.
         stimuli: The input that models get for its conditions; None for the six stimuli that ship
             or that the user names.
-        notes: Remarks on what was left out and why, a line each.
     """
 
     animals: tuple[Animal, ...]
@@ -48,8 +46,6 @@ class NeuralDataset:
 
     Attributes:
         name: The name that a user gives, such as the number of a DANDI set.
-        title: The title that its authors gave it.
-        citation: The words to cite it by.
         license: The SPDX name of its license; empty for a set of the user's own.
         url: The address of its page; empty if there is none.
         size: The size and the number of its files, in words.

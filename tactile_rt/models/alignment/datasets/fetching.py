@@ -96,7 +96,6 @@ def fetch(
     What is there already stays, so that a fetch that broke off goes on.
 
     Args:
-        files: of `published_files`.
         folder: is made if it is not there.
         progress: called with the share done, 0 to 1.
 
@@ -120,9 +119,6 @@ def fetch(
 
 def counted(paths: Sequence[Path]) -> tuple[int, int, list[str]]:
     """Mice and units of sessions with valid trials, and notes on what was left out.
-
-    Args:
-        paths: NWB files.
 
     Raises:
         ConfigError: none can be read.
