@@ -32,6 +32,11 @@ Models = Annotated[
     list[Path], typer.Argument(help="Checkpoints (best.pt), .onnx files, and responses (.npz).")
 ]
 
+Untrained = Annotated[bool, typer.Option(help="Score each network before its training too.")]
+UntrainedSeed = Annotated[
+    int, typer.Option(min=0, max=LARGEST_SEED, help="Of the untrained networks.")
+]
+
 
 @align.command("example")
 def write_brain(
@@ -134,12 +139,8 @@ def score_models(
     json: Json = None,
     html: Annotated[Path | None, typer.Option(help="Write the report here, .html.")] = None,
     stimuli: Stimuli = None,
-    untrained: Annotated[
-        bool, typer.Option(help="Score each checkpoint's network before training too.")
-    ] = True,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the untrained networks.")
-    ] = 0,
+    untrained: Untrained = True,
+    seed: UntrainedSeed = 0,
     performance: Annotated[
         str | None,
         typer.Option(help="Accuracy of each model on its task, 0.46,0.52,...; else its own."),

@@ -9,8 +9,8 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from tactile_rt.cli.align import align
-from tactile_rt.cli.app import LARGEST_SEED, check_output, needs
+from tactile_rt.cli.align import Stimuli, Untrained, UntrainedSeed, align, needing_torch
+from tactile_rt.cli.app import check_output, needs
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import Json, print_table, told_as_json
 from tactile_rt.errors import ConfigError
@@ -26,24 +26,16 @@ def list_datasets(json: Json = None) -> None:
     """List the recordings that models can be compared with: license, citation, size."""
     from tactile_rt.models.alignment.datasets import dataset_names, find_dataset
 
-    found = {name: find_dataset(name) for name in dataset_names()}
-    told = [
-        {
-            "name": name, "title": one.title, "about": one.about, "citation": one.citation,
-            "url": one.url, "license": one.license, "size": one.size,
-        }
-        for name, one in found.items()
-    ]  # fmt: skip
-    if told_as_json(told, json):
+    found = [find_dataset(name) for name in dataset_names()]
+    keys = ("name", "title", "about", "citation", "url", "license", "size")
+    if told_as_json([{key: getattr(one, key) for key in keys} for one in found], json):
         return
     console = Console(soft_wrap=True)
-    for name, one in found.items():
-        console.print(f"[bold]{name}[/]  {one.title}", highlight=False)
-        for line in (one.about, one.citation, one.url):
-            if line:
-                console.print(f"    {line}", highlight=False, markup=False)
+    for one in found:
+        console.print(f"[bold]{one.name}[/]  {one.title}", highlight=False)
         licensed = f"license {one.license}, " if one.license else ""
-        console.print(f"    {licensed}{one.size}", highlight=False, markup=False)
+        for line in filter(None, (one.about, one.citation, one.url, f"{licensed}{one.size}")):
+            console.print(f"    {line}", highlight=False, markup=False)
 
 
 @align.command("fetch")
@@ -125,26 +117,52 @@ def write_board(
     ] = None,
     json: Json = None,
     html: Annotated[Path | None, typer.Option(help="Write it as a page here, .html.")] = None,
-    stimuli: Annotated[
-        Path | None,
-        typer.Option(help="Of `tactile-rt whisk`. Default: the mouse array's, which ships."),
-    ] = None,
-    untrained: Annotated[
-        bool, typer.Option(help="A row for each network before its training too.")
-    ] = True,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the untrained networks.")
-    ] = 0,
+    stimuli: Stimuli = None,
+    untrained: Untrained = True,
+    seed: UntrainedSeed = 0,
 ) -> None:
     """Compare models with recordings by every metric, as shares of what noise permits."""
     for file in (json, html):
         check_output(file)
     if not data:
         raise ConfigError("name recordings: --data NAME=PATH, see `tactile-rt align datasets`")
-    try:
-        made = _board(models or [], data, metric, part or ["all"], stimuli, untrained, seed)
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
+    parts, models = list(dict.fromkeys(part or ["all"])), models or []
+    with needing_torch():
+        from tactile_rt.models.alignment.board import joined, with_cells
+        from tactile_rt.models.alignment.datasets import find_dataset
+        from tactile_rt.models.alignment.loading import check_models, told_apart
+        from tactile_rt.models.alignment.metrics import find_metric, metric_names
+        from tactile_rt.models.alignment.selection import part_of
+        from tactile_rt.models.alignment.stimuli_input import read_stimuli
+
+        metrics = list(dict.fromkeys(metric or metric_names()))
+        for name in metrics:
+            find_metric(name)
+        for name in parts:
+            part_of((), name)
+        named = [_named(text) for text in data]
+        called = told_apart([name for name, _ in named], [path for _, path in named])
+        datasets = [
+            (replace(find_dataset(name), name=own), path)
+            for (name, path), own in zip(named, called, strict=True)
+        ]
+        felt = read_stimuli(stimuli)
+        files = list(zip(models, check_models(models), strict=True))
+        boards = []
+        console = Console(stderr=True)
+        for dataset, path in datasets:
+            with progress_bar(console, f"reading {dataset.name}", total=1.0) as update:
+                read = dataset.read([path], felt, _shown(update))
+            with progress_bar(console, f"models on {dataset.name}", max(len(files), 1)) as update:
+                rows = _rows(files, read.stimuli or felt, untrained, seed, update)
+            with progress_bar(console, f"scoring on {dataset.name}", total=1.0) as update:
+                boards.append(
+                    with_cells(
+                        rows, dataset, read.animals, parts, metrics, read.notes,
+                        _shown(update),
+                    )
+                )  # fmt: skip
+        made = joined(boards)
     if html:
         from tactile_rt.models.alignment.board_page import board_page
         from tactile_rt.models.alignment.html_page import write_page
@@ -152,52 +170,6 @@ def write_board(
         write_page(board_page(made), html)
     if not told_as_json(made, json):
         _show(made)
-
-
-def _board(
-    models: list[Path],
-    data: list[str],
-    metric: list[str] | None,
-    parts: list[str],
-    stimuli: Path | None,
-    untrained: bool,
-    seed: int,
-) -> "Alignments":
-    from tactile_rt.models.alignment.board import joined, with_cells
-    from tactile_rt.models.alignment.datasets import find_dataset
-    from tactile_rt.models.alignment.loading import check_models, told_apart
-    from tactile_rt.models.alignment.metrics import find_metric, metric_names
-    from tactile_rt.models.alignment.selection import part_of
-    from tactile_rt.models.alignment.stimuli_input import read_stimuli
-
-    metrics = list(dict.fromkeys(metric or metric_names()))
-    for name in metrics:
-        find_metric(name)
-    for name in parts:
-        part_of((), name)
-    named = [_named(text) for text in data]
-    called = told_apart([name for name, _ in named], [path for _, path in named])
-    datasets = [
-        (replace(find_dataset(name), name=own), path)
-        for (name, path), own in zip(named, called, strict=True)
-    ]
-    felt = read_stimuli(stimuli)
-    files = list(zip(models, check_models(models), strict=True))
-    boards = []
-    console = Console(stderr=True)
-    for dataset, path in datasets:
-        with progress_bar(console, f"reading {dataset.name}", total=1.0) as update:
-            read = dataset.read([path], felt, _shown(update))
-        with progress_bar(console, f"models on {dataset.name}", max(len(files), 1)) as update:
-            rows = _rows(files, read.stimuli or felt, untrained, seed, update)
-        with progress_bar(console, f"scoring on {dataset.name}", total=1.0) as update:
-            boards.append(
-                with_cells(
-                    rows, dataset, read.animals, list(dict.fromkeys(parts)), metrics, read.notes,
-                    _shown(update),
-                )
-            )  # fmt: skip
-    return joined(boards)
 
 
 def _shown(update: Any) -> Callable[[float], None]:

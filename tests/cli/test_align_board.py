@@ -76,7 +76,7 @@ def test_another_seed_is_another_untrained_network(call, brain, tmp_path):
 def test_the_datasets_are_listed(call):
     code, out, _ = call("align", "datasets")
     assert code == 0
-    for said in ("000231", "example", "CC-BY-4.0"):
+    for said in ("000231", "example", "CC0-1.0"):
         assert said in out
 
 

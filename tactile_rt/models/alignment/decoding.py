@@ -15,15 +15,15 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.models.alignment.rdm import STIMULI, rdm, square
+from tactile_rt.models.alignment.rdm import DISTANCES, SHAPES, STIMULI, rdm, square
 
 __all__ = ["Decoded", "decode", "decode_paper", "decode_rdm", "mean_decoded"]
 
 Floats = NDArray[np.float64]
 Labels = tuple[int, ...]
 
-SHAPE: Labels = (0, 0, 0, 1, 1, 1)  # in the order of `STIMULI`
-DISTANCE: Labels = (0, 1, 2, 0, 1, 2)
+SHAPE: Labels = tuple(SHAPES.index(name.split("-")[0]) for name in STIMULI)
+DISTANCE: Labels = tuple(DISTANCES.index(name.split("-")[1]) for name in STIMULI)
 TIE = 1e-9
 
 
