@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from msgspec.structs import replace as change
 
 from bench.perception.methods import Method, of_kinds
 from tactile_rt.models import evaluation
@@ -18,7 +19,7 @@ from tactile_rt.models.evaluation import Interval
 from tactile_rt.models.onsets import find_onsets
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
-from tactile_rt.sim_backend.datasets.recipes import Between, Choice, Each
+from tactile_rt.sim_backend.datasets.recipes import Choice, Range
 from tactile_rt.sweep_set import Sweeps
 
 __all__ = ["UPRIGHT", "Condition", "false_touches", "measured", "rows"]
@@ -31,16 +32,16 @@ LEAN = 14.1  # degrees about either axis: 20 in all
 WORLDS: dict[str, dict[str, Choice]] = {
     UPRIGHT: {},
     "leaning by 20 degrees": {"roll_deg": LEAN, "pitch_deg": LEAN},
-    "in any orientation": {"roll_deg": Between(-180, 180), "pitch_deg": Between(-90, 90)},
+    "in any orientation": {"roll_deg": Range((-180, 180)), "pitch_deg": Range((-90, 90))},
     "20 mm/s": {"speed_mm_s": 20.0},
     "60 mm/s": {"speed_mm_s": 60.0},
     "30 mm large": {"size_mm": 30.0},
     "55 mm large": {"size_mm": 55.0},
-    "4 to 10 mm high": {"height_mm": Between(4, 10)},
-    "8 to 10 mm away": {"distance_mm": Between(8, 10)},
+    "4 to 10 mm high": {"height_mm": Range((4, 10))},
+    "8 to 10 mm away": {"distance_mm": Range((8, 10))},
     "a tenth of the friction": {"surface_friction": 0.1},
     "2.5 times the friction": {"surface_friction": 2.5},
-    SHAKEN: {"shake_g": 0.5, "shake_hz": Between(10, 100)},
+    SHAKEN: {"shake_g": 0.5, "shake_hz": Range((10, 100))},
 }
 # on upright sweeps; an amount of 1 is 20 uN and 0.1 uN m, 10 uN being the rated noise
 SENSORS = {
@@ -72,7 +73,7 @@ def rows(
     found = {}
     for name, changed in WORLDS.items():
         recipe = read_recipe(RECIPE)
-        objects = replace(
+        objects = change(
             recipe.objects, per_category=FIRST + OBJECTS, test=OBJECTS, withheld=(), per_withheld=0
         )
         sweeps = replace(recipe.sweeps, draws=DRAWS, **changed)
@@ -97,9 +98,11 @@ def false_touches(folder: Path, noise: float) -> float:
         noise: of the sensor, in units of the rated.
     """
     recipe = read_recipe(RECIPE)
-    objects = replace(recipe.objects, per_category=3, validation=1, test=1, withheld=(),
+    objects = change(recipe.objects, per_category=3, validation=1, test=1, withheld=(),
                       per_withheld=0)  # fmt: skip
-    sweeps = replace(recipe.sweeps, draws=DRAWS, distance_mm=Each((FAR_MM,)), **WORLDS[SHAKEN])
+    sweeps = replace(
+        recipe.sweeps, draws=DRAWS, distance_mm=Range(each=(FAR_MM,)), **WORLDS[SHAKEN]
+    )
     recipe = replace(recipe, name="generator: shaken in the air", objects=objects, sweeps=sweeps)
     there = folder / "generator" / "shaken-in-the-air"
     for _ in make_sweeps(recipe, there, splits=("test",)):

@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+from msgspec.structs import replace as change
+
 from bench.perception.data import FILE, SOURCE, Portion, pack
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import DEFAULT_RECIPE, read_recipe
@@ -51,7 +53,7 @@ def _recipes(objects: Path) -> Iterator[tuple[SweepRecipe, tuple[str, ...]]]:
     wide = read_recipe(DEFAULT_RECIPE).sweeps
     for name in (INSTANCES, ANOTHER):
         recipe = read_recipe(str(RECIPES / f"{name}.toml"))
-        recipe = replace(recipe, objects=replace(recipe.objects, source=str(objects)))
+        recipe = replace(recipe, objects=change(recipe.objects, source=str(objects)))
         yield recipe, ()
         sweeps = replace(wide, draws=recipe.sweeps.draws)
         yield replace(recipe, name=name + WIDE, sweeps=sweeps), ("test",)

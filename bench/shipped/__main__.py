@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from msgspec.structs import replace as change
 
 from bench.perception.make import RECIPES as OF_THE_BENCHMARK
 from tactile_rt.export.release import release
@@ -93,7 +94,7 @@ def recipes(objects: Path) -> list[SweepRecipe]:
 
 
 def _of(recipe: SweepRecipe, objects: Path) -> SweepRecipe:
-    return replace(recipe, objects=replace(recipe.objects, source=str(objects)))
+    return replace(recipe, objects=change(recipe.objects, source=str(objects)))
 
 
 def _trained(folder: Path, sets: list[Path], seed: int) -> list[Path]:

@@ -19,7 +19,7 @@ from bench.perception.page import write_page
 from bench.perception.scores import accuracy_by_source, score
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
+from tactile_rt.sim_backend.datasets.recipe_files import read_recipe, recipe_of_set
 from tactile_rt.sweep_set import OUTLIERS, WITHHELD, write_object
 from tests.helpers.source_tree import ROOT
 
@@ -72,7 +72,7 @@ def test_its_recipes_are_those_that_made_it(data: Data) -> None:
     told = {o.category for o in data.origins.values() if o.split == OUTLIERS}
     assert set(recipe.objects.outliers) == told
     stored = data.sets["train"].manifest.recipe
-    assert stored["sweeps"] == recipe.to_dict()["sweeps"]
+    assert recipe_of_set(stored).sweeps == recipe.sweeps
 
 
 def test_what_is_packed_is_what_was_felt_to_a_fifth_of_the_noise(
