@@ -36,7 +36,7 @@ class FittedSVM:
 
     Attributes:
         machine: The machine of scikit-learn.
-        kernel: From (sweep, feature) values to what the machine takes.
+        kernel: The map of (sweep, feature) values to what the machine takes.
         how: A sentence for reports that says how the machine was made.
     """
 

@@ -115,7 +115,7 @@ class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt 
 
     Attributes:
         rows: The models and what they are read against.
-        cells: (row, column) The values.
+        cells: (row, column) The value of each row in each column.
         metrics: What each metric is, in a line, by its name.
     """
 

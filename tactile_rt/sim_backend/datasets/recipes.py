@@ -150,7 +150,7 @@ class ObjectChoice(msgspec.Struct, frozen=True):
             out; empty: none.
         only_source: Objects of a folder from this source only, all of them held out for a test,
             without those that are like one from elsewhere; empty: of all sources.
-        surface_error_mm, max_pieces, hull, up: As `MeshDetail` has them.
+        surface_error_mm, max_pieces, hull, up: The settings of `MeshDetail`, for a folder.
 
     Raises:
         ConfigError: values that cannot be, or contradict each other.
