@@ -12,8 +12,9 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.options import Json, Quick
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import Json, show_records
+from tactile_rt.cli.tables import show_records
 from tactile_rt.errors import ConfigError, name_some
 
 CHECKOUT = Path(__file__).parents[2]
@@ -37,9 +38,7 @@ def bench(
     area: Annotated[
         str | None, typer.Argument(help=f"{', '.join(AREAS)}, or {FAULTS}; default: all but it.")
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Fewer repetitions: a look, not a figure.")
-    ] = False,
+    quick: Quick = False,
     json: Json = None,
     resume: Annotated[
         Path | None, typer.Option(help="Of faults: keep each here, and go on from there.")

@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
-from tactile_rt.cli.tables import STDOUT, Json, show_table, told_as_json
+from tactile_rt.cli.app import app, check_output, leaving, starting
+from tactile_rt.cli.options import STDOUT, Json, Seconds, Url
+from tactile_rt.cli.tables import show_table, told_as_json
 
-Url = Annotated[str, typer.Argument(help="URL of a source, e.g. serial:///dev/ttyUSB0?codec=bota.")]
 WINDOW_S = 1.0
 
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import Pace, app, leaving, needs, set_option, starting
+from tactile_rt.cli.app import app, leaving, needs, starting
+from tactile_rt.cli.options import Fast, Faults, ProjectFolder, set_option
 from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -25,10 +26,7 @@ def emulate(
     source: Annotated[
         str | None, typer.Option(help="What it measures: sim:mouse, replay:FILE. Default: waves.")
     ] = None,
-    project: Annotated[
-        Path | None,
-        typer.Option(help="A folder of `tactile-rt new`: its array, in the codec of robot.toml."),
-    ] = None,
+    project: ProjectFolder = None,
     wire: Annotated[
         str | None, typer.Option(help="serial, slcan or can. Default: serial, else slcan.")
     ] = None,
@@ -38,12 +36,12 @@ def emulate(
     bus: Annotated[
         str | None, typer.Option(help="For --wire can: INTERFACE:CHANNEL, e.g. socketcan:vcan0.")
     ] = None,
-    faults: Annotated[Path | None, typer.Option(help="A .toml of what goes wrong.")] = None,
+    faults: Faults = None,
     sets: Annotated[
         list[str] | None,
         set_option("An option of codec or line: format=int16, baud=9600, bitrate=0 (no speed)"),
     ] = None,
-    fast: Pace = False,
+    fast: Fast = False,
     seconds: Annotated[
         float | None,
         typer.Option(min=0.001, max=1e9, help="Send so many seconds of samples, then leave."),

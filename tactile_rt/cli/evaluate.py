@@ -7,8 +7,9 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.options import Json, Quick
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import Json, show_records
+from tactile_rt.cli.tables import show_records
 
 
 @app.command(name="eval")
@@ -18,13 +19,13 @@ def evaluate(
     accurate: Annotated[
         Path | None, typer.Option(help="The same sweeps at another profile, to compare with.")
     ] = None,
-    svm: Annotated[bool, typer.Option(help="Fit an RBF SVM on the same windows too.")] = False,
+    svm: Annotated[
+        bool, typer.Option("--svm", help="Fit an RBF SVM on the same windows too.")
+    ] = False,
     pictures: Annotated[
         Path | None, typer.Option(help="Folder for confusion, accuracy over time and robustness.")
     ] = None,
-    quick: Annotated[
-        bool, typer.Option(help="Two sweeps of each object: to compare by, not to quote.")
-    ] = False,
+    quick: Quick = False,
     json: Json = None,
 ) -> None:
     """Measure a model on the test objects of a sweep set: accuracy, fusion, calibration, noise

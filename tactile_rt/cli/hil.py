@@ -1,27 +1,18 @@
 """`tactile-rt hil`: hardware in the loop, with an emulated device."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 from urllib.parse import parse_qsl
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli.app import (
-    INTERRUPTED,
-    LARGEST_SEED,
-    Pace,
-    app,
-    check_output,
-    leaving,
-    needs,
-    set_option,
-    starting,
-)
+from tactile_rt.cli.app import INTERRUPTED, app, check_output, leaving, needs, starting
 from tactile_rt.cli.emulate import codec_options
+from tactile_rt.cli.options import Faults, Json, Model, ProjectFolder, set_option
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import Json, print_table, told_as_json
+from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -44,24 +35,15 @@ def hil(
         str | None, typer.Option(help="What the device speaks. Default: native, or a project's.")
     ] = None,
     sets: Annotated[list[str] | None, set_option("An option of the codec: format=int16")] = None,
-    faults: Annotated[Path | None, typer.Option(help="A .toml of what goes wrong.")] = None,
+    faults: Faults = None,
     sweeps: Annotated[
         int | None, typer.Option(min=1, help=f"Of sim:, how many objects pass. Default: {SWEEPS}.")
     ] = None,
     seconds: Annotated[
         float | None, typer.Option(min=0.001, max=1e9, help="Leave after so much of the stream.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the default source.")] = 0,
-    fast: Pace = True,
-    clock: Annotated[
-        str, typer.Option(help="Time of the driver's samples: device; host (in real time).")
-    ] = "device",
-    model: Annotated[
-        Path | None, typer.Option(help="An .onnx model; default: the package's own.")
-    ] = None,
-    project: Annotated[
-        Path | None, typer.Option(help="A folder of `tactile-rt make`: its array and its model.")
-    ] = None,
+    model: Model = None,
+    project: ProjectFolder = None,
     json: Json = None,
 ) -> None:
     """Run a simulated array through an emulated device and its real driver.
@@ -81,27 +63,27 @@ def hil(
     fields = codec_options(sets or [])
     if project is not None:
         source, model, wire, codec, fields = _of_project(
-            project, source, model, wire, codec, fields, seed
+            project, source, model, wire, codec, fields
         )
     wire, codec = wire or "serial", codec or "native"
     file = model or shipped_model()
     schedule = read_faults(faults) if faults else None
-    check_line(wire, codec, fields, clock)
+    check_line(wire, codec, fields)
     if source is None:
         unseen = load_model(file)[1].provenance.get("unseen_objects", [])
-        source = f"sim:mouse?seed={seed}" + (f"&objects={','.join(unseen)}" if unseen else "")
+        source = "sim:mouse" + (f"?objects={','.join(unseen)}" if unseen else "")
     if source.startswith(("sim:", "whisking:")):
-        source = _with(source, "pace", "fast" if fast else "realtime")
+        source = _add_option(source, "pace", "fast")
     if source.startswith("sim:"):
         if sweeps is not None or seconds is None:
-            source = _with(source, "sweeps", str(sweeps or SWEEPS))
+            source = _add_option(source, "sweeps", str(sweeps or SWEEPS))
     elif sweeps is not None:
         raise ConfigError("--sweeps is of a sim: source; of others give --seconds")
     console = Console(stderr=True)
     with starting():
         opened = open_source(source)
     try:
-        loop = Loop(opened, file, wire, codec, fields, schedule, seconds, clock)
+        loop = Loop(opened, file, wire, codec, fields, schedule, seconds)
     except BaseException:
         opened.close()
         raise
@@ -111,8 +93,6 @@ def hil(
     told = {
         "source": source, "wire": wire, "codec": codec, "complete": loop.complete,
         "failure": report.failure, **vars(report),
-        "latency_s": _percentiles(report.latency_s),
-        "stamp_error_s": _percentiles(report.stamp_error_s),
     }  # fmt: skip
     if not told_as_json(told, json):
         print_table(_table(report, source, f"{codec} over {wire}"))
@@ -131,7 +111,6 @@ def _of_project(
     wire: str | None,
     codec: str | None,
     fields: dict[str, str],
-    seed: int,
 ) -> tuple[str, Path, str, str, dict[str, str]]:
     """Source, model and device that a project has, unless others are asked for."""
     try:
@@ -147,12 +126,12 @@ def _of_project(
             read_budget(made)
         except ConfigError as error:  # as when the array has been fitted to the device since
             typer.echo(f"{error}; until then the model is the one made before", err=True)
-    url = source or made.source_url(made.unseen(), seed)
+    url = source or made.source_url(made.unseen())
     wire = wire or ("serial" if made.line().wire == "serial" else "slcan")
     return url, model or made.model, wire, *made.spoken(codec, fields)
 
 
-def _with(url: str, name: str, value: str) -> str:
+def _add_option(url: str, name: str, value: str) -> str:
     """The URL with this option, unless it has one."""
     _, mark, query = url.partition("?")
     if any(key == name for key, _ in parse_qsl(query, keep_blank_values=True)):
@@ -182,27 +161,8 @@ def _table(report: "LoopReport", source: str, title: str) -> Table:
         f"{stats.missing} missing, {stats.corrupt} corrupt, {stats.dropped} dropped, "
         f"{stats.duplicates} duplicates; {'all' if report.accounted else 'NOT all'} accounted for",
     )
-    table.add_row("latency", _spread(report.latency_s, 1e3, "ms") or "not in real time")
-    late = _spread(report.stamp_error_s, 1e3, "ms")
     table.add_row(
         "clock",
-        (f"host, late by {late}; drift {health.drift_ppm:.1f} ppm" if late else "device")
-        + f"; {health.clock_steps} steps, {health.counter_resets} resets of the counter",
+        f"device; {health.clock_steps} steps, {health.counter_resets} resets of the counter",
     )
     return table
-
-
-def _percentiles(values: Any) -> dict[str, float] | None:
-    import numpy as np
-
-    if values is None:
-        return None
-    p50, p99, worst = np.percentile(values, (50, 99, 100))
-    return {"p50": float(p50), "p99": float(p99), "worst": float(worst)}
-
-
-def _spread(values: Any, scale: float, unit: str) -> str:
-    found = _percentiles(values)
-    if found is None:
-        return ""
-    return ", ".join(f"{name} {scale * value:.2f}" for name, value in found.items()) + f" {unit}"

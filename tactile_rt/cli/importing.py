@@ -8,8 +8,9 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, starting
+from tactile_rt.cli.options import Force, Json
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError
 
 
@@ -41,7 +42,7 @@ def import_file(
     array: Annotated[
         str, typer.Option(help="Of samples of ours in a bag: a file that says what they are of.")
     ] = "",
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    force: Force = False,
     json: Json = None,
 ) -> None:
     """Make a recording of what is on the disk; `tactile-rt sniff` tells how.

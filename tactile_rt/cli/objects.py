@@ -8,8 +8,9 @@ from rich.console import Console
 from rich.markup import escape
 
 from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.options import Json
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import Json, show_table, told_as_json
+from tactile_rt.cli.tables import show_table, told_as_json
 from tactile_rt.errors import ConfigError
 
 objects = typer.Typer(help="Objects that others made.", no_args_is_help=True)

@@ -8,8 +8,9 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.options import Json
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.tables import told_as_json
 
 if TYPE_CHECKING:
     from tactile_rt.project.making import MakeProgress
@@ -23,7 +24,7 @@ def new(
     array: Annotated[
         str, typer.Option(help="A .toml file, or one of `array list`; default: an example.")
     ] = "",
-    kinds: Annotated[
+    classes: Annotated[
         str, typer.Option(help="Categories of objects to tell apart, comma-separated.")
     ] = "",
 ) -> None:
@@ -33,7 +34,7 @@ def new(
             from tactile_rt.project.folder import KINDS, new_project
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
-    chosen = tuple(k.strip() for k in kinds.split(",") if k.strip()) or KINDS
+    chosen = tuple(k.strip() for k in classes.split(",") if k.strip()) or KINDS
     new_project(folder, array, chosen)
     again = shlex.join(["tactile-rt", "make", str(folder)])
     typer.echo(f"{folder}: edit array.toml and sweeps.toml, then `{again}`")

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import typer
@@ -12,16 +12,14 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from tactile_rt.cli.app import check_named_once, check_output
-from tactile_rt.errors import ConfigError
+from tactile_rt.cli.app import check_output
+from tactile_rt.cli.options import STDOUT
 from tactile_rt.files import write_whole
 
 if TYPE_CHECKING:
     from tactile_rt.evidence.records import Record
 
 __all__ = [
-    "STDOUT",
-    "Json",
     "fitting",
     "print_table",
     "show_records",
@@ -29,27 +27,6 @@ __all__ = [
     "told_as_json",
 ]
 
-STDOUT = Path("-")
-
-
-def _not_over_another(file: Path | None) -> Path | None:
-    """Refuse to write over a file that the same command line names for something else."""
-    if file is not None and file != STDOUT:
-        try:
-            check_named_once(file)
-        except ConfigError as error:
-            raise typer.BadParameter(str(error)) from None
-    return file
-
-
-Json = Annotated[
-    Path | None,
-    typer.Option(
-        "--json",
-        help="Write what is told as JSON, too; - prints that alone.",
-        callback=_not_over_another,
-    ),
-]
 WIDE = 10_000  # columns: more than any table has
 
 

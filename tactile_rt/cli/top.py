@@ -13,7 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from tactile_rt.cli.app import app, check_output
-from tactile_rt.cli.tables import Json, fitting, print_table, told_as_json
+from tactile_rt.cli.options import Json
+from tactile_rt.cli.tables import fitting, print_table, told_as_json
 from tactile_rt.errors import ConfigError, SourceError
 
 if TYPE_CHECKING:
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["picture", "read_snapshots", "snapshot_at"]
 
 LARGEST = 16 << 20  # bytes of a state
+EVERY_S = 1.0  # between looks
 COLOURS = {
     "running": "green", "streaming": "green", "ended": "dim", "stopped": "dim",
     "starting": "yellow", "connecting": "yellow", "waiting": "red", "stalled": "red",
@@ -34,7 +36,6 @@ def top(
     where: Annotated[
         str, typer.Argument(help="The daemon's [metrics], or - for its jsonl on standard input.")
     ] = "http://127.0.0.1:9464",
-    every: Annotated[float, typer.Option(min=0.1, max=60, help="Seconds between looks.")] = 1.0,
     once: Annotated[bool, typer.Option("--once", help="Look once, and print.")] = False,
     json: Json = None,
 ) -> None:
@@ -48,7 +49,7 @@ def top(
     check_output(json)
     console = Console()
     if once:
-        found = next(_looks(where, every))
+        found = next(_looks(where))
         if not told_as_json(found, json):
             for part in picture(found, None).renderables:
                 if isinstance(part, Table):
@@ -58,7 +59,7 @@ def top(
         return
     before = None
     with Live(console=console, screen=console.is_terminal, auto_refresh=False) as live:
-        for snapshot in _looks(where, every):
+        for snapshot in _looks(where):
             live.update(
                 Group(
                     *(
@@ -123,7 +124,7 @@ def read_snapshots(lines: Iterator[bytes]) -> "Iterator[Snapshot]":
             continue
 
 
-def _looks(where: str, every: float) -> "Iterator[Snapshot]":
+def _looks(where: str) -> "Iterator[Snapshot]":
     if where == "-":
         found = False
         for snapshot in read_snapshots(iter(sys.stdin.buffer.readline, b"")):
@@ -134,7 +135,7 @@ def _looks(where: str, every: float) -> "Iterator[Snapshot]":
         return
     yield snapshot_at(where)
     while True:
-        time.sleep(every)
+        time.sleep(EVERY_S)
         try:
             yield snapshot_at(where)
         except SourceError:

@@ -7,17 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import (
-    LARGEST_SEED,
-    MOST_THREADS,
-    app,
-    check_folder,
-    check_output,
-    needs,
-    set_option,
-)
+from tactile_rt.cli.app import app, check_folder, check_output, needs
+from tactile_rt.cli.options import Accelerator, Json, Seed, set_option
 from tactile_rt.cli.progress import progress_bar, working
-from tactile_rt.cli.tables import Json, show_table, told_as_json
+from tactile_rt.cli.tables import show_table, told_as_json
 from tactile_rt.errors import ConfigError
 from tactile_rt.locks import alone_in
 from tactile_rt.settings import take_sets
@@ -46,22 +39,19 @@ def train(
         str | None,
         typer.Option(help="zhuang-CELL, resnet18, s4, ...; or a TOML file of nodes and edges."),
     ] = None,
-    attender: Annotated[str | None, typer.Option(help="gpt, mamba or none.")] = None,
-    decoder: Annotated[str | None, typer.Option(help="linear, mlp or mlp-all.")] = None,
     epochs: Annotated[
         int | None, typer.Option(min=1, help="Passes over the training split.")
     ] = None,
-    batch: Annotated[int | None, typer.Option(min=1, help="Sweeps per update.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of weights, windows and noise.")] = None,
     sets: Annotated[
         list[str] | None,
-        set_option("Any key of the recipe: width=0.25, objective=simclr, learning_rate=0.01"),
+        set_option("Any key of the recipe: width=0.25, attender=none, decoder=linear, batch=8"),
     ] = None,
-    accelerator: Annotated[str, typer.Option(help="auto, cpu, cuda ...")] = "auto",
+    accelerator: Accelerator = "auto",
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Write logs for TensorBoard, too.")
     ] = False,
-    threads: Annotated[int, typer.Option(min=1, max=MOST_THREADS, help="CPU threads.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, max=1024, help="CPU threads.")] = 1,
     json: Json = None,
 ) -> None:
     """Train an Encoder-Attender-Decoder network on a sweep set."""
@@ -70,14 +60,7 @@ def train(
     from tactile_rt.models.training.recipes import read_recipe
 
     check_output(json)
-    asked = {
-        "encoder": encoder,
-        "attender": attender,
-        "decoder": decoder,
-        "epochs": epochs,
-        "batch": batch,
-        "seed": seed,
-    }
+    asked = {"encoder": encoder, "epochs": epochs, "seed": seed}
     if encoder is not None and encoder.endswith(".toml"):
         asked |= {"encoder": "graph", "graph": _text(Path(encoder))}
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
@@ -168,9 +151,7 @@ def probe(
         Path | None, typer.Option(help="Sweep set; default: the one it was trained on.")
     ] = None,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the features.")] = 100,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the layer and the windows.")
-    ] = 0,
+    seed: Seed = 0,
     sets: Annotated[
         list[str] | None,
         set_option("How it is fitted: readout=mean, standardise=false, learning_rate=0.01"),

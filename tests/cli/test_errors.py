@@ -158,12 +158,15 @@ def torch():
             ("--set", "width=1e6"),
             "width is 1000000.0, must be a positive multiple of 1/32, at most 4",
         ),
-        (("--attender", "lstm"), "attender is 'lstm', not one of gpt, mamba, none"),
+        (("--set", "attender=lstm"), "attender is 'lstm', not one of gpt, mamba, none"),
         (("--seed", -1), "seed must be 0 to 4294967295"),
         (("--set", "learning_rate=nan"), "--set learning_rate=nan: nan is no quantity"),
         (("--accelerator", "glove"), "accelerator is 'glove': "),
         (("--threads", 10**30), "'--threads'"),
-        (("--set", f"width={1 / 32}", "--batch", 99), "a batch of 99 is more than the 12 sweeps"),
+        (
+            ("--set", f"width={1 / 32}", "--set", "batch=99"),
+            "a batch of 99 is more than the 12 sweeps",
+        ),
     ],
 )
 def test_options_that_cannot_be_trained_with_leave_no_run(
@@ -177,9 +180,9 @@ def test_a_run_that_cannot_begin_can_be_begun_again_with_other_options(
     torch, refused, call, sweep_set, tmp_path
 ):
     command = ("train", sweep_set, tmp_path / "run", "--set", f"width={1 / 32}", "--epochs", 1)
-    assert "a batch of 99 is more than the 12 sweeps" in refused(*command, "--batch", 99)
-    assert call(*command, "--batch", 12)[0] == 0
-    assert "another configuration" in refused(*command, "--batch", 6)
+    assert "a batch of 99 is more than the 12 sweeps" in refused(*command, "--set", "batch=99")
+    assert call(*command, "--set", "batch=12")[0] == 0
+    assert "another configuration" in refused(*command, "--set", "batch=6")
 
 
 def test_an_interrupted_run_goes_on_to_the_same_end(torch, sweep_set, tmp_path):
@@ -208,13 +211,23 @@ def test_an_interrupted_run_goes_on_to_the_same_end(torch, sweep_set, tmp_path):
 
 
 def test_a_run_cannot_be_made_in_a_file(torch, refused, sweep_set, a_file):
-    assert f"{a_file}: is not a folder" in refused("train", sweep_set, a_file, "--batch", 4)
+    assert f"{a_file}: is not a folder" in refused("train", sweep_set, a_file, "--set", "batch=4")
 
 
 @pytest.mark.parametrize("content", [b"", b"junk\n", b"PK\x03\x04 cut short"])
 def test_a_damaged_checkpoint_is_one_line(torch, call, refused, sweep_set, tmp_path, content):
     folder = tmp_path / "run"
-    command = ("train", sweep_set, folder, "--set", f"width={1 / 32}", "--epochs", 1, "--batch", 12)
+    command = (
+        "train",
+        sweep_set,
+        folder,
+        "--set",
+        f"width={1 / 32}",
+        "--epochs",
+        1,
+        "--set",
+        "batch=12",
+    )
     assert call(*command)[0] == 0
     for name in ("best.pt", "last.pt"):
         (folder / name).write_bytes(content)

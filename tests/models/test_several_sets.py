@@ -19,14 +19,14 @@ from tests.helpers.tiny_sweeps import plate, write_tiny_set
 SMALL = (
     "--encoder",
     "gru",
-    "--attender",
-    "none",
-    "--decoder",
-    "linear",
+    "--set",
+    "attender=none",
+    "--set",
+    "decoder=linear",
     "--set",
     f"width={1 / 32}",
 )
-QUICK = ("--batch", 6, "--set", "updates=3")
+QUICK = ("--set", "batch=6", "--set", "updates=3")
 FAULTS = {"implausible": 0.2}
 
 
@@ -97,8 +97,8 @@ def test_a_network_begins_with_what_another_knew_by_the_same_name(sets, run, tmp
     begun = (
         "--from",
         run / "best.pt",
-        "--batch",
-        6,
+        "--set",
+        "batch=6",
         "--set",
         "updates=1",
         "--set",
@@ -139,7 +139,7 @@ def test_what_cannot_be_begun_with_is_said(sets, run, tmp_path, call):
 
 def test_things_of_no_category_are_what_unknown_is_learnt_from(sets, tmp_path, call):
     """After some updates things of none are less likely to be taken for known ones."""
-    code, _, said = call("train", sets / "one", tmp_path / "r", *SMALL, "--batch", 6,
+    code, _, said = call("train", sets / "one", tmp_path / "r", *SMALL, "--set", "batch=6",
                          "--set", "updates=150", "--set", "learning_rate=0.01")  # fmt: skip
     assert not code, said
     model, saved = load_checkpoint(tmp_path / "r" / "best.pt")
