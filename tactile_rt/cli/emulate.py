@@ -13,6 +13,7 @@ from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.drivers.emulation.device import EmulatedDevice
+    from tactile_rt.project.folder import Project
 
 LOOK_S = 0.25  # how often the count is renewed
 LINGER_S = 0.5  # for the host to read the last samples before the port disappears
@@ -66,7 +67,13 @@ def emulate(
 
     fields = codec_options(sets or [])
     if project is not None:
-        codec, source, wire, link, fields = _of_project(project, codec, source, wire, link, fields)
+        made = open_project(project)
+        codec, fields = made.spoken(codec, fields)
+        source = source or made.source_url(made.unseen())
+        line = made.line()
+        wire = wire or ("serial" if line.wire == "serial" else None)
+        if line.wire == "serial" and link is None and not line.port.startswith("/dev/"):
+            link = Path(line.port)
     elif codec is None:
         raise ConfigError("name a CODEC (`tactile-rt codecs` lists them), or a --project")
     source = source or "synthetic:"
@@ -107,35 +114,21 @@ def emulate(
         typer.echo(_count(device), err=True)
 
 
-def _of_project(
-    folder: Path,
-    codec: str | None,
-    source: str | None,
-    wire: str | None,
-    link: Path | None,
-    fields: dict[str, str],
-) -> tuple[str, str, str | None, Path | None, dict[str, str]]:
-    """What a project says of its device, where nothing else is asked for."""
+def open_project(folder: Path) -> "Project":
+    """Open the folder of a project.
+
+    Raises:
+        TactileError: it is none, or the extra that it needs is not installed.
+    """
     try:
         from tactile_rt.project.folder import Project
     except ModuleNotFoundError as error:
         raise needs("sim", error) from None
-    project = Project(folder)
-    line = project.line()
-    if line.wire == "serial" and link is None and not line.port.startswith("/dev/"):
-        link = Path(line.port)
-    codec, fields = project.spoken(codec, fields)
-    return (
-        codec,
-        source or project.source_url(project.unseen()),
-        wire or ("serial" if line.wire == "serial" else None),
-        link,
-        fields,
-    )
+    return Project(folder)
 
 
 def codec_options(given: list[str]) -> dict[str, str]:
-    """``KEY=VALUE`` options of a codec, as fields."""
+    """Split ``KEY=VALUE`` options of a codec into fields."""
     fields = {}
     for pair in given:
         name, equals, value = pair.partition("=")

@@ -8,8 +8,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli.app import INTERRUPTED, app, check_output, leaving, needs, starting
-from tactile_rt.cli.emulate import codec_options
+from tactile_rt.cli.app import INTERRUPTED, app, check_output, leaving, starting
+from tactile_rt.cli.emulate import codec_options, open_project
 from tactile_rt.cli.options import Faults, Json, Model, ProjectFolder, set_option
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import print_table, told_as_json
@@ -17,6 +17,7 @@ from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.evidence.hil import LoopReport
+    from tactile_rt.project.folder import Project
 
 SWEEPS = 6  # unless told otherwise
 
@@ -62,9 +63,11 @@ def hil(
     check_output(json)
     fields = codec_options(sets or [])
     if project is not None:
-        source, model, wire, codec, fields = _of_project(
-            project, source, model, wire, codec, fields
-        )
+        made = open_project(project)
+        model = model or _find_model(made)
+        codec, fields = made.spoken(codec, fields)
+        wire = wire or ("serial" if made.line().wire == "serial" else "slcan")
+        source = source or made.source_url(made.unseen())
     wire, codec = wire or "serial", codec or "native"
     file = model or shipped_model()
     schedule = read_faults(faults) if faults else None
@@ -95,7 +98,7 @@ def hil(
         "failure": report.failure, **vars(report),
     }  # fmt: skip
     if not told_as_json(told, json):
-        print_table(_table(report, source, f"{codec} over {wire}"))
+        print_table(_make_table(report, source, f"{codec} over {wire}"))
     if not loop.complete:
         typer.echo("interrupted: what was on its way is missing above", err=True)
         raise typer.Exit(INTERRUPTED)
@@ -104,31 +107,17 @@ def hil(
         raise typer.Exit(1)
 
 
-def _of_project(
-    folder: Path,
-    source: str | None,
-    model: Path | None,
-    wire: str | None,
-    codec: str | None,
-    fields: dict[str, str],
-) -> tuple[str, Path, str, str, dict[str, str]]:
-    """Source, model and device that a project has, unless others are asked for."""
+def _find_model(project: "Project") -> Path:
+    """Find the model that a project has made; say if its array has changed since."""
+    from tactile_rt.project.budget import read_budget
+
+    if not project.model.exists():
+        raise ConfigError(f"{project.folder} has no model yet: `tactile-rt make {project.folder}`")
     try:
-        from tactile_rt.project.budget import read_budget
-        from tactile_rt.project.folder import Project
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
-    made = Project(folder)
-    if model is None and not made.model.exists():
-        raise ConfigError(f"{folder} has no model yet: `tactile-rt make {folder}`")
-    if model is None:
-        try:
-            read_budget(made)
-        except ConfigError as error:  # as when the array has been fitted to the device since
-            typer.echo(f"{error}; until then the model is the one made before", err=True)
-    url = source or made.source_url(made.unseen())
-    wire = wire or ("serial" if made.line().wire == "serial" else "slcan")
-    return url, model or made.model, wire, *made.spoken(codec, fields)
+        read_budget(project)
+    except ConfigError as error:  # as when the array has been fitted to the device since
+        typer.echo(f"{error}; until then the model is the one made before", err=True)
+    return project.model
 
 
 def _add_option(url: str, name: str, value: str) -> str:
@@ -139,30 +128,28 @@ def _add_option(url: str, name: str, value: str) -> str:
     return f"{url}{'&' if mark else '?'}{name}={value}"
 
 
-def _table(report: "LoopReport", source: str, title: str) -> Table:
-    table = Table("", "", title=title, show_header=False, title_justify="left")
+def _make_table(report: "LoopReport", source: str, title: str) -> Table:
     decisions = max(report.direct, report.wire)
     stats, health = report.stats, report.health
 
     def share(n: int, of: int) -> str:
         return f"{n} of {of}" + (f" ({100 * n / of:.2f} %)" if of else "")
 
-    table.add_row("source", source.partition("?")[0])
-    table.add_row("samples", f"{report.samples}, {stats.delivered} through the driver")
-    table.add_row("identical samples", share(report.identical_samples, report.samples))
-    table.add_row("decisions", f"{report.direct} direct, {report.wire} through the driver")
-    table.add_row("identical decisions", share(report.identical, decisions))
-    table.add_row("same labels", share(report.same_label, decisions))
-    table.add_row("same final labels", share(report.finals_same, report.finals))
-    if report.passed:
-        table.add_row("objects named right", share(report.right, report.passed))
-    table.add_row(
-        "lost",
-        f"{stats.missing} missing, {stats.corrupt} corrupt, {stats.dropped} dropped, "
+    rows = {
+        "source": source.partition("?")[0],
+        "samples": f"{report.samples}, {stats.delivered} through the driver",
+        "identical samples": share(report.identical_samples, report.samples),
+        "decisions": f"{report.direct} direct, {report.wire} through the driver",
+        "identical decisions": share(report.identical, decisions),
+        "same labels": share(report.same_label, decisions),
+        "same final labels": share(report.finals_same, report.finals),
+        "objects named right": share(report.right, report.passed) if report.passed else "",
+        "lost": f"{stats.missing} missing, {stats.corrupt} corrupt, {stats.dropped} dropped, "
         f"{stats.duplicates} duplicates; {'all' if report.accounted else 'NOT all'} accounted for",
-    )
-    table.add_row(
-        "clock",
-        f"device; {health.clock_steps} steps, {health.counter_resets} resets of the counter",
-    )
+        "clock": f"{health.clock_steps} steps, {health.counter_resets} resets of the counter",
+    }
+    table = Table("", "", title=title, show_header=False, title_justify="left")
+    for what, text in rows.items():
+        if text:
+            table.add_row(what, text)
     return table
