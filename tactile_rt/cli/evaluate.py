@@ -16,9 +16,6 @@ from tactile_rt.cli.tables import show_records
 def evaluate(
     model: Annotated[Path, typer.Argument(help="An .onnx model.")],
     data: Annotated[Path, typer.Argument(help="A sweep set.")],
-    accurate: Annotated[
-        Path | None, typer.Option(help="The same sweeps at another profile, to compare with.")
-    ] = None,
     svm: Annotated[
         bool, typer.Option("--svm", help="Fit an RBF SVM on the same windows too.")
     ] = False,
@@ -33,12 +30,11 @@ def evaluate(
     from tactile_rt.sweep_set import SweepManifest
 
     check_output(json)
-    for folder in filter(None, (data, accurate)):
-        SweepManifest.read(folder)
+    SweepManifest.read(data)
     try:
         from tactile_rt.evidence.classification import evaluate_model
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     with working(Console(stderr=True), "evaluating"):
-        records = evaluate_model(model, data, accurate, svm, pictures, quick)
+        records = evaluate_model(model, data, svm, pictures, quick)
     show_records(records, json)

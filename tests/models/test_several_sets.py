@@ -1,6 +1,5 @@
 """Sets that are learnt from together, things of no category, networks that begin with another."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -169,21 +168,6 @@ def test_rows_go_by_name_where_as_many_labels_are_known_in_another_order(tmp_pat
     )
     for name in ("network.decoder.weight", "network.decoder.bias"):
         assert torch.allclose(new[name], old[name][[2, 1, 0]], atol=1e-6)
-
-
-def test_two_profiles_are_compared_on_the_same_sweeps(sets, run, tmp_path, call):
-    call("export", run / "best.pt", tmp_path / "m.onnx")
-    write_tiny_set(tmp_path / "three", sweeps=3)
-    at = ("eval", tmp_path / "m.onnx", tmp_path / "three", "--quick")
-    code, *_ = call(*at, "--accurate", tmp_path / "three", "--json", tmp_path / "figures")
-    assert not code
-    records = {r["name"]: r for r in json.loads((tmp_path / "figures").read_text())}
-    lost = records["models.points lost at the other profile"]
-    assert lost["value"] == 0
-    assert lost["how"].startswith("6 sweeps of 3 unseen objects")
-    write_tiny_set(tmp_path / "robot", spec=plate(1, 4))
-    code, _, said = call(*at, "--accurate", tmp_path / "robot")
-    assert code == 2 and f"was made for another array than {tmp_path / 'robot'} is of" in said
 
 
 def test_a_network_that_began_with_another_has_met_its_objects(sets, run, tmp_path, call):
