@@ -179,7 +179,7 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
                 ended = True
             spread = np.quantile(late, (0.5, 0.99)) - min(late) if late else (0.0, 0.0)
             health = getattr(opened, "health", None)
-            look = {
+            look: dict[str, Any] = {
                 "rate_hz": n / (time.monotonic() - began), "jitter_p50_ms": float(spread[0]),
                 "jitter_p99_ms": float(spread[1]), "missing": opened.stats.missing,
                 "corrupt": opened.stats.corrupt, "duplicates": opened.stats.duplicates,
