@@ -29,6 +29,7 @@ __all__ = [
     "check_output",
     "check_text",
     "leaving",
+    "needing",
     "needs",
     "starting",
 ]
@@ -93,6 +94,16 @@ def starting() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
     if asked:
         raise KeyboardInterrupt
+
+
+@contextmanager
+def needing(extra: str) -> Iterator[None]:
+    """Let the block import what an extra brings; say which where it is missing."""
+    try:
+        with starting():
+            yield
+    except ModuleNotFoundError as error:
+        raise needs(extra, error) from None
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Json, Quick
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import show_records
@@ -57,14 +57,12 @@ def bench(
     console, records = Console(stderr=True), []
     for name in [area] if area else AREAS:
         with working(console, f"measuring {name}"):
-            try:
+            with needing(AREAS.get(name, "train")):
                 if name == FAULTS:
                     rig = _rig("daemon", "faults")
                     records += rig.faults(2 if quick else rig.TIMES, resume=resume)
                 else:
                     records += _rig(name).run(quick)
-            except ModuleNotFoundError as error:
-                raise needs(AREAS.get(name, "train"), error) from None
     if show_records(records, json):
         return
     bars = [r for r in records if r.bar]

@@ -23,7 +23,7 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 
-from tactile_rt.cli.app import app, check_output, leaving, needs, starting
+from tactile_rt.cli.app import app, check_output, leaving, needing
 from tactile_rt.cli.options import STDOUT, Fast, Json, Model, Seconds, Seed
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import told_as_json
@@ -118,11 +118,8 @@ def demo(
         do = "leave out --recorded" if simulated else install_extra("sim")
         raise ConfigError(f"--fast and --seed are for a simulation: {do}")
     recorded |= not simulated
-    try:
-        with starting(), working(Console(stderr=True), "building the array and the objects"):
-            demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
+    with needing("sim"), working(Console(stderr=True), "building the array and the objects"):
+        demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)
     with leaving(seconds), demonstration:
         if console.width < WIDTH or not console.is_terminal or console.is_dumb_terminal:
             for settled in demonstration.run():

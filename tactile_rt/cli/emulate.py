@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, leaving, needs, starting
+from tactile_rt.cli.app import app, leaving, needing, starting
 from tactile_rt.cli.options import Fast, Faults, ProjectFolder, set_option
 from tactile_rt.errors import ConfigError
 
@@ -120,10 +120,8 @@ def open_project(folder: Path) -> "Project":
     Raises:
         TactileError: it is none, or the extra that it needs is not installed.
     """
-    try:
+    with needing("sim"):
         from tactile_rt.project.folder import Project
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
     return Project(folder)
 
 

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.app import app, check_output, needing
 from tactile_rt.cli.options import Json, Quick
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import show_records
@@ -31,10 +31,8 @@ def evaluate(
 
     check_output(json)
     SweepManifest.read(data)
-    try:
+    with needing("train"):
         from tactile_rt.evidence.classification import evaluate_model
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     with working(Console(stderr=True), "evaluating"):
         records = evaluate_model(model, data, svm, pictures, quick)
     show_records(records, json)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_folder, check_output, needs
+from tactile_rt.cli.app import app, check_folder, check_output, needing
 from tactile_rt.cli.options import Accelerator, Json, Seed, set_option
 from tactile_rt.cli.progress import progress_bar, working
 from tactile_rt.cli.tables import show_table, told_as_json
@@ -75,12 +75,10 @@ def train(
     if first:
         with alone_in(folder):  # for a moment: the training takes it again
             pass
-    try:
+    with needing("train"):
         import torch
 
         from tactile_rt.models import training
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     torch.set_num_threads(threads)
     # Under torchrun every process has the same to say.
     console = Console(stderr=True, quiet=not first)
@@ -97,10 +95,8 @@ def train(
                 history.append({"epoch": at.epoch, "update": at.update, **at.metrics})
                 console.print(_in_words(at))
 
-        try:
+        with needing("train"):
             best = training.train(config, folder, show, device=accelerator)
-        except ModuleNotFoundError as error:
-            raise needs("train", error) from None
     if not console.quiet:
         told_as_json({"best": best, "epochs": history}, json)
     console.print(f"best network: {best}")
@@ -164,10 +160,8 @@ def probe(
     usual = {"data": str(data or ""), "epochs": epochs, "seed": seed}
     (config,) = take_sets("probe", sets or (), ProbeConfig, usual=usual)
     probed_on(checkpoint, describe_checkpoint(checkpoint), folder, config.data)
-    try:
+    with needing("train"):
         from tactile_rt.models.training.probing import probe as fit
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     console = Console(stderr=True)
     shown: list[Progress] = []
     with progress_bar(console, "probing") as update:
@@ -215,18 +209,14 @@ def export(
     for file in (model, json):
         check_output(file)
     trained_on(checkpoint, describe_checkpoint(checkpoint), data or ())
-    try:
+    with needing("train"):
         from tactile_rt.export.precision import PRECISIONS
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     if precision not in PRECISIONS:
         raise ConfigError(f"--precision is {precision!r}, not one of {', '.join(PRECISIONS)}")
     if kind not in ("step", "window"):
         raise ConfigError(f"--kind is {kind!r}, not one of step, window")
-    try:
+    with needing("train"):
         from tactile_rt.export.release import release
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     console = Console(stderr=True)
     with working(console, "calibrating, exporting and checking parity"):
         card = release(
