@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needing
+from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json, Quick
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import show_records
@@ -53,7 +53,6 @@ def bench(
         raise ConfigError(f"no benchmark area {area!r}: there are {name_some(known, 8)}")
     if resume is not None and area != FAULTS:
         raise ConfigError("--resume goes with faults: tactile-rt bench faults --resume FILE")
-    check_output(json)
     console, records = Console(stderr=True), []
     for name in [area] if area else AREAS:
         with working(console, f"measuring {name}"):

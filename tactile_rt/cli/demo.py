@@ -23,7 +23,7 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 
-from tactile_rt.cli.app import app, check_output, leaving, needing
+from tactile_rt.cli.app import app, leaving, needing
 from tactile_rt.cli.options import STDOUT, Fast, Json, Model, Seconds, Seed
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import told_as_json
@@ -111,7 +111,6 @@ def demo(
     """
     from tactile_rt.classifier.model_file import shipped_model
 
-    check_output(json)
     console = Console(stderr=json == STDOUT)
     simulated = find_spec("mujoco") and find_spec("trimesh")
     if (recorded or not simulated) and (fast or seed):

@@ -48,8 +48,7 @@ def doctor(
     from tactile_rt.drivers.discovery import can_buses, diagnose, serial_ports, udev_rules
     from tactile_rt.files import write_whole
 
-    for file in (udev, json):
-        check_output(file)
+    check_output(udev)
     ports = serial_ports()
     findings = diagnose(ports, can_buses())
     alone = told_as_json(findings, json)
@@ -157,7 +156,6 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
     from tactile_rt.sources.opening import open_source
     from tactile_rt.stream import EndOfStream
 
-    check_output(json)
     with starting():
         opened = open_source(source)
     looks: list[dict[str, Any]] = []

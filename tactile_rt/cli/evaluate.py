@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needing
+from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json, Quick
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import show_records
@@ -29,7 +29,6 @@ def evaluate(
     and what else goes wrong with a sensor."""
     from tactile_rt.sweep_set import SweepManifest
 
-    check_output(json)
     SweepManifest.read(data)
     with needing("train"):
         from tactile_rt.evidence.classification import evaluate_model

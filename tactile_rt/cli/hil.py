@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli.app import INTERRUPTED, app, check_output, leaving, starting
+from tactile_rt.cli.app import INTERRUPTED, app, leaving, starting
 from tactile_rt.cli.emulate import codec_options, open_project
 from tactile_rt.cli.options import Faults, Json, Model, ProjectFolder, set_option
 from tactile_rt.cli.progress import working
@@ -60,7 +60,6 @@ def hil(
     from tactile_rt.evidence.hil import Loop, check_line
     from tactile_rt.sources.opening import open_source
 
-    check_output(json)
     fields = codec_options(sets or [])
     if project is not None:
         made = open_project(project)

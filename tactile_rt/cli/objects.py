@@ -7,7 +7,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from tactile_rt.cli.app import app, check_output, needing
+from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import show_table, told_as_json
@@ -38,7 +38,6 @@ def get(
     """
     from tactile_rt.sim_backend.objects.object_lists import get_objects, read_list
 
-    check_output(json)
     listed = read_list(wanted)
     console = Console(stderr=True)
     with needing("sim"), progress_bar(console, "getting", len(listed), counted=True) as update:

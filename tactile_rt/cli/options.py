@@ -5,7 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
-from tactile_rt.cli.app import check_named_once
+from tactile_rt.cli.app import check_named_once, check_output
 from tactile_rt.errors import ConfigError
 
 __all__ = [
@@ -34,10 +34,11 @@ LARGEST_SEED = 2**32 - 1  # that every generator takes
 
 
 def _check_json(file: Path | None) -> Path | None:
-    """Refuse to write over a file that the same command line names for something else."""
+    """Refuse a file that cannot be written, or that the command line names for something else."""
     if file is not None and file != STDOUT:
         try:
             check_named_once(file)
+            check_output(file)
         except ConfigError as error:
             raise typer.BadParameter(str(error)) from None
     return file

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needing
+from tactile_rt.cli.app import app, needing
 from tactile_rt.cli.options import Json
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.cli.tables import told_as_json
@@ -49,7 +49,6 @@ def make(
 
     What is there is not made again; what was interrupted goes on.
     """
-    check_output(json)
     console = Console(stderr=True, soft_wrap=True)
     with needing("sim,train"):
         from tactile_rt.evidence.records import as_dicts

@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from tactile_rt.cli.app import app, check_output
+from tactile_rt.cli.app import app
 from tactile_rt.cli.options import Json
 from tactile_rt.cli.tables import fitting, print_table, told_as_json
 from tactile_rt.errors import ConfigError, SourceError
@@ -47,7 +47,6 @@ def top(
     """
     if json is not None and not once:
         raise ConfigError("--json is of one look: give --once, too")
-    check_output(json)
     console = Console()
     if once:
         found = next(_looks(where))

@@ -56,7 +56,6 @@ def train(
     from tactile_rt.models.training.config import manifests_of
     from tactile_rt.models.training.recipes import read_recipe
 
-    check_output(json)
     asked = {"encoder": encoder, "epochs": epochs, "seed": seed}
     if encoder is not None and encoder.endswith(".toml"):
         asked |= {"encoder": "graph", "graph": _text(Path(encoder))}
@@ -156,7 +155,6 @@ def probe(
     from tactile_rt.models.data_checks import probed_on
     from tactile_rt.models.training.config import ProbeConfig
 
-    check_output(json)
     usual = {"data": str(data or ""), "epochs": epochs, "seed": seed}
     (config,) = take_sets("probe", sets or (), ProbeConfig, usual=usual)
     probed_on(checkpoint, describe_checkpoint(checkpoint), folder, config.data)
@@ -206,8 +204,7 @@ def export(
     from tactile_rt.models.checkpoint_files import describe_checkpoint
     from tactile_rt.models.data_checks import trained_on
 
-    for file in (model, json):
-        check_output(file)
+    check_output(model)
     trained_on(checkpoint, describe_checkpoint(checkpoint), data or ())
     with needing("train"):
         from tactile_rt.export.precision import PRECISIONS
