@@ -39,8 +39,8 @@ def _check_json(file: Path | None) -> Path | None:
         try:
             check_named_once(file)
             check_output(file)
-        except ConfigError as error:
-            raise typer.BadParameter(str(error)) from None
+        except (ConfigError, OSError) as error:  # such as a name that is too long
+            raise typer.BadParameter(getattr(error, "strerror", None) or str(error)) from None
     return file
 
 
