@@ -153,7 +153,6 @@ class Demonstration:
     Args:
         model: an ``.onnx`` file made for the mouse array.
         sweeps: objects that pass before the end; 0: endless.
-        seed: of the drawn objects and sweeps.
         fast: as fast as the simulation goes, instead of in real time.
         recorded: play the recording instead.
 

@@ -114,9 +114,6 @@ class Loop:
 
     Args:
         source: What the device measures; the loop closes it.
-        model: An ``.onnx`` file made for the source's array.
-        wire: The kind of line, one of `WIRES`.
-        codec: Name of the codec that the device speaks.
         options: Options of the codec, as in a URL; a native device's ranges are `RANGES` unless
             given.
         faults: What goes wrong on the way; the schedule is used up.
