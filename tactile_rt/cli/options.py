@@ -34,7 +34,7 @@ LARGEST_SEED = 2**32 - 1  # that every generator takes
 
 
 def _check_json(file: Path | None) -> Path | None:
-    """Refuse a file that cannot be written, or that the command line names for something else."""
+    """Refuse a file that cannot be written, or that the command names twice."""
     if file is not None and file != STDOUT:
         try:
             check_named_once(file)
