@@ -11,8 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from tactile_rt.classifier.model_file import shipped_model
-from tactile_rt.cli.demo import WIDTH, draw
-from tactile_rt.cli.demonstration import Demonstration
+from tactile_rt.cli.demo import WIDTH, Demonstration, draw
 
 # The moment: so many objects have passed, and the next is so many steps under way and well felt.
 OBJECTS, STEP, WHISKERS, FELT_N = 12, 8, 6, 1e-5

@@ -53,8 +53,8 @@ def _train(road: Road) -> None:
     for name in names:
         road.step("record", "tactile-rt", "record", "replay:demo?speed=0", name)
     road.step("label", "tactile-rt", "label", *names, "set", "--by-name")
-    network = ["--encoder", "gru", "--attender", "none", "--decoder", "linear"]
-    few = ["--batch", "2", "--set", "updates=20"]
+    network = ["--encoder", "gru", "--set", "attender=none", "--set", "decoder=linear"]
+    few = ["--set", "batch=2", "--set", "updates=20"]
     road.step("train", "tactile-rt", "train", "set", "run", *network, *few)
     road.step("export", "tactile-rt", "export", "run/best.pt", "model.onnx")
     road.step("evaluate", "tactile-rt", "eval", "model.onnx", "set")

@@ -5,12 +5,12 @@ A user's mistake is one clear line on stderr and exit code 2; Ctrl-C leaves quie
 
 import io
 import os
+import pkgutil
 import signal
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-AGAIN_S = 0.01  # after which a signal that was dropped comes again, until it is obeyed
+AGAIN_S = 0.01  # after which a signal whose exception Python dropped comes again
 
 
 def main() -> None:
@@ -36,53 +36,40 @@ def main() -> None:
 
 @contextmanager
 def _signals() -> Iterator[list[int]]:
-    """Let Ctrl-C, SIGTERM and SIGHUP alike end the block, so that what is half-written is taken
-    away; gives the signals that have come."""
+    """Let Ctrl-C, SIGTERM and SIGHUP end the block alike; gives the signals that have come."""
     told: list[int] = []
-    insisting: list[int] = []  # the signal that comes until it is obeyed
+    alike = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
+    untouched = signal.SIG_DFL, signal.default_int_handler
 
     def leave(number: int, frame: FrameType | None) -> None:
-        told.append(number)
-        while frame is not None:
-            if frame.f_code is again.__code__:  # what is raised there is dropped, too
-                insisting[:] = [number]
-                return
-            frame = frame.f_back
-        insisting.clear()
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        if number in alike:
+            told.append(number)
+        elif told:
+            number = told[-1]
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         _leave(number)
 
-    def again(unraisable: "sys.UnraisableHookArgs") -> None:
+    def report_or_repeat(unraisable: "sys.UnraisableHookArgs") -> None:
+        # While an object is taken away Python drops what is raised: it comes again a little later.
         if told and isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
-            # It came while an object was taken away, where Python drops what is raised; and would
-            # do so at once again.
-            insisting[:] = [told[-1]]
+            signal.setitimer(signal.ITIMER_REAL, AGAIN_S)
         else:
-            dropped(unraisable)
-        if insisting:
-            threading.Thread(target=insist, daemon=True).start()
+            report(unraisable)
 
-    def insist() -> None:
-        main = threading.main_thread().ident or 0
-        time.sleep(AGAIN_S)
-        while number := next(iter(insisting), 0):
-            signal.pthread_kill(main, number)
-            time.sleep(AGAIN_S)
-
-    untouched = signal.SIG_DFL, signal.default_int_handler
-    alike = signal.SIGINT, signal.SIGTERM, signal.SIGHUP
-    before = {s: signal.getsignal(s) for s in alike if signal.getsignal(s) in untouched}
+    found = {s: signal.getsignal(s) for s in (*alike, signal.SIGALRM)}
+    before = {s: handler for s, handler in found.items() if handler in untouched}
     for number in before:
         signal.signal(number, leave)
-    dropped, sys.unraisablehook = sys.unraisablehook, again
+    report, sys.unraisablehook = sys.unraisablehook, report_or_repeat
     try:
         yield told
     except KeyboardInterrupt:
         _leave(signal.SIGINT)
     finally:
-        insisting.clear()
-        sys.unraisablehook = dropped
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        sys.unraisablehook = report
         for number, handler in before.items():
             signal.signal(number, handler)
 
@@ -96,37 +83,8 @@ def _run(told: list[int]) -> None:
     # `--help` is instant and a robot never imports torch.
     import typer
 
-    from tactile_rt.cli import (  # noqa: F401
-        align,
-        align_board,
-        align_gate,
-        array,
-        bench,
-        calibrate,
-        daemon,
-        demo,
-        devices,
-        emulate,
-        evaluate,
-        grid,
-        hil,
-        importing,
-        label,
-        locate,
-        model,
-        objects,
-        project,
-        record,
-        replay,
-        run,
-        sniff,
-        sweep,
-        teach,
-        top,
-        train,
-        view,
-        whisk,
-    )
+    for module in pkgutil.iter_modules(__path__):
+        import_module(f"{__name__}.{module.name}")
     from tactile_rt.cli.app import app
     from tactile_rt.errors import TactileError
 
@@ -188,25 +146,9 @@ def _misused(error: Any) -> NoReturn:
     if type(error).__name__ == "NoArgsIsHelpError":  # nothing was said at all
         error.show()
         sys.exit(error.exit_code)
-    command = error.ctx.command_path if error.ctx else _command_path(sys.argv[1:])
+    command = error.ctx.command_path if error.ctx else "tactile-rt"
     said = " ".join(error.format_message().split()).rstrip(".")
     _give_up(f"{said}; see {command} --help", error.exit_code)
-
-
-def _command_path(words: list[str]) -> str:
-    """Return the command that the words of the command line name, as its help calls it."""
-    from typer.main import get_command
-
-    from tactile_rt.cli.app import app
-
-    path = "tactile-rt"
-    command: Any = get_command(app)
-    for word in words:
-        command = getattr(command, "commands", {}).get(word)
-        if command is None:
-            break
-        path += f" {word}"
-    return path
 
 
 def _empty_stdout() -> None:

@@ -11,9 +11,10 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from tactile_rt.cli.app import LARGEST_SEED, app, check_output, needs, set_option
+from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.options import Json, Models, Page, Seed, Sessions, Stimuli, set_option
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import Json, print_table, told_as_json
+from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.errors import ConfigError
 from tactile_rt.settings import take_sets
 
@@ -23,25 +24,13 @@ if TYPE_CHECKING:
 align = typer.Typer(help="Compare a model with recordings of barrel cortex.", no_args_is_help=True)
 app.add_typer(align, name="align")
 
-Stimuli = Annotated[
-    Path | None,
-    typer.Option(help="Of `tactile-rt whisk`. Default: the mouse array's, which ships."),
-]
 Benchmark = Annotated[Path, typer.Option(help="What `align build` wrote.")]
-Models = Annotated[
-    list[Path], typer.Argument(help="Checkpoints (best.pt), .onnx files, and responses (.npz).")
-]
-
-Untrained = Annotated[bool, typer.Option(help="Score each network before its training too.")]
-UntrainedSeed = Annotated[
-    int, typer.Option(min=0, max=LARGEST_SEED, help="Of the untrained networks.")
-]
 
 
 @align.command("example")
 def write_brain(
     folder: Annotated[Path, typer.Argument(help="The folder to make.")],
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of every random number.")] = 0,
+    seed: Seed = 0,
     sets: Annotated[
         list[str] | None, set_option("Of the brain: mice=6, trials=60, private=0.3")
     ] = None,
@@ -77,9 +66,7 @@ def build_benchmark(
     task: Annotated[
         str | None, typer.Option(help="Only sessions of: discrimination, or detection.")
     ] = None,
-    session: Annotated[
-        list[str] | None, typer.Option(help="Only sessions whose name has this; * and ? fit any.")
-    ] = None,
+    sessions: Sessions = None,
     depth: Annotated[
         str | None, typer.Option(help="Only units of a layer, L4, or a range in um, 419-626.")
     ] = None,
@@ -91,7 +78,7 @@ def build_benchmark(
         typer.Option(help="Spike times are on the session's, or the recording's. See the docs."),
     ] = None,
     bootstraps: Annotated[int, typer.Option(help="Splits of the trials.")] = 1000,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the splits.")] = 1234,
+    seed: Seed = 1234,
     json: Json = None,
 ) -> None:
     """Freeze recordings into a small benchmark, so that nobody else needs them."""
@@ -101,7 +88,7 @@ def build_benchmark(
     for file in (out, json):
         check_output(file)
     console = Console(stderr=True)
-    selection = Selection.of(task, session or (), depth, cells)
+    selection = Selection.of(task, sessions or (), depth, cells)
     with progress_bar(console, "building", total=1.0) as update:
         try:
             made = build(
@@ -137,21 +124,15 @@ def score_models(
     models: Models,
     benchmark: Benchmark,
     json: Json = None,
-    html: Annotated[Path | None, typer.Option(help="Write the report here, .html.")] = None,
+    page: Page = None,
     stimuli: Stimuli = None,
-    untrained: Untrained = True,
-    seed: UntrainedSeed = 0,
-    performance: Annotated[
-        str | None,
-        typer.Option(help="Accuracy of each model on its task, 0.46,0.52,...; else its own."),
-    ] = None,
+    seed: Seed = 0,
 ) -> None:
     """Score every layer of some models against a benchmark."""
-    for file in (json, html):
+    for file in (json, page):
         check_output(file)
-    given = _performances(performance, len(models))
     with needing_torch():
-        if html:
+        if page:
             import matplotlib  # noqa: F401
         from tactile_rt.models.alignment.benchmark import load_benchmark
         from tactile_rt.models.alignment.loading import check_models, load_layers, load_untrained
@@ -166,16 +147,16 @@ def score_models(
         names = check_models(models)
         done: list[ModelResult] = []
         with progress_bar(Console(stderr=True), "scoring", len(models)) as update:
-            for path, name, told in zip(models, names, given, strict=True):
+            for path, name in zip(models, names, strict=True):
                 update(description=name)
                 layers, own = load_layers(path, felt)
                 layers = replace(layers, name=name)
-                before = load_untrained(path, felt, seed) if untrained else None
-                done.append(model_result(frozen, layers, before, told or own))
+                before = load_untrained(path, felt, seed)
+                done.append(model_result(frozen, layers, before, own))
                 update(advance=1)
     results = results_of(frozen, felt, done)
-    if html:
-        _write_report(results, html)
+    if page:
+        _write_report(results, page)
     for model in done:
         if not isfinite(model.score):
             typer.echo(f"{model.name}: no score: {_why_none(results)}", err=True)
@@ -225,7 +206,8 @@ def decode_stimuli(
     ] = None,
     stimuli: Stimuli = None,
     paper: Annotated[
-        bool, typer.Option(help="Also the paper's variant: one stimulus held out at a time.")
+        bool,
+        typer.Option("--paper", help="Also the paper's variant: one stimulus held out at a time."),
     ] = False,
     json: Json = None,
 ) -> None:
@@ -300,18 +282,6 @@ def _why_none(results: Any) -> str:
             "two are needed"
         )
     return "in no layer do its responses tell the stimuli apart"
-
-
-def _performances(text: str | None, number: int) -> list[tuple[float, str] | None]:
-    if text is None:
-        return [None] * number
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) != number or not all(0 <= v <= 1 for v in values):
-        raise ConfigError(f"--performance is {number} numbers from 0 to 1, not {text!r}")
-    return [(value, "as told") for value in values]
 
 
 def _show_scores(results: Any) -> None:

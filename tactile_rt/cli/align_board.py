@@ -9,10 +9,11 @@ import typer
 from rich.console import Console
 from rich.table import Column, Table
 
-from tactile_rt.cli.align import Stimuli, Untrained, UntrainedSeed, align, needing_torch
+from tactile_rt.cli.align import align, needing_torch
 from tactile_rt.cli.app import check_output, needs
+from tactile_rt.cli.options import Json, Page, Seed, Sessions, Stimuli
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import Json, print_table, told_as_json
+from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -44,9 +45,7 @@ def fetch_recordings(
     folder: Annotated[
         Path | None, typer.Argument(help="Where small NWB files are written to, a session each.")
     ] = None,
-    session: Annotated[
-        list[str] | None, typer.Option(help="Only sessions whose name has this; * and ? fit any.")
-    ] = None,
+    sessions: Sessions = None,
     listed: Annotated[
         bool, typer.Option("--list", help="List sizes in bytes, SHA-256 and names; fetch nothing.")
     ] = False,
@@ -61,7 +60,7 @@ def fetch_recordings(
     if not dataset.listing:
         raise ConfigError(f"{name} cannot be fetched: download it, see `align datasets`")
     every = published_files(dataset.listing)
-    wanted = Selection(sessions=tuple(session or ()))
+    wanted = Selection(sessions=tuple(sessions or ()))
     files = [file for file in every if wanted.takes(file.name)]
     if not files:
         raise ConfigError(f"no session of {len(every)} is of {wanted}: --list names them")
@@ -116,13 +115,12 @@ def write_board(
         typer.Option(help="all, L1, L2/3, L4, L5, L6, excitatory or inhibitory; may be repeated."),
     ] = None,
     json: Json = None,
-    html: Annotated[Path | None, typer.Option(help="Write it as a page here, .html.")] = None,
+    page: Page = None,
     stimuli: Stimuli = None,
-    untrained: Untrained = True,
-    seed: UntrainedSeed = 0,
+    seed: Seed = 0,
 ) -> None:
     """Compare models with recordings by every metric, as shares of what noise permits."""
-    for file in (json, html):
+    for file in (json, page):
         check_output(file)
     if not data:
         raise ConfigError("name recordings: --data NAME=PATH, see `tactile-rt align datasets`")
@@ -154,7 +152,7 @@ def write_board(
             with progress_bar(console, f"reading {dataset.name}", total=1.0) as update:
                 read = dataset.read([path], felt, _shown(update))
             with progress_bar(console, f"models on {dataset.name}", max(len(files), 1)) as update:
-                rows = _rows(files, read.stimuli or felt, untrained, seed, update)
+                rows = _rows(files, read.stimuli or felt, seed, update)
             with progress_bar(console, f"scoring on {dataset.name}", total=1.0) as update:
                 boards.append(
                     with_cells(
@@ -163,11 +161,11 @@ def write_board(
                     )
                 )  # fmt: skip
         made = joined(boards)
-    if html:
+    if page:
         from tactile_rt.models.alignment.board_page import board_page
         from tactile_rt.models.alignment.html_page import write_page
 
-        write_page(board_page(made), html)
+        write_page(board_page(made), page)
     if not told_as_json(made, json):
         _show(made)
 
@@ -177,7 +175,7 @@ def _shown(update: Any) -> Callable[[float], None]:
 
 
 def _rows(
-    files: list[tuple[Path, str]], felt: "StimuliInput", untrained: bool, seed: int, update: Any
+    files: list[tuple[Path, str]], felt: "StimuliInput", seed: int, update: Any
 ) -> list[tuple["BoardRow", Any]]:
     from tactile_rt.models.alignment.board import BoardRow, traces_of, traces_of_stimuli
     from tactile_rt.models.alignment.loading import load_layers, load_untrained
@@ -186,7 +184,7 @@ def _rows(
     for path, name in files:
         update(description=name)
         layers: Layers = load_layers(path, felt)[0]
-        before = load_untrained(path, felt, seed) if untrained else None
+        before = load_untrained(path, felt, seed)
         # The same network: a file keeps some of its numbers in other places than a checkpoint.
         size = before.parameters if before else layers.parameters
         row = BoardRow(name, "model", layers.sha256, size, layers.notes)

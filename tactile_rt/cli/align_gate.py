@@ -11,9 +11,10 @@ from rich.console import Console
 from rich.markup import escape
 from typer.core import TyperCommand
 
-from tactile_rt.cli.align import Stimuli, align, needing_torch
+from tactile_rt.cli.align import align, needing_torch
 from tactile_rt.cli.app import check_output
-from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.options import Json, Stimuli
+from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError, TactileError
 
 if TYPE_CHECKING:

@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
 from urllib.parse import unquote
 
 import typer
@@ -21,12 +20,7 @@ from tactile_rt.version import VERSION
 
 __all__ = [
     "INTERRUPTED",
-    "LARGEST_SEED",
-    "MOST_THREADS",
     "USER_ERROR",
-    "Model",
-    "Pace",
-    "Seconds",
     "app",
     "check_folder",
     "check_is_mcap",
@@ -35,34 +29,13 @@ __all__ = [
     "check_output",
     "check_text",
     "leaving",
+    "needing",
     "needs",
-    "set_option",
     "starting",
 ]
 
 USER_ERROR, INTERRUPTED = 2, 130  # exit codes
-LARGEST_SEED = 2**32 - 1  # that every generator takes
-MOST_THREADS = 1024
 SLOW_WORK = "tactile_rt.sim_backend.objects"  # a logger
-
-Model = Annotated[
-    Path | None, typer.Option(help="An .onnx model; default: the one that comes with the package.")
-]
-Seconds = Annotated[
-    float | None, typer.Option(min=0.001, max=1e9, help="Leave after so many seconds.")
-]
-
-Pace = Annotated[bool, typer.Option("--fast/--realtime", help="As fast as it goes; in real time.")]
-
-
-def set_option(help: str) -> Any:
-    """The option ``--set KEY=VALUE`` of a command, which may be given again.
-
-    Args:
-        help: of what, with an example.
-    """
-    return typer.Option("--set", metavar="KEY=VALUE", help=f"{help}; may be repeated.")
-
 
 COLUMNS, BOXED = shutil.get_terminal_size().columns, 100
 
@@ -121,6 +94,16 @@ def starting() -> Iterator[None]:
         signal.signal(signal.SIGINT, before)
     if asked:
         raise KeyboardInterrupt
+
+
+@contextmanager
+def needing(extra: str) -> Iterator[None]:
+    """Let the block import what an extra brings; say which where it is missing."""
+    try:
+        with starting():
+            yield
+    except ModuleNotFoundError as error:
+        raise needs(extra, error) from None
 
 
 @contextmanager

@@ -9,7 +9,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output, needs, starting
-from tactile_rt.cli.tables import STDOUT, Json, print_table, show_table, told_as_json
+from tactile_rt.cli.options import STDOUT, Json
+from tactile_rt.cli.tables import print_table, show_table, told_as_json
 from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -62,9 +63,9 @@ def fit(
     recording: Annotated[str, typer.Argument(help="An .mcap file, or the URL of a source.")],
     described: Annotated[Path, typer.Option("--array", help="The array's .toml file.")],
     out: Annotated[
-        Path | None, typer.Option(help="Write the file, brought to what was measured, here.")
+        Path | None,
+        typer.Option(help="Where the file, brought to what was measured, goes; also over itself."),
     ] = None,
-    in_place: Annotated[bool, typer.Option("--in-place", help="Change the array's file.")] = False,
     seconds: Annotated[
         float, typer.Option(min=1, max=3600, help="Read at most so many seconds.")
     ] = 600.0,
@@ -75,8 +76,6 @@ def fit(
     Record the array untouched for a minute or two, then bend each whisker and
     let it go, three times or more, with some seconds between.
     """
-    if in_place and out:
-        raise ConfigError("--out and --in-place: choose one of the two")
     for file in (out, json):
         check_output(file)
     from tactile_rt.sources.opening import check_source, open_source
@@ -108,13 +107,13 @@ def fit(
         json,
     ):
         _show(fitted.findings, Console())
-    if target := described if in_place else out:
-        write_whole(target, lambda file: file.write(fitted.text.encode()))
+    if out is not None:
+        write_whole(out, lambda file: file.write(fitted.text.encode()))
         values = sum(len(f.edits) for f in fitted.findings)
-        typer.echo(f"{target}: {values} values brought to what was measured", err=json == STDOUT)
+        typer.echo(f"{out}: {values} values brought to what was measured", err=json == STDOUT)
     else:
         typer.echo(
-            "not written: --in-place changes the array's file, --out FILE makes another",
+            "not written: --out FILE takes what was measured, also the array's own",
             err=json == STDOUT,
         )
 

@@ -11,9 +11,10 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.app import app, needing
+from tactile_rt.cli.options import Json, Quick
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import Json, show_records
+from tactile_rt.cli.tables import show_records
 from tactile_rt.errors import ConfigError, name_some
 
 CHECKOUT = Path(__file__).parents[2]
@@ -37,9 +38,7 @@ def bench(
     area: Annotated[
         str | None, typer.Argument(help=f"{', '.join(AREAS)}, or {FAULTS}; default: all but it.")
     ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Fewer repetitions: a look, not a figure.")
-    ] = False,
+    quick: Quick = False,
     json: Json = None,
     resume: Annotated[
         Path | None, typer.Option(help="Of faults: keep each here, and go on from there.")
@@ -54,18 +53,15 @@ def bench(
         raise ConfigError(f"no benchmark area {area!r}: there are {name_some(known, 8)}")
     if resume is not None and area != FAULTS:
         raise ConfigError("--resume goes with faults: tactile-rt bench faults --resume FILE")
-    check_output(json)
     console, records = Console(stderr=True), []
     for name in [area] if area else AREAS:
         with working(console, f"measuring {name}"):
-            try:
+            with needing(AREAS.get(name, "train")):
                 if name == FAULTS:
                     rig = _rig("daemon", "faults")
                     records += rig.faults(2 if quick else rig.TIMES, resume=resume)
                 else:
                     records += _rig(name).run(quick)
-            except ModuleNotFoundError as error:
-                raise needs(AREAS.get(name, "train"), error) from None
     if show_records(records, json):
         return
     bars = [r for r in records if r.bar]

@@ -11,8 +11,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output, starting
+from tactile_rt.cli.options import STDOUT, Json, Url
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import STDOUT, Json, print_table, told_as_json
+from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.errors import ConfigError, name_some
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ Device = Annotated[str, typer.Option(help="Id of the device. Default: what it ca
 
 @app.command()
 def tare(
-    source: Annotated[str, typer.Argument(help="URL of a device, e.g. serial:/dev/ttyACM0?...")],
+    source: Url,
     seconds: Annotated[float, typer.Option(min=0.01, max=3600, help="How long to read.")] = 2.0,
     device: Device = "",
     out: Out = None,
@@ -102,7 +103,6 @@ def calibrate(
         str, typer.Option(help="URL of the recording that start_s and end_s are times in.")
     ] = "",
     device: Device = "",
-    unit: Annotated[str, typer.Option(help="Of the readings, for a device not yet known.")] = "1",
     out: Out = None,
     json: Json = None,
 ) -> None:
@@ -134,7 +134,7 @@ def calibrate(
             device or (path.stem if path else "unnamed"),
             (element or "A0",),
             loads.channels,
-            (unit,) * len(loads.channels),
+            ("1",) * len(loads.channels),
         )
     target = known or fresh
     if not element and len(target.elements) > 1:

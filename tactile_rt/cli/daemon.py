@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from tactile_rt.cli.app import app, check_output, set_option
+from tactile_rt.cli.app import app, check_output
+from tactile_rt.cli.options import set_option
 from tactile_rt.errors import ConfigError
 
 __all__ = ["Settings", "serve"]

@@ -1,13 +1,20 @@
 """`tactile-rt demo`: objects sweep past whiskers and every guess is scored.
 
-The view takes 80 columns and 22 lines of the terminal and is understood at a glance. Every coloured
-cell sets its own background and text colour, and bars are of middle brightness, so that it reads
-alike on dark and on light terminals; no meaning hangs on colour alone.
+The whiskers are simulated; where nothing can be, an emulated device on a serial port plays a
+recording of theirs. The view takes 80 columns and 22 lines of a terminal. Every coloured cell sets
+its own background and text colour, so that it reads alike on dark and on light terminals.
 """
 
+import sys
 import time
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 from rich.columns import Columns
@@ -16,31 +23,25 @@ from rich.live import Live
 from rich.panel import Panel
 from rich.text import Text
 
-from tactile_rt.cli.app import (
-    LARGEST_SEED,
-    Model,
-    Pace,
-    Seconds,
-    app,
-    check_output,
-    leaving,
-    needs,
-    starting,
-)
+from tactile_rt.cli.app import app, leaving, needing
+from tactile_rt.cli.options import STDOUT, Fast, Json, Model, Seconds, Seed
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import STDOUT, Json, told_as_json
+from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError
 from tactile_rt.extras import install_extra
 
 if TYPE_CHECKING:
-    from tactile_rt.cli.demonstration import Demonstration, SweepOutcome
+    from tactile_rt.classifier.classifier import Classification
+    from tactile_rt.stream import Source
 
-__all__ = ["WIDTH", "draw", "watch"]
+__all__ = ["WIDTH", "Demonstration", "SweepOutcome", "draw", "watch"]
 
 WIDTH = 80
 HEIGHT = 15  # of the upper panels
 DROPPED = 0.02  # share of the samples from which on the score says little of the model
 REFRESH_S = 1 / 15  # seldom enough that drawing costs the stream nothing
+END_NS = 50_000_000  # before the end of the recording: the last samples may be lost
+LATENCIES_KEPT = 10_000  # steps that the latency percentiles look back on: a demo may run for days
 
 # Lower limit of |F| (uN) and (background, text): matplotlib's inferno, whose lightness rises
 # evenly, from a grey for "untouched".
@@ -54,9 +55,39 @@ LEVELS: tuple[tuple[float, str, str], ...] = (
     (300, "#f37819", "#000000"),
     (1000, "#fca50a", "#000000"),
 )
-CELL = 4  # columns of the terminal, and one between cells
-BAR = 18
+LARGEST_UN = 9999.0  # that a cell has room for
+BAR = 18  # columns
 GREEN, RED, GREY = "#2f9e62", "#d64545", "#8a8fa3"
+
+
+@dataclass(frozen=True)
+class SweepOutcome:
+    """One object that has passed, and what the model took it for."""
+
+    name: str
+    category: str
+    said: str | None = None  # None: it passed without a decision
+    probability: float = 0.0
+
+    @property
+    def right(self) -> bool:
+        """Whether the decision is the object's category."""
+        return self.said == self.category
+
+    def line(self) -> str:
+        """Return one line with the object, the decision and the verdict."""
+        what = f"taken for {self.said}" if self.said else "no decision"
+        verdict = "right" if self.right else "WRONG"
+        return f"{self.name:<12} {what:<25} {100 * self.probability:3.0f} %  {verdict}"
+
+
+@dataclass(frozen=True)
+class RecordedPass:
+    """An object that passes in the recording; it starts ns after the first sample."""
+
+    start_ns: int
+    name: str
+    category: str
 
 
 @app.command()
@@ -66,15 +97,10 @@ def demo(
     ] = 0,
     seconds: Seconds = None,
     model: Model = None,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the drawn objects and sweeps.")
-    ] = 0,
-    fast: Pace = False,
+    seed: Seed = 0,
+    fast: Fast = False,
     recorded: Annotated[
         bool, typer.Option("--recorded", help="Play the recording, also if there is MuJoCo.")
-    ] = False,
-    plain: Annotated[
-        bool, typer.Option("--plain", help="One line per object instead of the view.")
     ] = False,
     json: Json = None,
 ) -> None:
@@ -84,23 +110,17 @@ def demo(
     whiskers is played by an emulated device, over a serial port.
     """
     from tactile_rt.classifier.model_file import shipped_model
-    from tactile_rt.cli.demonstration import Demonstration
 
-    check_output(json)
     console = Console(stderr=json == STDOUT)
     simulated = find_spec("mujoco") and find_spec("trimesh")
     if (recorded or not simulated) and (fast or seed):
         do = "leave out --recorded" if simulated else install_extra("sim")
         raise ConfigError(f"--fast and --seed are for a simulation: {do}")
     recorded |= not simulated
-    try:
-        with starting(), working(Console(stderr=True), "building the array and the objects"):
-            demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
+    with needing("sim"), working(Console(stderr=True), "building the array and the objects"):
+        demonstration = Demonstration(model or shipped_model(), sweeps, seed, fast, recorded)
     with leaving(seconds), demonstration:
-        narrow = console.width < WIDTH
-        if plain or narrow or not console.is_terminal or console.is_dumb_terminal:
+        if console.width < WIDTH or not console.is_terminal or console.is_dumb_terminal:
             for settled in demonstration.run():
                 for outcome in settled:
                     typer.echo(outcome.line(), err=json == STDOUT)
@@ -113,13 +133,178 @@ def demo(
     }  # fmt: skip
     if not told_as_json(told, json):
         typer.echo(demonstration.summary())
-    if demonstration.share_dropped > DROPPED:
+    late = demonstration.dropped / max(1.0, demonstration.samples)
+    if late > DROPPED:
         wait = "" if recorded else "; --fast waits for it"
-        late = f"{100 * demonstration.share_dropped:.0f} % of the samples came too late"
-        typer.echo(f"the machine is busy: {late} for the model to be right{wait}", err=True)
+        typer.echo(
+            f"the machine is busy: {100 * late:.0f} % of the samples came too late for the model "
+            f"to be right{wait}",
+            err=True,
+        )
 
 
-def watch(demo: "Demonstration", console: Console) -> None:
+class Demonstration:
+    """Run a model on the simulated or recorded array, and keep the score.
+
+    The score counts objects, not touches: only the first episode of each object's pass, by its
+    final decision. An episode belongs to the pass in which it began, even if its last steps come
+    while the next object is still on its way. An object whose pass brings no decision is wrong.
+
+    Args:
+        model: an ``.onnx`` file made for the mouse array.
+        sweeps: objects that pass before the end; 0: endless.
+        fast: as fast as the simulation goes, instead of in real time.
+        recorded: play the recording instead.
+
+    Attributes:
+        target: The object that `decision` is about; None before the first touch.
+        decision: The latest decision of the model; None before the first one.
+        outcomes: The outcomes of the objects that have passed, in order.
+
+    Raises:
+        ModelError, SpecMismatch: the model cannot be used on the mouse array.
+    """
+
+    def __init__(
+        self, model: Path, sweeps: int, seed: int, fast: bool, recorded: bool = False
+    ) -> None:
+        from tactile_rt.classifier.classifier import Classifier
+        from tactile_rt.classifier.model_file import load_model
+        from tactile_rt.classifier.session import Session
+
+        self.recorded = recorded
+        self.passes: Sequence[Any]  # each with start_ns, name and category
+        self._device = ExitStack()
+        self._ends_ns = sys.maxsize  # stream time from the first sample at which it is over
+        if recorded:
+            self._source = self._open_recording(sweeps)
+        else:
+            from tactile_rt.sim_backend.source import SimOptions, SimSource
+
+            unseen = load_model(model)[1].provenance.get("unseen_objects", [])
+            options = SimOptions(
+                objects=",".join(unseen),  # none listed: the first one of every category
+                sweeps=sweeps,
+                seed=seed,
+                pace="fast" if fast else "realtime",
+            )
+            self._source = source = SimSource("mouse", options)
+            self.passes = source.passes
+        self.classifier = Classifier(model, self._source.spec)
+        self._session = Session(self._source, self.classifier)
+        self.target: Any = None
+        self.decision: Classification | None = None
+        self.outcomes: list[SweepOutcome] = []
+        self._latencies: deque[float] = deque(maxlen=LATENCIES_KEPT)
+        self._first_ns = self._now_ns = 0  # stream time
+        self._base_ns = 0  # stream time from which passes count
+        self._began = self._now = 0.0  # wall time, s
+
+    def _open_recording(self, sweeps: int) -> "Source":
+        """Play the recording on an emulated serial device and open that."""
+        from tactile_rt.drivers.emulation.device import EmulatedSerial
+        from tactile_rt.recording import Recording
+        from tactile_rt.recording.replay import DEMO
+        from tactile_rt.sources.opening import open_source
+
+        recording = Recording(DEMO)
+        notes = recording.description.session
+        told = [notes[f"pass_{i}"].split() for i in range(len(notes))]
+        passes = [RecordedPass(int(start), name, category) for start, name, category in told]
+        chunks = list(recording)
+        last = int(chunks[-1].t_ns[-1] - chunks[0].t_ns[0])
+        ends = [p.start_ns for p in passes[1:]] + [last - END_NS]
+        count = min(sweeps or len(passes), len(passes))
+        self.passes, self._ends_ns = passes[:count], ends[count - 1]
+        played = self._device.enter_context(open_source(f"replay:{DEMO}?speed=0"))
+        device = self._device.enter_context(EmulatedSerial(played, "native", log=False))
+        return open_source(device.url)
+
+    def run(self) -> Iterator[list[SweepOutcome]]:
+        """Run to the end; yields after every chunk the outcomes that it has settled."""
+        from tactile_rt.stream import NS_PER_S
+
+        for chunk, decisions in self._session:
+            self._now_ns, self._now = int(chunk.t_ns[-1]), time.monotonic()
+            if not self._began:
+                self._first_ns, self._began = self._now_ns, self._now
+                if self.recorded:
+                    before = int(chunk.seq[0]) / self._source.spec.rate_hz * NS_PER_S
+                    self._base_ns = int(chunk.t_ns[0]) - round(before)
+            settled = len(self.outcomes)
+            for decision in decisions:
+                self._latencies.append(decision.latency_s)
+                self._score(decision)
+            yield self.outcomes[settled:]
+            if self._now_ns - self._base_ns >= self._ends_ns:
+                break
+        settled = len(self.outcomes)
+        self._miss_before(len(self.passes))
+        yield self.outcomes[settled:]
+
+    @property
+    def right(self) -> int:
+        """Number of objects recognised."""
+        return sum(o.right for o in self.outcomes)
+
+    @property
+    def stream_s(self) -> float:
+        """Stream time since the first chunk, s."""
+        return (self._now_ns - self._first_ns) / 1e9
+
+    @property
+    def samples(self) -> float:
+        """Number of samples in that time."""
+        return self.stream_s * self._source.spec.rate_hz
+
+    @property
+    def dropped(self) -> int:
+        """Number of samples for which the classifier was too late."""
+        return self._session.dropped + self._source.stats.dropped
+
+    def latency_ms(self, percentile: float) -> float:
+        """Return a percentile of a model step's time, ms; NaN before the first step."""
+        import numpy as np
+
+        return 1e3 * float(np.percentile(self._latencies or [np.nan], percentile))
+
+    def summary(self) -> str:
+        """Return the figures so far, in one line."""
+        done, wall = len(self.outcomes), self._now - self._began
+        share = f" ({100 * self.right / done:.0f} %)" if done else ""
+        return (
+            f"{self.right} of {done} right{share}; step p50 {self.latency_ms(50):.1f}, "
+            f"p99 {self.latency_ms(99):.1f} ms; {self.stream_s / (wall or 1):.2f} x real time; "
+            f"{self.dropped} dropped"
+        )
+
+    def _score(self, decision: "Classification") -> None:
+        onset_ns = decision.onset_ns - self._base_ns
+        number = bisect_right(self.passes, onset_ns, key=lambda p: p.start_ns) - 1
+        if number < len(self.outcomes):
+            return  # touched again after its first episode, which alone counts
+        self._miss_before(number)
+        self.target, self.decision = self.passes[number], decision
+        if decision.final:
+            self.outcomes.append(
+                SweepOutcome(
+                    self.target.name, self.target.category, decision.label, decision.probability
+                )
+            )
+
+    def _miss_before(self, number: int) -> None:
+        for missed in self.passes[len(self.outcomes) : number]:
+            self.outcomes.append(SweepOutcome(missed.name, missed.category))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        with self._device:
+            self._session.__exit__(*error)
+
+
+def watch(demo: Demonstration, console: Console) -> None:
     """Run the demonstration and redraw as it goes."""
     with Live(console=console, auto_refresh=False) as live:
         due = 0.0
@@ -132,120 +317,74 @@ def watch(demo: "Demonstration", console: Console) -> None:
             live.update(draw(demo), refresh=True)
 
 
-def draw(demo: "Demonstration") -> RenderableType:
-    """The view at this moment."""
-    what = "objects that the model has never met" if demo.unseen else "objects"
-    whiskers = "30 recorded whiskers felt" if demo.recorded else "30 simulated whiskers feel"
-    title = Text.assemble((" tactile_rt", "bold"), f"  {whiskers} {what}")
+def draw(demo: Demonstration) -> RenderableType:
+    """Draw the view at this moment."""
+    whiskers = "30 recorded whiskers" if demo.recorded else "30 simulated whiskers"
+    head = Text.assemble((" tactile_rt", "bold"), f"  {whiskers}, and what the model makes of it")
     half = WIDTH // 2
-    forces = Panel(
-        _forces(demo), title="force at each whisker's base", padding=0, width=half, height=HEIGHT
-    )
-    guess = Panel(_guess(demo), title="what is it?", width=half, height=HEIGHT)
-    score = Panel(_score(demo), title="score", subtitle="Ctrl-C leaves", width=WIDTH)
-    return Group(title, Columns([forces, guess], padding=0), score)
+    title = "force at each whisker's base"
+    forces = Panel(_draw_forces(demo), title=title, padding=0, width=half, height=HEIGHT)
+    guess = Panel(_draw_guess(demo), title="what is it?", width=half, height=HEIGHT)
+    score = Panel(_draw_score(demo), title="score", subtitle="Ctrl-C leaves", width=WIDTH)
+    return Group(head, Columns([forces, guess], padding=0), score)
 
 
-def _level(force_un: float) -> tuple[str, str]:
-    """(background, text) of a force in uN."""
-    _, background, text = [level for level in LEVELS if force_un >= level[0]][-1]
-    return background, text
-
-
-def _forces(demo: "Demonstration") -> Text:
-    """The array as a heat map: rows from the top of the face down, columns from rear to nose."""
+def _draw_forces(demo: Demonstration) -> Text:
+    """Draw the array as a heat map, its columns from rear to nose."""
     import numpy as np
 
     spec = demo.classifier.card.array
     newtons = [i for i, unit in enumerate(spec.units) if unit == "N"]
     force_un = 1e6 * np.linalg.norm(demo.classifier.tared[:, newtons], axis=1)  # (element,)
-    at = {cell: float(force_un[i]) for i, cell in enumerate(spec.grid)}
-    names = dict(zip(spec.grid, spec.elements, strict=True))
+    at = dict(zip(spec.grid, zip(spec.elements, force_un.tolist(), strict=True), strict=True))
     rows, columns = spec.grid_shape
-    header = "".join(f"{c:>3}".ljust(CELL + 1) for c in range(columns))
-    text = Text(f"   {header}\n", no_wrap=True)
+    text = Text(no_wrap=True)
     for row in range(rows):
-        numbers, lower = Text(f" {names[row, 0][0]} "), Text("   ")
+        text.append(f"{at[row, 0][0][0]} ")
         for column in range(columns):
-            force = at.get((row, column))
-            if force is None:
-                numbers.append(" " * (CELL + 1))
-                lower.append(" " * (CELL + 1))
+            if (row, column) not in at:
+                text.append(" " * 5)
                 continue
-            background, colour = _level(force)
-            shown = f"{force:.0f}" if force < 9999.5 else f"{force / 1000:.0f}k"
-            numbers.append(f"{shown:>3}".ljust(CELL), f"{colour} on {background}").append(" ")
-            lower.append("▀" * CELL, background).append(" ")  # half a line, the rest is a gap
-        text.append_text(numbers).append("\n").append_text(lower).append("\n")
-    text.append("   rear     A top, E bottom      nose\n", GREY)
-    text.append(" µN", GREY)
+            force = min(at[row, column][1], LARGEST_UN)
+            _, background, colour = [level for level in LEVELS if force >= level[0]][-1]
+            text.append(f"{force:4.0f}", f"{colour} on {background}").append(" ")
+        text.append("\n\n")
+    text.append("rear      A top, E bottom       nose\nµN", GREY)
     for lowest, background, colour in LEVELS:
-        text.append(f" {f'≥{lowest:g}' if lowest else '<1'}", f"{colour} on {background}")
+        text.append(f" {lowest:g}", f"{colour} on {background}")
     return text
 
 
-def _guess(demo: "Demonstration") -> Text:
-    """What is passing, what the model makes of it, and whether that is right."""
+def _draw_guess(demo: Demonstration) -> Text:
+    """Draw what is passing, the five likeliest classes, and whether that is right."""
     detector = demo.classifier.detector
-    if not detector.ready:
-        contact = Text("○ measuring at rest")
-    elif detector.contact:
-        contact = Text("● touching", "bold")
-    else:
-        contact = Text("○ nothing touched")
-    text = Text(no_wrap=True, overflow="ellipsis")
-    text.append("whiskers  ").append_text(contact).append("\n")
-    if demo.decision is None or demo.target is None:
+    state = "touching" if detector.contact else "nothing touched"
+    text = Text(f"whiskers  {state if detector.ready else 'measuring at rest'}\n", no_wrap=True)
+    if demo.decision is None:
         return text.append("\nwaiting for the first object", GREY)
-    truth, decision, steps = demo.target.category, demo.decision, demo.classifier.card.steps
+    truth, decision, card = demo.target.category, demo.decision, demo.classifier.card
     text.append("object    ").append(truth, f"bold {GREEN}").append(f"  ({demo.target.name})\n")
-    text.append(f"step      {decision.step:>2}/{steps} ")
-    text.append("━" * round(BAR * decision.step / steps) + "\n", GREY)
-    text.append("\nthe model's five best guesses\n", GREY)
-    top = decision.top(5)
-    for label, probability in top:
+    text.append(f"step      {decision.step:>2}/{card.steps}\n\n")
+    for label, probability in decision.top(5):
         style = GREEN if label == truth else GREY
         text.append(f"{label[:9]:<10}", f"bold {style}" if label == truth else "")
         text.append(f"{'█' * round(BAR * probability):<{BAR}}", style)
         text.append(f" {100 * probability:3.0f} %\n")
     if decision.candidates:
-        kinds = len(demo.classifier.card.classes)
-        text.append(f"still possible: {len(decision.candidates)} of {kinds} kinds", GREY)
-    text.append("\n" * (6 - len(top)))
+        possible = f"still possible: {len(decision.candidates)} of {len(card.classes)} kinds"
+        text.append(possible, GREY)
     right = decision.label == truth
-    if decision.final:
-        verdict = "✓ RIGHT" if right else f"✗ WRONG, it is a {truth}"
-    else:
-        verdict = "✓ right so far" if right else "✗ not right yet"
-    return text.append(verdict + "\n", f"bold {GREEN if right else RED}")
+    verdict = ("✓ " if right else "✗ ") + ("RIGHT" if right else f"WRONG, it is a {truth}")
+    return text.append(f"\n{verdict if decision.final else ''}", f"bold {GREEN if right else RED}")
 
 
-def _score(demo: "Demonstration") -> Text:
-    """The figures since the start."""
-    card, done = demo.classifier.card, len(demo.outcomes)
-    text = Text(no_wrap=True, overflow="ellipsis")
-    text.append("objects  ")
-    if done:
-        text.append(f"{demo.right} of {done} right, {100 * demo.right / done:.0f} %", "bold")
-    else:
-        text.append("none has passed yet")
-    text.append(f"  (blind guessing: {100 / len(card.classes):.0f} %)\n", GREY)
-    text.append("latest   ").append_text(_latest(demo.outcomes)).append("\n")
-    text.append("latency  ")
-    if done:
-        text.append(f"p50 {demo.latency_ms(50):.2f} ms, p99 {demo.latency_ms(99):.2f} ms a step")
-        budget = card.substeps * card.period_ns / 1e6
-        text.append(f"  (a step is {budget:.0f} ms of touch)", GREY)
-    text.append(f"\nspeed    {demo.real_time_factor:.2f} x real time")
+def _draw_score(demo: Demonstration) -> Text:
+    """Draw the figures since the start, and the newest outcomes."""
+    text = Text(f"{demo.summary()}\n", no_wrap=True, overflow="ellipsis")
+    blind = 100 / len(demo.classifier.card.classes)
     how = "of a recording" if demo.recorded else "simulated"
-    text.append(f"  ({demo.simulated_s:.0f} s {how}, {demo.dropped} samples dropped)", GREY)
-    return text
-
-
-def _latest(outcomes: "list[SweepOutcome]") -> Text:
-    """The newest outcomes, newest first, as many as fit."""
-    text = Text()
-    for outcome in reversed(outcomes[-8:]):
+    text.append(f"{demo.stream_s:.0f} s {how}; blind guessing: {blind:.0f} %\nlatest ", GREY)
+    for outcome in reversed(demo.outcomes[-8:]):
         said = "" if outcome.right else f" (said {outcome.said or 'nothing'})"
         text.append("✓ " if outcome.right else "✗ ", GREEN if outcome.right else RED)
         text.append(f"{outcome.category}{said}  ")

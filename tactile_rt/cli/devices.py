@@ -2,15 +2,16 @@
 
 import math
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from tactile_rt.cli.app import Seconds, app, check_output, leaving, starting
-from tactile_rt.cli.tables import STDOUT, Json, show_table, told_as_json
+from tactile_rt.cli.app import app, check_output, leaving, starting
+from tactile_rt.cli.options import STDOUT, Json, Seconds, Url
+from tactile_rt.cli.tables import show_table, told_as_json
 
-Url = Annotated[str, typer.Argument(help="URL of a source, e.g. serial:///dev/ttyUSB0?codec=bota.")]
 WINDOW_S = 1.0
 
 
@@ -47,8 +48,7 @@ def doctor(
     from tactile_rt.drivers.discovery import can_buses, diagnose, serial_ports, udev_rules
     from tactile_rt.files import write_whole
 
-    for file in (udev, json):
-        check_output(file)
+    check_output(udev)
     ports = serial_ports()
     findings = diagnose(ports, can_buses())
     alone = told_as_json(findings, json)
@@ -102,11 +102,9 @@ def codecs(
             one["options"] = list(kind.Options.__dataclass_fields__)
             one["cannot_detect"] = kind.cannot_detect
     show_table(found, {"codec": "codec", "wire": "wire", "device": "device"}, json)
-    if codec and json is None:
-        for one in found:
-            options = ", ".join(one["options"]) or "none"
-            typer.echo(f"\noptions over {one['wire']}: {options}")
-            typer.echo(f"cannot detect: {one['cannot_detect']}")
+    for one in found if codec and json is None else ():
+        typer.echo(f"\noptions over {one['wire']}: {', '.join(one['options']) or 'none'}")
+        typer.echo(f"cannot detect: {one['cannot_detect']}")
 
 
 @app.command()
@@ -158,7 +156,6 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
     from tactile_rt.sources.opening import open_source
     from tactile_rt.stream import EndOfStream
 
-    check_output(json)
     with starting():
         opened = open_source(source)
     looks: list[dict[str, Any]] = []
@@ -178,27 +175,21 @@ def hz(source: Url, seconds: Seconds = None, json: Json = None) -> None:
                         late.append((time.monotonic_ns() - int(chunk.t_ns[-1])) / 1e6)
             except EndOfStream:
                 ended = True
-            rate = n / (time.monotonic() - began)
             spread = np.quantile(late, (0.5, 0.99)) - min(late) if late else (0.0, 0.0)
-            stats = opened.stats
             health = getattr(opened, "health", None)
-            state = (
-                f", {health.state}{f': {health.reason}' if health.reason else ''}" if health else ""
-            )
-            typer.echo(
-                f"{rate:8.1f} Hz, jitter p50 {spread[0]:.2f} p99 {spread[1]:.2f} ms, "
-                f"missing {stats.missing}, corrupt {stats.corrupt}, "
-                f"duplicates {stats.duplicates}{state}",
-                err=json == STDOUT,
-            )
-            looks.append(
-                {
-                    "rate_hz": rate, "jitter_p50_ms": spread[0], "jitter_p99_ms": spread[1],
-                    "missing": stats.missing, "corrupt": stats.corrupt,
-                    "duplicates": stats.duplicates,
-                    "state": health.state if health else None,
-                }
-            )  # fmt: skip
+            look: dict[str, Any] = {
+                "rate_hz": n / (time.monotonic() - began), "jitter_p50_ms": float(spread[0]),
+                "jitter_p99_ms": float(spread[1]), "missing": opened.stats.missing,
+                "corrupt": opened.stats.corrupt, "duplicates": opened.stats.duplicates,
+                "state": health.state if health else None,
+            }  # fmt: skip
+            looks.append(look)
+            line = (
+                "{rate_hz:8.1f} Hz, jitter p50 {jitter_p50_ms:.2f} p99 {jitter_p99_ms:.2f} ms, "
+                "missing {missing}, corrupt {corrupt}, duplicates {duplicates}"
+            ).format(**look)
+            why = ": ".join(filter(None, (health.state, health.reason))) if health else ""
+            typer.echo(", ".join(filter(None, (line, why))), err=json == STDOUT)
     told_as_json(looks, json)
 
 
@@ -210,27 +201,18 @@ def dump(
     """Print what comes over a line, undecoded: time, bytes in hex, text; or CAN frames."""
     from tactile_rt.drivers.opening import open_line
 
-    link = open_line(line)
     start = time.monotonic_ns()
-    try:
-        with leaving(seconds):
-            while True:
-                found = link.receive(0.2)
-                if found is None:
-                    continue
-                packet, t_ns = found
-                ms = (t_ns - start) / 1e6
-                if isinstance(packet, bytes):
-                    for at in range(0, len(packet), 16):
-                        row = packet[at : at + 16]
-                        text = "".join(chr(b) if 32 <= b < 127 else "." for b in row)
-                        typer.echo(f"{ms:12.3f} ms  {row.hex(' '):<47}  {text}")
-                    continue
-                for f in packet:
-                    kind = "R" if f.remote else "F" if f.fd else " "
-                    width = 8 if f.extended else 3
-                    typer.echo(
-                        f"{ms:12.3f} ms  {f.id:0{width}X} {kind} [{len(f.data)}] {f.data.hex(' ')}"
-                    )
-    finally:
-        link.close()
+    with closing(open_line(line)) as link, leaving(seconds):
+        while True:
+            packet, t_ns = link.receive(0.2) or ([], 0)
+            at = f"{(t_ns - start) / 1e6:12.3f} ms"
+            if isinstance(packet, bytes):
+                for k in range(0, len(packet), 16):
+                    row = packet[k : k + 16]
+                    text = "".join(chr(b) if 32 <= b < 127 else "." for b in row)
+                    typer.echo(f"{at}  {row.hex(' '):<47}  {text}")
+                continue
+            for f in packet:
+                kind = "R" if f.remote else "F" if f.fd else " "
+                name = f"{f.id:0{8 if f.extended else 3}X}"
+                typer.echo(f"{at}  {name} {kind} [{len(f.data)}] {f.data.hex(' ')}")

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import Pace, app, leaving, needs, set_option, starting
+from tactile_rt.cli.app import app, leaving, needing, starting
+from tactile_rt.cli.options import Fast, Faults, ProjectFolder, set_option
 from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.drivers.emulation.device import EmulatedDevice
+    from tactile_rt.project.folder import Project
 
 LOOK_S = 0.25  # how often the count is renewed
 LINGER_S = 0.5  # for the host to read the last samples before the port disappears
@@ -25,10 +27,7 @@ def emulate(
     source: Annotated[
         str | None, typer.Option(help="What it measures: sim:mouse, replay:FILE. Default: waves.")
     ] = None,
-    project: Annotated[
-        Path | None,
-        typer.Option(help="A folder of `tactile-rt new`: its array, in the codec of robot.toml."),
-    ] = None,
+    project: ProjectFolder = None,
     wire: Annotated[
         str | None, typer.Option(help="serial, slcan or can. Default: serial, else slcan.")
     ] = None,
@@ -38,12 +37,12 @@ def emulate(
     bus: Annotated[
         str | None, typer.Option(help="For --wire can: INTERFACE:CHANNEL, e.g. socketcan:vcan0.")
     ] = None,
-    faults: Annotated[Path | None, typer.Option(help="A .toml of what goes wrong.")] = None,
+    faults: Faults = None,
     sets: Annotated[
         list[str] | None,
         set_option("An option of codec or line: format=int16, baud=9600, bitrate=0 (no speed)"),
     ] = None,
-    fast: Pace = False,
+    fast: Fast = False,
     seconds: Annotated[
         float | None,
         typer.Option(min=0.001, max=1e9, help="Send so many seconds of samples, then leave."),
@@ -68,7 +67,13 @@ def emulate(
 
     fields = codec_options(sets or [])
     if project is not None:
-        codec, source, wire, link, fields = _of_project(project, codec, source, wire, link, fields)
+        made = open_project(project)
+        codec, fields = made.spoken(codec, fields)
+        source = source or made.source_url(made.unseen())
+        line = made.line()
+        wire = wire or ("serial" if line.wire == "serial" else None)
+        if line.wire == "serial" and link is None and not line.port.startswith("/dev/"):
+            link = Path(line.port)
     elif codec is None:
         raise ConfigError("name a CODEC (`tactile-rt codecs` lists them), or a --project")
     source = source or "synthetic:"
@@ -109,35 +114,19 @@ def emulate(
         typer.echo(_count(device), err=True)
 
 
-def _of_project(
-    folder: Path,
-    codec: str | None,
-    source: str | None,
-    wire: str | None,
-    link: Path | None,
-    fields: dict[str, str],
-) -> tuple[str, str, str | None, Path | None, dict[str, str]]:
-    """What a project says of its device, where nothing else is asked for."""
-    try:
+def open_project(folder: Path) -> "Project":
+    """Open the folder of a project.
+
+    Raises:
+        TactileError: it is none, or the extra that it needs is not installed.
+    """
+    with needing("sim"):
         from tactile_rt.project.folder import Project
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
-    project = Project(folder)
-    line = project.line()
-    if line.wire == "serial" and link is None and not line.port.startswith("/dev/"):
-        link = Path(line.port)
-    codec, fields = project.spoken(codec, fields)
-    return (
-        codec,
-        source or project.source_url(project.unseen()),
-        wire or ("serial" if line.wire == "serial" else None),
-        link,
-        fields,
-    )
+    return Project(folder)
 
 
 def codec_options(given: list[str]) -> dict[str, str]:
-    """``KEY=VALUE`` options of a codec, as fields."""
+    """Split ``KEY=VALUE`` options of a codec into fields."""
     fields = {}
     for pair in given:
         name, equals, value = pair.partition("=")

@@ -6,38 +6,32 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.app import app, needing
+from tactile_rt.cli.options import Json, Quick
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import Json, show_records
+from tactile_rt.cli.tables import show_records
 
 
 @app.command(name="eval")
 def evaluate(
     model: Annotated[Path, typer.Argument(help="An .onnx model.")],
     data: Annotated[Path, typer.Argument(help="A sweep set.")],
-    accurate: Annotated[
-        Path | None, typer.Option(help="The same sweeps at another profile, to compare with.")
-    ] = None,
-    svm: Annotated[bool, typer.Option(help="Fit an RBF SVM on the same windows too.")] = False,
+    svm: Annotated[
+        bool, typer.Option("--svm", help="Fit an RBF SVM on the same windows too.")
+    ] = False,
     pictures: Annotated[
         Path | None, typer.Option(help="Folder for confusion, accuracy over time and robustness.")
     ] = None,
-    quick: Annotated[
-        bool, typer.Option(help="Two sweeps of each object: to compare by, not to quote.")
-    ] = False,
+    quick: Quick = False,
     json: Json = None,
 ) -> None:
     """Measure a model on the test objects of a sweep set: accuracy, fusion, calibration, noise
     and what else goes wrong with a sensor."""
     from tactile_rt.sweep_set import SweepManifest
 
-    check_output(json)
-    for folder in filter(None, (data, accurate)):
-        SweepManifest.read(folder)
-    try:
+    SweepManifest.read(data)
+    with needing("train"):
         from tactile_rt.evidence.classification import evaluate_model
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     with working(Console(stderr=True), "evaluating"):
-        records = evaluate_model(model, data, accurate, svm, pictures, quick)
+        records = evaluate_model(model, data, svm, pictures, quick)
     show_records(records, json)

@@ -7,8 +7,9 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_folder, check_output, needs
+from tactile_rt.cli.options import Accelerator, Json
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.tables import told_as_json
 
 
 @app.command()
@@ -18,7 +19,7 @@ def grid(
     ],
     folder: Annotated[Path, typer.Argument(help="Where it goes; what is done is kept.")],
     processes: Annotated[int, typer.Option(min=1, help="That train side by side.")] = 2,
-    accelerator: Annotated[str, typer.Option(help="auto, cpu, cuda ...")] = "cpu",
+    accelerator: Accelerator = "cpu",
     report: Annotated[
         Path | None,
         typer.Option(help="Train nothing: write the table of what is done into this page."),

@@ -1,31 +1,23 @@
 """`tactile-rt hil`: hardware in the loop, with an emulated device."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 from urllib.parse import parse_qsl
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from tactile_rt.cli.app import (
-    INTERRUPTED,
-    LARGEST_SEED,
-    Pace,
-    app,
-    check_output,
-    leaving,
-    needs,
-    set_option,
-    starting,
-)
-from tactile_rt.cli.emulate import codec_options
+from tactile_rt.cli.app import INTERRUPTED, app, leaving, starting
+from tactile_rt.cli.emulate import codec_options, open_project
+from tactile_rt.cli.options import Faults, Json, Model, ProjectFolder, set_option
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import Json, print_table, told_as_json
+from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:
     from tactile_rt.evidence.hil import LoopReport
+    from tactile_rt.project.folder import Project
 
 SWEEPS = 6  # unless told otherwise
 
@@ -44,24 +36,15 @@ def hil(
         str | None, typer.Option(help="What the device speaks. Default: native, or a project's.")
     ] = None,
     sets: Annotated[list[str] | None, set_option("An option of the codec: format=int16")] = None,
-    faults: Annotated[Path | None, typer.Option(help="A .toml of what goes wrong.")] = None,
+    faults: Faults = None,
     sweeps: Annotated[
         int | None, typer.Option(min=1, help=f"Of sim:, how many objects pass. Default: {SWEEPS}.")
     ] = None,
     seconds: Annotated[
         float | None, typer.Option(min=0.001, max=1e9, help="Leave after so much of the stream.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the default source.")] = 0,
-    fast: Pace = True,
-    clock: Annotated[
-        str, typer.Option(help="Time of the driver's samples: device; host (in real time).")
-    ] = "device",
-    model: Annotated[
-        Path | None, typer.Option(help="An .onnx model; default: the package's own.")
-    ] = None,
-    project: Annotated[
-        Path | None, typer.Option(help="A folder of `tactile-rt make`: its array and its model.")
-    ] = None,
+    model: Model = None,
+    project: ProjectFolder = None,
     json: Json = None,
 ) -> None:
     """Run a simulated array through an emulated device and its real driver.
@@ -77,31 +60,32 @@ def hil(
     from tactile_rt.evidence.hil import Loop, check_line
     from tactile_rt.sources.opening import open_source
 
-    check_output(json)
     fields = codec_options(sets or [])
     if project is not None:
-        source, model, wire, codec, fields = _of_project(
-            project, source, model, wire, codec, fields, seed
-        )
+        made = open_project(project)
+        model = model or _find_model(made)
+        codec, fields = made.spoken(codec, fields)
+        wire = wire or ("serial" if made.line().wire == "serial" else "slcan")
+        source = source or made.source_url(made.unseen())
     wire, codec = wire or "serial", codec or "native"
     file = model or shipped_model()
     schedule = read_faults(faults) if faults else None
-    check_line(wire, codec, fields, clock)
+    check_line(wire, codec, fields)
     if source is None:
         unseen = load_model(file)[1].provenance.get("unseen_objects", [])
-        source = f"sim:mouse?seed={seed}" + (f"&objects={','.join(unseen)}" if unseen else "")
+        source = "sim:mouse" + (f"?objects={','.join(unseen)}" if unseen else "")
     if source.startswith(("sim:", "whisking:")):
-        source = _with(source, "pace", "fast" if fast else "realtime")
+        source = _add_option(source, "pace", "fast")
     if source.startswith("sim:"):
         if sweeps is not None or seconds is None:
-            source = _with(source, "sweeps", str(sweeps or SWEEPS))
+            source = _add_option(source, "sweeps", str(sweeps or SWEEPS))
     elif sweeps is not None:
         raise ConfigError("--sweeps is of a sim: source; of others give --seconds")
     console = Console(stderr=True)
     with starting():
         opened = open_source(source)
     try:
-        loop = Loop(opened, file, wire, codec, fields, schedule, seconds, clock)
+        loop = Loop(opened, file, wire, codec, fields, schedule, seconds)
     except BaseException:
         opened.close()
         raise
@@ -111,11 +95,9 @@ def hil(
     told = {
         "source": source, "wire": wire, "codec": codec, "complete": loop.complete,
         "failure": report.failure, **vars(report),
-        "latency_s": _percentiles(report.latency_s),
-        "stamp_error_s": _percentiles(report.stamp_error_s),
     }  # fmt: skip
     if not told_as_json(told, json):
-        print_table(_table(report, source, f"{codec} over {wire}"))
+        print_table(_make_table(report, source, f"{codec} over {wire}"))
     if not loop.complete:
         typer.echo("interrupted: what was on its way is missing above", err=True)
         raise typer.Exit(INTERRUPTED)
@@ -124,35 +106,20 @@ def hil(
         raise typer.Exit(1)
 
 
-def _of_project(
-    folder: Path,
-    source: str | None,
-    model: Path | None,
-    wire: str | None,
-    codec: str | None,
-    fields: dict[str, str],
-    seed: int,
-) -> tuple[str, Path, str, str, dict[str, str]]:
-    """Source, model and device that a project has, unless others are asked for."""
+def _find_model(project: "Project") -> Path:
+    """Find the model that a project has made; say if its array has changed since."""
+    from tactile_rt.project.budget import read_budget
+
+    if not project.model.exists():
+        raise ConfigError(f"{project.folder} has no model yet: `tactile-rt make {project.folder}`")
     try:
-        from tactile_rt.project.budget import read_budget
-        from tactile_rt.project.folder import Project
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
-    made = Project(folder)
-    if model is None and not made.model.exists():
-        raise ConfigError(f"{folder} has no model yet: `tactile-rt make {folder}`")
-    if model is None:
-        try:
-            read_budget(made)
-        except ConfigError as error:  # as when the array has been fitted to the device since
-            typer.echo(f"{error}; until then the model is the one made before", err=True)
-    url = source or made.source_url(made.unseen(), seed)
-    wire = wire or ("serial" if made.line().wire == "serial" else "slcan")
-    return url, model or made.model, wire, *made.spoken(codec, fields)
+        read_budget(project)
+    except ConfigError as error:  # as when the array has been fitted to the device since
+        typer.echo(f"{error}; until then the model is the one made before", err=True)
+    return project.model
 
 
-def _with(url: str, name: str, value: str) -> str:
+def _add_option(url: str, name: str, value: str) -> str:
     """The URL with this option, unless it has one."""
     _, mark, query = url.partition("?")
     if any(key == name for key, _ in parse_qsl(query, keep_blank_values=True)):
@@ -160,49 +127,28 @@ def _with(url: str, name: str, value: str) -> str:
     return f"{url}{'&' if mark else '?'}{name}={value}"
 
 
-def _table(report: "LoopReport", source: str, title: str) -> Table:
-    table = Table("", "", title=title, show_header=False, title_justify="left")
+def _make_table(report: "LoopReport", source: str, title: str) -> Table:
     decisions = max(report.direct, report.wire)
     stats, health = report.stats, report.health
 
     def share(n: int, of: int) -> str:
         return f"{n} of {of}" + (f" ({100 * n / of:.2f} %)" if of else "")
 
-    table.add_row("source", source.partition("?")[0])
-    table.add_row("samples", f"{report.samples}, {stats.delivered} through the driver")
-    table.add_row("identical samples", share(report.identical_samples, report.samples))
-    table.add_row("decisions", f"{report.direct} direct, {report.wire} through the driver")
-    table.add_row("identical decisions", share(report.identical, decisions))
-    table.add_row("same labels", share(report.same_label, decisions))
-    table.add_row("same final labels", share(report.finals_same, report.finals))
-    if report.passed:
-        table.add_row("objects named right", share(report.right, report.passed))
-    table.add_row(
-        "lost",
-        f"{stats.missing} missing, {stats.corrupt} corrupt, {stats.dropped} dropped, "
+    rows = {
+        "source": source.partition("?")[0],
+        "samples": f"{report.samples}, {stats.delivered} through the driver",
+        "identical samples": share(report.identical_samples, report.samples),
+        "decisions": f"{report.direct} direct, {report.wire} through the driver",
+        "identical decisions": share(report.identical, decisions),
+        "same labels": share(report.same_label, decisions),
+        "same final labels": share(report.finals_same, report.finals),
+        "objects named right": share(report.right, report.passed) if report.passed else "",
+        "lost": f"{stats.missing} missing, {stats.corrupt} corrupt, {stats.dropped} dropped, "
         f"{stats.duplicates} duplicates; {'all' if report.accounted else 'NOT all'} accounted for",
-    )
-    table.add_row("latency", _spread(report.latency_s, 1e3, "ms") or "not in real time")
-    late = _spread(report.stamp_error_s, 1e3, "ms")
-    table.add_row(
-        "clock",
-        (f"host, late by {late}; drift {health.drift_ppm:.1f} ppm" if late else "device")
-        + f"; {health.clock_steps} steps, {health.counter_resets} resets of the counter",
-    )
+        "clock": f"{health.clock_steps} steps, {health.counter_resets} resets of the counter",
+    }
+    table = Table("", "", title=title, show_header=False, title_justify="left")
+    for what, text in rows.items():
+        if text:
+            table.add_row(what, text)
     return table
-
-
-def _percentiles(values: Any) -> dict[str, float] | None:
-    import numpy as np
-
-    if values is None:
-        return None
-    p50, p99, worst = np.percentile(values, (50, 99, 100))
-    return {"p50": float(p50), "p99": float(p99), "worst": float(worst)}
-
-
-def _spread(values: Any, scale: float, unit: str) -> str:
-    found = _percentiles(values)
-    if found is None:
-        return ""
-    return ", ".join(f"{name} {scale * value:.2f}" for name, value in found.items()) + f" {unit}"

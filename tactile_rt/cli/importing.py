@@ -8,8 +8,9 @@ import typer
 from rich.console import Console
 
 from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, starting
+from tactile_rt.cli.options import Force, Json
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError
 
 
@@ -38,7 +39,7 @@ def import_file(
     lines: Annotated[
         int, typer.Option(min=1, max=1000, help="Of a table: lines of text that are one row.")
     ] = 1,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    force: Force = False,
     json: Json = None,
 ) -> None:
     """Make a recording of what is on the disk; `tactile-rt sniff` tells how.

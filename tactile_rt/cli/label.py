@@ -7,9 +7,10 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import LARGEST_SEED, app, check_folder, check_output, check_text
+from tactile_rt.cli.app import app, check_folder, check_output, check_text
+from tactile_rt.cli.options import Force, Json, Seed
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError, RecordingError
 
 
@@ -38,8 +39,8 @@ def label(
     shares: Annotated[
         str, typer.Option(help="Shares of the objects: train,validation,test.")
     ] = "0.7,0.15,0.15",
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of the split.")] = 0,
-    force: Annotated[bool, typer.Option("--force", help="Replace a set that is there.")] = False,
+    seed: Seed = 0,
+    force: Force = False,
     json: Json = None,
 ) -> None:
     """Make a sweep set of recordings, to train and evaluate on.

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import LARGEST_SEED, MOST_THREADS, app, check_output, needs, set_option
+from tactile_rt.cli.app import app, check_output, needs
+from tactile_rt.cli.options import Json, Seed, set_option
 from tactile_rt.cli.progress import progress_bar, working
-from tactile_rt.cli.tables import Json, show_records, told_as_json
+from tactile_rt.cli.tables import show_records, told_as_json
 from tactile_rt.settings import take_sets
 
 if TYPE_CHECKING:
@@ -24,11 +25,11 @@ def train(
     data: Annotated[Path, typer.Argument(help="A sweep set made with --contacts.")],
     checkpoint: Annotated[Path, typer.Argument(help="The file to write.")],
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the training split.")] = 12,
-    seed: Annotated[int, typer.Option(min=0, max=LARGEST_SEED, help="Of weights and noise.")] = 0,
+    seed: Seed = 0,
     sets: Annotated[
         list[str] | None, set_option("Of the training: hidden=64, batch=256, learning_rate=0.002")
     ] = None,
-    threads: Annotated[int, typer.Option(min=1, max=MOST_THREADS, help="CPU threads.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, max=1024, help="CPU threads.")] = 1,
     json: Json = None,
 ) -> None:
     """Train the contact network on the simulator's own contacts."""

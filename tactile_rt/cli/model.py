@@ -10,8 +10,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from tactile_rt.cli.app import app, check_output
+from tactile_rt.cli.options import STDOUT, Json
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import STDOUT, Json, print_table, show_records, told_as_json
+from tactile_rt.cli.tables import print_table, show_records, told_as_json
 from tactile_rt.errors import ConfigError, ModelError
 from tactile_rt.extras import install_extra
 

@@ -7,9 +7,10 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.app import app, needing
+from tactile_rt.cli.options import Json
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import Json, show_table, told_as_json
+from tactile_rt.cli.tables import show_table, told_as_json
 from tactile_rt.errors import ConfigError
 
 objects = typer.Typer(help="Objects that others made.", no_args_is_help=True)
@@ -37,14 +38,10 @@ def get(
     """
     from tactile_rt.sim_backend.objects.object_lists import get_objects, read_list
 
-    check_output(json)
     listed = read_list(wanted)
     console = Console(stderr=True)
-    try:
-        with starting(), progress_bar(console, "getting", len(listed), counted=True) as update:
-            missing = get_objects(listed, folder, clones, lambda name: update(advance=1))
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
+    with needing("sim"), progress_bar(console, "getting", len(listed), counted=True) as update:
+        missing = get_objects(listed, folder, clones, lambda name: update(advance=1))
     for name, why in missing.items():
         console.print(f"[red]{escape(name)}[/]: {escape(why)}", soft_wrap=True, highlight=False)
     licences = sorted({thing.files[0].licence for thing in listed})
@@ -73,12 +70,9 @@ def check(
     """
     if not folder.is_dir():
         raise ConfigError(f"no folder {folder}")
-    try:
-        with starting():
-            from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
-            from tactile_rt.sim_backend.objects.object_sets import open_objects
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
+    with needing("sim"):
+        from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
+        from tactile_rt.sim_backend.objects.object_sets import open_objects
     opened = open_objects(folder)
     console = Console(stderr=True)
     with progress_bar(console, "loading", total=len(opened.names), counted=True) as update:

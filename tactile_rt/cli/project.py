@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.app import app, needing
+from tactile_rt.cli.options import Json
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.tables import told_as_json
 
 if TYPE_CHECKING:
     from tactile_rt.project.making import MakeProgress
@@ -23,17 +24,14 @@ def new(
     array: Annotated[
         str, typer.Option(help="A .toml file, or one of `array list`; default: an example.")
     ] = "",
-    kinds: Annotated[
+    classes: Annotated[
         str, typer.Option(help="Categories of objects to tell apart, comma-separated.")
     ] = "",
 ) -> None:
     """Begin a project: your whiskers, what touches them, your robot."""
-    try:
-        with starting():
-            from tactile_rt.project.folder import KINDS, new_project
-    except ModuleNotFoundError as error:
-        raise needs("sim", error) from None
-    chosen = tuple(k.strip() for k in kinds.split(",") if k.strip()) or KINDS
+    with needing("sim"):
+        from tactile_rt.project.folder import KINDS, new_project
+    chosen = tuple(k.strip() for k in classes.split(",") if k.strip()) or KINDS
     new_project(folder, array, chosen)
     again = shlex.join(["tactile-rt", "make", str(folder)])
     typer.echo(f"{folder}: edit array.toml and sweeps.toml, then `{again}`")
@@ -51,15 +49,11 @@ def make(
 
     What is there is not made again; what was interrupted goes on.
     """
-    check_output(json)
     console = Console(stderr=True, soft_wrap=True)
-    try:
-        with starting():
-            from tactile_rt.evidence.records import as_dicts
-            from tactile_rt.project.folder import Project
-            from tactile_rt.project.making import make as make_project
-    except ModuleNotFoundError as error:
-        raise needs("sim,train", error) from None
+    with needing("sim,train"):
+        from tactile_rt.evidence.records import as_dicts
+        from tactile_rt.project.folder import Project
+        from tactile_rt.project.making import make as make_project
     project = Project(folder)
     with progress_bar(console, "reading") as update:
         seen = ""

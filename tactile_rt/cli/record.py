@@ -7,17 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import (
-    Seconds,
-    app,
-    check_is_mcap,
-    check_new,
-    check_output,
-    leaving,
-    starting,
-)
+from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, leaving, starting
+from tactile_rt.cli.options import Force, Json, Seconds, Url
 from tactile_rt.cli.progress import working
-from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError
 from tactile_rt.settings import no_such
 
@@ -28,27 +21,15 @@ if TYPE_CHECKING:
 POLL_S = 0.1
 TELL_S = 1.0
 
-Force = Annotated[bool, typer.Option("--force", help="Replace a file that is there.")]
-
 
 @app.command()
 def record(
-    source: Annotated[str, typer.Argument(help="URL of a source, e.g. serial:PORT?codec=native.")],
+    source: Url,
     output: Annotated[Path, typer.Argument(help="The recording, a .mcap.")],
     seconds: Seconds = None,
     note: Annotated[
         list[str] | None, typer.Option(help="To keep with it: NAME=VALUE; may be repeated.")
     ] = None,
-    rotate_mb: Annotated[
-        float, typer.Option(min=0, help="Go on in a new file beyond so many MB: OUTPUT-TIME.mcap.")
-    ] = 0,
-    rotate_s: Annotated[
-        float, typer.Option(min=0, help="Go on in a new file after so many seconds.")
-    ] = 0,
-    sync_s: Annotated[
-        float,
-        typer.Option(min=0, help="What a power cut may take, s; 0: all that is not written yet."),
-    ] = 1.0,
     force: Force = False,
     json: Json = None,
 ) -> None:
@@ -64,33 +45,25 @@ def record(
     for file in (output, json):
         check_output(file)
     check_is_mcap(output)
-    rotated = rotate_mb or rotate_s  # which writes over nothing
-    if not rotated:  # before a device is opened and started
-        check_new(output, force)
+    check_new(output, force)  # before a device is opened and started
     session = _notes(note or [])
     with starting():
         opened = open_source(source)
     with (
         opened,
-        StreamWriter(
-            output, opened, url=source, session=session, force=force,
-            rotate_mb=rotate_mb, rotate_s=rotate_s, sync_s=sync_s,
-        ) as writer,
+        StreamWriter(output, opened, url=source, session=session, force=force) as writer,
         leaving(seconds),
-    ):  # fmt: skip
+    ):
         _copy(opened, writer)
-    files = (
-        f"{output.with_stem(f'{output.stem}-*')} ({writer.files} of them)" if rotated else output
-    )
     told = {
-        "file": output, "files": writer.files, "samples": writer.stats.samples,
+        "file": output, "samples": writer.stats.samples,
         "packets": writer.stats.packets, "bytes": writer.stats.bytes,
         "corrupt": opened.stats.corrupt, "missing": opened.stats.missing,
         "dropped_samples": writer.stats.dropped_samples,
         "dropped_packets": writer.stats.dropped_packets,
     }  # fmt: skip
     if not told_as_json(told, json):
-        typer.echo(f"{files}: {_told(opened, writer)}")
+        typer.echo(f"{output}: {_told(opened, writer)}")
 
 
 def _copy(source: "Source", writer: "StreamWriter") -> None:

@@ -8,6 +8,7 @@ from urllib.parse import parse_qsl
 import typer
 
 from tactile_rt.cli.app import app, check_new, leaving
+from tactile_rt.cli.options import Force
 from tactile_rt.errors import ConfigError, RecordingError, name_some
 
 if TYPE_CHECKING:
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from tactile_rt.stream import Chunk
 
 DIFFERENT = 1
+RECORDED = "recorded"  # the codec and options by which packets were decoded live
 TIMING = ("model_ms", "latency_ms", "age_ms", "late")  # of a decision's message: not the same twice
 
 
@@ -32,16 +34,14 @@ def replay(
         str, typer.Option(help="Times the recorded pace, 1 for as it was; or max.")
     ] = "max",
     codec: Annotated[
-        str, typer.Option(help="Decode the raw packets by this codec: NAME, NAME?OPTION=VALUE.")
+        str,
+        typer.Option(help="Decode the raw packets: recorded (as live), NAME or NAME?OPTION=VALUE."),
     ] = "",
-    redecode: Annotated[
-        bool, typer.Option("--redecode", help="Decode the raw packets again, as recorded.")
-    ] = False,
     check: Annotated[
         bool, typer.Option("--check", help="Compare with the recorded decisions; 1: they differ.")
     ] = False,
     out: Annotated[Path | None, typer.Option(help="Where decisions go; default: stdout.")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there.")] = False,
+    force: Force = False,
 ) -> None:
     """Let a model decide on a recording, as it did or would have done live.
 
@@ -49,10 +49,10 @@ def replay(
     less the times that they took: the same bytes at every speed and in
     every run. With --check they are compared with the recorded ones
     instead of printed; exit code 1, and the first difference, if there is
-    one. With --codec or --redecode the samples are decoded anew, and how
-    they differ from the recorded ones is told.
+    one. With --codec the samples are decoded anew, and how they differ from
+    the recorded ones goes to stderr.
     """
-    fields = {"speed": _speed(speed)} | _decoding(codec, redecode)
+    fields = {"speed": _speed(speed)} | _decoding(codec)
     if out is not None:
         check_new(out, force)
     told = _Replay(_in_order(files), model, name, check, fields)
@@ -278,10 +278,10 @@ def _speed(text: str) -> str:
     return repr(speed)
 
 
-def _decoding(codec: str, redecode: bool) -> dict[str, str]:
+def _decoding(codec: str) -> dict[str, str]:
     """Options of `replay:` for raw packets; none to replay samples."""
-    if not codec:
-        return {"from": "wire"} if redecode else {}
+    if codec in ("", RECORDED):
+        return {"from": "wire"} if codec else {}
     chosen, _, query = codec.partition("?")
     own = dict(parse_qsl(query.replace("+", "%2B"), keep_blank_values=True))
     if set(own) & {"from", "speed", "codec"}:

@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
-from tactile_rt.cli.app import Model, Seconds, app, leaving, starting
+from tactile_rt.cli.app import app, leaving, starting
 from tactile_rt.cli.daemon import Settings, serve
+from tactile_rt.cli.options import Model, Seconds
 from tactile_rt.errors import ConfigError, SpecMismatch
 
 
@@ -19,9 +20,9 @@ def run(
         str | None, typer.Option(help="URL of a source, e.g. sim:mouse?objects=mug.")
     ] = None,
     model: Model = None,
-    every_step: Annotated[
-        bool, typer.Option("--every-step/--final-only", help="Decisions to print.")
-    ] = True,
+    final_only: Annotated[
+        bool, typer.Option("--final-only", help="Print the last decision of each touch alone.")
+    ] = False,
     seconds: Seconds = None,
     sets: Settings = None,
 ) -> None:
@@ -43,7 +44,7 @@ def run(
     A summary goes to stderr. Ctrl-C leaves.
     """
     if file is not None:
-        if source is not None or model is not None or not every_step:
+        if source is not None or model is not None or final_only:
             raise ConfigError(
                 f"{file} says source, model and decisions: change them there or by --set, as "
                 "--set source.NAME.url=..."
@@ -79,7 +80,7 @@ def run(
             for chunk, decisions in session:
                 samples += len(chunk)
                 for d in decisions:
-                    if not (every_step or d.final):
+                    if final_only and not d.final:
                         continue
                     fields = {
                         "type": "classification",

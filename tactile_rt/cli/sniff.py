@@ -9,7 +9,8 @@ from urllib.parse import quote, urlencode
 import typer
 
 from tactile_rt.cli.app import app, check_output, leaving, starting
-from tactile_rt.cli.tables import STDOUT, Json, print_table, told_as_json
+from tactile_rt.cli.options import STDOUT, Json
+from tactile_rt.cli.tables import print_table, told_as_json
 from tactile_rt.errors import ConfigError, RecordingError
 
 if TYPE_CHECKING:
@@ -41,9 +42,6 @@ def sniff(
     ask: Annotated[
         bool, typer.Option("--ask", help="Send what starts each device; without, only listen.")
     ] = False,
-    dtr: Annotated[
-        bool, typer.Option("--dtr/--no-dtr", help="Assert DTR, at which many boards reset.")
-    ] = True,
     json: Json = None,
 ) -> None:
     """Find out what a device speaks, from half a second of it.
@@ -69,7 +67,7 @@ def sniff(
             _sniff_bus(target, seconds, candidates, ask, told)
         elif target.startswith(("serial:", "socket:", "rfc2217:")) or _is_port(path):
             port = str(path) if path.exists() else target.removeprefix("serial:")
-            _sniff_port(port, seconds, baud, candidates, ask, dtr, told)
+            _sniff_port(port, seconds, baud, candidates, ask, told)
         elif path.exists():
             _sniff_file(path, candidates, told)
         else:
@@ -130,7 +128,6 @@ def _sniff_port(
     bauds: list[int] | None,
     further: "list[Tried]",
     ask: bool,
-    dtr: bool,
     told: _Told,
 ) -> None:
     from tactile_rt.drivers.links import SerialLink
@@ -141,7 +138,7 @@ def _sniff_port(
     found: list[tuple[CodecFit, int]] = []
     texts: list[tuple[int, bytes]] = []
     came = 0
-    for baud, _, data in hear_port(port, seconds, speeds, dtr):
+    for baud, _, data in hear_port(port, seconds, speeds):
         came += len(data)
         typer.echo(f"{baud} bit/s: {len(data)} bytes", err=True)
         found += [(fit, baud) for fit in sniff_bytes(data, further)]
@@ -152,7 +149,7 @@ def _sniff_port(
         for speed in bauds or [0]:  # 0: each codec's own
 
             def connect(codec: Any, speed: int = speed) -> SerialLink:
-                return SerialLink(port, speed or codec.baud, codec.parity, dtr)
+                return SerialLink(port, speed or codec.baud, codec.parity)
 
             for _, data in ask_devices("serial", connect, seconds):
                 found += [(fit, speed or _usual_baud(fit)) for fit in sniff_bytes(data, further)]

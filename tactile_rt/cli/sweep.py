@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, set_option, starting
+from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.options import Json, set_option
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError
 
 if TYPE_CHECKING:

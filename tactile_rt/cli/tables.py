@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import typer
@@ -12,44 +12,14 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from tactile_rt.cli.app import check_named_once, check_output
-from tactile_rt.errors import ConfigError
+from tactile_rt.cli.options import STDOUT
 from tactile_rt.files import write_whole
 
 if TYPE_CHECKING:
     from tactile_rt.evidence.records import Record
 
-__all__ = [
-    "STDOUT",
-    "Json",
-    "fitting",
-    "print_table",
-    "show_records",
-    "show_table",
-    "told_as_json",
-]
+__all__ = ["fitting", "print_table", "show_records", "show_table", "told_as_json"]
 
-STDOUT = Path("-")
-
-
-def _not_over_another(file: Path | None) -> Path | None:
-    """Refuse to write over a file that the same command line names for something else."""
-    if file is not None and file != STDOUT:
-        try:
-            check_named_once(file)
-        except ConfigError as error:
-            raise typer.BadParameter(str(error)) from None
-    return file
-
-
-Json = Annotated[
-    Path | None,
-    typer.Option(
-        "--json",
-        help="Write what is told as JSON, too; - prints that alone.",
-        callback=_not_over_another,
-    ),
-]
 WIDE = 10_000  # columns: more than any table has
 
 
@@ -61,10 +31,7 @@ def show_table(
     Args:
         records: what there is to tell of each; may hold more than is printed.
         headings: the heading of every column, by the key of the records that it prints.
-        json: where `Json` says.
-
-    Raises:
-        ConfigError: the file cannot be written.
+        json: the file to write; `STDOUT`; or None, not to.
     """
     if told_as_json(list(records), json):
         return
@@ -79,9 +46,6 @@ def show_records(records: "list[Record]", json: Path | None) -> bool:
 
     Returns:
         Whether stdout took the JSON, and nothing else may go there.
-
-    Raises:
-        ConfigError: the file cannot be written.
     """
     from tactile_rt.evidence.records import as_dicts, as_table
 
@@ -112,13 +76,10 @@ def told_as_json(what: Any, json: Path | None) -> bool:
 
     Args:
         what: structs, dataclasses, mappings, sequences, arrays; a number that is none becomes null.
-        json: where `Json` says; None: nowhere.
+        json: the file to write; `STDOUT`; or None, not to.
 
     Returns:
         Whether it went to stdout, where nothing else may go then.
-
-    Raises:
-        ConfigError: the file cannot be written.
     """
     if json is None:
         return False
@@ -126,7 +87,6 @@ def told_as_json(what: Any, json: Path | None) -> bool:
     if json == STDOUT:
         typer.echo(text, nl=False)
         return True
-    check_output(json)
     write_whole(json, lambda file: file.write(text))
     return False
 

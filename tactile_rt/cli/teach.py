@@ -9,16 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from tactile_rt.cli.app import (
-    Seconds,
-    app,
-    check_folder,
-    check_output,
-    check_text,
-    leaving,
-    starting,
-)
-from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.app import app, check_folder, check_output, check_text, leaving, starting
+from tactile_rt.cli.options import Json, Seconds, Url
+from tactile_rt.cli.tables import told_as_json
 from tactile_rt.cli.teach_orders import HELP, Buttons, listening
 from tactile_rt.errors import ConfigError, SourceError, SpecMismatch
 
@@ -37,7 +30,7 @@ HASTY = "that came too soon after the last touch to be one: wait a second"
 
 @app.command()
 def teach(
-    source: Annotated[str, typer.Argument(help="URL of a source, e.g. serial:PORT?codec=bota.")],
+    source: Url,
     folder: Annotated[
         Path, typer.Argument(help="Where the lesson is kept; one that is there goes on.")
     ],

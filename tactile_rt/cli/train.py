@@ -7,17 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import (
-    LARGEST_SEED,
-    MOST_THREADS,
-    app,
-    check_folder,
-    check_output,
-    needs,
-    set_option,
-)
+from tactile_rt.cli.app import app, check_folder, check_output, needing
+from tactile_rt.cli.options import Accelerator, Json, Seed, set_option
 from tactile_rt.cli.progress import progress_bar, working
-from tactile_rt.cli.tables import Json, show_table, told_as_json
+from tactile_rt.cli.tables import show_table, told_as_json
 from tactile_rt.errors import ConfigError
 from tactile_rt.locks import alone_in
 from tactile_rt.settings import take_sets
@@ -46,22 +39,19 @@ def train(
         str | None,
         typer.Option(help="zhuang-CELL, resnet18, s4, ...; or a TOML file of nodes and edges."),
     ] = None,
-    attender: Annotated[str | None, typer.Option(help="gpt, mamba or none.")] = None,
-    decoder: Annotated[str | None, typer.Option(help="linear, mlp or mlp-all.")] = None,
     epochs: Annotated[
         int | None, typer.Option(min=1, help="Passes over the training split.")
     ] = None,
-    batch: Annotated[int | None, typer.Option(min=1, help="Sweeps per update.")] = None,
     seed: Annotated[int | None, typer.Option(help="Of weights, windows and noise.")] = None,
     sets: Annotated[
         list[str] | None,
-        set_option("Any key of the recipe: width=0.25, objective=simclr, learning_rate=0.01"),
+        set_option("Any key of the recipe: width=0.25, attender=none, decoder=linear, batch=8"),
     ] = None,
-    accelerator: Annotated[str, typer.Option(help="auto, cpu, cuda ...")] = "auto",
+    accelerator: Accelerator = "auto",
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Write logs for TensorBoard, too.")
     ] = False,
-    threads: Annotated[int, typer.Option(min=1, max=MOST_THREADS, help="CPU threads.")] = 1,
+    threads: Annotated[int, typer.Option(min=1, max=1024, help="CPU threads.")] = 1,
     json: Json = None,
 ) -> None:
     """Train an Encoder-Attender-Decoder network on a sweep set."""
@@ -69,15 +59,7 @@ def train(
     from tactile_rt.models.training.config import manifests_of
     from tactile_rt.models.training.recipes import read_recipe
 
-    check_output(json)
-    asked = {
-        "encoder": encoder,
-        "attender": attender,
-        "decoder": decoder,
-        "epochs": epochs,
-        "batch": batch,
-        "seed": seed,
-    }
+    asked = {"encoder": encoder, "epochs": epochs, "seed": seed}
     if encoder is not None and encoder.endswith(".toml"):
         asked |= {"encoder": "graph", "graph": _text(Path(encoder))}
     given: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
@@ -95,12 +77,10 @@ def train(
     if first:
         with alone_in(folder):  # for a moment: the training takes it again
             pass
-    try:
+    with needing("train"):
         import torch
 
         from tactile_rt.models import training
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     torch.set_num_threads(threads)
     # Under torchrun every process has the same to say.
     console = Console(stderr=True, quiet=not first)
@@ -117,10 +97,8 @@ def train(
                 history.append({"epoch": at.epoch, "update": at.update, **at.metrics})
                 console.print(_in_words(at))
 
-        try:
+        with needing("train"):
             best = training.train(config, folder, show, tensorboard=tensorboard, device=accelerator)
-        except ModuleNotFoundError as error:
-            raise needs("train", error) from None
     if not console.quiet:
         told_as_json({"best": best, "epochs": history}, json)
     console.print(f"best network: {best}")
@@ -168,9 +146,7 @@ def probe(
         Path | None, typer.Option(help="Sweep set; default: the one it was trained on.")
     ] = None,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the features.")] = 100,
-    seed: Annotated[
-        int, typer.Option(min=0, max=LARGEST_SEED, help="Of the layer and the windows.")
-    ] = 0,
+    seed: Seed = 0,
     sets: Annotated[
         list[str] | None,
         set_option("How it is fitted: readout=mean, standardise=false, learning_rate=0.01"),
@@ -182,14 +158,11 @@ def probe(
     from tactile_rt.models.data_checks import probed_on
     from tactile_rt.models.training.config import ProbeConfig
 
-    check_output(json)
     usual = {"data": str(data or ""), "epochs": epochs, "seed": seed}
     (config,) = take_sets("probe", sets or (), ProbeConfig, usual=usual)
     probed_on(checkpoint, describe_checkpoint(checkpoint), folder, config.data)
-    try:
+    with needing("train"):
         from tactile_rt.models.training.probing import probe as fit
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     console = Console(stderr=True)
     shown: list[Progress] = []
     with progress_bar(console, "probing") as update:
@@ -234,21 +207,16 @@ def export(
     from tactile_rt.models.checkpoint_files import describe_checkpoint
     from tactile_rt.models.data_checks import trained_on
 
-    for file in (model, json):
-        check_output(file)
+    check_output(model)
     trained_on(checkpoint, describe_checkpoint(checkpoint), data or ())
-    try:
+    with needing("train"):
         from tactile_rt.export.precision import PRECISIONS
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     if precision not in PRECISIONS:
         raise ConfigError(f"--precision is {precision!r}, not one of {', '.join(PRECISIONS)}")
     if kind not in ("step", "window"):
         raise ConfigError(f"--kind is {kind!r}, not one of step, window")
-    try:
+    with needing("train"):
         from tactile_rt.export.release import release
-    except ModuleNotFoundError as error:
-        raise needs("train", error) from None
     console = Console(stderr=True)
     with working(console, "calibrating, exporting and checking parity"):
         card = release(

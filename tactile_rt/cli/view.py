@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, set_option, starting
+from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.options import Array, set_option
 from tactile_rt.cli.progress import progress_bar
 from tactile_rt.errors import ConfigError
 from tactile_rt.settings import take_sets
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 PICTURE_MS = 4  # between the samples of a picture's traces
 FPS = 25
+WIDTH = 1280  # pixels
 
 
 @app.command()
@@ -35,8 +37,7 @@ def view(
     slow: Annotated[
         float, typer.Option(min=1, max=40, help="How much slower than real a video is.")
     ] = 10.0,
-    pixels: Annotated[int, typer.Option(min=320, max=3840, help="Width.")] = 1280,
-    array: Annotated[str, typer.Option(help="mouse, rat, rat-left, ..., or a file.")] = "mouse",
+    array: Array = "mouse",
     profile: Annotated[
         str, typer.Option(help="How finely: realtime, dataset (finer), accurate, mujoco.")
     ] = "dataset",
@@ -98,7 +99,7 @@ def view(
         f"{thing.name[:40]}, {sweep.size_mm:g} mm large, sweeps past the {len(spec.elements)} "
         f"whiskers of {spec.name[:40]} at {sweep.speed_mm_s:g} mm/s"
     )
-    with closing(Film(footage, camera, title, detail, pixels)) as film:
+    with closing(Film(footage, camera, title, detail, WIDTH)) as film:
         if suffix in IMAGES:
             write_image(out, film.picture(footage.strongest if at is None else footage.at(at)))
             return

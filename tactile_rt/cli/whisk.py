@@ -8,9 +8,10 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 
-from tactile_rt.cli.app import app, check_output, needs, set_option, starting
+from tactile_rt.cli.app import app, check_output, needs, starting
+from tactile_rt.cli.options import Array, Json, set_option
 from tactile_rt.cli.progress import progress_bar
-from tactile_rt.cli.tables import Json, told_as_json
+from tactile_rt.cli.tables import told_as_json
 from tactile_rt.errors import ConfigError
 from tactile_rt.settings import take_sets
 
@@ -38,7 +39,7 @@ def whisk(
     target: Annotated[
         str | None, typer.Option("--object", help="Instead of a stimulus: mug-3, or a mesh file.")
     ] = None,
-    array: Annotated[str, typer.Option(help="mouse, rat, mouse-left, ..., or a file.")] = "mouse",
+    array: Array = "mouse",
     trajectory: Annotated[
         Path | None,
         typer.Option(help="A .csv of time_s and theta_deg, instead of regular whisking."),

@@ -39,7 +39,6 @@ ROBUSTNESS_SWEEPS, QUICK_SWEEPS = 4, 2
 def evaluate_model(
     model: Path,
     data: Path,
-    accurate: Path | None = None,
     svm: bool = False,
     pictures: Path | None = None,
     quick: bool = False,
@@ -49,14 +48,13 @@ def evaluate_model(
     Args:
         model: the ``.onnx`` file.
         data: a sweep set.
-        accurate: a set with the same test sweeps simulated at another profile.
         svm: fit an RBF support vector machine on the same windows to compare with.
         pictures: folder for ``confusion.png``, ``accuracy_over_time.png``, ``robustness.png``.
         quick: take two sweeps of each object: enough to compare by, not to quote.
 
     Raises:
         ConfigError: the model was trained on some of the test objects, does not know all of their
-            categories, or another sample period; or `accurate` tests on other objects.
+            categories, or another sample period.
         SpecMismatch: the model was made for another array than a set's.
         ModelError, RecordingError: a file cannot be read.
     """
@@ -66,12 +64,6 @@ def evaluate_model(
     labels, objects = test.sweeps.labels, test.sweeps.objects
     if _met(card, test):
         raise ConfigError(f"{model} may have been trained on objects that {data} tests on")
-    # What may fail comes first, lest it fail after minutes.
-    other = None
-    if accurate is not None:
-        other = _tested_on(accurate, card, model, quick)
-    if other and not set(other.sweeps.objects.tolist()) <= set(objects.tolist()):
-        raise ConfigError(f"{accurate} tests on other objects than {data}")
     if pictures is not None:
         pictures.mkdir(parents=True, exist_ok=True)
     sample = f"{len(set(objects.tolist()))} unseen objects, {len(labels)} sweeps"
@@ -141,8 +133,6 @@ def evaluate_model(
             unknown = _first_of_each(unknown, QUICK_SWEEPS)
         records.append(_open_set(model, unknown, test))
     records += _refusals_and_candidates(model, test, unknown, sample)
-    if other:
-        records += _compare_profiles(run, other, test, clean)
     if svm:
         right = evaluation.hits(clean[:, -1], labels)
         records += _compare_svm(data, card, test, right)
@@ -319,30 +309,6 @@ def _firsts(objects: NDArray[np.str_], sweeps: int) -> NDArray[np.int64]:
 
 def _first_of_each(data: SweepSet, sweeps: int) -> SweepSet:
     return data[_firsts(data.sweeps.objects, sweeps)]
-
-
-def _compare_profiles(
-    run: evaluation.Step, other: SweepSet, test: SweepSet, clean: NDArray[np.float32]
-) -> list[Record]:
-    # The same object's first sweeps are the same draws: compare on those that both sets have.
-    both = [
-        (a[: len(b)], b[: len(a)])
-        for name in dict.fromkeys(other.sweeps.objects.tolist())
-        for a, b in [[np.flatnonzero(one.sweeps.objects == name) for one in (test, other)]]
-    ]
-    mine, theirs = (np.concatenate(some) for some in zip(*both, strict=True))
-    other = other[theirs]
-    labels = other.sweeps.labels
-    there = evaluation.predict(other, run)[:, -1]
-    at_profile = evaluation.accuracy(evaluation.hits(there, labels), other.sweeps.objects)
-    here = evaluation.hits(clean[mine, -1], labels).mean()
-    profile = other.manifest.recipe.get("profile", "other")
-    how = f"{len(labels)} sweeps of {len(set(other.sweeps.objects.tolist()))} unseen objects"
-    lost = 100 * (float(here) - at_profile.value)
-    return [
-        _record(f"top-1 at the {profile} profile", at_profile, "", how),
-        Record(f"models.points lost at the {profile} profile", lost, "points", "<= 4", "", how),
-    ]
 
 
 def _compare_svm(

@@ -7,16 +7,14 @@ source --> emulated device --> pty, slcan or CAN bus --> the real driver --> cla
 A decision depends on the times of its samples, as they are resampled. So the driver is asked for
 the device's own time (`clock=device`), and the direct path's samples have the time that the
 device's clock showed: what is compared is what the wire and the driver did, and nothing else. Of a
-device that sends no time, samples are a period apart on both paths. With the host's time, as a
-robot has it, decisions may differ from run to run.
+device that sends no time, samples are a period apart on both paths.
 """
 
 import os
-import time
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -36,20 +34,9 @@ if TYPE_CHECKING:
     from tactile_rt.drivers.emulation.faults import FaultSchedule
     from tactile_rt.drivers.health import Health
 
-__all__ = [
-    "CLOCKS",
-    "RANGES",
-    "SAME_LABEL",
-    "WIRES",
-    "Loop",
-    "LoopReport",
-    "check_line",
-    "named_right",
-    "pair",
-]
+__all__ = ["Loop", "LoopReport", "check_line", "named_right", "pair"]
 
 WIRES: Final = ("serial", "slcan", "virtual")
-CLOCKS: Final = ("device", "host")
 SAME_LABEL: Final = 0.99  # of the decisions, where the format rounds
 START_S: Final = 30.0  # for a simulation to build its world before the first sample
 WAIT_S: Final = 0.1
@@ -61,45 +48,22 @@ SAME_EPISODE_NS: Final = 100_000_000  # onsets of the same touch differ by less
 
 @dataclass(frozen=True)
 class LoopReport:
-    """What came out of a loop, and whether it is as it must be.
-
-    Attributes:
-        samples: Number of samples that the source delivered.
-        identical_samples: Number of samples that came out of the driver with the same bits.
-        direct: Number of decisions that the direct path made.
-        wire: Number of decisions that the driver's path made.
-        identical: Decisions that are the same in every bit on both paths, latency apart.
-        same_label: Decisions of the same touch and step that have the same label on both paths.
-        finals: Last decisions of a touch on the direct path.
-        finals_same: Last decisions of a touch that have the same label on both paths.
-        passed: Number of simulated objects that passed; 0 where nobody knows what did.
-        right: Number of objects whose first touch ended, on the driver's path, with the right name.
-        exact: Whether all decisions must be identical; else 99 % must have the same label.
-        faulty: Whether faults were on the way; then only the account of losses must be right.
-        stats: The driver's account of what it delivered and what it lost.
-        sent: Number of packets that the device sent, copies included.
-        latency_s: (n,) time from the source's delivery of a chunk's last sample to the driver's, s;
-            None where the source does not keep to real time.
-        stamp_error_s: (n,) delay of each of the driver's times, s; None with the device's time.
-        health: The driver's state at the end.
-    """
+    """What came out of a loop, in numbers of samples and decisions."""
 
     samples: int
-    identical_samples: int
-    direct: int
-    wire: int
-    identical: int
-    same_label: int
-    finals: int
-    finals_same: int
-    passed: int
-    right: int
-    exact: bool
-    faulty: bool
+    identical_samples: int  # with the same bits
+    direct: int  # decisions of the direct path
+    wire: int  # decisions of the driver's path
+    identical: int  # decisions that are the same in every bit on both paths, latency apart
+    same_label: int  # decisions of the same touch and step
+    finals: int  # last decisions of a touch on the direct path
+    finals_same: int  # of them with the same label on both paths
+    passed: int  # simulated objects; 0 where nobody knows what passed
+    right: int  # objects whose first touch ended, on the driver's path, with the right name
+    exact: bool  # all decisions must be identical; else 99 % must have the same label
+    faulty: bool  # faults were on the way: only the account of losses must be right
     stats: SourceStats
-    sent: int
-    latency_s: "np.ndarray | None"
-    stamp_error_s: "np.ndarray | None"
+    sent: int  # packets, copies included
     health: "Health"
 
     @property
@@ -127,22 +91,18 @@ class LoopReport:
         return ""
 
 
-@dataclass(eq=False)
 class _Tee(Source):
-    """A source whose chunks are also kept, with the host time of their delivery."""
-
-    inner: Source
-    kept: "deque[tuple[Chunk, int]]" = field(default_factory=deque)
+    """A source whose chunks are also kept."""
 
     def __init__(self, inner: Source) -> None:
         super().__init__(inner.spec)
-        self.inner, self.kept, self.live = inner, deque(), inner.live
-        self.stats = inner.stats
+        self.inner, self.live, self.stats = inner, inner.live, inner.stats
+        self.kept: deque[Chunk] = deque()
 
     def read(self, timeout: float | None = None) -> Chunk | None:
         chunk = self.inner.read(timeout)
         if chunk is not None:
-            self.kept.append((chunk, time.monotonic_ns()))
+            self.kept.append(chunk)
         return chunk
 
     def close(self) -> None:
@@ -154,21 +114,16 @@ class Loop:
 
     Args:
         source: What the device measures; the loop closes it.
-        model: An ``.onnx`` file made for the source's array.
-        wire: The kind of line, one of `WIRES`.
-        codec: Name of the codec that the device speaks.
         options: Options of the codec, as in a URL; a native device's ranges are `RANGES` unless
             given.
         faults: What goes wrong on the way; the schedule is used up.
         seconds: How much of the source's stream to send, s; None to send all.
-        clock: Which times the driver's samples have: ``device``, or ``host``, in real time only. Of
-            a device that sends no time, ``device`` is a period from each sample to the next.
 
     Attributes:
         complete: Whether the loop has run to the end; a report is only judged then.
 
     Raises:
-        ConfigError: an unknown wire, clock, codec or option, or ones that do not go together.
+        ConfigError: an unknown wire, codec or option.
         SpecMismatch: the model is for another array.
     """
 
@@ -181,13 +136,10 @@ class Loop:
         options: dict[str, str] | None = None,
         faults: "FaultSchedule | None" = None,
         seconds: float | None = None,
-        clock: str = "device",
     ) -> None:
-        check_line(wire, codec, options or {}, clock)
-        if clock == "host" and not source.live:
-            raise ConfigError("the host's clock means nothing of a source that is not in real time")
+        check_line(wire, codec, options or {})
         self._options = {**(RANGES if codec == "native" else {}), **(options or {})}
-        self._model, self._clock, self._faulty = model, clock, faults is not None
+        self._model, self._faulty = model, faults is not None
         self._direct = Classifier(model, source.spec)
         self._tee = _Tee(source)
         further: dict[str, Any] = {
@@ -203,38 +155,25 @@ class Loop:
         self._device = make(self._tee, codec, **further)
         own = codec_class(make.wire, codec).Options
         form = self._options.get("format", getattr(own, "format", ""))
-        self._exact = codec == "native" and form == "float32" and clock == "device" and not faults
-        period_ns = NS_PER_S / source.spec.rate_hz
-        untimed = clock == "device" and self._device.codec.tick_ns is None
-        self._period_ns = period_ns if untimed else None
+        self._exact = codec == "native" and form == "float32" and not faults
+        self._tick_ns = self._device.codec.tick_ns  # of the device's clock; None: it sends no time
+        self._period_ns = NS_PER_S / source.spec.rate_hz
         self._first_ns: int | None = None
-        self._pending: deque[tuple[int, Chunk, int]] = deque()  # first number, samples, when
+        self._pending: deque[tuple[int, Chunk]] = deque()  # first number, samples
         self._samples = self._identical = 0
         self._decided: tuple[list[Classification], list[Classification]] = ([], [])
-        self._latency: list[int] = []
-        self._late: list[int] = []
         self._driver: Source | None = None
         self.complete = False
-
-    @property
-    def samples(self) -> int:
-        """Samples that the source has delivered so far."""
-        return self._samples
-
-    @property
-    def decisions(self) -> int:
-        """Decisions of the driver's path so far."""
-        return len(self._decided[1])
 
     def run(self) -> LoopReport:
         """Run to the source's end, or to an interrupt, after which `report` tells the rest.
 
         Raises:
             SourceError: the source, the device or the driver broke.
-        SpecMismatch: what the codec carries cannot be the source's array.
+            SpecMismatch: what the codec carries cannot be the source's array.
         """
         with self._tee, self._device:
-            clock = "host" if self._period_ns else self._clock
+            clock = "host" if self._tick_ns is None else "device"
             url = f"{self._device.url}&clock={clock}&start_s={START_S:g}"
             try:
                 driver = open_source(url)
@@ -247,12 +186,12 @@ class Loop:
                 classifier = Classifier(self._model, driver.spec)
                 while True:
                     chunk = driver.read(WAIT_S)
-                    came_ns = time.monotonic_ns()
                     self._push_direct()
                     if chunk is not None:
-                        chunk = self._counted(chunk, chunk.seq)
+                        if self._tick_ns is None:
+                            chunk = self._space_evenly(chunk, chunk.seq)
                         self._decided[1].extend(classifier.push(chunk))
-                        self._compare(chunk, came_ns)
+                        self._compare(chunk)
                     elif self._device.wait(0):
                         break
         self.complete = True
@@ -266,7 +205,7 @@ class Loop:
         direct, wire = self._decided
         pairs = pair(direct, wire)
         finals = [(a, b) for a, b in pairs if a.final]
-        live, log = self._tee.live, self._device.emulator.log
+        log = self._device.emulator.log
         return LoopReport(
             samples=self._samples,
             identical_samples=self._identical,
@@ -282,70 +221,60 @@ class Loop:
             faulty=self._faulty,
             stats=driver.stats,
             sent=log.sent + log.duplicated,
-            latency_s=np.array(self._latency) * 1e-9 if live and self._latency else None,
-            stamp_error_s=np.array(self._late) * 1e-9 if self._late else None,
             health=driver.health,
         )
 
     @property
     def _passes(self) -> "list[tuple[int, str]]":
         """When each object began to come by, in the driver's time, ns, and its category."""
-        began_ns = (self._first_ns or 0) if self._clock == "device" else 0
+        began_ns = self._first_ns or 0
         passes = getattr(self._tee.inner, "passes", ())
         return [(p.start_ns - began_ns, p.category) for p in passes]
 
-    def _counted(self, chunk: Chunk, numbers: NDArray[np.int64]) -> Chunk:
-        """A chunk with the times of these sample numbers, where the device sends no time."""
-        if self._period_ns is None:
-            return chunk
+    def _space_evenly(self, chunk: Chunk, numbers: NDArray[np.int64]) -> Chunk:
+        """Return a chunk whose samples, of these numbers, are a period apart."""
         t_ns = np.round(numbers * self._period_ns).astype(np.int64)
         return Chunk(chunk.seq, t_ns, chunk.values, chunk.valid)
 
     def _push_direct(self) -> None:
         """The samples that have gone into the device since, straight into the classifier."""
         while self._tee.kept:
-            chunk, went_ns = self._tee.kept.popleft()
+            chunk = self._tee.kept.popleft()
             if self._first_ns is None:
                 self._first_ns = int(chunk.t_ns[0])
-            chunk = self._counted(chunk, self._samples + np.arange(len(chunk)))
-            tick = self._device.codec.tick_ns
-            if self._clock == "device" and tick is not None:
-                ticks = np.floor_divide(chunk.t_ns - self._first_ns, tick)
-                t_ns = np.round(ticks * tick).astype(np.int64)
+            if self._tick_ns is None:
+                chunk = self._space_evenly(chunk, self._samples + np.arange(len(chunk)))
+            else:
+                ticks = np.floor_divide(chunk.t_ns - self._first_ns, self._tick_ns)
+                t_ns = np.round(ticks * self._tick_ns).astype(np.int64)
                 chunk = Chunk(chunk.seq, t_ns, chunk.values, chunk.valid)
-            self._pending.append((self._samples, chunk, went_ns))
+            self._pending.append((self._samples, chunk))
             self._samples += len(chunk)
             self._decided[0].extend(self._direct.push(chunk))
 
-    def _compare(self, chunk: Chunk, came_ns: int) -> None:
+    def _compare(self, chunk: Chunk) -> None:
         """Compare what came with what went, sample by sample, by their numbers."""
         for i, number in enumerate(chunk.seq.tolist()):
             while self._pending and self._pending[0][0] + len(self._pending[0][1]) <= number:
                 self._pending.popleft()
             if not self._pending or number < self._pending[0][0]:
                 continue
-            first, went, went_ns = self._pending[0]
+            first, went = self._pending[0]
             at = number - first
             if went.values.shape[1:] == chunk.values.shape[1:]:
                 same = went.values[at].tobytes() == chunk.values[i].tobytes()
                 same = same and bool((went.valid[at] == chunk.valid[i]).all())
-                same = same and (self._clock == "host" or went.t_ns[at] == chunk.t_ns[i])
-                self._identical += bool(same)
-            if self._clock == "host":
-                self._late.append(int(chunk.t_ns[i] - went.t_ns[at]))
-            if at == len(went) - 1:
-                self._latency.append(came_ns - went_ns)
+                self._identical += bool(same and went.t_ns[at] == chunk.t_ns[i])
 
 
-def check_line(wire: str, codec: str, options: dict[str, str], clock: str) -> None:
+def check_line(wire: str, codec: str, options: dict[str, str]) -> None:
     """Refuse what no source could go through, before one is opened; see `Loop`.
 
     Raises:
-        ConfigError: an unknown wire, clock, codec or option.
+        ConfigError: an unknown wire, codec or option.
     """
-    for given, name, known in ((wire, "wire", WIRES), (clock, "clock", CLOCKS)):
-        if given not in known:
-            raise ConfigError(f"{name} must be one of {', '.join(known)}, not {given!r}")
+    if wire not in WIRES:
+        raise ConfigError(f"wire must be one of {', '.join(WIRES)}, not {wire!r}")
     make_codec("serial" if wire == "serial" else "can", codec, options)
 
 

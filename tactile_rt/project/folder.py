@@ -204,7 +204,7 @@ def new_project(folder: Path, array: str = "", kinds: Sequence[str] = KINDS) -> 
         if kind not in known:
             raise ConfigError(no_such("category", kind, known))
     if len(set(kinds)) < len(kinds) or len(kinds) < 2:
-        raise ConfigError("--kinds takes two or more categories, each once")
+        raise ConfigError("--classes takes two or more categories, each once")
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"{folder} is not empty: name a new folder")
     distance = usual_distance(animals)

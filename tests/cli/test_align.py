@@ -35,11 +35,11 @@ def test_score_report_and_a_baseline(call, frozen, tmp_path):
     scores, page = tmp_path / "scores.json", tmp_path / "page.html"
     code, out, _ = call(
         "align", "score", MODEL, "--benchmark", frozen / "6.json", "--json", scores,
-        "--html", page, "--performance", "0.91",
+        "--out", page,
     )  # fmt: skip
     assert code == 0 and "mouse44" in out and "raw sensor" in out
     model = json.loads(scores.read_text())["models"][0]
-    assert model["performance"] == 0.91 and model["layers"][0] == "encoder.layer0"
+    assert model["layers"][0] == "encoder.layer0"
     assert page.read_text().startswith("<!doctype html>")
     again = tmp_path / "again.html"
     assert call("align", "report", scores, "--out", again)[0] == 0
@@ -90,7 +90,7 @@ def test_stimuli_without_names_are_neither_gated_nor_decoded_by(call, tmp_path):
         found, out, err = call("align", command, MODEL, *benchmark)
         assert (found, out) == (code, "")
         assert "paper.json is of protocol paper-code" in err and err.count("\n") == 1
-    code, out, _ = call("align", "score", MODEL, *benchmark, "--json", "-", "--no-untrained")
+    code, out, _ = call("align", "score", MODEL, *benchmark, "--json", "-")
     assert code == 0
     (model,) = json.loads(out)["models"]
     assert model["score"] is not None and model["turing"] == model["turing_why"] == ""
@@ -214,9 +214,7 @@ def test_mistakes_are_one_line(call, frozen, tmp_path):
     for arguments, said in (
         (("score", tmp_path / "none.onnx", *benchmark), "no model file"),
         (("score", tmp_path / "none.pt", *benchmark), "no checkpoint"),
-        (("score", MODEL, *benchmark, "--performance", "0.4,0.5"), "--performance is 1 numbers"),
-        (("score", MODEL, *benchmark, "--performance", "90"), "from 0 to 1"),
-        (("score", MODEL, *benchmark, "--html", tmp_path / "x" / "p.html"), "no folder"),
+        (("score", MODEL, *benchmark, "--out", tmp_path / "x" / "p.html"), "no folder"),
         (
             ("report", frozen / "6.json", "--out", tmp_path / "p.html"),
             "not of `tactile-rt align score",

@@ -30,7 +30,7 @@ def test_a_board_of_a_model_its_untrained_network_and_responses(call, brain, tmp
     code, out, err = call(
         "align", "board", MODEL, brain / "models" / "another-mouse.npz",
         "--data", f"example={brain / 'recordings'}", "--metric", "rsa", "--metric", "crossnobis",
-        "--part", "all", "--part", "L5", "--json", board, "--html", page,
+        "--part", "all", "--part", "L5", "--json", board, "--out", page,
     )  # fmt: skip
     assert code == 0, err
     made = json.loads(board.read_text())
@@ -50,7 +50,7 @@ def test_recordings_of_one_name_are_told_apart(call, brain, tmp_path):
     files = ("--data", f"example={brain / 'recordings'}", "--data", f"example={other}")
     board, page = tmp_path / "board.json", tmp_path / "board.html"
     code, out, err = call(
-        "align", "board", *files, "--metric", "rsa", "--json", board, "--html", page
+        "align", "board", *files, "--metric", "rsa", "--json", board, "--out", page
     )
     assert code == 0, err
     made = json.loads(board.read_text())

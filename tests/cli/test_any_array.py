@@ -14,7 +14,7 @@ for module in ("torch", "lightning", "onnx", "matplotlib"):
     pytest.importorskip(module)
 
 ROBOT = plate(2, 4)
-TINY = ("--encoder", "gru", "--attender", "none", "--epochs", 1, "--batch", 4,
+TINY = ("--encoder", "gru", "--set", "attender=none", "--epochs", 1, "--set", "batch=4",
         "--set", "width=0.0625", "--set", "precision=fp32")  # fmt: skip
 
 

@@ -2,14 +2,6 @@
 
 import tomllib
 
-from tactile_rt.drivers.catalogue import CODECS
-
-
-def test_every_codec_has_a_row(call):
-    code, said, _ = call("codecs")
-    assert code == 0
-    assert said.count("serial") >= sum(wire == "serial" for wire, _ in CODECS)
-
 
 def test_the_description_of_a_frame_is_printed_to_be_changed(call, tmp_path):
     code, said, _ = call("codecs", "--frame", "kwr75")

@@ -45,6 +45,7 @@ OF_TWO_KINDS = {
     "--data": "a sweep set; of `align board` NAME=PATH",
     "--model": "a file; of `teach` also `shipped`",
 }
+MOST_NAMES = 105  # of options, over all commands: fewer are easier to remember
 MODEL = shipped_model()
 
 
@@ -67,6 +68,13 @@ def test_an_option_takes_the_same_in_every_command():
         for name, option in options_of(command).items():
             kinds[name].add(_kind(option))
     assert {name for name, found in kinds.items() if len(found) > 1} <= OF_TWO_KINDS.keys()
+
+
+def test_options_have_few_names():
+    every = commands().values()
+    names = {n for command in every for n in options_of(command)}
+    negated = {n for command in every for p in command.params for n in p.secondary_opts}
+    assert len(names | negated) <= MOST_NAMES
 
 
 def _kind(option):

@@ -91,7 +91,6 @@ def test_what_cannot_be_is_refused_before_torch_is_loaded(made):
         (("eval", made / "none.onnx", data), "no model file"),
         (("eval", made / "junk.onnx", data), "is not a readable ONNX model"),
         (("eval", made / "junk.onnx", made / "none"), no_set),
-        (("eval", made / "junk.onnx", data, "--accurate", made / "none"), no_set),
         (("grid", "wide42", out), "no grid wide42: name a TOML file, or one of"),
         (("grid", made / "plan.toml", out), f"{made}/none {no_set}"),
         (("grid", made / "junk.pt", out), "junk.pt:1: not TOML"),

@@ -20,17 +20,10 @@ from tactile_rt.sim_backend.datasets.dataset import describe_set
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sweep_set import write_object
 
-COUNTS = [
-    part
-    for text in (
-        "objects.per_category=3",
-        "objects.validation=1",
-        "objects.test=1",
-        "sweeps.draws=1",
-    )
-    for part in ("--set", text)
-]
-TINY_SET = ("--recipe", "mouse12", *COUNTS)
+TINY_SET = (
+    "--recipe", "mouse12", "--set", "objects.per_category=3", "--set", "objects.validation=1",
+    "--set", "objects.test=1", "--set", "sweeps.draws=1",
+)  # fmt: skip
 
 
 def tiny_recipe():
@@ -98,14 +91,6 @@ def test_a_split_named_twice_counts_once(call, sweep_set):
 # ---- run
 
 
-def test_a_negative_seed_is_refused(refused):
-    assert "seed must be 0 or more" in refused("run", "--source", "sim:mouse?seed=-1")
-
-
-def test_a_time_beyond_every_timer_is_refused(call):
-    assert call("run", "--source", "sim:mouse", "--seconds", "1e300")[0] == 2
-
-
 def test_a_file_name_may_hold_a_plus_and_a_space(call, tmp_path):
     path = tmp_path / "a + b.stl"
     trimesh.creation.box((1, 1, 1)).export(path)
@@ -154,16 +139,15 @@ def torch():
     ("options", "said"),
     [
         (("--set", "width=0.1"), "width is 0.1, must be a positive multiple of 1/32"),
-        (
-            ("--set", "width=1e6"),
-            "width is 1000000.0, must be a positive multiple of 1/32, at most 4",
-        ),
-        (("--attender", "lstm"), "attender is 'lstm', not one of gpt, mamba, none"),
+        (("--set", "attender=lstm"), "attender is 'lstm', not one of gpt, mamba, none"),
         (("--seed", -1), "seed must be 0 to 4294967295"),
         (("--set", "learning_rate=nan"), "--set learning_rate=nan: nan is no quantity"),
         (("--accelerator", "glove"), "accelerator is 'glove': "),
         (("--threads", 10**30), "'--threads'"),
-        (("--set", f"width={1 / 32}", "--batch", 99), "a batch of 99 is more than the 12 sweeps"),
+        (
+            ("--set", f"width={1 / 32}", "--set", "batch=99"),
+            "a batch of 99 is more than the 12 sweeps",
+        ),
     ],
 )
 def test_options_that_cannot_be_trained_with_leave_no_run(
@@ -177,9 +161,9 @@ def test_a_run_that_cannot_begin_can_be_begun_again_with_other_options(
     torch, refused, call, sweep_set, tmp_path
 ):
     command = ("train", sweep_set, tmp_path / "run", "--set", f"width={1 / 32}", "--epochs", 1)
-    assert "a batch of 99 is more than the 12 sweeps" in refused(*command, "--batch", 99)
-    assert call(*command, "--batch", 12)[0] == 0
-    assert "another configuration" in refused(*command, "--batch", 6)
+    assert "a batch of 99 is more than the 12 sweeps" in refused(*command, "--set", "batch=99")
+    assert call(*command, "--set", "batch=12")[0] == 0
+    assert "another configuration" in refused(*command, "--set", "batch=6")
 
 
 def test_an_interrupted_run_goes_on_to_the_same_end(torch, sweep_set, tmp_path):
@@ -207,14 +191,11 @@ def test_an_interrupted_run_goes_on_to_the_same_end(torch, sweep_set, tmp_path):
     assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
 
 
-def test_a_run_cannot_be_made_in_a_file(torch, refused, sweep_set, a_file):
-    assert f"{a_file}: is not a folder" in refused("train", sweep_set, a_file, "--batch", 4)
-
-
 @pytest.mark.parametrize("content", [b"", b"junk\n", b"PK\x03\x04 cut short"])
 def test_a_damaged_checkpoint_is_one_line(torch, call, refused, sweep_set, tmp_path, content):
     folder = tmp_path / "run"
-    command = ("train", sweep_set, folder, "--set", f"width={1 / 32}", "--epochs", 1, "--batch", 12)
+    options = ("--set", f"width={1 / 32}", "--epochs", 1, "--set", "batch=12")
+    command = ("train", sweep_set, folder, *options)
     assert call(*command)[0] == 0
     for name in ("best.pt", "last.pt"):
         (folder / name).write_bytes(content)
@@ -222,10 +203,6 @@ def test_a_damaged_checkpoint_is_one_line(torch, call, refused, sweep_set, tmp_p
     model = tmp_path / "model.onnx"
     assert "is not a checkpoint" in refused("export", folder / "best.pt", model)
     assert not model.exists()
-
-
-def test_a_folder_is_no_model_to_write(torch, refused, tmp_path):
-    assert "is a folder" in refused("export", tmp_path / "best.pt", tmp_path)
 
 
 @pytest.fixture
@@ -270,7 +247,6 @@ def test_a_model_is_evaluated_only_on_what_it_was_made_for(
     assert f"no folder {a_file}" in refused("eval", path, sweep_set, "--json", a_file / "a.json")
     assert "is a folder" in refused("eval", path, sweep_set, "--json", tmp_path)
     assert "is not a folder" in refused("eval", path, sweep_set, "--pictures", a_file)
-    assert "not a sweep set" in refused("eval", path, sweep_set, "--accurate", tmp_path / "none")
     pictures = tmp_path / "not" / "yet"
     code, out, err = call("eval", path, sweep_set, "--quick", "--pictures", pictures)
     assert (code, err) == (0, "")

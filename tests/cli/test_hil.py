@@ -42,12 +42,12 @@ def test_unless_told_otherwise_objects_pass_that_the_model_has_never_met(
         raise ConfigError("enough")
 
     monkeypatch.setattr("tactile_rt.sources.opening.open_source", refuse)
-    assert call("hil", "--seed", 2)[0] == 2
+    assert call("hil")[0] == 2
     (url,) = asked
     options = dict(parse_qsl(url.partition("?")[2]))
     unseen = load_model(shipped_model())[1].provenance["unseen_objects"]
     assert url.startswith("sim:mouse?") and options["objects"].split(",") == unseen
-    assert (options["seed"], options["sweeps"], options["pace"]) == ("2", "6", "fast")
+    assert (options["sweeps"], options["pace"]) == ("6", "fast")
 
 
 @pytest.mark.parametrize(

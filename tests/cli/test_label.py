@@ -32,10 +32,10 @@ SOUND = {"noise": 1.0, "gain": 0.0, "dead": 0.0}
 SMALL = (
     "--encoder",
     "gru",
-    "--attender",
-    "none",
-    "--decoder",
-    "linear",
+    "--set",
+    "attender=none",
+    "--set",
+    "decoder=linear",
     "--set",
     f"width={1 / 32}",
 )
@@ -129,7 +129,7 @@ def fed(model, path):
 
 def test_training_gets_what_a_classifier_feeds_its_network(here, night, call, monkeypatch):
     run = here / "parity"
-    lines_of(call, "train", night, run, *SMALL, "--batch", 8, "--set", "updates=1")
+    lines_of(call, "train", night, run, *SMALL, "--set", "batch=8", "--set", "updates=1")
     lines_of(call, "export", run / "best.pt", here / "parity.onnx")
     samples, offset, sigma = fed(here / "parity.onnx", here / "night.mcap")
     assert samples.shape == (24, 22, 5, *ARRAY.shape)

@@ -190,13 +190,3 @@ def test_a_mistake_is_one_line(arguments, said, call, tmp_path, monkeypatch):
     assert said in err
     assert err.count("\n") == 1
     assert [p.name for p in tmp_path.iterdir()] == ["text.mcap"]  # nothing half-written
-
-
-def test_rotated_files_are_named_by_time_and_hold_all(call, path):
-    path.write_bytes(b"precious")  # is in nobody's way
-    code, out, err = call("record", SOURCE, path, "--rotate-s", "1000", "--rotate-mb", "100")
-    assert (code, err) == (0, "")
-    assert out.startswith(f"{path.with_name('run-*.mcap')} (1 of them): 300 samples, ")
-    (made,) = path.parent.glob("run-*.mcap")
-    assert samples(made) == 300
-    assert path.read_bytes() == b"precious"

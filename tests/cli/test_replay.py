@@ -124,7 +124,7 @@ def test_it_decides_as_the_daemon_did_at_every_speed(call, live, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["left", "last"])
-@pytest.mark.parametrize("further", [(), ("--redecode",)])
+@pytest.mark.parametrize("further", [(), ("--codec", "recorded")])
 def test_a_check_passes(name, further, call, live):
     path, model = live
     n = sum(d["model"] == name for d in Recording(path).decisions())
@@ -188,7 +188,7 @@ def test_rotated_files_are_one_stream(call, tmp_path):
     code, _, err = call("replay", paths[1], "--check")
     assert code == 1
     assert "begins in the middle of its stream (sample " in err
-    assert call("replay", *paths, "--redecode")[0] == 2
+    assert call("replay", *paths, "--codec", "recorded")[0] == 2
 
 
 def test_a_folder_and_several_sources_are_named(call, live, tmp_path):
@@ -215,7 +215,7 @@ def test_what_another_codec_makes_of_the_packets_is_told(call, tmp_path):
     def told(*arguments):
         return call("replay", path, "--model", model, *arguments)[2]
 
-    same = told("--redecode")
+    same = told("--codec", "recorded")
     assert f"{n} samples recorded, {n} decoded: {n} are the same, bit for bit, 0 differ" in same
     twice = told("--codec", "ascii_line?columns=A0.fx*2:N,A0.fy:N")
     assert "0 are the same, bit for bit, 40 differ, 0 were recorded alone" in twice

@@ -10,7 +10,6 @@ import threading
 import pytest
 from rich.console import Console
 
-from tactile_rt.cli import main
 from tactile_rt.cli.top import picture, read_snapshots, snapshot_at
 from tactile_rt.daemon.config import MetricsConfig
 from tactile_rt.daemon.messages import encode, message_of, state_message
@@ -52,12 +51,11 @@ def daemon():
         yield f"http://127.0.0.1:{port}"
 
 
-def call(monkeypatch, capsys, *arguments):
-    monkeypatch.setattr(sys, "argv", ["tactile-rt", "top", *map(str, arguments)])
+@pytest.fixture
+def top(call, monkeypatch):
+    """Call `top` on a terminal of 118 columns."""
     monkeypatch.setenv("COLUMNS", "118")
-    with pytest.raises(SystemExit) as left:
-        main()
-    return left.value.code or 0, *capsys.readouterr()
+    return lambda *arguments: call("top", *arguments)
 
 
 def test_all_that_matters_is_on_one_screen():
@@ -78,25 +76,25 @@ def test_markup_in_a_reason_is_text():
     assert "[red]x[/nonsense]" in text(picture(snapshot, None))
 
 
-def test_it_looks_at_a_running_daemon(daemon, monkeypatch, capsys):
+def test_it_looks_at_a_running_daemon(daemon, top):
     assert snapshot_at(daemon) == busy_snapshot()
-    code, out, err = call(monkeypatch, capsys, daemon, "--once")
+    code, out, err = top(daemon, "--once")
     assert code == 0, err
     assert "mug 93% touching" in out and "No space left on device" in out
-    code, out, err = call(monkeypatch, capsys, daemon.removeprefix("http://"), "--once")
+    code, out, err = top(daemon.removeprefix("http://"), "--once")
     assert code == 0, err
 
 
-def test_it_reads_what_the_jsonl_publisher_says(monkeypatch, capsys):
+def test_it_reads_what_the_jsonl_publisher_says(top, monkeypatch):
     lines = [encode(message_of(decision())), b"garbage", encode(message_of(event()))]
     lines += [encode(state_message(busy_snapshot(s))) for s in (0, 2)]
     assert list(read_snapshots(iter(lines))) == [busy_snapshot(), busy_snapshot(2)]
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"\n".join(lines) + b"\n")))
-    code, out, err = call(monkeypatch, capsys, "-")
+    code, out, err = top("-")
     assert code == 0, err
     assert "7000" in out and "streaming  1000  1000" in out
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"garbage\n")))
-    code, out, err = call(monkeypatch, capsys, "-")
+    code, out, err = top("-")
     assert code == 2 and "state_s = 1" in err
 
 

@@ -11,12 +11,14 @@ import av
 import numpy as np
 from PIL import Image
 
-QUICK = ("--set", "speed_mm_s=300", "--set", "size_mm=20", "--profile", "realtime", "--pixels", 320)
+QUICK = ("--set", "speed_mm_s=300", "--set", "size_mm=20", "--profile", "realtime")
 
 
 @pytest.fixture
-def view(call, tmp_path):
+def view(call, tmp_path, monkeypatch):
     """Call `view mug-1` with these options: the file that it wrote."""
+
+    monkeypatch.setattr("tactile_rt.cli.view.WIDTH", 320)
 
     def run(name, *options):
         path = tmp_path / name

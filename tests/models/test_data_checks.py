@@ -27,7 +27,7 @@ def unfit(folder, tmp_path, refused):
     """Train on the set, expect one line and no run, and return the line."""
 
     def run():
-        said = refused("train", folder, tmp_path / "run", "--batch", 2, "--encoder", "gru")
+        said = refused("train", folder, tmp_path / "run", "--set", "batch=2", "--encoder", "gru")
         assert not (tmp_path / "run").exists()
         return said
 
@@ -117,8 +117,17 @@ def test_sweeps_in_which_nothing_is_felt_are_no_twins_also_in_a_field(folder):
 
 def test_good_data_is_trained_on_and_exported_wherever_it_lies_then(folder, tmp_path, call):
     run, moved, model = tmp_path / "run", tmp_path / "moved", tmp_path / "model.onnx"
-    options = ("--batch", 2, "--encoder", "gru", "--set", f"width={1 / 32}", "--set", "updates=1")
-    code, _, said = call("train", folder, run, "--attender", "none", *options)
+    options = (
+        "--set",
+        "batch=2",
+        "--encoder",
+        "gru",
+        "--set",
+        f"width={1 / 32}",
+        "--set",
+        "updates=1",
+    )
+    code, _, said = call("train", folder, run, "--set", "attender=none", *options)
     assert not code, said
     folder.rename(moved)
     code, _, said = call("export", run / "best.pt", model)

@@ -1,6 +1,5 @@
 """Sets that are learnt from together, things of no category, networks that begin with another."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -19,14 +18,14 @@ from tests.helpers.tiny_sweeps import plate, write_tiny_set
 SMALL = (
     "--encoder",
     "gru",
-    "--attender",
-    "none",
-    "--decoder",
-    "linear",
+    "--set",
+    "attender=none",
+    "--set",
+    "decoder=linear",
     "--set",
     f"width={1 / 32}",
 )
-QUICK = ("--batch", 6, "--set", "updates=3")
+QUICK = ("--set", "batch=6", "--set", "updates=3")
 FAULTS = {"implausible": 0.2}
 
 
@@ -97,8 +96,8 @@ def test_a_network_begins_with_what_another_knew_by_the_same_name(sets, run, tmp
     begun = (
         "--from",
         run / "best.pt",
-        "--batch",
-        6,
+        "--set",
+        "batch=6",
         "--set",
         "updates=1",
         "--set",
@@ -139,7 +138,7 @@ def test_what_cannot_be_begun_with_is_said(sets, run, tmp_path, call):
 
 def test_things_of_no_category_are_what_unknown_is_learnt_from(sets, tmp_path, call):
     """After some updates things of none are less likely to be taken for known ones."""
-    code, _, said = call("train", sets / "one", tmp_path / "r", *SMALL, "--batch", 6,
+    code, _, said = call("train", sets / "one", tmp_path / "r", *SMALL, "--set", "batch=6",
                          "--set", "updates=150", "--set", "learning_rate=0.01")  # fmt: skip
     assert not code, said
     model, saved = load_checkpoint(tmp_path / "r" / "best.pt")
@@ -169,21 +168,6 @@ def test_rows_go_by_name_where_as_many_labels_are_known_in_another_order(tmp_pat
     )
     for name in ("network.decoder.weight", "network.decoder.bias"):
         assert torch.allclose(new[name], old[name][[2, 1, 0]], atol=1e-6)
-
-
-def test_two_profiles_are_compared_on_the_same_sweeps(sets, run, tmp_path, call):
-    call("export", run / "best.pt", tmp_path / "m.onnx")
-    write_tiny_set(tmp_path / "three", sweeps=3)
-    at = ("eval", tmp_path / "m.onnx", tmp_path / "three", "--quick")
-    code, *_ = call(*at, "--accurate", tmp_path / "three", "--json", tmp_path / "figures")
-    assert not code
-    records = {r["name"]: r for r in json.loads((tmp_path / "figures").read_text())}
-    lost = records["models.points lost at the other profile"]
-    assert lost["value"] == 0
-    assert lost["how"].startswith("6 sweeps of 3 unseen objects")
-    write_tiny_set(tmp_path / "robot", spec=plate(1, 4))
-    code, _, said = call(*at, "--accurate", tmp_path / "robot")
-    assert code == 2 and f"was made for another array than {tmp_path / 'robot'} is of" in said
 
 
 def test_a_network_that_began_with_another_has_met_its_objects(sets, run, tmp_path, call):

@@ -34,7 +34,16 @@ from tests.helpers.holding import held_elsewhere  # noqa: E402
 from tests.helpers.tiny_sweeps import write_tiny_set  # noqa: E402
 
 SMALL = {"encoder": "gru", "decoder": "linear", "width": 1 / 32, "batch": 6}
-OPTIONS = ("--encoder", "gru", "--decoder", "linear", "--set", f"width={1 / 32}", "--batch", 6)
+OPTIONS = (
+    "--encoder",
+    "gru",
+    "--set",
+    "decoder=linear",
+    "--set",
+    f"width={1 / 32}",
+    "--set",
+    "batch=6",
+)
 
 
 @pytest.fixture(scope="module")

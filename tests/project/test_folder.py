@@ -132,8 +132,8 @@ def test_what_cannot_begin_is_one_line(refused, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("x")
     assert "is not empty: name a new folder" in refused("new", tmp_path / "full")
-    assert "no category 'mugg'" in refused("new", tmp_path / "a", "--kinds", "mugg,gear")
-    assert "two or more" in refused("new", tmp_path / "a", "--kinds", "mug")
+    assert "no category 'mugg'" in refused("new", tmp_path / "a", "--classes", "mugg,gear")
+    assert "two or more" in refused("new", tmp_path / "a", "--classes", "mug")
     assert "no simulated array" in refused("new", tmp_path / "a", "--array", "hamster")
     said = refused("new", tmp_path / "a", "--array", "hx711_whiskers")
     assert "did you mean hx711_whisker?" in said
