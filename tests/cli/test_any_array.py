@@ -1,13 +1,10 @@
-"""`probe`, `grid`, `align` and `locate` on an array that is not the mouse's: they work, or say in
-one line why not."""
-
-from dataclasses import replace
+"""`probe`, `grid` and `align` on an array that is not the mouse's: they work, or say in one line
+why not."""
 
 import numpy as np
 import pytest
 
 from tactile_rt.classifier.model_file import read_model
-from tactile_rt.sweep_set import SweepManifest
 from tests.helpers.tiny_sweeps import plate, write_tiny_set
 
 for module in ("torch", "lightning", "onnx", "matplotlib"):
@@ -113,34 +110,3 @@ def test_align_says_of_what_it_cannot_compare(call, refused, trained, tmp_path):
     said = refused("align", "decode", moments, "--stimuli", stimuli)
     assert "has the channels fx, fy, fz, mx, ... (6), but" in said
     assert "only a model of base forces and moments" in said
-
-
-def test_locate_wants_all_loads_of_the_array_that_it_was_trained_on(refused, tmp_path):
-    from tactile_rt.classifier.contact_point import WhiskerShapes
-    from tactile_rt.models import contact_regression as regression
-    from tactile_rt.models.datasets import SweepSet
-
-    checkpoint = tmp_path / "locate.pt"
-    whole = tmp_path / "whole"
-    write_tiny_set(whole, spec=ROBOT, contacts=True)
-    column = np.full(8, 0.02)
-    shapes = WhiskerShapes(column, column * 0, column * 3e-3, column * 3e-3, column * 1e11)
-    sets = [SweepSet.read(whole, split) for split in ("train", "validation")]
-    regression.train_contacts(
-        *sets, shapes, regression.ContactConfig(hidden=4, epochs=1), checkpoint
-    )
-    regression.load_contacts(checkpoint, sets[0])
-    moments = tmp_path / "moments"
-    write_tiny_set(moments, spec=plate(2, 4, "mx my mz"), contacts=True)
-    said = refused("locate", "eval", checkpoint, moments)
-    assert "the sweeps of 'plate' have mx (N m), my (N m), mz (N m)" in said
-    # The same names do not make it the same array, nor the same loads at another time.
-    moved = tmp_path / "moved"
-    places = ((0.5, 0.0, 0.0), *ROBOT.positions[1:])
-    write_tiny_set(moved, spec=replace(ROBOT, positions=places), contacts=True)
-    slow = tmp_path / "slow"
-    write_tiny_set(slow, spec=ROBOT, period_ns=10_000_000, contacts=True)
-    for other in (moved, slow):
-        assert SweepManifest.read(other).spec.elements == ROBOT.elements
-        said = refused("locate", "eval", checkpoint, other)
-        assert "of another array than the sweeps, or of another sample period" in said

@@ -104,7 +104,6 @@ def test_what_cannot_be_is_refused_before_torch_is_loaded(made):
         (("align", "gate", made / "junk.pt", "--reference", best), no_checkpoint),
         (("align", "gate", best, "--reference", made / "none.pt"), "no checkpoint"),
         (("align", "gate", best, "--benchmark", made / "junk.json"), "junk.json"),
-        (("locate", "train", made / "none", out), no_set),
     ]
     found, _ = children(command for command, _ in cases)
     assert len(found) == len(cases)
