@@ -27,7 +27,6 @@ HEAVY = (
     "onnxscript",
     "sklearn",
     "matplotlib",
-    "openvino",
 )
 ONBOARD = (
     "calibration", "classifier.classifier", "classifier.contact_point", "classifier.session",

@@ -1,5 +1,5 @@
 """Benchmark area `inference`: the shipped model on a synthetic stream, and steps of networks of
-full size beside the machine's roofline. The latter are made here and need the `train` extra.
+full size. The latter are made here and need the `train` extra.
 """
 
 import itertools
@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.inference.engine_speed import engine_speed
 from bench.inference.window_speed import window_speed
 from tactile_rt.classifier.classifier import Classifier
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.classifier.session import Session
 from tactile_rt.evidence.model_steps import Subject, measure_model
 from tactile_rt.evidence.records import Record
-from tactile_rt.evidence.roofline import measure_machine
 from tactile_rt.extras import install_extra
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk, EndOfStream, Source
 
@@ -83,22 +81,12 @@ class Pulses(Source):
 
 def run(quick: bool) -> list[Record]:
     """Measure the shipped model: size, loading, one step, and a consumer that is too slow; then
-    steps of models beside what the machine could do (those of full size not when `quick`), and
-    windows beside the same network written plainly.
+    steps of models (those of full size not when `quick`), and windows beside the same network
+    written plainly.
     """
     records = _load(3 if quick else 20) + _steps(200 if quick else 5000) + _slow(2 if quick else 10)
-    machine = measure_machine(5 if quick else 30)
-    how = "best of one core, in this process, CPU time"
-    records += [
-        Record(
-            "inference.machine.fp32", machine.fp32 / 1e9, "GFLOP/s", how=f"{how}, 256x1024x1024"
-        ),
-        Record("inference.machine.int8", machine.int8 / 1e9, "GOP/s", how=f"{how}, 256x1024x1024"),
-        Record("inference.machine.memory", machine.memory / 1e9, "GB/s", how=f"{how}, 134 MB read"),
-    ]
     shipped = Subject("shipped", shipped_model(), step_ms="<= 2")
-    records += measure_model(shipped, 300 if quick else 3000, 5 if quick else 10)
-    records += engine_speed("shipped", shipped.path, 44 if quick else 2000)
+    records += measure_model(shipped, 300 if quick else 3000)
     return [*records, *_full_size(quick), *window_speed(quick)]
 
 
@@ -117,8 +105,6 @@ def _full_size(quick: bool) -> list[Record]:
                 for subject in full_size(Path(folder)):
                     records.append(measure_model(subject, 500))
                     measured += 1
-                    if subject.name.endswith("fp32"):
-                        records.append(engine_speed(subject.name, subject.path, 264))
                     subject.path.unlink()
     count = Record("inference.full_size", measured, f"of {NETWORKS}", how=why)
     return [*itertools.chain(*records), count]

@@ -25,11 +25,9 @@ from numpy.typing import NDArray
 
 from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.classifier.decision_rules import CandidateRule, fitting
-from tactile_rt.classifier.engine_choice import choose_engine
-from tactile_rt.classifier.engines import open_network
 from tactile_rt.classifier.exits import IN_A_ROW, Deadline, EarlyExit, Lanes, Policy
 from tactile_rt.classifier.model_card import decided, rated_noise
-from tactile_rt.classifier.model_file import fit_source
+from tactile_rt.classifier.model_file import fit_source, load_model
 from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.classifier.skips import CatchUp, Skip, Skips
 from tactile_rt.classifier.stepper import Stepper
@@ -142,9 +140,6 @@ class Classifier:
         late: what becomes of a late decision, see `tactile_rt.classifier.exits.Deadline`.
         providers: execution providers, first choice first: cpu, cuda, tensorrt, openvino, coreml.
         threads: that may share one operator of the network.
-        engine: what runs the network: ``onnxruntime``, ``openvino`` or ``openvino-bf16``; empty:
-            what `tactile-rt model bench --engines` kept for this model and machine, else
-            onnxruntime.
         embedding: whether decisions carry the step's embedding, a copy each.
         age: of a live stream: how old the sample of a stream time (ns) is now, s.
         catch_up: what is done where a live stream's decisions would be older than `behind_s`: the
@@ -162,10 +157,7 @@ class Classifier:
             whoever reads them takes them out.
         stats: The counters of steps, late steps and bad samples.
         skips: The stretches of the stream that the network skips.
-        engine: The name of the engine in use.
-        providers: Names of the execution providers in use, as onnxruntime has them; of other
-            engines none.
-        remark: The reason, a line, for which not the engine runs it that was kept; else empty.
+        providers: Names of the execution providers in use, as onnxruntime has them.
 
     Raises:
         ModelError: the file cannot be used, or has no embedding and is asked for one.
@@ -187,7 +179,6 @@ class Classifier:
         late: Policy = "count",
         providers: Sequence[str] = ("cpu",),
         threads: int = 1,
-        engine: str = "",
         embedding: bool = False,
         age: Callable[[int], float] | None = None,
         catch_up: CatchUp = "all",
@@ -200,9 +191,8 @@ class Classifier:
             raise ConfigError("sure: windows that slide have no early end; decide by episodes")
         self._exit = EarlyExit(sure, in_a_row)
         names = onnxruntime_names(providers)
-        choice = choose_engine(model, engine, providers)
-        network, self.card = open_network(model, choice.engine, threads, names)
-        self.engine, self.remark, self.providers = choice.engine, choice.remark, network.providers
+        session, self.card = load_model(model, names, threads)
+        self.providers = tuple(session.get_providers())
         if embedding and not self.card.embedding:
             raise ModelError(
                 f"{model} has no embedding: its metadata is of version {self.card.version}, and "
@@ -224,7 +214,7 @@ class Classifier:
             raise ConfigError(f"catch_up: {catch_up!r}; it can be {', '.join(get_args(CatchUp))}")
         most_s = max(BEHIND_S, BEHIND_STEPS * step_s) if behind_s is None else behind_s
         self.skips = Skips(skips, most_s, age if catch_up == "newest" else None)
-        self._stepper = Stepper(network, self.card, self._lanes.count)
+        self._stepper = Stepper(session, self.card, self._lanes.count)
         self._rate_hz = spec.rate_hz
         self._resampler = Resampler(self.card.period_ns, spec.rate_hz)
         self._order = order  # where the array has the model's elements

@@ -5,15 +5,15 @@ step allocates nothing, and with a GPU the state never leaves it. A cache of whi
 few rows is in both sets the same buffer: onnxruntime then copies nothing.
 """
 
-from collections.abc import Callable
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from tactile_rt.classifier.model_card import ModelCard
-from tactile_rt.classifier.network import Network, OnnxruntimeNetwork, Tensor
-from tactile_rt.classifier.runtime import FlushDenormals
+from tactile_rt.classifier.runtime import PROVIDERS, FlushDenormals, device_of
 from tactile_rt.errors import ConfigError
 
 __all__ = ["Stepper"]
@@ -21,11 +21,35 @@ __all__ = ["Stepper"]
 WARM_UP = 4  # runs, two of each binding: the first ones allocate, and may even compile
 
 
+class Tensor:
+    """An array, and what onnxruntime sees: the same memory on the CPU, else a copy on a device."""
+
+    def __init__(self, shape: tuple[int, ...], dtype: DTypeLike, device: str) -> None:
+        self.array: NDArray[Any] = np.zeros(shape, dtype=dtype)
+        self.value = ort.OrtValue.ortvalue_from_numpy(self.array, device, 0)
+        self._apart = device != "cpu"
+
+    def send(self) -> None:
+        """Copy the host array to the device."""
+        if self._apart:
+            self.value.update_inplace(self.array)
+
+    def zero(self, lane: int | None = None) -> None:
+        """Zero one lane, or all."""
+        if lane is None:
+            self.array.fill(0)
+        else:
+            if self._apart:
+                self.array[:] = self.value.numpy()
+            self.array[lane] = 0
+        self.send()
+
+
 class Stepper:
     """A model file's graph, run step by step in so many lanes at once.
 
     Args:
-        network: the opened graph: of an engine, or a session of onnxruntime.
+        session: the opened graph.
         card: its metadata.
         lanes: independent streams, the batch axis.
 
@@ -38,18 +62,17 @@ class Stepper:
         ConfigError: the graph's batch is fixed to another number than `lanes`.
     """
 
-    def __init__(
-        self, network: Network | ort.InferenceSession, card: ModelCard, lanes: int = 1
-    ) -> None:
-        if isinstance(network, ort.InferenceSession):
-            network = OnnxruntimeNetwork(network)
-        if network.batch not in (None, lanes):
+    def __init__(self, session: ort.InferenceSession, card: ModelCard, lanes: int = 1) -> None:
+        batch = session.get_inputs()[0].shape[0]
+        if isinstance(batch, int) and batch != lanes:
             raise ConfigError(
-                f"model {card.name!r} has a batch fixed to {network.batch}, and {lanes} lanes are "
+                f"model {card.name!r} has a batch fixed to {batch}, and {lanes} lanes are "
                 "needed: export it with a dynamic batch, or decide by episodes"
             )
-        self._network = network
-        device = network.device
+        self._session = session
+        device = device_of(session)
+        # How other providers than onnxruntime's own write rows is not known.
+        in_place = session.get_providers() == [PROVIDERS["cpu"]]
         elements, channels = card.array.shape
         shape = (lanes, elements, channels)
         self._samples = Tensor((lanes, card.substeps, elements, channels), np.float32, device)
@@ -60,7 +83,7 @@ class Stepper:
         first = {s.name: Tensor((lanes, *s.shape), s.dtype, device) for s in card.state}
         second = {
             s.name: first[s.name]
-            if s.in_place and network.in_place
+            if s.in_place and in_place
             else Tensor((lanes, *s.shape), s.dtype, device)
             for s in card.state
         }
@@ -68,7 +91,7 @@ class Stepper:
         self.samples = self._samples.array
         self.embedding = self._embedding.array
         self._steps = tuple(
-            self._bound(self._states[now], self._states[1 - now]) for now in range(2)
+            self._bind(self._states[now], self._states[1 - now]) for now in range(2)
         )
         self._now = 0
         self._flush = FlushDenormals()
@@ -96,16 +119,22 @@ class Stepper:
         """Take a step; return (lane, class) logits, a buffer that the next step overwrites."""
         self._samples.send()
         with self._flush:
-            self._steps[self._now]()
+            self._session.run_with_iobinding(self._steps[self._now])
         self._now = 1 - self._now
         logits: NDArray[np.float32] = self._logits.array
         return logits
 
-    def _bound(self, before: dict[str, Tensor], after: dict[str, Tensor]) -> Callable[[], object]:
+    def _bind(self, before: Mapping[str, Tensor], after: Mapping[str, Tensor]) -> Any:
+        """Bind the buffers of a step from the one state to the other."""
         inputs = {
             "samples": self._samples, "offset": self._offset, "sigma": self._sigma, **before,
         }  # fmt: skip
         outputs = {"logits": self._logits, **{f"{k}_next": v for k, v in after.items()}}
         if self.embedding.size:
             outputs["embedding"] = self._embedding
-        return self._network.bind(inputs, outputs)
+        binding = self._session.io_binding()
+        for name, tensor in inputs.items():
+            binding.bind_ortvalue_input(name, tensor.value)
+        for name, tensor in outputs.items():
+            binding.bind_ortvalue_output(name, tensor.value)
+        return binding

@@ -54,21 +54,18 @@ class Trial(msgspec.Struct, frozen=True):
         load_s: The time that it took to load and to warm up, s.
         step_s: The median time of a step, s.
         memory_mb: The memory that it took, in MB.
-        engine: The name of the engine that ran it.
     """
 
     sha256: str
     load_s: float
     step_s: float
     memory_mb: float
-    engine: str = "onnxruntime"
 
 
 class _Task(msgspec.Struct, frozen=True):
     path: str
     every: int  # of windows that slide; 0: none does
     limits: TrialLimits
-    engine: str = ""  # empty: onnxruntime
 
 
 class _Refusal(msgspec.Struct, frozen=True):
@@ -80,7 +77,6 @@ def try_model(
     limits: TrialLimits | None = None,
     every: int = 0,
     stopped: Callable[[], bool] = lambda: False,
-    engine: str = "",
 ) -> Trial:
     """Load a file, warm it up and take steps, in a child process.
 
@@ -89,13 +85,12 @@ def try_model(
         limits: what it may need; None: the usual ones.
         every: steps between windows that slide, for as many lanes; 0: one lane.
         stopped: whether nobody wants to know any more; asked again and again.
-        engine: that is to run it; empty: onnxruntime.
 
     Raises:
         ModelError: one line: what is wrong with the file, or which limit it broke.
     """
     limits = limits or TrialLimits()
-    task = _Task(str(path), every, limits, engine)
+    task = _Task(str(path), every, limits)
     child = subprocess.Popen(
         [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL, close_fds=True,
@@ -157,13 +152,11 @@ MEMORY = 77  # its exit code when there was not enough
 def _run(task: _Task) -> Trial:
     import numpy as np
 
-    from tactile_rt.classifier.engines import DEFAULT, import_engine, open_network
     from tactile_rt.classifier.exits import Lanes
-    from tactile_rt.classifier.model_file import hash_of
+    from tactile_rt.classifier.model_file import hash_of, load_model
     from tactile_rt.classifier.stepper import Stepper
 
-    path, limits, engine = Path(task.path), task.limits, task.engine or DEFAULT
-    import_engine(engine)  # what that takes is not the model's
+    path, limits = Path(task.path), task.limits
     before = _data_bytes()
     size = path.stat().st_size if path.is_file() else 0
     most = before + round(limits.memory_mb * MB) + 4 * size
@@ -173,16 +166,16 @@ def _run(task: _Task) -> Trial:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     sha256 = hash_of(path)
     began = time.monotonic()
-    network, card = open_network(path, engine)
+    session, card = load_model(path)
     every = min(task.every, card.steps) or card.steps
-    stepper = Stepper(network, card, Lanes(card.steps, every).count)
+    stepper = Stepper(session, card, Lanes(card.steps, every).count)
     load_s = time.monotonic() - began
     took = []
     for _ in range(STEPS):
         began = time.monotonic()
         stepper.run()
         took.append(time.monotonic() - began)
-    return Trial(sha256, load_s, float(np.median(took)), (_data_bytes() - before) / MB, engine)
+    return Trial(sha256, load_s, float(np.median(took)), (_data_bytes() - before) / MB)
 
 
 def _data_bytes() -> int:

@@ -13,8 +13,7 @@ from tactile_rt.cli.app import app, check_output
 from tactile_rt.cli.options import STDOUT, Json
 from tactile_rt.cli.progress import working
 from tactile_rt.cli.tables import print_table, show_records, told_as_json
-from tactile_rt.errors import ConfigError, ModelError
-from tactile_rt.extras import install_extra
+from tactile_rt.errors import ModelError
 
 model = typer.Typer(help="Look into a model file, check it, time it.", no_args_is_help=True)
 app.add_typer(model, name="model")
@@ -130,23 +129,9 @@ def verify(file: File, json: Json = None) -> None:
 def bench(
     file: File,
     steps: Annotated[int, typer.Option(min=10, max=1_000_000, help="Steps to time.")] = 2000,
-    engines: Annotated[
-        bool, typer.Option("--engines", help="Compare the installed engines, and keep the best.")
-    ] = False,
-    on: Annotated[
-        str | None,
-        typer.Option(metavar="URL", help="Compare decisions on this, e.g. replay:FILE.mcap."),
-    ] = None,
     json: Json = None,
 ) -> None:
-    """How fast it is here: size, loading, memory, CPU time of a step, and the machine's limit.
-
-    --engines: CPU time of a step by every engine that is installed (onnxruntime,
-    openvino, openvino-bf16), and how many of its decisions are onnxruntime's. The
-    fastest of which 99.9 % are is kept for this file and machine: whatever runs
-    the model here takes it, unless told otherwise. They are compared on touches
-    that are made up, harder than real ones; --on takes a recording of yours.
-    """
+    """Measure it here: size, loading, memory, CPU time of a step."""
     from tactile_rt.classifier.model_file import read_model
     from tactile_rt.evidence.model_steps import Subject, measure_model
 
@@ -154,41 +139,9 @@ def bench(
     if card.kind != "step":
         raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
     check_output(json)
-    if engines:
-        _engines(file, steps, on, json)
-        return
-    if on is not None:
-        raise ConfigError("--on is what engines are compared on: give --engines")
     with working(Console(stderr=True), "measuring"):
         records = measure_model(Subject("model", file), steps)
     show_records(records, json)
-
-
-def _engines(file: Path, steps: int, on: str | None, json: Path | None) -> None:
-    from tactile_rt.classifier.engine_choice import keep_engine
-    from tactile_rt.classifier.engines import ENGINES
-    from tactile_rt.evidence.engines import (
-        best_engine,
-        decide_stream,
-        engine_records,
-        measure_engines,
-    )
-
-    with working(Console(stderr=True), "measuring"):
-        found = measure_engines(file, steps)
-        if on is not None:
-            decide_stream(file, found, on)
-    alone = show_records(engine_records(found, "engines"), json)
-    missing = {e.package: e.extra for e in ENGINES.values() if not e.version}
-    for package, extra in missing.items():
-        typer.echo(f"{package} is not installed, not compared: {install_extra(extra)}", err=alone)
-    best = best_engine(found)
-    try:
-        where = keep_engine(file, best.engine, best.p50)
-    except ConfigError as error:
-        typer.echo(f"{best.engine} is best here, and not kept: {error}", err=True)
-        return
-    typer.echo(f"{best.engine} is kept for this file on this machine, in {where}", err=alone)
 
 
 def _channels(spec: Any, values: tuple[float, ...]) -> str:

@@ -71,8 +71,6 @@ def run(
             classifier = Classifier(file, opened.spec)
         except SpecMismatch as error:
             raise SpecMismatch(f"{source}: {error}") from None
-        if classifier.remark:
-            typer.echo(classifier.remark, err=True)
         if is_made_up(source):
             typer.echo(f"{source} is made up: what is decided on it means nothing", err=True)
         session = Session(opened, classifier)

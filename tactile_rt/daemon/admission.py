@@ -9,8 +9,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tactile_rt.classifier.classifier import EVERY, Classifier
-from tactile_rt.classifier.engine_choice import choose_engine
-from tactile_rt.classifier.engines import DEFAULT
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.classifier.trial import Trial, TrialLimits, try_model
 from tactile_rt.daemon.config import LimitsConfig, ModelConfig
@@ -34,7 +32,6 @@ class Admission:
         finished: Set when the model is there, or refused.
         error: The reason for which the model is refused; None: it is not.
         trial: What the trial found; None before.
-        remark: The reason, a line, for which not the engine runs it that was kept; else empty.
         classifier: The model, warm; None before, and without a stream.
     """
 
@@ -51,7 +48,6 @@ class Admission:
         self.finished = threading.Event()
         self.error: TactileError | None = None
         self.trial = trial
-        self.remark = ""
         self.classifier: Classifier | None = None
         self._limits, self._opened, self._age = limits, opened, age
         self._given_up = threading.Event()
@@ -70,7 +66,7 @@ class Admission:
         t = self.trial
         said = (
             f"{self.file}, sha256 {t.sha256[:12]}: warm after {t.load_s:.2f} s, "
-            f"{t.memory_mb:.0f} MB, {1e3 * t.step_s:.1f} ms a step by {t.engine}"
+            f"{t.memory_mb:.0f} MB, {1e3 * t.step_s:.1f} ms a step"
         )
         if self.classifier is not None and 1e3 * t.step_s > self.classifier.step_ms:
             said += f", longer than the {self.classifier.step_ms:.0f} ms of it: it cannot keep up"
@@ -88,7 +84,9 @@ class Admission:
     def _try(self) -> None:
         config, opened = self.config, self._opened
         if self.trial is None:
-            self.trial = self._tried()
+            every = (config.every or EVERY) if config.mode == "sliding" else 0
+            limits = TrialLimits(self._limits.model_mb, self._limits.model_s)
+            self.trial = try_model(self.file, limits, every, self._given_up.is_set)
         if opened is None or self._given_up.is_set():
             return
         live = opened.stream.live
@@ -96,25 +94,11 @@ class Admission:
             self.file, opened.spec, mode=config.mode, every=config.every or None,
             sure=config.sure or None, in_a_row=config.in_a_row,
             deadline_s=config.deadline_ms / 1e3 or None, late=config.late,
-            providers=config.providers, engine=self.trial.engine, age=self._age if live else None,
+            providers=config.providers, age=self._age if live else None,
             catch_up=config.catch_up, behind_s=config.behind_ms / 1e3 or None,
         )  # fmt: skip
         if file_stamp(self.file) != self.stamp:
             raise ModelError(f"{self.file} was written while it was being tried: try again")
-
-    def _tried(self) -> Trial:
-        config = self.config
-        choice = choose_engine(self.file, config.engine, config.providers)
-        self.remark = choice.remark
-        every = (config.every or EVERY) if config.mode == "sliding" else 0
-        limits = TrialLimits(self._limits.model_mb, self._limits.model_s)
-        try:
-            return try_model(self.file, limits, every, self._given_up.is_set, choice.engine)
-        except ModelError as error:
-            if not choice.kept or choice.engine == DEFAULT or self._given_up.is_set():
-                raise
-            self.remark = f"{error} (by {choice.engine}, which was kept for it); {DEFAULT} runs it"
-        return try_model(self.file, limits, every, self._given_up.is_set, DEFAULT)
 
 
 def model_path(config: ModelConfig) -> Path:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tactile_rt.classifier.engine_choice import choose_engine
 from tactile_rt.classifier.model_file import fit_source, read_model, shipped_model
 from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.daemon.config import Config, ModelConfig, SourceConfig, is_loopback
@@ -100,11 +99,6 @@ def _check_model(
         # What it does when it runs is for its trial to find out, see `admission`.
         _try(loaded, [*path, "file"], lambda f: read_model(f, "step"), file)
     _try(loaded, [*path, "providers"], onnxruntime_names, model.providers)
-    if model.engine:
-        _try(
-            loaded, [*path, "engine"],
-            lambda engine: choose_engine(file, engine, model.providers), model.engine,
-        )  # fmt: skip
     if model.every and model.mode != "sliding":
         loaded.refuse([*path, "every"], 'it is for mode = "sliding"')
     for key in ("every", "in_a_row"):

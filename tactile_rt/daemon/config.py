@@ -73,8 +73,6 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
             running; 0 for never.
         in_a_row: Number of steps running for `sure`, at most those of an episode.
         providers: Execution providers of onnxruntime, best first: ``cpu``, ``cuda``, ``tensorrt``.
-        engine: What runs the model: ``onnxruntime``, ``openvino`` or ``openvino-bf16``; empty for
-            what `tactile-rt model bench --engines` kept for this machine, else ``onnxruntime``.
     """
 
     file: str = ""
@@ -90,7 +88,6 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
     catch_up: Literal["newest", "all"] = "newest"
     behind_ms: Annotated[float, msgspec.Meta(ge=0, le=60_000)] = 0.0
     providers: Annotated[tuple[Text, ...], msgspec.Meta(min_length=1)] = ("cpu",)
-    engine: Literal["", "onnxruntime", "openvino", "openvino-bf16"] = ""
 
 
 class PublisherConfig(_Table, frozen=True, kw_only=True):

@@ -136,7 +136,6 @@ class ModelState:
     skips: Losses = field(default_factory=Losses)
     lost: Losses = field(default_factory=Losses)  # samples that were dropped from its mailbox
     refused: str = ""  # why the model that was to take the place of this one does not
-    engine: str = ""  # empty if not known yet
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 
 from tactile_rt.classifier.classifier import Classification, Classifier
-from tactile_rt.classifier.engine_choice import choose_engine
 from tactile_rt.classifier.model_card import sensor_of
 from tactile_rt.classifier.model_file import hash_of
 from tactile_rt.classifier.trial import Trial
@@ -66,9 +65,6 @@ class ModelPart(Part):
         self._sha256 = ""
         with suppress(ConfigError):  # loading tells if it is none
             self._sha256 = hash_of(self.file)  # a recording tells it from its first byte
-        self._engine = ""
-        with suppress(ConfigError):  # likewise
-            self._engine = choose_engine(self.file, config.engine, config.providers).engine
         self._labels: tuple[str, ...] = ()
         self.sensor: SensorSpec | None = None  # what the model was made for, if it tells
         self._decisions = self._final = self._late = self._bad_samples = 0
@@ -90,7 +86,7 @@ class ModelPart(Part):
             self._latency.state, self._step.state, self._late, self._bad_samples,
             1e3 * self._age_s, max(queue.oldest_s, self.silent_s), self._skips,
             self._skipped.add(self._skips), self._losses.add(queue.dropped["samples"]),
-            self.refused, self._engine,
+            self.refused,
         )  # fmt: skip
 
     def stop(self) -> None:
@@ -184,9 +180,7 @@ class ModelPart(Part):
 
     def _admit(self, config: ModelConfig, opened: Opened | None) -> Admission:
         known, trial = self._trial
-        same = known == file_stamp(model_path(config)) and (config.mode, config.engine) == (
-            self.config.mode, self.config.engine,
-        )  # fmt: skip
+        same = known == file_stamp(model_path(config)) and config.mode == self.config.mode
         return Admission(config, self.limits, opened, self._age, trial if same else None)
 
     def _install(self, opened: Opened, admission: Admission) -> None:
@@ -195,9 +189,6 @@ class ModelPart(Part):
         self._classifier = admission.classifier
         self.config, self.file = admission.config, admission.file
         self._sha256, self.refused = admission.trial.sha256, ""
-        self._engine = admission.trial.engine
-        if admission.remark:
-            self._report(self.name, "engine", admission.remark, "warning")
         self._opened = opened
         self._labels = self._classifier.card.labels
         self.sensor = sensor_of(self._classifier.card)

@@ -14,7 +14,6 @@ from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 
-from tactile_rt.classifier.engines import DEFAULT
 from tactile_rt.daemon.config import RecorderConfig
 from tactile_rt.daemon.consumer import Consumer, View
 from tactile_rt.daemon.health import OnDisk
@@ -329,11 +328,6 @@ class Recorder(Consumer):
             "daemon_source": opened.source,
             "config": self._view.config_text(),
             **{m.part.name: f"{m.file} sha256:{m.sha256}" for m in snapshot.models},
-            **{
-                f"engine.{m.part.name.removeprefix('model.')}": m.engine
-                for m in snapshot.models
-                if m.engine not in ("", DEFAULT)
-            },
         }
         try:
             about = describe(opened.stream, opened.url, session)

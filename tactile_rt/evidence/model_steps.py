@@ -1,4 +1,4 @@
-"""What a step of a model file costs here, beside the least that this machine could do it in."""
+"""What a step of a model file costs here: size, loading, memory, time."""
 
 import gc
 import os
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from tactile_rt.classifier.model_file import ModelCard, load_model
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.evidence.records import Record
-from tactile_rt.evidence.roofline import measure_machine, products, roofline_s
 
 __all__ = ["Subject", "measure_model", "step_times"]
 
@@ -30,27 +29,22 @@ class Subject:
     Attributes:
         name: The name of the file in its figures.
         path: The model file, of kind "step".
-        over_roofline: The bar of the median step's CPU time over the roofline, e.g. ``<= 1.6``.
         step_ms: The bar of the median step's CPU time in ms.
         load_ms: The bar of the CPU time of loading in ms.
     """
 
     name: str
     path: Path
-    over_roofline: str = ""
     step_ms: str = ""
     load_ms: str = ""
 
 
-def measure_model(subject: Subject, steps: int, repetitions: int = 10) -> list[Record]:
-    """Measure one file of kind "step": size, loading, memory, steps, and these over the roofline.
-
-    Steps and the machine are measured in turns, and each turn's steps are compared with its own
-    roofline: what else a shared host does changes from minute to minute.
+def measure_model(subject: Subject, steps: int) -> list[Record]:
+    """Measure one file of kind "step": size, loading, memory, steps.
 
     Args:
+        subject: the file and its bars.
         steps: to time, in all.
-        repetitions: of each product that measures the machine.
 
     Raises:
         ModelError: the file cannot be used.
@@ -61,20 +55,14 @@ def measure_model(subject: Subject, steps: int, repetitions: int = 10) -> list[R
     before, began = _resident(), time.process_time()
     session, card = load_model(path)
     load = time.process_time() - began
-    turns, machines, interruptions, grown = [], [], [], 0
+    turns, interruptions, grown = [], [], 0
     for _ in range(TURNS):
         seconds, interrupted = step_times(session, card, -(-steps // TURNS))
         grown = grown or _resident() - before
         turns.append(1e3 * seconds)
         interruptions.append(interrupted)
-        machines.append(measure_machine(repetitions))
-    work = products(path)
-    least = np.array([1e3 * roofline_s(machine, work) for machine in machines])
-    ratios = np.median(turns, axis=1) / least
     p50, p99 = np.percentile(turns, 50), np.percentile(turns, 99)
     how = f"network alone, {np.size(turns)} steps, one thread"
-    operations = sum(p.operations for p in work) / 1e6
-    weights = sum(p.weights for p in work) / 1e6
     return [
         Record(f"{name}.size", path.stat().st_size / 1e6, "MB", how=card.precision),
         Record(f"{name}.load", 1e3 * load, "ms CPU", subject.load_ms, how="file cached"),
@@ -87,15 +75,6 @@ def measure_model(subject: Subject, steps: int, repetitions: int = 10) -> list[R
             TAIL,
             _tail(np.ravel(turns), np.ravel(interruptions)),
             how,
-        ),
-        Record(
-            f"{name}.over_roofline",
-            float(np.median(ratios)),
-            "x",
-            subject.over_roofline,
-            f"roofline {np.median(least):.3g} ms; p50 over it, median of {TURNS} turns of both, "
-            f"{ratios.min():.3g} to {ratios.max():.3g}",
-            f"{len(work)} products, {operations:.3g} M operations, {weights:.3g} MB of weights",
         ),
     ]
 

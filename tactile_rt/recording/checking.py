@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from tactile_rt.classifier.engines import DEFAULT
 from tactile_rt.classifier.model_file import hash_of, shipped_model
 from tactile_rt.errors import ConfigError
 from tactile_rt.recording.description import Description
@@ -53,7 +52,6 @@ class RecordedModel:
     file: Path
     sha256: str
     table: Fields = field(default_factory=dict)
-    engine: str = DEFAULT
 
 
 def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
@@ -72,8 +70,7 @@ def recorded_models(about: Description) -> tuple[RecordedModel, ...]:
         table = tables.get(name, {})
         if table.get("source", session.get("daemon_source")) == session.get("daemon_source"):
             file, _, sha256 = value.rpartition(" sha256:")
-            engine = session.get(f"engine.{name}", DEFAULT)
-            found.append(RecordedModel(name, Path(file), sha256, table, engine))
+            found.append(RecordedModel(name, Path(file), sha256, table))
     return tuple(found)
 
 

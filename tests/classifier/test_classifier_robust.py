@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 pytest.importorskip("onnx")
 
-from tactile_rt.classifier import network, runtime
+from tactile_rt.classifier import runtime, stepper
 from tactile_rt.classifier.classifier import Classification, Classifier, without_bad_samples
 from tactile_rt.classifier.exits import Deadline
 from tactile_rt.classifier.model_file import load_model, shipped_model
@@ -82,6 +82,20 @@ def test_any_episode_after_any_other_is_as_a_fresh_one() -> None:
     assert np.array_equal(episode(used, card.steps), expected)
 
 
+def test_state_is_explicit_and_a_lane_is_reset_alone(tmp_path: Path) -> None:
+    session, card = load_model(write_model(tmp_path / "m.onnx"))
+    used = Stepper(session, card, lanes=2)
+    zeros = np.zeros(card.array.shape, np.float32)
+    used.begin(zeros, zeros)
+    counted = []
+    for step in range(STEPS):
+        if step == 2:
+            used.reset(1)
+        counted.append(used.run()[:, 1].copy())  # steps so far
+        assert np.array_equal(used.embedding[:, 0], counted[-1])
+    assert np.array_equal(counted, [[1, 1], [2, 2], [3, 1], [4, 2]])
+
+
 def test_a_step_allocates_nothing() -> None:
     session, card = SHIPPED
     used = Stepper(session, card)
@@ -107,8 +121,8 @@ def test_a_device_apart_from_the_cpu_gets_and_gives_the_same(
     options = {"mode": "sliding", "every": 1}
     chunks = stream(signal([(QUIET, 260, 0.1), (300, 360, 0.2)], 360))
     expected = push_all(Classifier(model, SAME_RATE, **options), chunks)
-    made = network.ort.OrtValue.ortvalue_from_numpy
-    init = network.Tensor.__init__
+    made = stepper.ort.OrtValue.ortvalue_from_numpy
+    init = stepper.Tensor.__init__
 
     def apart(self, shape, dtype, device) -> None:
         init(self, shape, dtype, device)
@@ -117,7 +131,7 @@ def test_a_device_apart_from_the_cpu_gets_and_gives_the_same(
             self.value = made(self.copy, "cpu", 0)
             self._apart = True
 
-    monkeypatch.setattr(network.Tensor, "__init__", apart)
+    monkeypatch.setattr(stepper.Tensor, "__init__", apart)
     assert same(push_all(Classifier(model, SAME_RATE, **options), chunks), expected)
 
 

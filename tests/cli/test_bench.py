@@ -10,7 +10,6 @@ import pytest
 from bench.drivers import fuzzing, losses, unplugging
 from bench.inference import area as inference
 from tactile_rt.cli import bench
-from tactile_rt.evidence import roofline
 from tactile_rt.evidence.records import Record
 
 
@@ -64,7 +63,6 @@ def test_a_folder_that_is_not_there_is_named_before_measuring(call, tmp_path):
 
 @pytest.mark.parametrize("windows", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_inference_loses_no_sample_uncounted(call, tmp_path, monkeypatch, windows):
-    monkeypatch.setattr(roofline, "WEIGHTS", (512, 512))  # in cache, for a test
     if not windows:  # they are traced for half a minute
         monkeypatch.setattr(inference, "window_speed", lambda quick: [])
     monkeypatch.setattr(inference, "window_speed", lambda quick: [])  # it exports: a slow test
@@ -75,7 +73,6 @@ def test_inference_loses_no_sample_uncounted(call, tmp_path, monkeypatch, window
     assert figures["inference.slow_dropped"]["value"] > 0  # the consumer was too slow
     assert figures["inference.slow_uncounted"]["value"] == 0
     assert figures["inference.size"]["met"]
-    assert figures["inference.shipped.over_roofline"]["value"] > 1
     assert figures["inference.full_size"]["value"] == 0
     assert "quick" in figures["inference.full_size"]["how"]
     assert 0 < figures["inference.step_p50"]["value"] <= figures["inference.step_p99"]["value"]

@@ -6,7 +6,6 @@ import pytest
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import EVERY
-from tactile_rt.classifier.engine_choice import EngineChoice
 from tactile_rt.classifier.trial import Trial, TrialLimits
 from tactile_rt.daemon import admission as module
 from tactile_rt.daemon.admission import Admission, file_stamp, model_path
@@ -31,7 +30,7 @@ class Trials:
         self._during = during
         monkeypatch.setattr(module, "try_model", self)
 
-    def __call__(self, path, limits, every, given_up, engine):
+    def __call__(self, path, limits, every, given_up):
         self.asked.append((path, limits, every))
         self._during()
         return self.found
@@ -68,33 +67,6 @@ def test_the_trial_steps_as_the_classifier_will(model, monkeypatch, config, ever
     made = admitted(model, **config)
     assert trials.asked == [(model, TrialLimits(300.0, 7.0), every)]
     assert made.error is None and made.classifier is None and made.trial is trials.found
-
-
-def test_an_engine_that_was_kept_and_fails_gives_way_and_one_that_was_asked_for_does_not(
-    model, monkeypatch
-):
-    asked, found = [], Trial("a" * 64, 0.25, 0.001, 22.0)
-
-    def try_model(path, limits, every, given_up, engine):
-        asked.append(engine)
-        if engine != "onnxruntime":
-            raise ModelError(f"{path} is refused: it needs more memory")
-        return found
-
-    monkeypatch.setattr(module, "try_model", try_model)
-    monkeypatch.setattr(
-        module, "choose_engine", lambda file, name, _: EngineChoice(name or "openvino", not name)
-    )
-    made = admitted(model, opened())
-    assert asked == ["openvino", "onnxruntime"] and made.error is None
-    assert made.classifier.engine == "onnxruntime"
-    assert made.remark == (
-        f"{model} is refused: it needs more memory (by openvino, which was kept for it); "
-        "onnxruntime runs it"
-    )
-    asked.clear()
-    made = admitted(model, opened(), engine="openvino-bf16")
-    assert asked == ["openvino-bf16"] and isinstance(made.error, ModelError)
 
 
 def test_what_was_tried_is_not_tried_again(model, monkeypatch):
