@@ -17,8 +17,7 @@ import typer
 from tactile_rt.errors import TactileError
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.grid.outcomes import read_outcome
-from tactile_rt.models.grid.plan import SUPERVISED, Task
-from tactile_rt.models.grid.plan_files import read_grid
+from tactile_rt.models.grid.plan import SUPERVISED, Task, read_grid
 from tactile_rt.models.training import TrainingConfig, train
 from tactile_rt.models.training.loop import read_splits
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-__all__ = ["MAX_BYTES", "BadModel", "Contents", "graph_sha256", "read_onnx"]
+__all__ = ["MAX_BYTES", "BadModel", "Contents", "graph_sha256", "read_onnx", "split_fields"]
 
 MAX_BYTES = 2**31 - 1  # protobuf's own limit
 MAX_METADATA = 4 * 2**20  # bytes: labels, array, provenance and figures take some 10 kB
@@ -82,19 +82,27 @@ def graph_sha256(data: bytes) -> str:
     Raises:
         BadModel: damaged.
     """
-    walk, digest, kept = _Walk(data), hashlib.sha256(), 0
-    at = 0
-    for number, _, _, end in walk.fields(0, len(data)):
-        if number == 14:
-            digest.update(walk.data[kept:at])
-            kept = end
-        at = end
-    digest.update(walk.data[kept:])
+    digest = hashlib.sha256()
+    for number, _, whole in split_fields(data):
+        if number != 14:
+            digest.update(whole)
     return digest.hexdigest()
 
 
+def split_fields(data: bytes | memoryview) -> Iterator[tuple[int, memoryview, memoryview]]:
+    """Split a message into (field number, value, whole field); a number's value is empty.
+
+    Raises:
+        BadModel: damaged.
+    """
+    walk, at = _Walk(data), 0
+    for number, wire, start, end in walk.fields(0, len(data)):
+        yield number, walk.data[start:end] if wire == BYTES else walk.data[:0], walk.data[at:end]
+        at = end
+
+
 class _Walk:
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes | memoryview) -> None:
         if len(data) > MAX_BYTES:
             raise BadModel(f"{len(data)} bytes, more than the {MAX_BYTES} that ONNX allows")
         self.data = memoryview(data)

@@ -22,7 +22,7 @@ WARM_UP = 4  # runs, two of each binding: the first ones allocate, and may even 
 
 
 class Tensor:
-    """An array, and what onnxruntime sees: the same memory on the CPU, else a copy on a device."""
+    """An array that onnxruntime shares on the CPU, and has a copy of on a device."""
 
     def __init__(self, shape: tuple[int, ...], dtype: DTypeLike, device: str) -> None:
         self.array: NDArray[Any] = np.zeros(shape, dtype=dtype)

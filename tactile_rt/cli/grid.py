@@ -20,38 +20,26 @@ def grid(
     folder: Annotated[Path, typer.Argument(help="Where it goes; what is done is kept.")],
     processes: Annotated[int, typer.Option(min=1, help="That train side by side.")] = 2,
     accelerator: Accelerator = "cpu",
-    report: Annotated[
-        Path | None,
-        typer.Option(help="Train nothing: write the table of what is done into this page."),
-    ] = None,
     json: Json = None,
 ) -> None:
     """Train encoder x attender x objective, each tuned alike, and draw how well they do.
 
-    Killed at any time, it goes on where it was. FOLDER gets results.json, results.csv, curves.csv,
-    task_performance.png and learning_curves.png.
+    Killed at any time, it goes on where it was. FOLDER gets results.json, results.md and
+    task_performance.png.
     """
     from tactile_rt.models.grid.outcomes import Outcome, waiting_tasks
-    from tactile_rt.models.grid.plan_files import read_grid
+    from tactile_rt.models.grid.plan import read_grid
     from tactile_rt.sweep_set import SweepManifest
 
-    for file in (report, json):
-        check_output(file)
-    if report is None:
-        check_folder(folder)
+    check_output(json)
+    check_folder(folder)
     wanted = read_grid(plan)
-    if report is None and waiting_tasks(wanted, folder):
+    if waiting_tasks(wanted, folder):
         SweepManifest.read(Path(wanted.data))
     try:
-        from tactile_rt.models.grid.picture import draw_curves, draw_grid
+        from tactile_rt.models.grid.picture import draw_grid
         from tactile_rt.models.grid.pool import run_grid
-        from tactile_rt.models.grid.results import (
-            GridResults,
-            gather,
-            put_into,
-            table,
-            write_results,
-        )
+        from tactile_rt.models.grid.results import GridResults, gather, write_results
     except ModuleNotFoundError as error:
         raise needs("train", error) from None
     console = Console(stderr=True)
@@ -60,9 +48,6 @@ def grid(
         results = gather(wanted, folder)
         write_results(results, folder)
         draw_grid(results, folder / "task_performance.png")
-        draw_curves(results, folder / "learning_curves.png")
-        if report is not None:
-            put_into(report, table(results))
         return results
 
     def show(found: Outcome, done: int, total: int) -> None:
@@ -77,9 +62,8 @@ def grid(
             conclude()
 
     per_seed = -(-len(wanted.tasks()) // wanted.seeds)
-    if report is None:
-        done = len(wanted.tasks()) - len(waiting_tasks(wanted, folder))
-        with progress_bar(console, "tasks", len(wanted.tasks()), done, counted=True) as update:
-            run_grid(wanted, folder, processes, show, accelerator)
+    done = len(wanted.tasks()) - len(waiting_tasks(wanted, folder))
+    with progress_bar(console, "tasks", len(wanted.tasks()), done, counted=True) as update:
+        run_grid(wanted, folder, processes, show, accelerator)
     told_as_json(conclude(), json)
     console.print(f"{folder}: its tables and pictures")

@@ -3,21 +3,22 @@
 import queue
 import shlex
 import sys
+import threading
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from tactile_rt.cli.app import app, check_folder, check_output, check_text, leaving, starting
 from tactile_rt.cli.options import Json, Seconds, Url
 from tactile_rt.cli.tables import told_as_json
-from tactile_rt.cli.teach_orders import HELP, Buttons, listening
 from tactile_rt.errors import ConfigError, SourceError, SpecMismatch
 
 if TYPE_CHECKING:
     from tactile_rt.stream import Chunk, Source
     from tactile_rt.teaching.lesson import Lesson
+    from tactile_rt.teaching.page import TeachingPage
     from tactile_rt.teaching.teacher import Teacher
 
 POLL_S = 0.1
@@ -25,6 +26,8 @@ REST_S = 2.0  # at rest, to measure the noise by
 HINT_S = 20.0  # without a touch, before it is said how strong the readings are; then twice as long
 DEAF_S = 10.0  # without a sample, before the first one: the device does not talk
 RESTING = f"touch nothing for {REST_S:g} s"
+HELP = "type and press Enter: a class or its number, n the next, u takes a touch back, q learns"
+ORDERS = {"n": "next", "u": "undo", "q": "done"}
 HASTY = "that came too soon after the last touch to be one: wait a second"
 
 
@@ -35,7 +38,7 @@ def teach(
         Path, typer.Argument(help="Where the lesson is kept; one that is there goes on.")
     ],
     classes: Annotated[
-        str, typer.Option(help="What is to be touched, comma-separated; more may come by key.")
+        str, typer.Option(help="What is to be touched, comma-separated; more may come by name.")
     ] = "",
     touches: Annotated[int, typer.Option(min=2, max=1000, help="Of each.")] = 10,
     page: Annotated[
@@ -50,9 +53,9 @@ def teach(
 ) -> None:
     """Touch it ten times a class, and it knows the classes: FOLDER/model.onnx.
 
-    Keep the sensor untouched for two seconds, then touch as you are told. Keys: a number chooses
-    a class, n the next one, a adds one, u takes the last touch back, q learns and leaves. Where
-    stdin is no terminal, a line is an order: a class's name, next, undo or done.
+    Keep the sensor untouched for two seconds, then touch as you are told. A line is an order: a
+    class's name or number, n (next), u (undo: takes the last touch back), or q (done: learns and
+    leaves).
     """
     from tactile_rt.classifier.model_file import shipped_model
     from tactile_rt.locks import alone_in
@@ -77,18 +80,19 @@ def teach(
     lesson = _begun_before(folder, base)
     with starting():
         opened = open_source(source)
-    with opened, alone_in(folder), Buttons(at, RESTING) as buttons, leaving(seconds):
+    with opened, alone_in(folder), Orders(at) as orders, leaving(seconds):
         lesson = lesson or (_begun(folder, opened) if base is None else Lesson.on(folder, base))
-        buttons.teacher = Teacher(lesson, wanted, touches)
-        _teach(buttons.teacher, opened, source, buttons.orders)
-    if lesson is None or buttons.teacher is None or not lesson.taught_enough:
+        orders.teacher = Teacher(lesson, wanted, touches)
+        _teach(orders.teacher, opened, source, orders)
+    teacher = orders.teacher
+    if lesson is None or teacher is None or not lesson.taught_enough:
         raise ConfigError(
             f"{folder}: touches kept: {len(lesson.touches) if lesson else 0}, too few to learn "
             "from: two of a class are needed; run the same command to go on"
         )
     began = time.process_time()
     card = lesson.learn()
-    for line in (*buttons.teacher.summary(), *_losses(opened)):
+    for line in (*teacher.summary(), *_losses(opened)):
         typer.echo(line)
     learnt = lesson.taught_enough
     told = {
@@ -96,8 +100,7 @@ def teach(
         "classes": card.classes,
         "touches": {name: lesson.count(name) for name in learnt},
         "left_out_touches_right": {
-            name: {"right": good, "of": count}
-            for name, count, good in buttons.teacher.progress.classes
+            name: {"right": good, "of": count} for name, count, good in teacher.progress.classes
         },
         "corrupt": opened.stats.corrupt,
         "missing": opened.stats.missing,
@@ -114,7 +117,55 @@ def teach(
     )
 
 
-def _teach(teacher: "Teacher", source: "Source", url: str, orders: "queue.Queue[str]") -> None:
+class Orders:
+    """What is ordered by lines of stdin and, if one is asked for, on a page in a browser.
+
+    Args:
+        at: host and port of the page; None: no page.
+
+    Attributes:
+        teacher: The teacher whose state the page shows; None: there is none yet.
+    """
+
+    def __init__(self, at: tuple[str, int] | None) -> None:
+        self.teacher: Teacher | None = None
+        self._orders: queue.Queue[str] = queue.Queue()
+        self._at = at
+        self._page: TeachingPage | None = None
+
+    def __enter__(self) -> "Orders":
+        if self._at is not None:
+            from tactile_rt.teaching.page import TeachingPage
+
+            self._page = TeachingPage(*self._at, self._state, self._orders.put)
+            typer.echo(f"buttons: {self._page.url}")
+        return self
+
+    def __exit__(self, *why: object) -> None:
+        if self._page is not None:
+            self._page.close()
+
+    def listen(self) -> None:
+        """Take lines of stdin from now on."""
+        threading.Thread(target=self._take_lines, daemon=True).start()
+
+    def next(self) -> str:
+        """Return the next order; empty if there is none."""
+        return "" if self._orders.empty() else self._orders.get()
+
+    def _take_lines(self) -> None:
+        try:
+            for line in sys.stdin or ():
+                if order := line.strip():
+                    self._orders.put(ORDERS.get(order, order))
+        except (OSError, ValueError):
+            return  # closed
+
+    def _state(self) -> dict[str, Any]:
+        return self.teacher.state() if self.teacher else {"prompt": RESTING}
+
+
+def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> None:
     """Take touches until there are enough, the stream ends, or who teaches has had enough."""
     from tactile_rt.recording import StreamWriter
     from tactile_rt.stream import EndOfStream
@@ -127,7 +178,8 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: "queue.Queue[
         raise SpecMismatch(f"{error}, or teach in another folder") from None
     typer.echo(_greeting(lesson, source))
     path = lesson.next_recording()
-    with StreamWriter(path, source, url=url) as writer, listening(orders):
+    orders.listen()
+    with StreamWriter(path, source, url=url) as writer:
         if sys.stdin is not None and sys.stdin.isatty() and not teacher.done:
             typer.echo(HELP)
         typer.echo(teacher.prompt())
@@ -141,8 +193,8 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: "queue.Queue[
                 chunk = source.read(POLL_S)
             except EndOfStream:
                 break
-            while not orders.empty() and not teacher.done:
-                _say(teacher.obey(orders.get()))
+            while not teacher.done and (order := orders.next()):
+                _say(teacher.obey(order))
             if chunk is None:
                 continue
             writer.push(chunk)

@@ -4,12 +4,14 @@ What a graph of a few operators needs of ``onnx.proto`` (IR version 10), and no 
 protocol buffers' varints; a message within a message is its length and then its bytes.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from tactile_rt.classifier.onnx_check import split_fields
 
 __all__ = ["OnnxGraph"]
 
@@ -63,43 +65,16 @@ def _attribute(name: str, value: int | float | str | Sequence[int]) -> bytes:
     return _bytes(1, name) + told
 
 
-def _fields(data: bytes) -> Iterator[tuple[int, bytes, bytes]]:
-    """(number, value, the whole field) of what a message holds; the value of numbers is empty."""
-    at = 0
-    while at < len(data):
-        begin = at
-        tag, at = _read_varint(data, at)
-        value = b""
-        if tag & 7 == 2:
-            length, at = _read_varint(data, at)
-            value, at = data[at : at + length], at + length
-        elif tag & 7 == 0:
-            _, at = _read_varint(data, at)
-        else:
-            at += 4 if tag & 7 == 5 else 8
-        yield tag >> 3, value, data[begin:at]
-
-
-def _read_varint(data: bytes, at: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = data[at]
-        value |= (byte & 0x7F) << shift
-        at, shift = at + 1, shift + 7
-        if byte < 0x80:
-            return value, at
-
-
-def _name(value: bytes) -> str:
+def _name(value: memoryview) -> str:
     """Of an input or output."""
-    return next(text.decode() for number, text, _ in _fields(value) if number == 1)
+    return next(str(text, "utf-8") for number, text, _ in split_fields(value) if number == 1)
 
 
-def _renamed(node: bytes, name: str) -> bytes:
+def _renamed(node: memoryview, name: str) -> bytes:
     """A node with another name for one of the values that it reads or writes."""
     return b"".join(
         _bytes(number, f"hidden_{name}") if number in (1, 2) and value == name.encode() else whole
-        for number, value, whole in _fields(node)
+        for number, value, whole in split_fields(node)
     )
 
 
@@ -128,16 +103,16 @@ class OnnxGraph:
             hidden: an output that it is to have no more; its values are ``hidden_NAME`` now.
         """
         graph = cls(opsets=[])
-        for number, value, whole in _fields(data):
+        for number, value, whole in split_fields(data):
             if number == 8:
-                graph.opsets.append(whole)
+                graph.opsets.append(bytes(whole))
             if number != 7:
                 continue
-            for kind, part, raw in _fields(value):
+            for kind, part, raw in split_fields(value):
                 if kind == 1:
                     graph.parts.append(_bytes(1, _renamed(part, hidden)))
                 elif kind == 5 or (kind in (11, 12) and _name(part) != hidden):
-                    graph.parts.append(raw)
+                    graph.parts.append(bytes(raw))
         return graph
 
     def constant(self, values: ArrayLike, dtype: DTypeLike = np.float32) -> str:

@@ -19,15 +19,6 @@ def test_a_damaged_grid_makes_nothing(refused, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_report_of_nothing_writes_nothing(refused, tmp_path):
-    page = tmp_path / "page.md"
-    assert "has no outcome yet" in refused("grid", "wide24", tmp_path / "o", "--report", page)
-    assert f"no folder {tmp_path / 'docs'}" in refused(
-        "grid", "wide24", tmp_path / "o", "--report", tmp_path / "docs" / "page.md"
-    )
-    assert not page.exists()
-
-
 def test_a_set_that_is_not_there(refused, tmp_path):
     plan = tmp_path / "grid.toml"
     plan.write_text(f'data = "{tmp_path}/none"\n[[cell]]\nencoder = "gru"\n')

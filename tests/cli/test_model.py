@@ -15,7 +15,6 @@ from tactile_rt.classifier.model_file import (
 )
 from tactile_rt.classifier.model_runs import probe_logits
 from tactile_rt.classifier.onnx_check import graph_sha256
-from tactile_rt.evidence import model_steps
 
 pytest.importorskip("onnx")
 
@@ -236,7 +235,6 @@ def test_a_broken_file_is_one_line_whatever_is_asked_of_it(
     path = tmp_path / "m.onnx"
     path.write_bytes(changed)
     monkeypatch.setattr("onnxruntime.InferenceSession", None)  # none of it is run
-    monkeypatch.setattr(model_steps, "measure_machine", None)
     opened = []
     monkeypatch.setattr(Path, "read_bytes", watched(Path.read_bytes, opened))
     assert said in refused("model", what, path)
@@ -254,7 +252,6 @@ def watched(read, opened):
 def test_bench_times_steps(call, sealed):
     code, out, _ = call("model", "bench", shipped_model(), "--steps", 50)
     assert code == 0
-    assert f"median of {model_steps.TURNS} turns" in " ".join(out.replace("│", "").split())
     for said in ("step_p50", "step_tail", "load", "size", "memory"):
         assert f"inference.model.{said}" in out
 

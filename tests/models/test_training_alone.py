@@ -18,7 +18,7 @@ from tactile_rt.files import replaced  # noqa: E402
 from tactile_rt.models.checkpoint_files import describe_checkpoint, network_of  # noqa: E402
 from tactile_rt.models.ead_config import CELLS  # noqa: E402
 from tactile_rt.models.encoders import cells  # noqa: E402
-from tactile_rt.models.grid.plan_files import read_grid  # noqa: E402
+from tactile_rt.models.grid.plan import read_grid  # noqa: E402
 from tactile_rt.models.grid.pool import run_grid  # noqa: E402
 from tactile_rt.models.training import (  # noqa: E402
     ProbeConfig,

@@ -17,7 +17,6 @@ __all__ = [
     "POINT",
     "SUBSET",
     "TESTED",
-    "KeptTraining",
     "Outcome",
     "Tested",
     "Training",
@@ -40,16 +39,16 @@ Kept = TypeVar("Kept")
 Hits = Annotated[str, msgspec.Meta(pattern="^[01]*$")]
 
 
-class Training(msgspec.Struct, frozen=True):
+class Training(msgspec.Struct, frozen=True, omit_defaults=True):
     """One training and what the validation split says of it.
 
     Attributes:
-        learning_rate, warmup, updates: The settings of the training, as in `TrainingConfig`.
         score: Top-1 of the validation split, 0 to 1, the mean of clean and noisy; of a
             self-supervised network by its probe. 0 if it diverged.
         seconds: The CPU time of its updates, and of what it was validated by, s; 0 if something
-            else than a CPU trained it.
+            else than a CPU trained it, or it was interrupted.
         diverged: Whether the gradients became no numbers, so that nothing was learnt.
+        key: The settings that it depends on, as JSON; in its own folder alone.
     """
 
     learning_rate: float
@@ -58,15 +57,6 @@ class Training(msgspec.Struct, frozen=True):
     score: float
     seconds: float
     diverged: bool = False
-
-
-class KeptTraining(Training, frozen=True):
-    """A training as its own folder keeps it.
-
-    Attributes:
-        key: The settings that it depends on, as JSON.
-    """
-
     key: str = ""
 
 
@@ -91,14 +81,11 @@ class Outcome(msgspec.Struct, frozen=True):
     """What a task found.
 
     Attributes:
-        name, seed: Name and seed of the task.
         key: The settings that the outcome depends on, as JSON; another key is another experiment.
         top1, top5, noisy: Hits as text, a 0 or 1 per test sweep: right, among the first five, right
             at the rated noise.
-        parameters: The number of parameters of encoder, attender and decoder.
         seconds: The CPU time of the training that was scored, s, as in `Training`.
-        trials: The trials that chose rate and warm-up; of the first seed alone.
-        growth: The trainings with more and more updates; of the first seed alone.
+        trials, growth: What chose rate and warm-up, then the updates; of the first seed alone.
         chosen: The training that was scored.
         failed: The reason why there is no figure; empty if there is one.
     """
@@ -128,13 +115,7 @@ def outcome_path(folder: Path, task: Task) -> Path:
 
 
 def write_tested(folder: Path, objects: NDArray[np.str_], classes: int) -> None:
-    """Keep what a grid tests on in its folder.
-
-    Args:
-        folder: of the grid.
-        objects: (sweep,) the object of each.
-        classes: the number of categories.
-    """
+    """Keep what a grid tests on in its folder: the object of each test sweep (sweep,)."""
     counts = tuple((name, len(list(same))) for name, same in groupby(objects.tolist()))
     text = msgspec.json.encode(Tested(counts, classes))
     write_whole(folder / TESTED, lambda file: file.write(text))
@@ -157,25 +138,21 @@ def runs_of(folder: Path, task: Task) -> Path:
     return folder / RUNS / task.slug
 
 
-def read_point(path: Path, key: str) -> KeptTraining | None:
-    """What a training has found, if it is done.
-
-    Args:
-        path: where its folder keeps it.
-        key: the settings that it should be of.
+def read_point(path: Path, key: str) -> Training | None:
+    """What a training of these settings has found, if it is done.
 
     Raises:
         ConfigError: it is of other settings, or damaged.
     """
     if not path.exists():
         return None
-    found = _decoded(path, KeptTraining, f"delete {path.parent}")
+    found = _decoded(path, Training, f"delete {path.parent}")
     if found.key != key:
         raise ConfigError(
             f"{path.parent} was trained with other settings: choose another folder for the grid, "
             "or delete this one to train it again"
         )
-    return found
+    return msgspec.structs.replace(found, key="")
 
 
 def read_outcome(grid: Grid, folder: Path, task: Task) -> Outcome | None:

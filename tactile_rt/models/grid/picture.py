@@ -1,19 +1,18 @@
-"""Two pictures of a grid: who ends best, as in the paper, and who learns fastest."""
+"""The picture of a grid: who ends best, as in the paper."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import MaxNLocator
 
 from tactile_rt.models.evaluation import Interval
 from tactile_rt.models.grid.plan import SUPERVISED, SVM
 from tactile_rt.models.grid.results import GridResults, Row
 
-__all__ = ["draw_curves", "draw_grid"]
+__all__ = ["draw_grid"]
 
 FAMILIES = {
     "zhuang": ("ConvRNN (Zhuang's graph)", "tab:blue"),
@@ -75,86 +74,6 @@ def draw_grid(results: GridResults, path: Path) -> None:
         fontsize=11,
     )
     figure.savefig(path, dpi=120)
-
-
-def draw_curves(results: GridResults, path: Path) -> None:
-    """Draw accuracy against updates, CPU time, parameters and training objects, as a PNG."""
-    networks = [row for row in results.rows if row.name != SVM]
-    figure = Figure(figsize=(11, 8.5), layout="constrained")
-    axes = figure.subplots(2, 2)
-    for row in networks:
-        if row.learning != SUPERVISED or not row.growth:
-            continue
-        how = _line(row)
-        timed = [point for point in row.growth if point.seconds]  # not what a GPU has trained
-        for at, points, unit in (
-            (axes[0, 0], row.growth, "updates"),
-            (axes[0, 1], timed, "seconds"),
-        ):
-            scores = [100 * point.score for point in points]
-            at.plot([getattr(point, unit) for point in points], scores, **how)
-    whole = [row for row in networks if row.share == 1 and row.top1 is not None]
-    for row in whole:
-        if row.learning == SUPERVISED and row.top1 is not None:
-            axes[1, 0].plot(row.parameters, 100 * row.top1.value, **_line(row))
-    for network in dict.fromkeys(row.network for row in networks if row.share < 1):
-        of = sorted(
-            (row.share, row)
-            for row in networks
-            if row.network == network and row.learning.split(" of ")[0] == SUPERVISED
-        )
-        shown = [(share, row) for share, row in of if row.top1 is not None]
-        if len(shown) > 1:
-            values = [100 * row.top1.value for _, row in shown if row.top1 is not None]
-            how = _line(shown[-1][1])
-            axes[1, 1].plot([100 * share for share, _ in shown], values, **how)
-    for at, title, label in (
-        (axes[0, 0], "who learns fastest, by updates", "updates"),
-        (axes[0, 1], "who learns fastest, by arithmetic", "CPU time of the training (s)"),
-        (axes[1, 0], "who ends best, by size", "parameters"),
-        (axes[1, 1], "who ends best, by data", "share of the training objects (%)"),
-    ):
-        at.set_xscale("log")
-        at.set_title(title, fontsize=10, loc="left")
-        at.set_xlabel(label)
-        at.grid(alpha=0.25)
-        for ticks in (at.xaxis.set_major_formatter, at.xaxis.set_minor_formatter):
-            ticks(FuncFormatter(_plainly))
-        if not at.has_data():
-            at.text(0.5, 0.5, "no shares were trained on", ha="center", transform=at.transAxes)
-        above = at in axes[0]
-        at.set_ylabel(f"top-1 (%), {'validation' if above else 'test'} objects")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=-(-len(handles) // 2) or 1, fontsize=8
-    )
-    figure.suptitle(
-        "Every point above is a whole training, with a rate and a warm-up of the network's own; "
-        "the last of a line gained less than a point, or was the longest tried",
-        fontsize=10,
-    )
-    figure.savefig(path, dpi=120)
-
-
-def _plainly(value: float, _: object) -> str:
-    """A tick of a logarithmic axis: 1, 2 or 4 times a power of ten, in full."""
-    digit = f"{value:.0e}"[0]
-    return f"{value:,.0f}" if digit in "124" and value >= 1 else ""
-
-
-def _line(row: Row) -> dict[str, Any]:
-    """How a network's line is drawn: dashed and with squares if it has an attender; another width
-    has open marks."""
-    _, colour = _family(row)
-    attender = "+" in row.network
-    return {
-        "color": colour,
-        "marker": "s" if attender else "o",
-        "markersize": 5,
-        "markerfacecolor": "white" if "@" in row.network else colour,
-        "linestyle": "--" if attender else "-",
-        "label": _label(row),
-    }
 
 
 def _bars(axes: Axes, rows: list[Row]) -> None:

@@ -10,13 +10,15 @@ growth = { first = 1000, most = 8000, gain = 0.01 }
 encoder = "zhuang-gru"
 """
 
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from tactile_rt.models.training.config import TrainingConfig
-from tactile_rt.settings import convert, make_node
+from tactile_rt.errors import ConfigError, name_some
+from tactile_rt.models.training.config import ProbeConfig, TrainingConfig
+from tactile_rt.settings import convert, make_node, parse_toml, read_toml
 
 __all__ = [
     "Candidate",
@@ -27,8 +29,13 @@ __all__ = [
     "Search",
     "SweepCounts",
     "Task",
+    "read_grid",
+    "shipped_grids",
 ]
 
+SHIPPED = resources.files("tactile_rt.models.grid")
+# of a training's configuration, what a grid sets task by task
+OWN = ("data", "also", "begin", "seed", "learning_rate", "warmup", "epochs", "updates")
 SUPERVISED, RANDOM, SVM = "supervised", "random", "svm"
 NAMING = ("pairs",)  # options that tell cells apart in their names
 # what of a training's configuration an untrained network and its probe depend on, too
@@ -39,21 +46,17 @@ OF_UNTRAINED = (
 
 
 class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One network and how it learns.
+    """One network and how it learns; names and values as in `TrainingConfig`.
 
     Attributes:
-        encoder, attender: Names of the encoder and the attender, as in `EADConfig`.
-        objective: The objective, "supervised", or a self-supervised one, whose features a linear
-            probe reads.
-        augmentation: The augmentation that makes the views of a self-supervised objective.
-        masking: The share of the steps of a view that is blanked, 0 to 1.
+        objective: "supervised", or a self-supervised one, whose features a linear probe reads.
         width: The width of this network; 0 takes the grid's.
         share: The share of the training objects of every category whose sweeps are learnt from, at
             least one.
         begin: The name of a cell whose trained network, of the same seed, this one begins with;
             empty begins with nothing.
         seeds: The number of seeds of this cell; 0 takes the grid's.
-        options: Further fields of `TrainingConfig`, for this cell alone.
+        options: Further fields of `TrainingConfig`.
     """
 
     encoder: str
@@ -104,7 +107,6 @@ class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         learning_rate: The peaks that are tried, all with the first warm-up.
         warmup: The shares of all updates in which the rate rises; the others are tried with the
             best peak.
-        updates: The number of updates of a trial.
     """
 
     learning_rate: tuple[float, ...] = (5e-4, 1.5e-3, 5e-3, 1.5e-2)
@@ -118,8 +120,7 @@ class Growth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Each time it is trained from the beginning, with a whole schedule of its rate.
 
     Attributes:
-        first: The number of updates of the first time.
-        most: The number that is never passed.
+        first, most: The numbers of updates that it begins with and that are never passed.
         gain: The least gain in the score of the validation split, 0 to 1.
     """
 
@@ -129,11 +130,7 @@ class Growth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Pair(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two cells to compare, by name; "svm" and "random NETWORK" are names too.
-
-    Attributes:
-        better, than: The names of the cell that is asked about and of the one it is held against.
-    """
+    """Two cells to compare, by name; "svm" and "random NETWORK" are names too."""
 
     better: str
     than: str
@@ -151,7 +148,6 @@ class Task(msgspec.Struct, frozen=True):
 
     Attributes:
         name: The name of the cell, "random NETWORK" or "svm".
-        seed: The seed of the weights, the windows and the noise.
         cell: The cell to train; None for the support vector machine.
     """
 
@@ -176,16 +172,11 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         data: The folder of the sweep set.
         cells: The cells, in the order in which they are trained.
-        width: The width of every network that has none of its own.
+        width, seeds: Of every cell that has none of its own.
         batch: The number of sweeps per update.
-        search: The trials of every cell.
-        growth: The lengths of training that are tried for every cell.
-        seeds: The number of seeds of every cell that has no number of its own.
-        sweeps: The number of sweeps of each object that are used, by split.
         supervised, self_supervised: Fields of `TrainingConfig` for cells of either kind.
         probe: Fields of `ProbeConfig` for cells whose features a probe reads.
         svm: Whether a support vector machine is fitted too.
-        questions: The questions that the report answers.
     """
 
     data: str
@@ -273,3 +264,97 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         tuned = (Task(task.name, 0, cell),) if task.seed else ()
         begun = (self.begun(task),) if cell.begin else ()
         return tuple(one.slug for one in (*tuned, *begun))
+
+
+def shipped_grids() -> tuple[str, ...]:
+    """Names that `read_grid` takes in place of a path."""
+    files = (entry.name for entry in SHIPPED.iterdir())
+    return tuple(sorted(name.removesuffix(".toml") for name in files if name.endswith(".toml")))
+
+
+def read_grid(name: str | Path) -> Grid:
+    """Read a grid file, or a shipped one by its name, and check every cell of it.
+
+    Raises:
+        ConfigError: there is none, or it is not such a file.
+    """
+    if str(name) in shipped_grids():
+        nodes = parse_toml((SHIPPED / f"{name}.toml").read_text(), str(name))
+    elif Path(name).exists():
+        nodes = read_toml(Path(name))
+    else:
+        raise ConfigError(
+            f"no grid {name}: name a TOML file, or one of {', '.join(shipped_grids())}"
+        )
+    grid: Grid = convert(nodes, Grid)
+    try:
+        _check(grid)
+    except ConfigError as error:
+        raise ConfigError(f"{name}: {error}") from None
+    return grid
+
+
+def _check(grid: Grid) -> None:
+    """Refuse what could only be told after hours of training, or never."""
+    search, growth = grid.search, grid.growth
+    if not grid.cells or min(grid.seeds, search.updates, growth.first) < 1:
+        raise ConfigError("a grid needs a cell, a seed and an update")
+    if not search.learning_rate or not search.warmup:
+        raise ConfigError("search needs a learning_rate and a warmup")
+    if growth.most < growth.first:
+        raise ConfigError(
+            f"growth goes from {growth.first} updates to {growth.most}, which is less"
+        )
+    if min(grid.sweeps.train, grid.sweeps.validation, grid.sweeps.test) < 0:
+        raise ConfigError("sweeps are counted from 0, which takes all")
+    convert(make_node(grid.probe, "probe", 0, Path()), ProbeConfig)
+    tables = {"supervised": grid.supervised, "self_supervised": grid.self_supervised}
+    tables |= {f"options of cell {cell.name!r}": cell.options for cell in grid.cells}
+    for table, fields in tables.items():
+        if taken := [key for key in fields if key in OWN]:
+            raise ConfigError(f"{table}: {name_some(taken)} is what the grid itself decides")
+    if "data" in grid.probe:
+        raise ConfigError("probe: data is what the grid itself decides")
+    before: dict[str, Candidate] = {}
+    untrained: dict[str, Candidate] = {}
+    for cell in grid.cells:
+        if cell.name in before:
+            raise ConfigError(f"two cells are {cell.name!r}")
+        _check_cell(grid, cell, before)
+        bare = grid.untrained(cell)
+        if untrained.setdefault(cell.network, bare) != bare:
+            raise ConfigError(
+                f"cell {cell.name!r}: the network is another than that of a cell before it that "
+                f"is called {cell.network!r} too: give one a width"
+            )
+        before[cell.name] = cell
+    known = {task.name for task in grid.tasks()}
+    for question in grid.questions:
+        for one in (name for pair in question.pairs for name in (pair.better, pair.than)):
+            if one not in known:
+                raise ConfigError(f"{question.text!r} compares {one!r}, which no cell is")
+
+
+def _check_cell(grid: Grid, cell: Candidate, before: dict[str, Candidate]) -> None:
+    called = f"cell {cell.name!r}"
+    if not 0 < cell.share <= 1:
+        raise ConfigError(f"{called}: share must be above 0, at most 1, not {cell.share}")
+    if cell.seeds < 0:
+        raise ConfigError(f"{called}: seeds must be 0 (the grid's) or more, not {cell.seeds}")
+    if cell.begin:
+        if cell.begin not in before:
+            raise ConfigError(f"{called} begins with {cell.begin!r}, which no cell before it is")
+        has, wants = (one.seeds or grid.seeds for one in (before[cell.begin], cell))
+        if has < wants:
+            raise ConfigError(
+                f"{called} begins with {cell.begin!r}, which is trained with {has} of {wants} seeds"
+            )
+    task, search = Task(cell.name, 0, cell), grid.search
+    for rate in search.learning_rate:
+        for warmup in search.warmup:
+            config = grid.config(task, Path(grid.data), learning_rate=rate, warmup=warmup)
+    if config.encoder != "graph":  # whose frame is that of an array, which is not read here
+        try:
+            config.network(2)
+        except ConfigError as error:
+            raise ConfigError(f"{called}: {error}") from None

@@ -6,12 +6,13 @@ whenever the grid was killed.
 
 import multiprocessing
 import os
-import queue
 import signal
+import threading
 from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from tactile_rt.errors import TactileError
 from tactile_rt.locks import alone_in
@@ -32,7 +33,7 @@ from tactile_rt.sweep_set import (
 
 __all__ = ["prepare", "run_grid", "write_subset"]
 
-PATIENCE_S = 1.0
+_bench: Workbench | None = None  # of a process of the pool
 
 
 def run_grid(
@@ -93,36 +94,24 @@ def _run(
         return
     # Spawned: torch does not survive a fork in every state.
     context = multiprocessing.get_context("spawn")
-    todo: Any = context.Queue()
-    outcomes: Any = context.Queue()
-    workers = [
-        context.Process(target=_work, args=(grid, folder, accelerator, todo, outcomes), daemon=True)
-        for _ in range(min(processes, len(waiting)))
-    ]
-    # Ctrl-C is this process's to handle: the others hear it not even while they begin.
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        for worker in workers:
-            worker.start()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-    idle, busy = len(workers), 0
-    try:
-        while True:
-            while idle and (task := ready()):
-                todo.put(task)
-                idle, busy = idle - 1, busy + 1
-            if not busy:
-                return
-            found = _next(outcomes, workers)
-            if isinstance(found, Exception):
-                raise found
-            idle, busy = idle + 1, busy - 1
-            conclude(*found)
-    finally:
-        for worker in workers:
-            worker.terminate()
-            worker.join()
+    with ProcessPoolExecutor(processes, context, _begin) as pool:
+        running: dict[Future[Outcome], Task] = {}
+        try:
+            while True:
+                while len(running) < processes and (task := ready()):
+                    running[_submit(pool, grid, folder, accelerator, task)] = task
+                if not running:
+                    return
+                for one in wait(running, return_when=FIRST_COMPLETED).done:
+                    conclude(one.result(), running.pop(one))
+        except BrokenProcessPool:  # killed for memory, for one; its task is done again next time
+            raise TactileError(
+                "a process of the grid ended: run the grid again to go on, with fewer processes if "
+                "memory ran out"
+            ) from None
+        finally:
+            for worker in context.active_children():
+                worker.terminate()
 
 
 def prepare(grid: Grid, folder: Path) -> None:
@@ -170,37 +159,35 @@ def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
             write_object(folder, name, values[few], {k: v[few] for k, v in parameters.items()})
 
 
-def _next(outcomes: Any, workers: list[Any]) -> Any:
-    while True:
-        try:
-            return outcomes.get(timeout=PATIENCE_S)
-        except queue.Empty:
-            dead = [w for w in workers if w.exitcode not in (None, 0)]
-            if dead:  # killed for memory, for one; what it was at is done again next time
-                raise TactileError(
-                    f"a process of the grid ended with {dead[0].exitcode}: run the grid again to "
-                    "go on, with fewer processes if memory ran out"
-                ) from None
+def _submit(
+    pool: ProcessPoolExecutor, grid: Grid, folder: Path, accelerator: str, task: Task
+) -> Future[Outcome]:
+    """Give a task to a process; Ctrl-C is this process's to handle, even while one begins."""
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        return pool.submit(_do, grid, folder, accelerator, task)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
-def _work(grid: Grid, folder: Path, accelerator: str, todo: Any, outcomes: Any) -> None:
+def _begin() -> None:
+    """Begin a process: one thread of torch, and no life after the parent's."""
     import torch
 
     torch.set_num_threads(1)
-    parent = os.getppid()
+    parent = multiprocessing.parent_process()
+    assert parent is not None
 
-    def orphaned(_: object = None) -> None:
-        if os.getppid() != parent:  # it was killed: nobody would hear of what this one does
-            os._exit(1)
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
 
-    try:
-        bench = Workbench(grid, folder, accelerator)
-        while True:
-            orphaned()
-            try:
-                task: Task = todo.get(timeout=PATIENCE_S)
-            except queue.Empty:
-                continue
-            outcomes.put((bench.do(task, orphaned), task))
-    except (TactileError, OSError) as error:  # a full disk, for one
-        outcomes.put(error)
+    threading.Thread(target=follow, daemon=True).start()
+
+
+def _do(grid: Grid, folder: Path, accelerator: str, task: Task) -> Outcome:
+    """Do a task at the workbench of this process."""
+    global _bench
+    if _bench is None:
+        _bench = Workbench(grid, folder, accelerator)
+    return _bench.do(task)

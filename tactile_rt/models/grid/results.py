@@ -1,7 +1,5 @@
 """What a grid found: accuracies with honest intervals, comparisons, and tables of both."""
 
-import csv
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,9 +13,7 @@ from tactile_rt.models.evaluation import Interval, accuracy
 from tactile_rt.models.grid.outcomes import Outcome, Training, read_outcome, read_tested
 from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid, Growth
 
-__all__ = ["Answer", "GridResults", "Row", "gather", "put_into", "table", "write_results"]
-
-BEGIN, END = "<!-- grid: begin -->", "<!-- grid: end -->"
+__all__ = ["Answer", "GridResults", "Row", "gather", "table", "write_results"]
 
 
 @dataclass(frozen=True)
@@ -25,16 +21,13 @@ class Row:
     """A cell over its seeds, beside its network's random initialisation.
 
     Attributes:
-        name: The name of the cell, or "svm".
         network, learning: Names of the network and of how the cell learns; empty for the SVM.
         seeds: The number of seeds that are done.
         top1, top5, noisy: Accuracies on the test sweeps, 0 to 1; `noisy` is top-1 at the rated
             noise. None where there is no figure.
         random: The top-1 accuracy of a linear probe on the untrained network, 0 to 1.
-        parameters: The number of parameters of the network.
-        seconds: The mean CPU time of a seed's training, s, of the seeds that a CPU trained; else 0.
+        seconds: The mean CPU time of a seed's training, s, of those whose time is known; else 0.
         share: The share of the training objects that it learnt from.
-        chosen: The settings of its training, which its trials chose; None if there were none.
         growth: The trainings with more and more updates.
         flat: Whether the last of these gained less than the grid asks for.
         failed: The reason why seeds are missing; empty if none failed.
@@ -226,44 +219,7 @@ def _percent(one: Interval | None) -> str:
 
 
 def write_results(results: GridResults, folder: Path) -> None:
-    """Write `results.json`, `results.csv` and `curves.csv` into a grid's folder."""
+    """Write `results.json` and the tables, `results.md`, into a grid's folder."""
     text = msgspec.json.format(msgspec.json.encode(results), indent=1)
     write_whole(folder / "results.json", lambda file: file.write(text))
-    out = io.StringIO()
-    columns = ("top1", "top5", "noisy", "random")
-    writer = csv.writer(out)
-    plain = ("name", "network", "learning", "seeds", "parameters", "seconds", "failed")
-    writer.writerow([*plain, *(f"{c}{end}" for c in columns for end in ("", "_low", "_high"))])
-    for row in results.rows:
-        intervals = [getattr(row, c) for c in columns]
-        values = [(i.value, i.low, i.high) if i else ("", "", "") for i in intervals]
-        writer.writerow(
-            [*(getattr(row, p) for p in plain), *(v for three in values for v in three)]
-        )
-    write_whole(folder / "results.csv", lambda file: file.write(out.getvalue().encode()))
-    curves = io.StringIO()
-    writer = csv.writer(curves)
-    writer.writerow(["name", "learning_rate", "warmup", "updates", "seconds", "validation_top1"])
-    for row in results.rows:
-        for p in row.growth:
-            numbers = (p.learning_rate, p.warmup, p.updates, round(p.seconds, 1), round(p.score, 4))
-            writer.writerow([row.name, *numbers])
-    write_whole(folder / "curves.csv", lambda file: file.write(curves.getvalue().encode()))
-
-
-def put_into(page: Path, text: str) -> None:
-    """Replace what stands between the grid's marks on a page.
-
-    Raises:
-        ConfigError: the page has no such marks, or is no text.
-    """
-    try:
-        old = page.read_text(encoding="utf-8") if page.exists() else f"{BEGIN}\n{END}\n"
-    except UnicodeDecodeError:
-        raise ConfigError(f"{page} is no page of text in UTF-8") from None
-    before, begin, rest = old.partition(BEGIN)
-    _, end, after = rest.partition(END)
-    if not (begin and end):
-        raise ConfigError(f"{page} has no {BEGIN} and {END} to put the table between")
-    new = f"{before}{BEGIN}\n{text}{END}{after}"
-    write_whole(page, lambda file: file.write(new.encode()))
+    write_whole(folder / "results.md", lambda file: file.write(table(results).encode()))

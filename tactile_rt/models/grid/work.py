@@ -25,7 +25,6 @@ from tactile_rt.models.evaluation import CutWindows, among, cut_windows, hits, p
 from tactile_rt.models.grid.outcomes import (
     POINT,
     SUBSET,
-    KeptTraining,
     Outcome,
     Training,
     outcome_path,
@@ -39,7 +38,6 @@ from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.svm import fit_svm
 from tactile_rt.models.training import (
     ProbeConfig,
-    Progress,
     TrainingConfig,
     initialise,
     probe,
@@ -53,7 +51,6 @@ from tactile_rt.sweep_set import SweepManifest
 __all__ = ["Workbench"]
 
 BATCH = 128
-SECONDS = "seconds"  # a file of a training that is not done: what it has cost so far
 
 
 class Workbench:
@@ -180,38 +177,31 @@ class Workbench:
         )  # fmt: skip
         key = self._key(task, config)
         if (found := read_point(run / POINT, key)) is not None:
-            return _plain(found)
+            return found
         if cell.begin:  # where only its outcome was kept
             assert begun is not None and begun.chosen is not None
             self._train(self.grid.begun(task), begun.chosen, report)
-        clock = _Clock(run / SECONDS)
-
-        def count(progress: Progress) -> None:
-            if progress.metrics:
-                clock.keep()
-            report(progress)
-
+        timed = self.accelerator == "cpu" and not (run / "last.pt").exists()
+        began = time.process_time()
         splits, diverged = self.splits_of(cell.share), False
         try:
-            best = train(config, run, count, device=self.accelerator, splits=splits)
-            clock.stop()
+            best = train(config, run, report, device=self.accelerator, splits=splits)
+            seconds = time.process_time() - began
             if cell.objective != SUPERVISED:
                 best = probe(best, run / "probe", ProbeConfig(**self.grid.probe), report, splits)
             metrics = load_checkpoint(best)[1]["metrics"]
             score = (metrics["validation_top1"] + metrics["validation_top1_noisy"]) / 2
         except DivergedError:
             run.mkdir(parents=True, exist_ok=True)
-            score, diverged = 0.0, True
-        done = KeptTraining(
+            score, diverged, seconds = 0.0, True, time.process_time() - began
+        done = Training(
             at.learning_rate, at.warmup, at.updates, score,
-            # a processor's time for starting a GPU's kernels says nothing
-            clock.seconds if self.accelerator == "cpu" else 0.0,
-            diverged, key,
+            seconds if timed else 0.0, diverged, key,
         )  # fmt: skip
         write_whole(run / POINT, lambda file: file.write(msgspec.json.encode(done)))
-        for path in (*run.rglob("last.pt"), run / SECONDS):  # what is done needs not go on
-            path.unlink(missing_ok=True)
-        return _plain(done)
+        for path in run.rglob("last.pt"):  # what is done needs not go on
+            path.unlink()
+        return msgspec.structs.replace(done, key="")
 
     def _key(self, task: Task, config: TrainingConfig) -> str:
         """What a training's score depends on, wherever the grid lies."""
@@ -262,11 +252,8 @@ class Workbench:
     def _scored(self, found: Outcome, best: Path, config: TrainingConfig) -> Outcome:
         """The outcome with what a checkpoint's network makes of the test split."""
         model, _ = load_checkpoint(best)
-        run, labels, classes = (
-            run_on(model),
-            self.test.sweeps.labels,
-            len(self.test.manifest.categories),
-        )
+        run, labels = run_on(model), self.test.sweeps.labels
+        classes = len(self.test.manifest.categories)
         clean, noisy = (  # had it to name one
             among(posteriors(cut, run)[:, -1], classes) for cut in self._windows(config)
         )
@@ -289,36 +276,8 @@ class Workbench:
         return self._cut[config.window]
 
 
-class _Clock:
-    """The CPU time of a training, kept in a file from epoch to epoch, since it may be killed."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._before = float(path.read_text()) if path.exists() else 0.0
-        self._began = time.process_time()
-        self._end: float | None = None
-
-    @property
-    def seconds(self) -> float:
-        """So far, or until it was stopped."""
-        end = time.process_time() if self._end is None else self._end
-        return self._before + end - self._began
-
-    def stop(self) -> None:
-        """Count what comes after this no more."""
-        self._end = time.process_time()
-
-    def keep(self) -> None:
-        """Write down what it is so far."""
-        write_whole(self._path, lambda file: file.write(f"{self.seconds}".encode()))
-
-
 def _score(point: Training) -> tuple[bool, float]:
     return not point.diverged, point.score
-
-
-def _plain(point: KeptTraining) -> Training:
-    return msgspec.convert(msgspec.to_builtins(point), Training, strict=False)
 
 
 def _as_text(hits: NDArray[np.bool_]) -> str:
