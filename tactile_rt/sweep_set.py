@@ -50,8 +50,7 @@ __all__ = [
 
 SET_VERSION = 2
 RECORDED_VERSION = 3  # of recordings: who does not know them would add their noise again
-# Version 1 knew neither withheld categories nor objects out of files.
-READABLE = (1, SET_VERSION, RECORDED_VERSION)
+READABLE = (SET_VERSION, RECORDED_VERSION)
 MANIFEST, SKIPPED = "manifest.json", "skipped.json"
 CONTACTS = "contacts"  # in an object's file, and in the recipe that asks for them
 FAULTS = "faults"  # in the recipe, see `sensor_faults`
@@ -179,11 +178,6 @@ class SweepManifest:
             # Compared as JSON, which knows no tuples: a recipe may have been written with some.
             here = msgspec.json.decode(text)
             there = msgspec.json.decode(msgspec.json.encode(SweepManifest.read(folder)))
-            if there["version"] != self.version:
-                raise ConfigError(
-                    f"{folder} holds a sweep set of version {there['version']}, which can be read "
-                    "but not gone on with: choose another folder"
-                )
             differing = _differing(here, there)
             if differing:
                 raise ConfigError(
@@ -206,7 +200,7 @@ class SweepManifest:
             if raw.get("version") not in READABLE:
                 raise RecordingError(
                     f"{path} is of version {raw.get('version')!r}; this release reads "
-                    f"{READABLE[0]} to {READABLE[-1]}"
+                    f"{READABLE[0]} and {READABLE[-1]}"
                 )
             return msgspec.convert(raw, cls)
         except OSError:

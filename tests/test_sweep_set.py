@@ -203,8 +203,9 @@ def manifest_with(**fields: object) -> bytes:
         (b"{", "is damaged"),
         (b"[]", "is damaged"),
         (b'{"version": "\xff"}', "is damaged"),
-        (b"{}", "is of version None; this release reads 1 to 3"),
-        (manifest_with(version=4), "is of version 4; this release reads 1 to 3"),
+        (b"{}", "is of version None; this release reads 2 and 3"),
+        (manifest_with(version=1), "is of version 1; this release reads 2 and 3"),
+        (manifest_with(version=4), "is of version 4; this release reads 2 and 3"),
         (manifest_with(lead="four"), r"is damaged: .*\$.lead"),
         (manifest_with(spec={}), r"is damaged: .*\$.spec"),
         (
@@ -310,19 +311,6 @@ def test_a_cut_parameter_is_named_too(folder: Path) -> None:
     spoil(folder / "mug-1.npz", "cut")
     with pytest.raises(RecordingError, match=r"mug-1\.npz is damaged"):
         read_object(folder, "mug-1")
-
-
-# Sets of version 1
-
-
-def test_a_set_of_version_1_is_read_but_not_gone_on_with(folder: Path) -> None:
-    """As the first release wrote it."""
-    new = ("withheld", "category_of", "versions", "settings")
-    old = {k: v for k, v in msgspec.to_builtins(MANIFEST).items() if k not in new}
-    (folder / "manifest.json").write_bytes(msgspec.json.encode({**old, "version": 1}))
-    assert read_sweeps(folder, "train").labels.tolist() == [0, 1, 1]
-    with pytest.raises(ConfigError, match="of version 1, which can be read but not gone on with"):
-        MANIFEST.write(folder)
 
 
 # Objects that are withheld, skipped, or have a name of their own

@@ -32,7 +32,7 @@ from tactile_rt.classifier.runtime import onnxruntime_names
 from tactile_rt.classifier.skips import CatchUp, Skip, Skips
 from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.classifier.timebase import Resampler
-from tactile_rt.errors import ConfigError, ModelError
+from tactile_rt.errors import ConfigError
 from tactile_rt.stream import NS_PER_S, ArraySpec, Chunk
 
 __all__ = ["Classification", "Classifier", "ClassifierStats", "fuse", "without_bad_samples"]
@@ -160,7 +160,7 @@ class Classifier:
         providers: Names of the execution providers in use, as onnxruntime has them.
 
     Raises:
-        ModelError: the file cannot be used, or has no embedding and is asked for one.
+        ModelError: the file cannot be used.
         SpecMismatch: the model was made for another array; the message says where they differ.
         ConfigError: an option that cannot be, or an execution provider or engine that was asked
             for and is not there.
@@ -193,11 +193,6 @@ class Classifier:
         names = onnxruntime_names(providers)
         session, self.card = load_model(model, names, threads)
         self.providers = tuple(session.get_providers())
-        if embedding and not self.card.embedding:
-            raise ModelError(
-                f"{model} has no embedding: its metadata is of version {self.card.version}, and "
-                "files have one since version 3; export it anew"
-            )
         order = fit_source(model, self.card, spec)
         self.detector = ContactDetector(spec.shape, np.array(self.card.floor, dtype=np.float32))
         self.tared = np.zeros(spec.shape, dtype=np.float32)

@@ -1,7 +1,7 @@
 """What a model file says of itself: the array, the episode, the classes, what was measured.
 
-Versions: a release reads every version of the metadata that an older one wrote, and passes over
-fields that it does not know; a version is raised only when an older reader would misread a file.
+Fields that a release does not know are passed over; the version is raised only when an older
+reader would misread a file.
 """
 
 import math
@@ -42,7 +42,6 @@ __all__ = [
 ]
 
 CARD_VERSION = 3
-CARD_VERSIONS = (1, 2, 3)  # the older ones without what `ModelCard` says is since 2 or 3
 STATE_TYPES = ("bool", "float16", "float32", "float64", "int32", "int64", "int8", "uint8")
 MAX_STEPS = 1_000_000
 PERIODS_NS = range(1_000, 10**12 + 1)  # of samples: from a million a second
@@ -114,29 +113,19 @@ class ModelCard(msgspec.Struct, frozen=True):
             probabilities mean what they say.
         provenance: The origin of the file: network, training, data set, hashes, commands.
         figures: The figures measured on the model, such as parity and accuracy.
-        version: The version of this schema, 1 to 3.
-
-    Since version 2:
         kind: What the graph takes at once, "step" or "window", see `model_file`.
         precision: The number format in which weights are stored and multiplied.
         opset: The version of ONNX's operators that the graph uses.
         hashes: SHA-256 sums, hex, by what they are of; "graph" is `onnx_check.graph_sha256` of the
             file.
-        thresholds: Posteriors from which a decision may be taken early, by what they promise.
-        decision: The defaults of the decision modes.
         probe: (step, class) Logits of the built-in probe episode, by which `tactile-rt model
             verify` tells whether another machine computes the same.
-
-    Since version 3, in which the graph has the output ``embedding`` and takes a sample that is no
-    number, or infinite, for no load:
-        embedding: The number of units of the output ``embedding``; 0 before version 3.
+        embedding: The number of units of the output ``embedding``.
         sensor: What is known of the array's sensor (rate, noise, range, ...); empty if nothing.
         unknown: When an object is of no known class; None if the model never says so.
         candidates: Which classes a step leaves possible, one rule for each promise.
         refusals: The last of the labels, if any: those that name no class, but say that the object
             is unknown, or what is wrong with the loads.
-        loads: Statistics of the loads, tare removed, that training saw: by name a table
-            (element, channel), SI.
         embeddings: Where touches of the known classes lie, so that others can be told from them
             without the data; None if it is not told.
         license: Under which the file may be used, as an SPDX expression such as "Apache-2.0"; empty
@@ -161,15 +150,12 @@ class ModelCard(msgspec.Struct, frozen=True):
     precision: Literal["fp32", "fp16", "bf16", "int8"] = "fp32"
     opset: int | None = None
     hashes: dict[str, str] = {}
-    thresholds: dict[str, float] = {}
-    decision: dict[str, Any] = {}
     probe: tuple[tuple[float, ...], ...] = ()
     embedding: int = 0
     sensor: dict[str, Any] = {}
     refusals: tuple[str, ...] = ()
     unknown: UnknownRule | None = None
     candidates: tuple[CandidateRule, ...] = ()
-    loads: dict[str, tuple[tuple[float, ...], ...]] = {}
     embeddings: EmbeddingStatistics | None = None
     license: str = ""
 
@@ -254,10 +240,10 @@ def parse_card(path: Path, text: str) -> ModelCard:
 
     try:
         version = msgspec.json.decode(text, type=dict[str, Any]).get("version")
-        if version not in CARD_VERSIONS:
+        if version != CARD_VERSION:
             raise ModelError(
                 f"{path} has metadata of version {repr(version)[:40]}; this release reads "
-                f"{CARD_VERSIONS[0]} to {CARD_VERSIONS[-1]}"
+                f"{CARD_VERSION}: export it anew"
             )
         card = msgspec.json.decode(text, type=ModelCard)
         elements, channels = card.array.shape
@@ -308,8 +294,8 @@ def parse_card(path: Path, text: str) -> ModelCard:
             raise damaged(f"{state.name[:40]} of type {state.dtype[:40]!r}")
     if card.probe and [len(row) for row in card.probe] != [len(card.labels)] * card.steps:
         raise damaged(f"the probe is not {card.steps} steps of {len(card.labels)} logits")
-    if (card.version >= 3) != (card.embedding > 0):
-        raise damaged(f"an embedding of {card.embedding} units in version {card.version}")
+    if card.embedding < 1:
+        raise damaged(f"an embedding of {card.embedding} units")
     rules = {f"candidates[{i}]": rule for i, rule in enumerate(card.candidates)}
     for what, rule in {"unknown": card.unknown, **rules}.items():
         if rule is not None and (wrong := rule.fault(card.steps)):
@@ -323,11 +309,6 @@ def parse_card(path: Path, text: str) -> ModelCard:
             card.embeddings.arrays(len(card.classes), card.embedding)
         except ValueError as error:
             raise damaged(f"embeddings: {error}") from None
-    for what, table in card.loads.items():
-        if not named(what):
-            raise damaged(f"names of loads must be 1 to {MAX_NAME} printable characters")
-        if [len(row) for row in table] != [channels] * elements or not np.isfinite(table).all():
-            raise damaged(f"loads.{what} is not {elements} x {channels} finite numbers")
     return card
 
 

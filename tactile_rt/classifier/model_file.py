@@ -8,9 +8,9 @@ Inputs of the graph, one step of a stream, for a batch of independent streams:
     <state>  every tensor of `ModelCard.state`, all zeros when an episode begins
 
 Outputs: ``logits (batch, class)``, ``embedding (batch, unit)`` (what the network's last linear
-layer reads in this step; since version 3) and for every state tensor ``<name>_next``, its next
-value. Units, clipping, scaling and the layout on the grid are inside the graph, and since version
-3 a sample that is no number, or infinite, is no load there and leaves nothing in the state.
+layer reads in this step) and for every state tensor ``<name>_next``, its next value. Units,
+clipping, scaling and the layout on the grid are inside the graph, where a sample that is no number,
+or infinite, is no load and leaves nothing in the state.
 
 A file of kind "window" takes a whole episode instead: ``samples (batch, step, sub-step, element,
 channel)``, no state, and gives ``logits`` and ``embedding`` with a step axis after the batch's.
@@ -114,8 +114,7 @@ def read_model(path: Path, kind: Kind | None = None) -> tuple[ModelCard, Content
     named = {"samples", "offset", "sigma", *(s.name for s in card.state)}
     if wrong := sorted(named ^ set(contents.inputs)):
         raise _disagree(path, wrong)
-    embedding = ("embedding",) if card.embedding else ()
-    for name in ("logits", *embedding, *(f"{s.name}_next" for s in card.state)):
+    for name in ("logits", "embedding", *(f"{s.name}_next" for s in card.state)):
         if name not in contents.outputs:
             raise ModelError(f"{path}: no output `{one_line(name)}`, which its metadata promises")
     return card, contents, data
@@ -206,9 +205,7 @@ def check_graph(
     batches = {shape[0] for shape, _ in inputs.values()}
     if any(isinstance(batch, int) and batch != 1 for batch in batches):
         raise ModelError(f"{path}: the graph's batch size is fixed to another than 1")
-    sizes = {"logits": (len(card.labels), "classes")}
-    if card.embedding:
-        sizes["embedding"] = (card.embedding, "units")
+    sizes = {"logits": (len(card.labels), "classes"), "embedding": (card.embedding, "units")}
     for name, (size, what) in sizes.items():
         shape, kind = outputs.get(name, ((), ""))
         if shape[-1:] != (size,) or len(shape) != 2 + window or kind != "tensor(float)":

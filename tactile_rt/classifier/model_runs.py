@@ -36,9 +36,9 @@ def file_outputs(
         offset, sigma: (batch, element, channel), SI.
 
     Returns:
-        ``logits`` (batch, step, class) and, since version 3, ``embedding`` (batch, step, unit).
+        ``logits`` (batch, step, class) and ``embedding`` (batch, step, unit).
     """
-    wanted = ["logits", "embedding"] if card.embedding else ["logits"]
+    wanted = ["logits", "embedding"]
     feed: dict[str, NDArray[Any]] = {"offset": offset, "sigma": sigma}
     if card.kind == "window":
         windows = session.run(wanted, {"samples": samples, **feed})
@@ -66,7 +66,7 @@ def verify_model(path: Path) -> list[str]:
     Raises:
         ModelError: as `load_model`; the graph is not the one that was exported, this machine
             computes other logits than those stored, or a sample that is no number outlives its
-            step though the file's version promises that it does not.
+            step.
     """
     session, card = load_model(path, kind=None)
     said = []
@@ -84,14 +84,13 @@ def verify_model(path: Path) -> list[str]:
     if not _same(outputs, file_outputs(session, card, samples, offset, sigma)):
         raise ModelError(f"{path}: the probe episode gives other logits when run again")
     said.append(f"probe: {card.steps} finite steps, the same again after a reset")
-    if card.embedding:
-        said.append(f"embedding: {card.embedding} units, finite")
-        samples[:, 0] = offset[:, None]
-        at_rest = file_outputs(session, card, samples, offset, sigma)
-        samples[:, 0] = np.resize((np.nan, np.inf, -np.inf), samples[:, 0].shape)
-        if not _same(file_outputs(session, card, samples, offset, sigma), at_rest):
-            raise ModelError(f"{path}: a sample that is no number is not taken for no load")
-        said.append("bad samples: NaN and infinity are no load")
+    said.append(f"embedding: {card.embedding} units, finite")
+    samples[:, 0] = offset[:, None]
+    at_rest = file_outputs(session, card, samples, offset, sigma)
+    samples[:, 0] = np.resize((np.nan, np.inf, -np.inf), samples[:, 0].shape)
+    if not _same(file_outputs(session, card, samples, offset, sigma), at_rest):
+        raise ModelError(f"{path}: a sample that is no number is not taken for no load")
+    said.append("bad samples: NaN and infinity are no load")
     if not card.probe:
         return [*said, "parity: the file stores no logits to compare with"]
     logits, expected = outputs["logits"][0], np.array(card.probe)

@@ -22,7 +22,7 @@ WARM_UP = 4  # runs, two of each binding: the first ones allocate, and may even 
 
 
 class Tensor:
-    """An array that onnxruntime shares on the CPU, and has a copy of on a device."""
+    """An array that onnxruntime shares on the CPU, or copies to a device."""
 
     def __init__(self, shape: tuple[int, ...], dtype: DTypeLike, device: str) -> None:
         self.array: NDArray[Any] = np.zeros(shape, dtype=dtype)
@@ -55,8 +55,7 @@ class Stepper:
 
     Attributes:
         samples: (lane, sub-step, element, channel) SI: write the step's input here.
-        embedding: (lane, unit) The embedding of the last step, which the next one overwrites; of no
-            units if the file has none.
+        embedding: (lane, unit) The embedding of the last step, which the next one overwrites.
 
     Raises:
         ConfigError: the graph's batch is fixed to another number than `lanes`.
@@ -129,9 +128,8 @@ class Stepper:
         inputs = {
             "samples": self._samples, "offset": self._offset, "sigma": self._sigma, **before,
         }  # fmt: skip
-        outputs = {"logits": self._logits, **{f"{k}_next": v for k, v in after.items()}}
-        if self.embedding.size:
-            outputs["embedding"] = self._embedding
+        outputs = {"logits": self._logits, "embedding": self._embedding}
+        outputs |= {f"{k}_next": v for k, v in after.items()}
         binding = self._session.io_binding()
         for name, tensor in inputs.items():
             binding.bind_ortvalue_input(name, tensor.value)

@@ -50,22 +50,16 @@ def show(file: File, json: Json = None) -> None:
         f"({card.steps * card.substeps * period_ms / 1e3:.3g} s)",
         "classes": f"{len(card.classes)}: {', '.join(card.classes[:MANY])}{rest}",
         "refusals": ", ".join(card.refusals),
-        "embedding": (
-            f"{card.embedding} units" + (", and where its classes lie" if card.embeddings else "")
-            if card.embedding
-            else "none before version 3"
-        ),
+        "embedding": f"{card.embedding} units"
+        + (", and where its classes lie" if card.embeddings else ""),
         "state": f"{len(card.state)} tensors, {state} values" if card.state else "none",
         "sensor": _pairs(card.sensor),
         "clip": _channels(spec, card.clip),
         "scale": _channels(spec, card.scale),
         "noise floor": _channels(spec, card.floor),
         "temperature": f"{card.temperature:.4g}",
-        "thresholds": _pairs(card.thresholds),
-        "decisions": _pairs(card.decision),
         "unknown": _unknown(card.unknown),
         "candidates": "\n".join(map(_candidates, card.candidates)),
-        "loads": ", ".join(card.loads),
         "figures": _pairs(card.figures),
         "licence": card.license,
         "probe": "stored" if card.probe else "none stored",

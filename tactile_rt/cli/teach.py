@@ -118,7 +118,7 @@ def teach(
 
 
 class Orders:
-    """What is ordered by lines of stdin and, if one is asked for, on a page in a browser.
+    """Queue of orders from lines of stdin and the buttons of a page.
 
     Args:
         at: host and port of the page; None: no page.

@@ -48,9 +48,6 @@ def train(
         set_option("Any key of the recipe: width=0.25, attender=none, decoder=linear, batch=8"),
     ] = None,
     accelerator: Accelerator = "auto",
-    tensorboard: Annotated[
-        bool, typer.Option("--tensorboard", help="Write logs for TensorBoard, too.")
-    ] = False,
     threads: Annotated[int, typer.Option(min=1, max=1024, help="CPU threads.")] = 1,
     json: Json = None,
 ) -> None:
@@ -98,7 +95,7 @@ def train(
                 console.print(_in_words(at))
 
         with needing("train"):
-            best = training.train(config, folder, show, tensorboard=tensorboard, device=accelerator)
+            best = training.train(config, folder, show, device=accelerator)
     if not console.quiet:
         told_as_json({"best": best, "epochs": history}, json)
     console.print(f"best network: {best}")

@@ -323,8 +323,7 @@ def parity(
     arrays = [torch.from_numpy(a) for a in (samples, offset, sigma)]
     with torch.inference_mode():
         expected = {"logits": model.eval()(*arrays).numpy()}
-        if card.embedding:
-            expected["embedding"] = model.network.embed(model.inputs(*arrays)).numpy()
+        expected["embedding"] = model.network.embed(model.inputs(*arrays)).numpy()
     found = file_outputs(session, card, samples, offset, sigma)
     return {
         name: float(np.abs(found[name] - v).max() / max(1.0, float(np.abs(v).max())))

@@ -69,7 +69,7 @@ def release(
     last = among(posteriors[:, -1], len(known))
     right = hits(last, labels).reshape(2, -1).mean(axis=1).tolist()
     temperature = fit_temperature(last, labels)
-    told = (*known, *saved.get("refusals", ()))
+    told = (*known, *saved["refusals"])
     unknown, candidates = fitted_rules(sets, run_on(model), temperature, told, len(known))
     chosen = "" if precision == "fp32" else f" --precision {precision}"
     chosen += "" if kind == "step" else f" --kind {kind}"
@@ -180,11 +180,8 @@ def _making(folder: Path, manifest: SweepManifest) -> str:
     if manifest.recorded:
         return f"tactile-rt label {' '.join(recipe[RECORDINGS])} {folder} {recipe['options']}"
     options = [f"--{key} {recipe[key]}" for key in ("profile", "seed") if key in recipe]
-    if isinstance(recipe.get("objects"), dict):  # since version 2 of the manifest
-        objects, draws = recipe["objects"], recipe["sweeps"]["draws"]
-        options.insert(0, f"--recipe {recipe['name']}")
-    else:
-        objects, draws = {**recipe, "per_category": recipe.get("objects")}, recipe.get("sweeps")
+    objects, draws = recipe["objects"], recipe["sweeps"]["draws"]
+    options.insert(0, f"--recipe {recipe['name']}")
     counts = {f"objects.{key}": objects.get(key) for key in ("per_category", "validation", "test")}
     for key, value in {**counts, "sweeps.draws": draws}.items():
         if value is not None:

@@ -18,7 +18,7 @@ from tactile_rt.stream import ArraySpec
 __all__ = ["NETWORK", "describe_checkpoint", "network_of", "no_checkpoint", "reason"]
 
 PICKLE = "/data.pkl"  # in the archive, in a folder of any name
-NEEDED = ("model", "network", "config", "spec")
+NEEDED = ("model", "network", "config", "spec", "categories", "refusals")
 # of a network's configuration, what a training configuration says
 NETWORK = (
     "encoder", "attender", "decoder", "width", "readout", "dropout", "graph", "norm_epsilon",

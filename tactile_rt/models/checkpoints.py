@@ -123,11 +123,8 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
 
 
 def labels_of_checkpoint(saved: dict[str, Any]) -> tuple[str, ...]:
-    """The names of what a checkpoint's network tells apart: categories, then refusals.
-
-    An early checkpoint has only how many they are: of that, none.
-    """
-    return (*saved.get("categories", ()), *saved.get("refusals", ()))
+    """List what a checkpoint's network tells apart: categories, then refusals."""
+    return (*saved["categories"], *saved["refusals"])
 
 
 def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> None:

@@ -77,10 +77,11 @@ def trained_on(
     manifest = join_manifests([SweepManifest.read(folder) for folder in folders])
     check_array(checkpoint, saved, manifest)
     held = list(manifest.categories)
-    classes = saved["network"]["classes"] - len(saved.get("refusals", ()))
-    told = saved.get("categories", held[:classes])  # of an early checkpoint, only how many
-    if told != held or len(held) != classes:
-        other = ", ".join(sorted({*told} ^ {*held})[:3]) or "the same in another order"
+    classes = saved["network"]["classes"] - len(saved["refusals"])
+    if saved["categories"] != held or len(held) != classes:
+        other = (
+            ", ".join(sorted({*saved["categories"]} ^ {*held})[:3]) or "the same in another order"
+        )
         there = " and ".join(map(str, folders))
         raise SpecMismatch(
             f"{checkpoint} tells other categories apart than {there} holds ({other}): name what "

@@ -204,7 +204,6 @@ def further_card(card: ModelCard, classes: FurtherClasses) -> ModelCard:
         state=(*card.state, *state),
         candidates=(),
         embeddings=None,
-        thresholds={},
         figures={},
         hashes={},
         probe=(),

@@ -20,12 +20,9 @@ from tactile_rt.classifier.model_file import (
     shipped_model,
 )
 from tactile_rt.classifier.model_runs import probe_logits
-from tactile_rt.classifier.stepper import Stepper
 from tactile_rt.errors import ConfigError, ModelError, SpecMismatch
 from tactile_rt.testing import small_spec
-from tests.helpers.old_models import write_old_model
 from tests.helpers.tiny_model import CARD, GRAPH, LABELS, WINDOW, write_model
-from tests.helpers.touch_streams import QUIET, SAME_RATE, push_all, signal, stream
 
 
 def test_the_card_comes_back_as_it_was_written(tmp_path: Path) -> None:
@@ -158,7 +155,6 @@ SWAPPED = (
 
 UNKNOWN = UnknownRule(score="entropy", output="logits", thresholds=(1.5,))
 PROMISE = CandidateRule(score="1 - posterior", coverage=0.95, quantiles=(0.9,) * 4, objects=200)
-LOADS = ((0.1, 1e-3), (0.2, 2e-3), (0.3, 3e-3))  # (element, channel)
 replaced = msgspec.structs.replace
 
 
@@ -171,10 +167,11 @@ def card_with(**fields: object) -> str:
     [
         ("{", "has damaged metadata"),
         ("[1]", "has damaged metadata"),
-        ("{}", "has metadata of version None; this release reads 1 to 3"),
-        (card_with(version=4), "has metadata of version 4; this release reads 1 to 3"),
-        ('{"version": 1}', "has damaged metadata: .*missing required field"),
-        ('{"version": 1, "name": ' + "[" * 100_000, "has damaged metadata: "),
+        (card_with(version=2), "has metadata of version 2; this release reads 3"),
+        ("{}", "has metadata of version None; this release reads 3"),
+        (card_with(version=4), "has metadata of version 4; this release reads 3"),
+        ('{"version": 3}', "has damaged metadata: .*missing required field"),
+        ('{"version": 3, "name": ' + "[" * 100_000, "has damaged metadata: "),
         (card_with(clip=[1e-3, float("1e308")]).replace("1e+308", "1e999"), "has damaged metadata"),
         (card_with(steps="many"), r"has damaged metadata: .*\$.steps"),
         (card_with(spec="{}"), "has damaged metadata: array spec of version None"),
@@ -272,9 +269,8 @@ def test_outputs_that_the_card_promises_must_be_there(
         ({"state": tuple(StateTensor(f"s{i}", (2**28,), "int8") for i in range(9))}, "its state"),
         ({"state": (CARD.state[0], StateTensor("total", (1,), "object"))}, "total of type"),
         ({"probe": ((0.0,) * 5,) * 3}, "the probe is not 4 steps of 5 logits"),
-        ({"embedding": 0}, "an embedding of 0 units in version 3"),
-        ({"embedding": -2}, "an embedding of -2 units in version 3"),
-        ({"version": 2}, "an embedding of 2 units in version 2"),
+        ({"embedding": 0}, "an embedding of 0 units"),
+        ({"embedding": -2}, "an embedding of -2 units"),
         ({"sensor": "quiet"}, r"Expected `object`, got `str` - at `\$.sensor`"),
         ({"refusals": ("steps",)}, "refusals are not the last of the labels"),
         ({"refusals": LABELS}, "there are no labels but refusals"),
@@ -291,10 +287,6 @@ def test_outputs_that_the_card_promises_must_be_there(
         ({"candidates": (replaced(PROMISE, score="\x1b[2J"),)}, r"candidates\[0\].score must be 1"),
         ({"candidates": (replaced(PROMISE, objects=0),)}, r"candidates\[0\].objects is 0, must be"),
         ({"candidates": (replaced(PROMISE, noise=-1.0),)}, r"candidates\[0\].noise is -1, must be"),
-        ({"loads": {"": LOADS}}, "names of loads must be 1 to 200 printable characters"),
-        ({"loads": {"mean": LOADS[:2]}}, "loads.mean is not 3 x 2 finite numbers"),
-        ({"loads": {"mean": (*LOADS[:2], (0.0,))}}, "loads.mean is not 3 x 2 finite numbers"),
-        ({"loads": {"mean": "large"}}, r"Expected `array`, got `str` - at `\$.loads"),
         ({"kind": "window"}, "a window has no state"),
         ({"kind": "film"}, r"Invalid enum value 'film'.*kind"),
     ],
@@ -383,44 +375,11 @@ def test_anything_else_that_differs_is_said_exactly() -> None:
 # ---- versions, kinds, providers
 
 
-@pytest.mark.parametrize("version", [1, 2])
-def test_a_file_of_an_older_release_is_read_and_decides_as_one_of_today(
-    tmp_path: Path, version: int
-) -> None:
-    old, new = write_old_model(tmp_path / "old.onnx", version), write_model(tmp_path / "new.onnx")
-    card = read_model(old)[0]
-    fields = {"version": version, "embedding": 0, "figures": {"parity": 1e-6}}
-    if version == 2:
-        fields |= {"opset": 18, "thresholds": {"99 %": 0.8}, "probe": card.probe}
-        assert card.probe[-1] == pytest.approx(GOLDEN, rel=1e-6)
-    assert card == replaced(CARD, **fields)
-    assert np.array_equal(probe_logits(*load_model(old)), probe_logits(*load_model(new)))
-    chunks = stream(signal([(QUIET, 400, 0.1)], 400))
-    decisions, expected = (push_all(Classifier(p, SAME_RATE), chunks) for p in (old, new))
-    assert len(decisions) == CARD.steps
-    for found, other in zip(decisions, expected, strict=True):
-        assert np.array_equal(found.probabilities, other.probabilities)
-        assert found.embedding is None
-
-
-@pytest.mark.parametrize("version", [1, 2])
-def test_an_older_file_has_no_embedding_and_says_so(tmp_path: Path, version: int) -> None:
-    path = write_old_model(tmp_path / "m.onnx", version)
-    with pytest.raises(ModelError) as caught:
-        Classifier(path, small_spec(), embedding=True)
-    assert str(caught.value) == (
-        f"{path} has no embedding: its metadata is of version {version}, and files have one since "
-        "version 3; export it anew"
-    )
-    assert Stepper(*load_model(path)).embedding.shape == (1, 0)
-
-
 def test_sensor_and_rules_come_back_as_they_were_written(tmp_path: Path) -> None:
     given = {
         "sensor": {"rate_hz": 80.0, "range": {"bx": [-0.1, 0.1]}, "noise_density": None},
         "unknown": UNKNOWN,
         "candidates": (PROMISE, replaced(PROMISE, coverage=0.8, noise=1.0)),
-        "loads": {"mean": LOADS, "rms": LOADS},
     }
     path = write_model(tmp_path / "m.onnx", **given)
     session, card = load_model(path)

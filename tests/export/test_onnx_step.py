@@ -225,7 +225,7 @@ def test_the_metadata_says_everything_needed(exported: SimpleNamespace) -> None:
     assert ArraySpec.from_json(card["spec"]) == SPEC
     assert card["name"] == "tiny"
     assert card["version"] == 3
-    places = {"sensor": {}, "unknown": None, "candidates": [], "loads": {}}
+    places = {"sensor": {}, "unknown": None, "candidates": []}
     assert {name: card[name] for name in places} == places
     assert (card["kind"], card["precision"], card["opset"]) == ("step", "fp32", onnx_step.OPSET)
     assert card["hashes"]["graph"] == graph_sha256(exported.path.read_bytes())
@@ -378,15 +378,12 @@ def test_what_the_card_says_of_sensor_and_rules_is_in_the_file(
         "sensor": {"rate_hz": 80.0, "noise_density": [1e-6] * 6},
         "unknown": UnknownRule("entropy", "embedding", (0.5,) * STEPS),
         "candidates": (CandidateRule("rank", 0.95, (2.5,) * STEPS, 200),),
-        "loads": {"rms": ((1e-4,) * 6,) * 30},
         "license": "Apache-2.0 OR MIT",
     }
-    for version in (2, 3):  # a card taken from an older file is of an older version
-        card = msgspec.structs.replace(exported.card, version=version, **given)
-        written = export_step(exported.model, card, tmp_path / "m.onnx")
-        assert written.version == 3
-        found = load_model(tmp_path / "m.onnx")[1]
-        assert {name: getattr(found, name) for name in given} == given
+    card = msgspec.structs.replace(exported.card, **given)
+    export_step(exported.model, card, tmp_path / "m.onnx")
+    found = load_model(tmp_path / "m.onnx")[1]
+    assert {name: getattr(found, name) for name in given} == given
 
 
 # Every encoder, attender and decoder at least once.

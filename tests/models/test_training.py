@@ -422,33 +422,6 @@ def test_a_run_that_diverges_says_so(tiny, tmp_path, updates):
         train(config, tmp_path / "run")
 
 
-def test_tensorboard_is_asked_for_by_name(tiny, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "tensorboard.summary.writer.record_writer", None)
-    config = TrainingConfig(tiny, **SMALL, updates=1)
-    with pytest.raises(ConfigError, match=r"pip install tensorboard$"):
-        train(config, tmp_path / "run", tensorboard=True)
-    assert not (tmp_path / "run").exists(), "nothing is begun"
-
-
-def test_tensorboard_shows_a_run_that_went_on_as_one(tiny, tmp_path):
-    """Read by TensorBoard itself. The update after the last that was saved is made again."""
-    accumulator = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator")
-
-    def cut(at):
-        if at.update == 4 and not at.metrics:
-            raise KeyboardInterrupt
-
-    config = TrainingConfig(tiny, **SMALL, epochs=3)
-    with pytest.raises(KeyboardInterrupt):
-        train(config, tmp_path / "run", cut, tensorboard=True)
-    train(config, tmp_path / "run", tensorboard=True)
-    found = accumulator.EventAccumulator(str(tmp_path / "run" / "tensorboard"))
-    found.Reload()
-    steps = [event.step for event in found.Scalars("loss")]
-    assert steps == list(range(1, len(steps) + 1)), "each update once"
-    assert len(found.Scalars("epoch/validation_top1")) == 3
-
-
 def test_the_initialised_network_is_what_training_begins_with(tiny, tmp_path):
     config = TrainingConfig(tiny, **SMALL, objective="simclr", updates=1, seed=5)
     at_rest = TrainingConfig(

@@ -194,17 +194,6 @@ def test_a_full_disk_leaves_the_checkpoints_as_they_were(tiny, disk, refused, ca
     assert all(torch.equal(ends[0][name], ends[1][name]) for name in ends[0])
 
 
-def test_a_full_disk_is_one_line_of_tensorboard_s_too(tiny, disk, refused, no_thread_left):
-    pytest.importorskip("tensorboard")
-    place, full = disk
-    train(TrainingConfig(tiny, **SMALL, updates=1), place / "run")
-    with full(0):
-        said = refused(
-            "train", tiny, place / "run", *OPTIONS, "--set", "updates=1", "--tensorboard"
-        )
-    assert f"cannot use {place / 'run' / 'tensorboard'}/events.out.tfevents" in said
-
-
 def test_what_fails_while_a_file_is_filled_changes_nothing(tmp_path):
     path = tmp_path / "last.pt"
     for content in (b"first", b"second"):

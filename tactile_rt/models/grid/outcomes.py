@@ -115,7 +115,7 @@ def outcome_path(folder: Path, task: Task) -> Path:
 
 
 def write_tested(folder: Path, objects: NDArray[np.str_], classes: int) -> None:
-    """Keep what a grid tests on in its folder: the object of each test sweep (sweep,)."""
+    """Write a grid's test objects (sweep,) and number of classes into its folder."""
     counts = tuple((name, len(list(same))) for name, same in groupby(objects.tolist()))
     text = msgspec.json.encode(Tested(counts, classes))
     write_whole(folder / TESTED, lambda file: file.write(text))

@@ -273,7 +273,7 @@ def shipped_grids() -> tuple[str, ...]:
 
 
 def read_grid(name: str | Path) -> Grid:
-    """Read a grid file, or a shipped one by its name, and check every cell of it.
+    """Read a grid file, or a shipped one by name; check every cell.
 
     Raises:
         ConfigError: there is none, or it is not such a file.

@@ -162,7 +162,7 @@ def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
 def _submit(
     pool: ProcessPoolExecutor, grid: Grid, folder: Path, accelerator: str, task: Task
 ) -> Future[Outcome]:
-    """Give a task to a process; Ctrl-C is this process's to handle, even while one begins."""
+    """Give a task to a process that does not hear Ctrl-C, even while it begins."""
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         return pool.submit(_do, grid, folder, accelerator, task)

@@ -45,10 +45,9 @@ from tactile_rt.models.training.config import (
 )
 from tactile_rt.models.training.devices import is_first, launched
 from tactile_rt.models.training.feeding import BatchFeed, Share, generator_of
-from tactile_rt.models.training.logs import Board, log_epoch
 from tactile_rt.models.training.optimizers import build_optimizer
 from tactile_rt.models.training.replay import batch_loss
-from tactile_rt.models.training.resuming import RunState, as_json, begin_run
+from tactile_rt.models.training.resuming import RunState, as_json, begin_run, log_epoch
 from tactile_rt.models.training.validation import Validation
 from tactile_rt.sweep_set import OUTLIERS
 
@@ -67,7 +66,6 @@ def train(
     folder: Path,
     report: Report = lambda _: None,
     *,
-    tensorboard: bool = False,
     device: str = "auto",
     splits: Splits | None = None,
 ) -> Path:
@@ -77,7 +75,6 @@ def train(
         config: what to train and how.
         folder: of the run.
         report: is told of every update and every epoch.
-        tensorboard: write its files beside `history.csv`.
         device: "auto" (an accelerator if there is one), "cpu", "cuda", ...
         splits: what `read_splits` gives, where many runs share it.
 
@@ -92,9 +89,8 @@ def train(
     with (
         alone_in(folder) if is_first() else nullcontext(),
         launched(config, device) as fabric,
-        closing(Board(folder, tensorboard and fabric.is_global_zero)) as board,
     ):
-        return _train(fabric, config, folder, report, board, splits)
+        return _train(fabric, config, folder, report, splits)
 
 
 def _train(
@@ -102,7 +98,6 @@ def _train(
     config: TrainingConfig,
     folder: Path,
     report: Report,
-    board: Board,
     splits: Splits | None,
 ) -> Path:
     torch.manual_seed(config.seed)
@@ -129,7 +124,6 @@ def _train(
         begin_run(config, folder)  # when all that may be refused has been
     fabric.barrier()
     run.resume(folder)
-    board.begin(run.done)
     wrapped, _ = fabric.setup(objective, optimizer)
     loss_of = batch_loss(fabric, wrapped, objective, config, feed)
 
@@ -163,8 +157,6 @@ def _train(
                 run.schedule.step()
                 run.done += 1
                 losses.append(loss.item())
-                rate = float(run.schedule.get_last_lr()[0])
-                board.write(run.done, {"loss": losses[-1], "rate": rate})
                 report(Progress(epoch, run.epochs, run.done, run.updates, losses[-1]))
         run.epoch += 1
         if share.devices > 1:
@@ -187,7 +179,6 @@ def _train(
             if better:
                 save_whole(folder / "best.pt", _card(config, objective, training, met, metrics))
             log_epoch(folder / "history.csv", metrics)
-            board.write(run.done, {f"epoch/{k}": v for k, v in metrics.items() if k != "epoch"})
             save_whole(folder / "last.pt", run.state())
         shown = {**metrics, "waiting": feed.waited / metrics["seconds"]}
         report(Progress(epoch + 1, run.epochs, run.done, run.updates, metrics["loss"], shown))

@@ -27,8 +27,8 @@ from tactile_rt.models.datasets import SweepSet, drawn_as, of_categories, window
 from tactile_rt.models.evaluation import hits, predict
 from tactile_rt.models.training.batches import JITTER, TrainingBatches
 from tactile_rt.models.training.config import ProbeConfig, Progress
-from tactile_rt.models.training.logs import log_epoch
 from tactile_rt.models.training.recipes import as_options, training_command
+from tactile_rt.models.training.resuming import log_epoch
 
 __all__ = ["linear_probe", "probe"]
 

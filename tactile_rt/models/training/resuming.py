@@ -1,10 +1,14 @@
 """Going on with a run that was interrupted: is it this one, and how far did it come?
 
-A run's folder holds `config.json`, written before its first epoch, and `last.pt`, written after
-each one: a run that is killed goes on from there and ends with the same numbers.
+A run's folder holds `config.json`, written before its first epoch, and `last.pt` and a line of
+`history.csv`, written after each one: a run that is killed goes on from there and ends with the
+same numbers.
 """
 
+import csv
+import io
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from math import ceil, inf
 from pathlib import Path
 from typing import Any
@@ -14,14 +18,13 @@ import torch
 from torch.optim.lr_scheduler import LRScheduler
 
 from tactile_rt.errors import ConfigError, ModelError, name_some
-from tactile_rt.files import write_whole
+from tactile_rt.files import replaced, write_whole
 from tactile_rt.models.checkpoint_files import describe_checkpoint, reason
 from tactile_rt.models.objectives import Objective
 from tactile_rt.models.training.config import TrainingConfig
-from tactile_rt.models.training.logs import logged_epochs
 from tactile_rt.models.training.optimizers import build_schedule
 
-__all__ = ["RunState", "as_json", "begin_run"]
+__all__ = ["RunState", "as_json", "begin_run", "log_epoch", "logged_epochs"]
 
 PATHS = ("data", "also", "begin")  # keys of a configuration
 
@@ -31,12 +34,8 @@ class RunState:
     """How far a run is, and all that it takes to go on.
 
     Attributes:
-        objective: The network and what it is trained for.
-        optimizer: The optimizer of its parameters.
-        config: The configuration of the run.
         per_epoch: The number of updates of an epoch.
-        epoch: The number of epochs that are done.
-        done: The number of updates that are done.
+        epoch, done: The numbers of epochs and of updates that are done.
         best: The best score of a validation so far.
     """
 
@@ -120,12 +119,8 @@ def begin_run(config: TrainingConfig, folder: Path) -> None:
         ) from None
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is damaged ({error}): choose another folder") from None
-    # a run of before a key was thought of
-    defaults = as_json(TrainingConfig(config.data))
     differing = [
-        key
-        for key in {**mine, **theirs}
-        if not _same(key, theirs.get(key, defaults.get(key)), mine.get(key))
+        key for key in {**mine, **theirs} if not _same(key, theirs.get(key), mine.get(key))
     ]
     if differing:
         raise ConfigError(
@@ -140,3 +135,39 @@ def _same(key: str, one: Any, other: Any) -> bool:
         names = [[value] if isinstance(value, str) else value for value in (one, other)]
         one, other = ([str(Path(name).resolve()) for name in some] for some in names)
     return bool(one == other)
+
+
+def logged_epochs(path: Path, until: float) -> list[dict[str, str]]:
+    """Read the lines of a run's `history.csv` before an epoch.
+
+    Raises:
+        ModelError: it is damaged, or lines are missing.
+    """
+    if until <= 1 or not path.exists():
+        return []
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            lines = list(csv.DictReader(file, strict=True))
+        epochs = [int(line["epoch"]) for line in lines]
+        whole = epochs[-1] >= until - 1 and all(b == a + 1 for a, b in pairwise(epochs))
+    except (UnicodeDecodeError, csv.Error, IndexError, KeyError, TypeError, ValueError):
+        whole = False
+    if not whole:
+        raise ModelError(f"{path} is damaged: delete it to go on without what it tells")
+    return [line for line, epoch in zip(lines, epochs, strict=True) if epoch < until]
+
+
+def log_epoch(path: Path, metrics: dict[str, float]) -> None:
+    """Add a line to `history.csv`, in place of those of later epochs.
+
+    Raises:
+        OSError: the medium is full, or failed.
+    """
+    # A line that was logged before the run was killed, but not yet saved, is written again.
+    old = logged_epochs(path, metrics["epoch"])
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(metrics))
+    writer.writeheader()
+    writer.writerows([*old, metrics])
+    with replaced(path) as whole:
+        whole.write(text.getvalue().encode())
