@@ -134,7 +134,7 @@ def _write_weights(checkpoints: list[Path], path: Path) -> None:
             weights[name] = torch.stack([s["model"][name].double() for s in saved]).mean(0).half()
         else:
             weights[name] = value
-    save_whole(path, {**saved[-1], "model": weights, "made_by": "python -m bench.shipped FOLDER"})
+    save_whole(path, {**saved[-1], "model": weights})
 
 
 def _read(checkpoint: Path) -> dict[str, Any]:

@@ -4,7 +4,7 @@ The network takes every step, whatever becomes of its answer. What becomes of it
 nothing here knows the network:
 
 - `EarlyExit` ends an episode before its last step when the same class has been sure for long
-  enough; `early_exit_curve` says what that costs on stored posteriors.
+  enough.
 - `Lanes` says, where windows overlap, which copy of the state begins before a step and which one
   is asked after it.
 - `Deadline` says whether a step's answer comes too late to be acted upon.
@@ -28,20 +28,16 @@ either side, and wider for sweeps of the same objects.
 """
 
 import logging
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.errors import ConfigError
 
-__all__ = ["IN_A_ROW", "Deadline", "EarlyExit", "ExitCurve", "Lanes", "Policy", "early_exit_curve"]
+__all__ = ["IN_A_ROW", "Deadline", "EarlyExit", "Lanes", "Policy"]
 
 IN_A_ROW = 2
-
-THRESHOLDS = (0.5, 0.6, 0.7, 0.8, 0.85, 0.9, 0.925, 0.95, 0.97, 0.98, 0.99, 0.995, 0.999, np.inf)
 
 Policy = Literal["count", "report", "skip"]
 log = logging.getLogger("tactile_rt.classifier")
@@ -79,65 +75,6 @@ class EarlyExit:
         else:
             self._sure_for = self._sure_for + 1 if again else 1
         return self._sure_for >= self._in_a_row
-
-
-@dataclass(frozen=True)
-class ExitCurve:
-    """The trade-off; arrays are (threshold,) float64.
-
-    Attributes:
-        thresholds: (threshold,) The largest probability must reach this value for a sweep to stop;
-            infinity never stops early.
-        accuracy: (threshold,) The share of sweeps whose decision is right at the step where they
-            stop, 0 to 1.
-        mean_step: (threshold,) The mean step at which sweeps stop, counted from 1.
-        early: (threshold,) The share of sweeps that stop before their last step, 0 to 1.
-    """
-
-    thresholds: NDArray[np.float64]
-    accuracy: NDArray[np.float64]
-    mean_step: NDArray[np.float64]
-    early: NDArray[np.float64]
-
-
-def early_exit_curve(
-    posteriors: ArrayLike,
-    labels: ArrayLike,
-    thresholds: Sequence[float] = THRESHOLDS,
-    in_a_row: int = IN_A_ROW,
-) -> ExitCurve:
-    """Accuracy against earliness, as a `Classifier` with `sure` and `in_a_row` would decide.
-
-    Args:
-        posteriors: (sweep, step, class) probabilities, calibrated as at run time; NaN where a
-            sweep has no decision, which is wrong and takes until the last step.
-        labels: (sweep,) index of the true class.
-        thresholds: to try.
-        in_a_row: steps running that the same class must exceed it, at least 1.
-
-    Raises:
-        ValueError: shapes that do not fit, no sweep, or no step in a row.
-    """
-    p, truth = np.asarray(posteriors), np.asarray(labels)
-    if p.ndim != 3 or truth.shape != p.shape[:1] or 0 in p.shape:
-        raise ValueError(f"posteriors {p.shape} and labels {truth.shape}")
-    if in_a_row < 1:
-        raise ValueError(f"{in_a_row} in a row")
-    largest = p.max(axis=2)  # (sweep, step)
-    best = p.argmax(axis=2)
-    right = (best == truth[:, None]) & np.isfinite(largest)
-    last = p.shape[1] - 1
-    rows = []
-    for threshold in thresholds:
-        above = largest >= threshold
-        sure = above.copy()
-        for back in range(1, in_a_row):
-            sure[:, :back] = False
-            sure[:, back:] &= above[:, :-back] & (best[:, :-back] == best[:, back:])
-        stop = np.where(sure.any(axis=1), sure.argmax(axis=1), last)
-        rows.append((right[np.arange(len(p)), stop].mean(), stop.mean() + 1, (stop < last).mean()))
-    accuracy, mean_step, early = np.array(rows, dtype=np.float64).T
-    return ExitCurve(np.array(thresholds, dtype=np.float64), accuracy, mean_step, early)
 
 
 class Lanes:

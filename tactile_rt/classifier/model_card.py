@@ -46,7 +46,6 @@ STATE_TYPES = ("bool", "float16", "float32", "float64", "int32", "int64", "int8"
 MAX_STEPS = 1_000_000
 PERIODS_NS = range(1_000, 10**12 + 1)  # of samples: from a million a second
 MAX_EPISODE = 2**24  # values: checks run one at once, and a robot's has some 20,000
-LISTS = ("commands", "unseen_objects")  # of the provenance, where they are there
 
 Kind = Literal["step", "window"]
 
@@ -111,7 +110,7 @@ class ModelCard(msgspec.Struct, frozen=True):
         floor: (channel,) The smallest sigma that the contact detector assumes, SI.
         temperature: The number that divides the logits, fitted on validation sweeps so that
             probabilities mean what they say.
-        provenance: The origin of the file: network, training, data set, hashes, commands.
+        provenance: The origin of the file: network, training, data set, hashes.
         figures: The figures measured on the model, such as parity and accuracy.
         kind: What the graph takes at once, "step" or "window", see `model_file`.
         precision: The number format in which weights are stored and multiplied.
@@ -269,9 +268,8 @@ def parse_card(path: Path, text: str) -> ModelCard:
         raise damaged(f"a name of {len(card.name)} characters")
     if card.license and not named(card.license):
         raise damaged(f"a licence must be at most {MAX_NAME} printable characters")
-    for what in LISTS:
-        if not isinstance(card.provenance.get(what, []), list):
-            raise damaged(f"{what} of the provenance must be a list")
+    if not isinstance(card.provenance.get("unseen_objects", []), list):
+        raise damaged("unseen_objects of the provenance must be a list")
     names = ["samples", "offset", "sigma", *(s.name for s in card.state)]
     if len(set(names)) != len(names):
         raise damaged("names of the state repeat")

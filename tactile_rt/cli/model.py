@@ -65,7 +65,6 @@ def show(file: File, json: Json = None) -> None:
         "probe": "stored" if card.probe else "none stored",
         "hashes": _pairs(card.hashes),
         "made by": _pairs({k: v for k, v in card.provenance.items() if isinstance(v, str)}),
-        "commands": "\n".join(map(str, card.provenance.get("commands", []))),
     }
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="bold", no_wrap=True)

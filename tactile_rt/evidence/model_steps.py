@@ -2,7 +2,6 @@
 
 import gc
 import os
-import resource
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +16,7 @@ from tactile_rt.evidence.records import Record
 
 __all__ = ["Subject", "measure_model", "step_times"]
 
-TURNS = 5
 TAIL = "<= 1.3"  # p99 over p50 of every step
-COLD = 2  # steps after another process had the core: they find their weights gone from its caches
 
 
 @dataclass(frozen=True)
@@ -55,14 +52,10 @@ def measure_model(subject: Subject, steps: int) -> list[Record]:
     before, began = _resident(), time.process_time()
     session, card = load_model(path)
     load = time.process_time() - began
-    turns, interruptions, grown = [], [], 0
-    for _ in range(TURNS):
-        seconds, interrupted = step_times(session, card, -(-steps // TURNS))
-        grown = grown or _resident() - before
-        turns.append(1e3 * seconds)
-        interruptions.append(interrupted)
-    p50, p99 = np.percentile(turns, 50), np.percentile(turns, 99)
-    how = f"network alone, {np.size(turns)} steps, one thread"
+    ms = 1e3 * step_times(session, card, steps)
+    grown = _resident() - before
+    p50, p99 = np.percentile(ms, [50, 99])
+    how = f"network alone, {steps} steps, one thread"
     return [
         Record(f"{name}.size", path.stat().st_size / 1e6, "MB", how=card.precision),
         Record(f"{name}.load", 1e3 * load, "ms CPU", subject.load_ms, how="file cached"),
@@ -73,33 +66,14 @@ def measure_model(subject: Subject, steps: int) -> list[Record]:
             float(p99 / p50),
             "x p50",
             TAIL,
-            _tail(np.ravel(turns), np.ravel(interruptions)),
+            f"p99 {p99:.3g} ms CPU",
             how,
         ),
     ]
 
 
-def _tail(taken: NDArray[np.float64], interrupted: NDArray[np.bool_]) -> str:
-    """The 99th percentile in words, also without the steps that others had the core before."""
-    said = f"p99 {np.percentile(taken, 99):.3g} ms CPU"
-    if interrupted.any() and not interrupted.all():
-        alone = np.percentile(taken[~interrupted], 99) / np.percentile(taken[~interrupted], 50)
-        share = 100 * interrupted.mean()
-        said += (
-            f"; in or up to {COLD} steps before {share:.2g} % of them another process had the "
-            f"core, the others' is {alone:.3g} x"
-        )
-    return said
-
-
-def step_times(
-    session: ort.InferenceSession, card: ModelCard, steps: int
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """CPU time of each step of episodes of noise, run as the classifier runs them, s.
-
-    And whether the system took the core away in it, or shortly before: such a step finds its
-    weights gone from the caches, and takes more CPU time itself.
-    """
+def step_times(session: ort.InferenceSession, card: ModelCard, steps: int) -> NDArray[np.float64]:
+    """Time the steps of episodes of noise, run as the classifier runs them: CPU time (step,), s."""
     rng = np.random.default_rng(0)
     scale = np.array(card.scale, dtype=np.float32)
     offset = np.zeros(card.array.shape, dtype=np.float32)
@@ -107,26 +81,16 @@ def step_times(
     shape = (card.steps, card.substeps, *card.array.shape)
     noise = rng.standard_normal(shape, dtype=np.float32) * scale
     stepper = Stepper(session, card)
-    taken, interrupted = np.empty(steps), np.zeros(steps, dtype=np.bool_)
-    seen, cold = _preemptions(), 0
+    taken = np.empty(steps)
     for step in range(-card.steps, steps):  # an episode to warm up
         if step % card.steps == 0:
             stepper.begin(offset, sigma)
         stepper.samples[0] = noise[step % card.steps]
         began = time.thread_time()
         stepper.run()
-        took = time.thread_time() - began
-        before, seen = seen, _preemptions()
-        cold = COLD + 1 if seen > before else max(0, cold - 1)
         if step >= 0:
-            taken[step], interrupted[step] = took, cold > 0
-    return taken, interrupted
-
-
-def _preemptions() -> int:
-    """How often this thread had to give its core away; 0 where the system does not tell."""
-    which = getattr(resource, "RUSAGE_THREAD", None)
-    return 0 if which is None else resource.getrusage(which).ru_nivcsw
+            taken[step] = time.thread_time() - began
+    return taken
 
 
 def _resident() -> int:

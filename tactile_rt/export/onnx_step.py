@@ -85,7 +85,6 @@ def export_checkpoint(
     rules: tuple[UnknownRule | None, tuple[CandidateRule, ...]] = (None, ()),
     embeddings: EmbeddingStatistics | None = None,
     figures: dict[str, Any] | None = None,
-    commands: Sequence[str] = (),
     precision: Precision = "fp32",
     kind: Kind = "step",
     data: Sequence[Path] = (),
@@ -101,7 +100,6 @@ def export_checkpoint(
         rules: when the model refuses to name a class, and what it promises of candidates.
         embeddings: where touches of the known classes lie.
         figures: measured accuracies to store in the file.
-        commands: that remake the file.
         precision: of the weights, and of products with them.
         kind: "step" or "window".
         data: where the sweep sets that it was trained on lie now; default: where they lay.
@@ -115,7 +113,7 @@ def export_checkpoint(
     model, saved = load_checkpoint(checkpoint)
     manifests = [SweepManifest.read(folder) for folder in trained_on(checkpoint, saved, data)]
     manifest = join_manifests(manifests)
-    refusals = tuple(saved.get("refusals", ()))
+    refusals = tuple(saved["refusals"])
     card = ModelCard(
         name=name,
         spec=saved["spec"],
@@ -141,7 +139,6 @@ def export_checkpoint(
             **({"also": [other.recipe for other in manifests[1:]]} if manifests[1:] else {}),
             "unseen_objects": list(manifests[0].split["test"]),
             "trained_objects": trained_objects(manifests, saved),
-            "commands": list(commands),
             "tactile_rt": VERSION,
             "torch": str(torch.__version__),  # not a plain str, which msgspec insists on
             "onnx": onnx.__version__,

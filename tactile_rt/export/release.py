@@ -24,8 +24,7 @@ from tactile_rt.models.training import (
     load_checkpoint,
     run_on,
 )
-from tactile_rt.models.training.recipes import training_command
-from tactile_rt.sweep_set import RECORDINGS, SweepManifest, join_manifests
+from tactile_rt.sweep_set import SweepManifest, join_manifests
 
 __all__ = ["fit_temperature", "quantisation_figures", "release", "run_file"]
 
@@ -71,8 +70,6 @@ def release(
     temperature = fit_temperature(last, labels)
     told = (*known, *saved["refusals"])
     unknown, candidates = fitted_rules(sets, run_on(model), temperature, told, len(known))
-    chosen = "" if precision == "fp32" else f" --precision {precision}"
-    chosen += "" if kind == "step" else f" --kind {kind}"
     card = export_checkpoint(
         checkpoint,
         path,
@@ -81,11 +78,6 @@ def release(
         rules=(unknown, candidates),
         embeddings=embedding_statistics(model, validation, len(known)),
         figures={"validation_top1": right[0], "validation_top1_noisy": right[1]},
-        commands=(
-            *(_making(folder, SweepManifest.read(folder)) for folder in folders),
-            saved.get("made_by") or training_command(config, checkpoint.parent),
-            f"tactile-rt export {checkpoint} {path.name} --name {name}{chosen}",
-        ),
         precision=precision,
         kind=kind,
         data=folders,
@@ -172,21 +164,6 @@ def _described(path: Path, card: ModelCard, figures: dict[str, float]) -> ModelC
     onnx.helper.set_model_props(proto, {METADATA_KEY: msgspec.json.encode(card).decode()})
     write_whole(path, lambda file: onnx.save(proto, file))
     return card
-
-
-def _making(folder: Path, manifest: SweepManifest) -> str:
-    """The command that makes a set again."""
-    recipe = manifest.recipe
-    if manifest.recorded:
-        return f"tactile-rt label {' '.join(recipe[RECORDINGS])} {folder} {recipe['options']}"
-    options = [f"--{key} {recipe[key]}" for key in ("profile", "seed") if key in recipe]
-    objects, draws = recipe["objects"], recipe["sweeps"]["draws"]
-    options.insert(0, f"--recipe {recipe['name']}")
-    counts = {f"objects.{key}": objects.get(key) for key in ("per_category", "validation", "test")}
-    for key, value in {**counts, "sweeps.draws": draws}.items():
-        if value is not None:
-            options.append(f"--set {key}={value:g}")
-    return f"tactile-rt sweep {folder} {' '.join(options)}"
 
 
 def fit_temperature(posteriors: NDArray[np.float32], labels: NDArray[np.int64]) -> float:

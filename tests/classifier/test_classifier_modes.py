@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("onnx")
 
 from tactile_rt.classifier.classifier import Classification, Classifier
-from tactile_rt.classifier.exits import Lanes, early_exit_curve
+from tactile_rt.classifier.exits import Lanes
 from tactile_rt.classifier.model_file import load_model, shipped_model
 from tactile_rt.errors import ConfigError
 from tactile_rt.stream import NS_PER_S, Chunk
@@ -149,46 +149,6 @@ def test_a_decision_that_is_sure_ends_the_episode(model: Path) -> None:
         assert again and again[-1].final and again[0].step == 1
     never = push_all(Classifier(model, SAME_RATE, sure=1.0), stream(values))
     assert [d.step for d in never] == [1, 2, 3, 4] * 2
-
-
-@pytest.mark.parametrize("in_a_row", [1, 2, 3])
-def test_the_curve_says_what_the_classifier_does(in_a_row: int) -> None:
-    """Sweep by sweep, with a loop instead of arrays."""
-    rng = np.random.default_rng(0)
-    logits = np.cumsum(rng.normal(size=(40, 22, 5)), axis=1)
-    posteriors = np.exp(logits) / np.exp(logits).sum(axis=2, keepdims=True)
-    labels = rng.integers(0, 5, 40)
-    curve = early_exit_curve(posteriors, labels, in_a_row=in_a_row)
-    assert curve.thresholds[-1] == np.inf
-    assert curve.mean_step[-1] == 22 and curve.early[-1] == 0
-    assert (np.diff(curve.mean_step) >= 0).all()
-    for k, threshold in enumerate(curve.thresholds):
-        right, stops = 0, []
-        for sweep, label in zip(posteriors, labels, strict=True):
-            for step, p in enumerate(sweep, start=1):
-                last = sweep[max(0, step - in_a_row) : step]
-                sure = all(q.max() >= threshold and q.argmax() == p.argmax() for q in last)
-                if (sure and step >= in_a_row) or step == 22:
-                    right += int(p.argmax() == label)
-                    stops.append(step)
-                    break
-        assert curve.accuracy[k] == pytest.approx(right / 40)
-        assert curve.mean_step[k] == pytest.approx(np.mean(stops))
-        assert curve.early[k] == pytest.approx(np.mean([s < 22 for s in stops]))
-
-
-def test_a_sweep_without_a_decision_is_wrong() -> None:
-    posteriors = np.zeros((2, 3, 2))
-    posteriors[:, :, 0] = 1
-    posteriors[1] = np.nan
-    curve = early_exit_curve(posteriors, [0, 0], [0.9], in_a_row=1)
-    assert (curve.accuracy[0], curve.mean_step[0], curve.early[0]) == (0.5, 2.0, 0.5)
-
-
-@pytest.mark.parametrize(("p", "labels"), [((3, 4), 3), ((3, 4, 5), 2), ((0, 4, 5), 0)])
-def test_a_curve_of_nothing_is_refused(p: tuple[int, ...], labels: int) -> None:
-    with pytest.raises(ValueError, match="posteriors"):
-        early_exit_curve(np.ones(p), np.zeros(labels, dtype=int))
 
 
 # Options that cannot be, and arrays in another order

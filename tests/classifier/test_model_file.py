@@ -260,7 +260,6 @@ def test_outputs_that_the_card_promises_must_be_there(
         ({"name": "x" * 3_000_000}, "a name of 3000000 characters"),
         ({"license": "\x1b[2J"}, "a licence must be at most 200 printable characters"),
         ({"steps": 1_000_000}, "an episode of 18000000 values"),
-        ({"provenance": {"commands": 5}}, "commands of the provenance must be a list"),
         ({"provenance": {"unseen_objects": "mug"}}, "unseen_objects of the provenance"),
         ({"state": (*CARD.state, StateTensor("samples", (1,), "float32"))}, "names of the state"),
         ({"state": (CARD.state[0], StateTensor("total", (2**40, 2**40), "float32"))},

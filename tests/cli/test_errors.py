@@ -217,13 +217,16 @@ def tiny_model(torch, tmp_path, sweep_set):
     from tactile_rt.models.training import TactileClassifier, TrainingConfig
     from tactile_rt.sweep_set import SweepManifest
 
-    spec = SweepManifest.read(sweep_set).spec
+    manifest = SweepManifest.read(sweep_set)
+    spec = manifest.spec
     network = EADConfig(classes=12, encoder="gru", attender="none", width=1 / 16)  # soon traced
     saved = {
         "model": TactileClassifier(spec, network).state_dict(),
         "network": msgspec.to_builtins(network),
         "config": msgspec.to_builtins(TrainingConfig(str(sweep_set))),
         "spec": spec.to_json(),
+        "categories": list(manifest.categories),
+        "refusals": [],
     }
     torch.save(saved, tmp_path / "best.pt")
     path = tmp_path / "tiny.onnx"

@@ -198,7 +198,6 @@ BROKEN = {
     "episode": (described(steps=900_000), "an episode of 810000000 values"),
     "state": (described(state=[]), "the graph's inputs disagree with its metadata at "),
     "spec": (described(spec="{}"), "array spec of version None"),
-    "commands": (described(provenance={"commands": 5}), "commands of the provenance must be a"),
     "escape": (described(labels=["\x1b[2J"]), "labels must be 1 to 200 printable characters"),
 }  # fmt: skip
 SHIPPED = shipped_model().read_bytes()

@@ -1,14 +1,13 @@
 """Recipes: those of the paper's tables, and what is said to a mistake in one's own."""
 
 from dataclasses import asdict
-from pathlib import Path
-from shlex import split
+from itertools import product
 
 import pytest
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.training import TrainingConfig, read_recipe, shipped_recipes
-from tactile_rt.models.training.recipes import load_recipe, training_command
+from tactile_rt.models.training.recipes import load_recipe
 
 E4 = [0.1, 0.01, 0.001, 0.0001]
 GATED = {"zhuang-ugrnn", "zhuang-intersection", "zhuang-gru", "zhuang-lstm"}
@@ -69,7 +68,8 @@ def choices(recipe, key):
 def test_every_combination_of_a_recipe_names_a_network(name):
     recipe = load_recipe(name)
     assert recipe.about
-    for values in recipe.searched():
+    for together in product(*recipe.search.values()):
+        values = dict(zip(recipe.search, together, strict=True))
         recipe.config("set", **values).network(classes=117)
         assert set(values) <= set(recipe.train)
     for key, values in recipe.search.items():
@@ -112,34 +112,6 @@ def test_self_supervised_recipes_are_those_of_the_tables(loss, attender):
     assert (config.optimizer, config.schedule, config.batch) == (optimizer, schedule, batch)
     assert warmup is None or config.warmup == warmup
     assert config.augmentation == ("none" if loss == "autoencoder" else "tactile-paper")
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [
-        {},
-        {"recipe": "mouse44", "seed": 7, "encoder": "s4"},
-        {"recipe": "paper-simclr", "width": 0.125, "also": ("a set", "another"), "seed": 3},
-        {"recipe": "simclr", "faults": {"gain": 0.0}, "own_rates": False, "updates": 9},
-        {"encoder": "graph", "graph": "[nodes.a]\nkind = 'x'\n", "learning_rate": 1.0 / 3.0},
-        {"begin": "runs/first/best.pt", "encoder": "gru", "width": 0.03125},
-    ],
-)
-def test_the_command_of_a_training_trains_so(asked):
-    asked = {"recipe": "default", **asked}
-    config = read_recipe(asked.pop("recipe"), "some data", **asked)
-    _, train, data, folder, *rest = split(training_command(asdict(config), Path("runs/mine")))
-    options = {}
-    for name, value in zip(rest[::2], rest[1::2], strict=True):
-        options.setdefault(name.removeprefix("--"), []).append(value)
-    begin = options.get("from", [""])[0]
-    of_another = {key: asked[key] for key in ("encoder", "width")} if begin else {}
-    again = read_recipe(
-        options["recipe"][0], data, options.get("set", []), begin=begin,
-        also=tuple(options.get("also", ())), seed=int(options["seed"][0]), **of_another,
-    )  # fmt: skip
-    assert (train, folder, again) == ("train", "runs/mine", config)
-    assert len(options.get("set", [])) <= len(asked) + 6, "the recipe says the rest"
 
 
 def test_overrides_come_last():

@@ -7,7 +7,6 @@ seconds. (The published probe left dropout and batch norm in training mode.)
 from collections.abc import Callable
 from dataclasses import asdict, replace
 from pathlib import Path
-from shlex import quote
 
 import msgspec
 import torch
@@ -27,12 +26,10 @@ from tactile_rt.models.datasets import SweepSet, drawn_as, of_categories, window
 from tactile_rt.models.evaluation import hits, predict
 from tactile_rt.models.training.batches import JITTER, TrainingBatches
 from tactile_rt.models.training.config import ProbeConfig, Progress
-from tactile_rt.models.training.recipes import as_options, training_command
 from tactile_rt.models.training.resuming import log_epoch
 
 __all__ = ["linear_probe", "probe"]
 
-TOLD = ("data", "epochs", "seed")  # by options of their own
 WINDOWS = 32  # at a time, through the frozen network
 
 
@@ -111,12 +108,7 @@ def _probe(
     folder.mkdir(parents=True, exist_ok=True)
     for line in history:
         log_epoch(folder / "history.csv", line)
-    made_by = saved.get("made_by") or training_command(saved["config"], checkpoint.parent)
-    fitted = as_options({k: v for k, v in asdict(config).items() if k not in TOLD})
     card = {
-        "made_by": f"{made_by} && tactile-rt probe {quote(str(checkpoint))} {quote(str(folder))} "
-        f"--data {quote(str(path))} --epochs {config.epochs} --seed {config.seed} "
-        + " ".join(fitted),
         "model": model.state_dict(),
         "config": {
             **saved["config"],
@@ -129,6 +121,7 @@ def _probe(
         "spec": manifest.spec.to_json(),
         "period_ns": manifest.period_ns,
         "categories": list(manifest.categories),
+        "refusals": [],
         "trained_objects": trained_objects([manifest], saved),
         "metrics": metrics,
     }

@@ -10,21 +10,18 @@ objective = "simclr"
 learning_rate = [0.1, 0.01, 0.001, 0.0001]
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Sequence
 from dataclasses import fields as fields_of
+from dataclasses import replace
 from importlib import resources
 from itertools import product
 from pathlib import Path
-from shlex import quote
 from typing import Any
 
 import msgspec
 
 from tactile_rt.errors import ConfigError
-from tactile_rt.models.checkpoint_files import NETWORK
 from tactile_rt.models.training.config import TrainingConfig
-from tactile_rt.sensor_faults import SensorFaults
 from tactile_rt.settings import (
     SettingNode,
     convert,
@@ -38,11 +35,9 @@ from tactile_rt.settings import (
 
 __all__ = [
     "Recipe",
-    "as_options",
     "load_recipe",
     "read_recipe",
     "shipped_recipes",
-    "training_command",
 ]
 
 KEYS = tuple(f.name for f in fields_of(TrainingConfig) if f.name != "data")
@@ -76,11 +71,6 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         set_keys(nodes, sets, TrainingConfig, KEYS)
         made: TrainingConfig = convert(nodes, TrainingConfig)
         return made
-
-    def searched(self) -> Iterator[dict[str, Any]]:
-        """Every combination of the values to be tried."""
-        for values in product(*self.search.values()):
-            yield dict(zip(self.search, values, strict=True))
 
 
 def shipped_recipes() -> tuple[str, ...]:
@@ -146,41 +136,3 @@ def read_recipe(name: str, data: str, sets: Sequence[str] = (), **overrides: Any
         ConfigError: there is none, it is damaged, or a value cannot be.
     """
     return load_recipe(name).config(data, sets, **overrides)
-
-
-def training_command(trained: Mapping[str, Any], folder: Path) -> str:
-    """The command that trains so again: with the recipe that says most of it, and what else.
-
-    Args:
-        trained: a run's configuration, as its `config.json` and its checkpoints have it.
-        folder: of the run.
-    """
-    known = {key: trained[key] for key in (*KEYS, "data") if key in trained}
-    asked = TrainingConfig(**{**known, "also": tuple(known.get("also", ()))})
-    given: dict[str, Any] = {"also": asked.also, "begin": asked.begin, "seed": asked.seed}
-    if asked.begin:  # whose network it is
-        given |= {key: getattr(asked, key) for key in NETWORK}
-
-    def changed(recipe: str) -> dict[str, Any]:
-        usual = read_recipe(recipe, asked.data, **given)
-        return {k: v for k in KEYS if (v := getattr(asked, k)) != getattr(usual, k)}
-
-    recipe = min(("default", *shipped_recipes()), key=lambda name: len(changed(name)))
-    options = [f"--recipe {recipe}", *as_options(changed(recipe))]
-    options += [f"--also {quote(other)}" for other in asked.also]
-    options += [f"--from {quote(asked.begin)}"] if asked.begin else []
-    where = f"{quote(asked.data)} {quote(str(folder))}"
-    return f"tactile-rt train {where} {' '.join(options)} --seed {asked.seed}"
-
-
-def as_options(values: Mapping[str, Any]) -> list[str]:
-    """Settings as they are written on a command line, ``--set key=value`` each."""
-    options = []
-    for key, value in values.items():
-        if isinstance(value, SensorFaults):
-            faults = asdict(value).items()
-            options += as_options({f"{key}.{name}": number for name, number in faults})
-        else:
-            text = str(value).lower() if isinstance(value, bool) else str(value)
-            options.append(f"--set {quote(f'{key}={text}')}")
-    return options
