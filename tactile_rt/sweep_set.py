@@ -36,7 +36,6 @@ __all__ = [
     "WITHHELD",
     "SweepManifest",
     "Sweeps",
-    "contacts_of",
     "has_object",
     "join_manifests",
     "object_path",
@@ -67,7 +66,6 @@ class SweepManifest:
     """What a sweep set is.
 
     Attributes:
-        spec: The description of the array.
         period_ns: The sample period of the stored arrays, ns.
         lead: The number of samples at the start of every sweep before the object can touch.
         categories: The names of the classes; a label is an index into them.
@@ -76,7 +74,6 @@ class SweepManifest:
         withheld: The categories of the splits "withheld" and "outliers".
         category_of: The category of objects whose name does not tell it.
         versions: The versions of what made the set (mujoco, numpy, ...).
-        settings: The settings of the simulation profile.
         sensor: The description of the array's sensor; None: it has none, and the values are base
             loads.
         version: The version of the set's format: 2 of simulated sweeps, 3 of recorded ones.
@@ -120,11 +117,7 @@ class SweepManifest:
 
     @property
     def limits(self) -> ChannelLimits:
-        """What a network may believe of the channels.
-
-        Raises:
-            ConfigError: as `channel_limits`.
-        """
+        """What a network may believe of the channels."""
         return channel_limits(self.spec, self.sensor, self.period_ns)
 
     def names(self, splits: Sequence[str] = ()) -> list[str]:
@@ -150,11 +143,7 @@ class SweepManifest:
         return category
 
     def label(self, name: str) -> int:
-        """The label of an object: -1 if its category is withheld from training.
-
-        Raises:
-            RecordingError: as `category`.
-        """
+        """The label of an object: -1 if its category is withheld from training."""
         category = self.category(name)
         return self.categories.index(category) if category in self.categories else -1
 
@@ -285,19 +274,6 @@ class Sweeps:
         return Sweeps(**taken)
 
 
-def contacts_of(sweeps: Sweeps) -> NDArray[np.float32]:
-    """The contacts of sweeps that must have them.
-
-    Raises:
-        ConfigError: their set was made without.
-    """
-    if sweeps.contacts is None:
-        raise ConfigError(
-            "the sweep set holds no contacts: make one with `tactile-rt sweep --set contacts=true`"
-        )
-    return sweeps.contacts
-
-
 def object_path(folder: Path, name: str) -> Path:
     """The file of one object's sweeps."""
     return folder / f"{name}.npz"
@@ -318,7 +294,6 @@ def write_object(
     """Write all sweeps of one object, whole or not at all.
 
     Args:
-        folder: the set.
         name: ``category-index``.
         values: (sweep, sample, element, channel) SI.
         parameters: (sweep,) arrays that describe each sweep, stored beside the values.

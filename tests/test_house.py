@@ -38,7 +38,6 @@ TABLES = {
     "tactile_rt.models.alignment.datasets",
     "tactile_rt.models.alignment.metrics",
     "tactile_rt.models.ead",
-    "tactile_rt.models.training",
     "tactile_rt.sources.opening",
 }
 ROOMS = sorted({m.room for m in product()} - {""})

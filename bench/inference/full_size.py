@@ -18,8 +18,8 @@ from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.evidence.model_steps import Subject
 from tactile_rt.export.onnx_step import OPSET, step_graph, write_model
 from tactile_rt.export.precision import Precision
+from tactile_rt.models.checkpoints import TactileClassifier
 from tactile_rt.models.ead import EADConfig
-from tactile_rt.models.training import TactileClassifier
 from tactile_rt.sensor_spec import channel_limits
 from tactile_rt.stream import ArraySpec
 from tactile_rt.timing import MOUSE

@@ -22,7 +22,7 @@ from tactile_rt.evidence.records import Record
 from tactile_rt.extras import install_extra
 
 if TYPE_CHECKING:  # a robot has no torch
-    from tactile_rt.models.training import TactileClassifier
+    from tactile_rt.models.checkpoints import TactileClassifier
 
 __all__ = ["window_speed"]
 

@@ -18,8 +18,8 @@ from tactile_rt.errors import TactileError
 from tactile_rt.models.checkpoints import load_checkpoint
 from tactile_rt.models.grid.outcomes import read_outcome
 from tactile_rt.models.grid.plan import SUPERVISED, Task, read_grid
-from tactile_rt.models.training import TrainingConfig, train
-from tactile_rt.models.training.loop import read_splits
+from tactile_rt.models.training.config import TrainingConfig
+from tactile_rt.models.training.loop import read_splits, train
 
 KEPT = Path(__file__).parent / "wide24"
 FOUR = ["gru", "s4", "mamba", "mamba+gpt"]

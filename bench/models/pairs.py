@@ -16,9 +16,9 @@ import typer
 
 from tactile_rt.errors import TactileError
 from tactile_rt.models.checkpoints import load_checkpoint
-from tactile_rt.models.training import ProbeConfig, TrainingConfig, probe, train
-from tactile_rt.models.training.config import ONE_SWEEP, TWO_SWEEPS
-from tactile_rt.models.training.loop import read_splits
+from tactile_rt.models.training.config import ONE_SWEEP, TWO_SWEEPS, ProbeConfig, TrainingConfig
+from tactile_rt.models.training.loop import read_splits, train
+from tactile_rt.models.training.probing import probe
 
 RATE, WARMUP = 5e-3, 0.3
 KINDS = (  # pairs, augmentation, temperatures

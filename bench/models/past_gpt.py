@@ -20,8 +20,8 @@ from torch.nn import functional as F
 from tactile_rt.errors import TactileError
 from tactile_rt.models import attenders
 from tactile_rt.models.attenders.gpt import GPT, LAYERS, TOKENS, TransformerBlock
-from tactile_rt.models.training import TrainingConfig, train
-from tactile_rt.models.training.loop import read_splits
+from tactile_rt.models.training.config import TrainingConfig
+from tactile_rt.models.training.loop import read_splits, train
 
 RATES = {  # peak rate, warm-up; alone, and with a GPT
     "gru": ((5e-3, 0.3), (1.5e-3, 0.05)),

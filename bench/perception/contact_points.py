@@ -10,7 +10,7 @@ import numpy as np
 
 from tactile_rt.classifier.contact_point import ESTIMATES, WhiskerShapes
 from tactile_rt.sim_backend.arrays.files import load_animals
-from tactile_rt.sweep_set import SweepManifest, contacts_of, read_sweeps
+from tactile_rt.sweep_set import SweepManifest, read_sweeps
 
 FELT_N = 30e-6  # of transverse force: three times the rated noise
 
@@ -26,7 +26,8 @@ def main(folder: Path) -> None:
         tip_radius=np.array([w.tip_radius for w in whiskers]) * 1e-3,
         young_modulus=np.array([w.young_modulus for w in whiskers]),
     )
-    truth = contacts_of(sweeps)
+    truth = sweeps.contacts
+    assert truth is not None, "make the set with --set contacts=true"
     truth[:, : manifest.lead] = np.nan
     touching = np.isfinite(truth)
     element, wanted = np.nonzero(touching)[2], truth[touching]

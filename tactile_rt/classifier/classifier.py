@@ -104,8 +104,6 @@ class ClassifierStats:
     """Counted since the classifier was made.
 
     Attributes:
-        steps: The number of steps that the network took.
-        late: The number of steps that missed the deadline.
         withheld: The number of decisions that were not returned because they were late.
         skips: The number of stretches of the stream that were skipped.
         bad_samples: The number of samples of one element that were no number, infinite or absurd
@@ -128,7 +126,6 @@ class Classifier:
 
     Args:
         model: path of the ``.onnx`` file.
-        spec: the array that the stream comes from.
         mode: ``episode`` or ``sliding``.
         every: steps between the windows of ``sliding``, None for 4 (180 ms at 45 ms); the network
             runs in ceil(steps / every) lanes, and takes up to as many times as long.
@@ -146,17 +143,14 @@ class Classifier:
             network skips to the ``newest`` sample, or takes ``all`` steps.
         behind_s: the greatest age of a step's newest sample when its decision is there, s; None:
             three steps, or 0.15 s if that is more.
-        skips: stretches to skip, as a recording tells them.
 
     Attributes:
-        card: The metadata of the model file.
         detector: The contact detector, which holds the stream's contact state and tare.
         tared: (element, channel) The last resampled sample less the tare, SI; zeros before the
             tare. The next `push` overwrites it.
         touches: The newest 256 changes of contact, as stream time (ns) and whether it began;
             whoever reads them takes them out.
         stats: The counters of steps, late steps and bad samples.
-        skips: The stretches of the stream that the network skips.
         providers: Names of the execution providers in use, as onnxruntime has them.
 
     Raises:

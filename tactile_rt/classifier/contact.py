@@ -82,7 +82,6 @@ class ContactDetector:
     Attributes:
         ready: Whether enough quiet samples have been seen for a tare; no contact is reported
             before.
-        contact: Whether something is being touched now.
         offset: (element, channel) The tare, which is the mean of the quiet samples, SI.
         sigma: (element, channel) The noise per sample, one standard deviation, SI; it is never
             below `floor`.

@@ -80,7 +80,6 @@ def straight(loads: Floats, element: NDArray[np.int64], shapes: WhiskerShapes) -
     Args:
         loads: (n, 6) force (N) and moment (N m) at the base in the whisker's frame.
         element: (n,) whose.
-        shapes: of the array.
     """
     force, moment = loads[:, 1:3], loads[:, 4:6]
     squared = (force**2).sum(axis=1)

@@ -86,7 +86,6 @@ class Lanes:
     before a step, and which is asked after it; steps are counted from 0.
 
     Args:
-        steps: length of a window, in steps.
         every: steps from one window's beginning to the next one's.
 
     Attributes:
@@ -136,7 +135,6 @@ class Deadline:
 
     Attributes:
         behind_s: The work that had gathered at the end of the last step, s.
-        late: The number of late steps so far.
 
     Raises:
         ConfigError: no such policy, or a limit that is not positive.

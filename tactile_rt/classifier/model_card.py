@@ -103,7 +103,6 @@ class ModelCard(msgspec.Struct, frozen=True):
         spec: The JSON form of the `ArraySpec` that the model was trained on.
         period_ns: The period of a sub-step, ns; the stream is resampled to it.
         substeps: The number of sub-steps in a step.
-        steps: The number of steps in an episode.
         labels: (class,) The names of the classes, in the order of the logits.
         state: The recurrent state tensors, all zero when an episode begins.
         clip, scale: (channel,) Limits and smallest scale of the input compression, SI.
@@ -204,8 +203,6 @@ def fit_source(model: Path, card: ModelCard, spec: ArraySpec) -> NDArray[np.intp
 
     Args:
         model: the file, for the message.
-        card: what the file says of itself.
-        spec: the array of the source.
 
     Raises:
         SpecMismatch: the model was made for another array; the message says where they differ, and
@@ -225,10 +222,6 @@ def fit_source(model: Path, card: ModelCard, spec: ArraySpec) -> NDArray[np.intp
 
 def parse_card(path: Path, text: str) -> ModelCard:
     """Read a model's metadata.
-
-    Args:
-        path: the file that it comes from, for messages.
-        text: its JSON.
 
     Raises:
         ModelError: damaged, of another version, or describing what cannot be run.
@@ -314,7 +307,6 @@ def decided(card: ModelCard, probabilities: NDArray[np.float32], step: int) -> i
     """The index of the label that a model decides for.
 
     Args:
-        card: what it says of itself.
         probabilities: (class,) of all its labels.
         step: of the episode, counted from 1.
     """

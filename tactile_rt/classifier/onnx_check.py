@@ -48,9 +48,7 @@ class Contents:
     """What a model file holds.
 
     Attributes:
-        producer: The name of the program that wrote the file.
         opset: The version of each operator set, by domain; ``""`` is ONNX's own.
-        metadata: The key-value pairs that the file carries.
         operators: The number of uses of each operator, by name, subgraphs included.
         inputs, outputs: Names of the graph's inputs and outputs, without the inputs that have a
             stored value.

@@ -48,11 +48,6 @@ class Tensor:
 class Stepper:
     """A model file's graph, run step by step in so many lanes at once.
 
-    Args:
-        session: the opened graph.
-        card: its metadata.
-        lanes: independent streams, the batch axis.
-
     Attributes:
         samples: (lane, sub-step, element, channel) SI: write the step's input here.
         embedding: (lane, unit) The embedding of the last step, which the next one overwrites.

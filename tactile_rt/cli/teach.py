@@ -222,7 +222,6 @@ def _begun_before(folder: Path, base: Path | None) -> "Lesson | None":
     """The lesson that a folder holds; None: none.
 
     Args:
-        folder: of the lesson.
         base: the model that is taught further classes, if one is.
     """
     from tactile_rt.classifier.model_file import hash_of

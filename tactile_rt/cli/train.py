@@ -77,7 +77,7 @@ def train(
     with needing("train"):
         import torch
 
-        from tactile_rt.models import training
+        from tactile_rt.models.training.loop import train as train_network
     torch.set_num_threads(threads)
     # Under torchrun every process has the same to say.
     console = Console(stderr=True, quiet=not first)
@@ -95,7 +95,7 @@ def train(
                 console.print(_in_words(at))
 
         with needing("train"):
-            best = training.train(config, folder, show, device=accelerator)
+            best = train_network(config, folder, show, device=accelerator)
     if not console.quiet:
         told_as_json({"best": best, "epochs": history}, json)
     console.print(f"best network: {best}")

@@ -47,7 +47,6 @@ def evaluate_model(
 
     Args:
         model: the ``.onnx`` file.
-        data: a sweep set.
         svm: fit an RBF support vector machine on the same windows to compare with.
         pictures: folder for ``confusion.png``, ``accuracy_over_time.png``, ``robustness.png``.
         quick: take two sweeps of each object: enough to compare by, not to quote.

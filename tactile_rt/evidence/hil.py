@@ -283,7 +283,6 @@ def named_right(passes: Sequence[tuple[int, str]], decisions: Sequence[Classific
 
     Args:
         passes: when each began to come by, stream time in ns, and its category; in order.
-        decisions: in order.
     """
     named: dict[int, str] = {}
     for decision in decisions:

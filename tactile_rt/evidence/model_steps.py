@@ -24,7 +24,6 @@ class Subject:
     """A model file to measure, and the bars that it must meet; without one it is only reported.
 
     Attributes:
-        name: The name of the file in its figures.
         path: The model file, of kind "step".
         step_ms: The bar of the median step's CPU time in ms.
         load_ms: The bar of the CPU time of loading in ms.
@@ -38,10 +37,6 @@ class Subject:
 
 def measure_model(subject: Subject, steps: int) -> list[Record]:
     """Measure one file of kind "step": size, loading, memory, steps.
-
-    Args:
-        subject: the file and its bars.
-        steps: to time, in all.
 
     Raises:
         ModelError: the file cannot be used.

@@ -61,10 +61,7 @@ def draw_robustness(found: dict[str, Interval], chance: float, title: str, path:
     """Draw top-1 accuracy under each condition, the first of them undisturbed.
 
     Args:
-        found: accuracy by condition.
         chance: accuracy of a guess (%).
-        title: which sweeps.
-        path: the picture to write.
     """
     figure = Figure(figsize=(7.2, 0.42 * len(found) + 1.2), layout="constrained")
     axes = figure.subplots()

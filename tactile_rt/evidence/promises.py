@@ -46,10 +46,8 @@ def promises(path: Path, test: SweepSet, disturbance: Disturbance = CLEAN) -> Pr
     """What becomes of them on a test; None if the model makes none.
 
     Args:
-        path: of the model file.
         test: the sweeps, labelled by the model's classes; those of none (-1) are only refused or
             not.
-        disturbance: what is wrong with the sensor.
     """
     _, card = load_model(path)
     if not card.refusals and not card.candidates:

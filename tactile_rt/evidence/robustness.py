@@ -72,7 +72,6 @@ def measure_robustness(
     """Accuracy under every condition, the first without any.
 
     Args:
-        test: the sweeps.
         run: as `evaluation.predict` takes it.
         clean: (sweep, class) final posteriors of the same sweeps, undisturbed.
     """
@@ -93,7 +92,6 @@ def robustness_records(found: list[Robustness], how: str) -> list[Record]:
 
     Args:
         found: as `measure_robustness` gives it.
-        how: which sweeps.
     """
     return [
         Record(

@@ -30,8 +30,8 @@ from tactile_rt.export.precision import Precision, in_precision
 from tactile_rt.export.streaming import streaming
 from tactile_rt.export.windows import window_graph
 from tactile_rt.files import write_whole
+from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint
 from tactile_rt.models.data_checks import trained_objects, trained_on
-from tactile_rt.models.training import TactileClassifier, load_checkpoint
 from tactile_rt.sweep_set import SweepManifest, join_manifests
 from tactile_rt.version import VERSION
 
@@ -54,7 +54,6 @@ class StreamingStep(nn.Module):
     """One step of a classifier with its state as arguments and results.
 
     Args:
-        model: as trained.
         integer: its products will be quantised, see `streaming`.
     """
 
@@ -95,12 +94,8 @@ def export_checkpoint(
     Args:
         checkpoint: a ``best.pt``.
         path: the ``.onnx`` file to write.
-        name: of the model.
         temperature: divides the logits at run time.
         rules: when the model refuses to name a class, and what it promises of candidates.
-        embeddings: where touches of the known classes lie.
-        figures: measured accuracies to store in the file.
-        precision: of the weights, and of products with them.
         kind: "step" or "window".
         data: where the sweep sets that it was trained on lie now; default: where they lay.
         licence: `ModelCard.license`.
@@ -178,8 +173,6 @@ def step_graph(
     """The step in single precision, without metadata, and its state.
 
     Args:
-        model: as trained.
-        card: says how large the array and a step are.
         integer: its products will be quantised, see `streaming`.
     """
     step = StreamingStep(model.eval(), integer).eval()

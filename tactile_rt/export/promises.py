@@ -52,8 +52,6 @@ def fitted_rules(
         sets: labelled sweeps that it has not learnt from, as groups of which each is to be kept
             the promise.
         run: (samples, offset, sigma) of windows to (batch, step, label) logits.
-        temperature: of the model.
-        labels: what it tells apart.
         classes: how many of the labels are classes; the others are refusals.
     """
     levels = {*REFUSED_AT, *(level for ends in NOISE.values() for level in ends)}
@@ -121,7 +119,6 @@ def fit_candidates(
         groups: posteriors (sweep, step, class), NaN where no contact was found, labels (sweep,)
             and objects (sweep,).
         noise: the largest in units of the rated at which they hold.
-        coverage: the promise.
 
     Raises:
         RecordingError: no contact in any sweep.

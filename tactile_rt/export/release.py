@@ -16,14 +16,10 @@ from tactile_rt.export.onnx_step import export_checkpoint
 from tactile_rt.export.precision import Precision
 from tactile_rt.export.promises import fitted_rules
 from tactile_rt.files import write_whole
+from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
 from tactile_rt.models.evaluation import Step, among, hits, predict, run_windows
-from tactile_rt.models.training import (
-    TactileClassifier,
-    load_checkpoint,
-    run_on,
-)
 from tactile_rt.sweep_set import SweepManifest, join_manifests
 
 __all__ = ["fit_temperature", "quantisation_figures", "release", "run_file"]
@@ -129,11 +125,6 @@ def run_file(path: Path) -> Step:
 
 def quantisation_figures(trained: Step, path: Path, sweeps: SweepSet) -> dict[str, float]:
     """What a file's precision costs on sweeps, half of them at rated noise, at the last step.
-
-    Args:
-        trained: the network in full precision.
-        path: the file.
-        sweeps: labelled ones that the network was not trained on.
 
     Returns:
         ``quantisation_top1_drop`` in points, ``quantisation_agreement`` in %,

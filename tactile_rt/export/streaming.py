@@ -72,7 +72,6 @@ class Taps(nn.Module):
 
     Args:
         weight: (output, 2, 2, input).
-        size: rows and columns of the maps that come in.
         valid: without the padding that makes the output as large as the input.
         whole: gather all four taps; else add the lower two as a product of their own, of fewer
             sites or of none: what lies below the map needs no product.
@@ -118,12 +117,7 @@ class Taps(nn.Module):
 
 
 class StreamingIntersection(Cell):
-    """An `IntersectionCell` with layer norm: scale, offset and forget bias are each gate's norm's.
-
-    Args:
-        cell: as trained.
-        conv: its convolution.
-    """
+    """An `IntersectionCell` with layer norm, whose norms have scale, offset and forget bias."""
 
     gates, norms = 0, 0
 

@@ -23,12 +23,7 @@ WIDE = 256  # features, from where on convolutions were the faster products
 
 
 class StreamingGPT(nn.Module):
-    """A `GPT` whose cache is one tensor per layer and kind, of which a step writes its own rows.
-
-    Args:
-        gpt: as trained.
-        integer: its products will be quantised.
-    """
+    """A `GPT` whose cache is one tensor per layer and kind, of which a step writes its own rows."""
 
     positions: Tensor
 
@@ -97,12 +92,7 @@ class Rows:
 
 
 class StreamingBlock(nn.Module):
-    """One layer of `StreamingGPT`.
-
-    Args:
-        block: as trained.
-        layout: of all tokens.
-    """
+    """One layer of `StreamingGPT`."""
 
     def __init__(self, block: nn.Module, layout: tuple[int, ...]) -> None:
         super().__init__()

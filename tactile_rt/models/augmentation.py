@@ -66,7 +66,6 @@ def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
 
     Args:
         name: one of `training.config.AUGMENTATIONS`.
-        spec: the array.
         masking: share of steps that are blanked, too.
 
     Raises:
@@ -108,9 +107,6 @@ def _as_is(x: T, _: Generator) -> T:
 
 class Tactile:
     """Mirroring, turning and time reversal of the loads themselves, drawn for every window.
-
-    Args:
-        spec: the array.
 
     Raises:
         ConfigError: its channels are neither forces nor moments, or it is no grid.
@@ -165,7 +161,6 @@ def tactile_paper(frames: Tensor, generator: Generator, channels: int = 6) -> Te
 
     Args:
         frames: (batch, step, sub-step * channel, row, column).
-        generator: on their device.
         channels: of a sub-step.
     """
 
@@ -216,7 +211,6 @@ def image(frames: Tensor, generator: Generator, colours: int = 6) -> Tensor:
 
     Args:
         frames: (batch, step, sub-step * colour, row, column).
-        generator: on their device.
         colours: channels of a sub-step.
     """
     n, device = len(frames), frames.device

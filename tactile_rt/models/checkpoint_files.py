@@ -53,11 +53,7 @@ def describe_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def network_of(path: Path) -> dict[str, Any]:
-    """What a training configuration says of the network of a checkpoint.
-
-    Raises:
-        ModelError: as `describe_checkpoint`.
-    """
+    """What a training configuration says of the network of a checkpoint."""
     network = describe_checkpoint(path)["network"]
     return {key: value for key, value in network.items() if key in NETWORK}
 

@@ -34,7 +34,6 @@ class TactileClassifier(nn.Module):
     """Samples in SI units to logits: the input stage and the network, trained and shipped as one.
 
     Args:
-        spec: the array.
         network: the EAD's configuration.
         limits: what is believed of the channels; None: what `channel_limits` says of an array
             without a described sensor.
@@ -132,7 +131,6 @@ def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> N
 
     Args:
         model: of the same network, but that it may tell apart other things.
-        path: of the checkpoint.
         labels: what the network is to tell apart; it knows those from the beginning that the
             checkpoint knew by the same name.
 

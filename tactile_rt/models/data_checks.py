@@ -34,9 +34,6 @@ __all__ = [
 def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManifest) -> None:
     """A set that a checkpoint is to be used on is of the array that it was made for, and its
     samples are so far apart that steps are of as many.
-
-    Raises:
-        SpecMismatch: otherwise.
     """
     spec = ArraySpec.from_json(saved["spec"])
     if differences := spec.differences(manifest.spec, ("name", "rate_hz")):
@@ -57,14 +54,11 @@ def trained_on(
     """The sweep sets that a checkpoint was trained on: where they lie now.
 
     Args:
-        checkpoint: for messages.
-        saved: what is in it.
         data: the sets; default: where they lay when it was trained on.
 
     Raises:
         RecordingError: one is not there, or no sweep set.
         SpecMismatch: one is of another array, or they hold other categories.
-        ConfigError: as `join_manifests`.
     """
     config = saved["config"]
     folders = tuple(data) or tuple(map(Path, (config["data"], *config.get("also", ()))))
@@ -93,12 +87,7 @@ def trained_on(
 def trained_objects(
     manifests: Sequence[SweepManifest], saved: Mapping[str, Any] | None = None
 ) -> dict[str, list[str]]:
-    """The names of the objects that a network has learnt from, by where the objects come from.
-
-    Args:
-        manifests: of the sets that it learns from.
-        saved: the checkpoint that it began with.
-    """
+    """The names of the objects that a network has learnt from, by where the objects come from."""
     before = saved.get("trained_objects", {}) if saved else {}
     found = {source: dict.fromkeys(names) for source, names in before.items()}
     for one in manifests:
@@ -113,9 +102,6 @@ def probed_on(
     """The sweep set that a checkpoint is probed on.
 
     Args:
-        checkpoint: for messages.
-        saved: what is in it.
-        folder: where the probe is to go.
         data: the set; empty: the first of those that it was trained on.
 
     Raises:
@@ -151,11 +137,7 @@ def check_labelled(folder: Path, manifest: SweepManifest) -> None:
 
 
 def check_split(folder: Path, manifest: SweepManifest) -> None:
-    """No object on two sides of the split, every trained object of a category that is trained.
-
-    Raises:
-        RecordingError: otherwise.
-    """
+    """No object on two sides of the split, every trained object of a category that is trained."""
     side: dict[str, str] = {}
     for split, names in manifest.split.items():
         for name in names:
@@ -178,7 +160,6 @@ def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
 
     Args:
         folder: the sweep set's.
-        sets: its splits, as they were read.
 
     Raises:
         RecordingError: otherwise; the message names the object.

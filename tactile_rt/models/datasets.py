@@ -49,8 +49,6 @@ class SweepSet:
     """One split of a sweep set, with what its windows need.
 
     Attributes:
-        manifest: The manifest of the whole set.
-        sweeps: The sweeps of the split.
         noise: (channel,) The rated noise per sample, SI.
         floor: (channel,) The smallest sigma of the detector, SI.
         window: The first sample of a sweep's window: "onset", where the detector hears the touch,
@@ -65,11 +63,7 @@ class SweepSet:
 
     @classmethod
     def read(cls, folder: Path, split: str) -> SweepSet:
-        """Read a split.
-
-        Raises:
-            RecordingError, ConfigError: as `read_sweeps` and `channel_limits`.
-        """
+        """Read a split."""
         manifest = SweepManifest.read(folder)
         limits = manifest.limits
         return cls(manifest, read_sweeps(folder, split), limits.noise, limits.floor)
@@ -167,9 +161,6 @@ def joined(sets: Sequence[SweepSet]) -> SweepSet:
     """Sets of one array as one, with the categories of all; faults are those of the first.
 
     Shorter sweeps rest longer before, as they did, and repeat their last sample after.
-
-    Raises:
-        ConfigError: as `join_manifests`.
     """
     if len(sets) == 1:
         return sets[0]

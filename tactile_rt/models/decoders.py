@@ -153,8 +153,6 @@ def make(
 
     Args:
         name: one of `DECODERS`.
-        features: what a step brings.
-        width: scales the hidden layers.
         steps: an episode's steps, which "mlp-all" has weights for.
 
     Raises:

@@ -60,8 +60,6 @@ class Disturbance:
 
         Args:
             values: (sweep, sample, element, channel) of these sweeps, SI.
-            data: the same sweeps.
-            rng: what is drawn is drawn from.
         """
         if self == CLEAN:
             return values

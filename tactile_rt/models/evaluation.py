@@ -89,13 +89,10 @@ def predict(
     """Posteriors of every sweep at every step, from where the detector finds its onset.
 
     Args:
-        data: the sweeps.
         run: (samples, offset, sigma) of windows to (batch, step, class) logits.
         noise_level: white sensor noise added to every stored sample, in units of the rated noise;
             short for a `disturbance` of only that.
-        seed: of the noise and of what else is drawn.
         batch: windows per call of `run`.
-        disturbance: what is wrong with the sensor.
 
     Returns:
         (sweep, step, class) posteriors; NaN where no contact was detected.
@@ -274,7 +271,6 @@ def accuracy(correct: NDArray[Any], objects: NDArray[np.str_], resamples: int = 
             points that one condition loses to another on the same sweeps; or (seed, sweep), whose
             seeds are then resampled too.
         objects: (sweep,) object of each sweep.
-        resamples: bootstrap resamples.
     """
     runs = np.atleast_2d(correct).astype(np.float64)
     _, which = np.unique(objects, return_inverse=True)
@@ -302,7 +298,6 @@ def bootstrap(
         statistic: of the sweeps with these indices (k,), some of which may come more than once; NaN
             where they do not tell, as a draw without one of two kinds.
         objects: (sweep,) object of each sweep.
-        resamples: bootstrap resamples.
     """
     _, which = np.unique(objects, return_inverse=True)
     of = np.split(np.argsort(which, kind="stable"), np.cumsum(np.bincount(which))[:-1])

@@ -57,8 +57,6 @@ class Objective(nn.Module):
     """A network and what it is trained for.
 
     Attributes:
-        model: The network that is trained.
-        augmentation: The augmentation that is applied to the frames.
         views: The number of times that an update sees each window, each time augmented afresh.
     """
 
@@ -131,7 +129,6 @@ class Supervised(Objective):
     Args:
         model, augmentation: as in `Objective`.
         loss: "anytime" or "last".
-        smoothing: of the labels.
     """
 
     def __init__(

@@ -67,8 +67,6 @@ def augment(frames: Tensor, generator: Generator, jitter: Jitter) -> Tensor:
 
     Args:
         frames: (batch, step, sub-step * channel, row, column); channels in threes are colours.
-        generator: on their device.
-        jitter: of the colours.
     """
     device = generator.device
 
@@ -106,7 +104,6 @@ def jittered(x: Tensor, order: Sequence[int], by: tuple[float, float, float, flo
     """Pictures (..., colour, row, column) with other brightness, contrast, saturation and hue.
 
     Args:
-        x: the pictures.
         order: in which the four are changed, by their places in `by`.
         by: factors of the first three, and turns that are added to the hue.
     """

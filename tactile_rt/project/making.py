@@ -21,8 +21,9 @@ from tactile_rt.evidence.classification import evaluate_model
 from tactile_rt.evidence.records import Record, write
 from tactile_rt.export.release import release
 from tactile_rt.models.datasets import SweepSet
-from tactile_rt.models.training import Progress, TrainingConfig, read_recipe, train
-from tactile_rt.models.training.loop import read_splits
+from tactile_rt.models.training.config import Progress, TrainingConfig
+from tactile_rt.models.training.loop import read_splits, train
+from tactile_rt.models.training.recipes import read_recipe
 from tactile_rt.project.budget import Budget, budget_sweeps, read_budget, sized, write_budget
 from tactile_rt.project.folder import Project
 from tactile_rt.project.report import write_report

@@ -38,8 +38,6 @@ class FeatureNetwork:
     """Features of a stream of an array, step by step.
 
     Attributes:
-        spec: The array that delivers the samples.
-        substeps: The number of samples of a step.
         kernels: (kernel, signal, tap) The weights of the temporal kernels.
         dilations: (kernel,) The number of samples from one tap to the next, ascending.
         thresholds: (kernel,) The output of a kernel above which it counts as high.
@@ -53,14 +51,7 @@ class FeatureNetwork:
 
     @classmethod
     def drawn(cls, spec: ArraySpec, substeps: int, steps: int, seed: int = 0) -> "FeatureNetwork":
-        """The network of an array: the same one every time, everywhere.
-
-        Args:
-            spec: the array.
-            substeps: samples of a step.
-            steps: steps of an episode.
-            seed: of the kernels.
-        """
+        """The network of an array: the same one every time, everywhere."""
         rng = np.random.default_rng(seed)
         signals = sum(cls._signals(spec, unit) for unit in dict.fromkeys(spec.units))
         reach = [d for d in DILATIONS if d * (TAPS - 1) < 0.8 * steps * substeps] or [1]

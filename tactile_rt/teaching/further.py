@@ -45,7 +45,6 @@ class FurtherClasses:
     """What tells new classes from those that a network knows.
 
     Attributes:
-        labels: The names of the new classes.
         whitening: (unit, unit) The map by which differences within a class become alike in all
             directions.
         known, new: (class, unit) The means of touches of the classes, whitened.

@@ -38,7 +38,6 @@ class TouchClasses:
     """What tells classes apart, step by step. Standardised features are (f - mean) / scale.
 
     Attributes:
-        labels: The names of the classes.
         mean, scale: (step, feature) The numbers by which features are standardised; then they are
             limited to 5.
         centres: (step, class, feature) The means of the classes, standardised.

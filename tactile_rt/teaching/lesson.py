@@ -67,10 +67,7 @@ class TaughtTouch:
     """One touch.
 
     Attributes:
-        label: The name of what it was.
         features: (step, feature) What was felt, step by step.
-        recording: The name of the recording that it is in.
-        line: The line that tells of it.
     """
 
     label: str
@@ -84,8 +81,6 @@ class Lesson:
     """Touches and what is learnt from them, kept in a folder.
 
     Attributes:
-        folder: The folder that keeps everything.
-        taught: What the model will be of.
         touches: All touches, in their order.
         lost: The number of touches in the list that are not in the recordings, as their last
             moment was not written when the program was killed.
@@ -102,7 +97,6 @@ class Lesson:
 
         Args:
             folder: where to; made if it is not there.
-            spec: the array.
             floor: (channel,) the smallest noise that the contact detector is to assume.
 
         Raises:
@@ -206,9 +200,7 @@ class Lesson:
         """Take a touch; on return it is on the disk, but for what the recording has not written.
 
         Args:
-            label: what it was.
             features: (step, feature).
-            recording: name of the recording that it is in.
             span_s: where in it, seconds since its first sample.
         """
         interval = LabelledInterval(label=label, start_s=max(0.0, span_s[0]), end_s=span_s[1])

@@ -23,7 +23,6 @@ class Listener:
 
     Args:
         model: ``features.onnx``.
-        spec: the array of the stream.
         felt: makes features of a touch's steps.
         hasty_ns: how soon after the end of a contact another is taken for its rest, ns.
 
@@ -125,9 +124,6 @@ def measured_floor(chunks: Sequence[Chunk]) -> NDArray[np.float32]:
 
     A share of the noise of the median element; of a channel that never changes, the smallest
     difference between its readings, or a millionth of the largest.
-
-    Args:
-        chunks: what the array delivers while nothing touches it.
 
     Raises:
         RecordingError: there is nothing, or nothing valid.

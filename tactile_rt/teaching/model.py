@@ -55,7 +55,6 @@ class Taught:
     """What a model that is taught is of.
 
     Attributes:
-        spec: The array that was touched.
         floor: (channel,) The smallest noise that the contact detector assumes, in the channel's
             unit.
     """
@@ -97,9 +96,6 @@ class Taught:
 
 class TaughtFurther:
     """What a network is taught further classes of.
-
-    Args:
-        model: its file.
 
     Raises:
         ModelError: it cannot be used.

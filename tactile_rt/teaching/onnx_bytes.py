@@ -80,12 +80,7 @@ def _renamed(node: memoryview, name: str) -> bytes:
 
 @dataclass
 class OnnxGraph:
-    """A graph that is built operator by operator, in the order in which they run.
-
-    Attributes:
-        parts: The serialised nodes, tensors, inputs and outputs.
-        opsets: The serialised versions of the sets of operators.
-    """
+    """A graph that is built operator by operator, in the order in which they run."""
 
     parts: list[bytes] = field(default_factory=list)
     opsets: list[bytes] = field(

@@ -31,9 +31,6 @@ class TeachingPage:
         state: gives what the page shows, see `Teacher.state`; called in another thread.
         obey: takes an order, in another thread.
 
-    Attributes:
-        url: The address of the page.
-
     Raises:
         SourceError: the address is taken, or not ours.
     """

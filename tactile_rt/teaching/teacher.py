@@ -23,12 +23,9 @@ class Teacher:
     """What is asked of who touches.
 
     Attributes:
-        lesson: The lesson that takes the touches.
         wanted: The names of the classes to be taught, in their order; more come as they are named.
-        each: The number of touches of each class.
         label: The name of what is touched now; empty: nobody has said.
         done: Whether who teaches has had enough, or all that was wanted is there.
-        said: What was said last.
     """
 
     lesson: Lesson

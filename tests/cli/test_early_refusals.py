@@ -13,7 +13,8 @@ torch = pytest.importorskip("torch")
 for module in ("lightning", "onnx", "matplotlib"):
     pytest.importorskip(module)
 
-from tactile_rt.models.training import TrainingConfig, train  # noqa: E402
+from tactile_rt.models.training.config import TrainingConfig  # noqa: E402
+from tactile_rt.models.training.loop import train  # noqa: E402
 
 # Commands of JSON lines, in one process; of each what it said, and what it had loaded.
 CHILD = """

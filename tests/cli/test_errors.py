@@ -167,7 +167,8 @@ def test_a_run_that_cannot_begin_can_be_begun_again_with_other_options(
 
 
 def test_an_interrupted_run_goes_on_to_the_same_end(torch, sweep_set, tmp_path):
-    from tactile_rt.models.training import TrainingConfig, train
+    from tactile_rt.models.training.config import TrainingConfig
+    from tactile_rt.models.training.loop import train
 
     config = TrainingConfig(str(sweep_set), width=1 / 32, epochs=3, batch=4)
 
@@ -213,8 +214,9 @@ def tiny_model(torch, tmp_path, sweep_set):
 
     from tactile_rt.classifier.model_file import METADATA_KEY
     from tactile_rt.export.onnx_step import export_checkpoint
+    from tactile_rt.models.checkpoints import TactileClassifier
     from tactile_rt.models.ead import EADConfig
-    from tactile_rt.models.training import TactileClassifier, TrainingConfig
+    from tactile_rt.models.training.config import TrainingConfig
     from tactile_rt.sweep_set import SweepManifest
 
     manifest = SweepManifest.read(sweep_set)

@@ -37,10 +37,10 @@ from tactile_rt.export.onnx_step import (
     step_graph,
     write_model,
 )
+from tactile_rt.models.checkpoints import TactileClassifier
 from tactile_rt.models.datasets import windows
 from tactile_rt.models.ead import EADConfig
 from tactile_rt.models.onsets import find_onsets
-from tactile_rt.models.training import TactileClassifier
 from tactile_rt.sensor_spec import CHANNEL_FLOOR
 from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest

@@ -21,7 +21,7 @@ from tactile_rt.export.streaming import (
     StreamingResNet18,
     streaming,
 )
-from tactile_rt.models.training import TactileClassifier
+from tactile_rt.models.checkpoints import TactileClassifier
 from tests.helpers.small_networks import TOLERANCE, build, frames, stream
 
 STEPS = 22

@@ -6,8 +6,8 @@ from itertools import product
 import pytest
 
 from tactile_rt.errors import ConfigError
-from tactile_rt.models.training import TrainingConfig, read_recipe, shipped_recipes
-from tactile_rt.models.training.recipes import load_recipe
+from tactile_rt.models.training.config import TrainingConfig
+from tactile_rt.models.training.recipes import load_recipe, read_recipe, shipped_recipes
 
 E4 = [0.1, 0.01, 0.001, 0.0001]
 GATED = {"zhuang-ugrnn", "zhuang-intersection", "zhuang-gru", "zhuang-lstm"}

@@ -15,27 +15,20 @@ import torch
 from torch import nn
 
 from tactile_rt.errors import ConfigError, ModelError
+from tactile_rt.models.checkpoints import load_checkpoint, run_on
 from tactile_rt.models.datasets import SweepSet
 from tactile_rt.models.evaluation import hits, predict
-from tactile_rt.models.training import (
-    ProbeConfig,
-    TrainingConfig,
-    initialise,
-    load_checkpoint,
-    probe,
-    run_on,
-    train,
-)
 from tactile_rt.models.training.batches import TrainingBatches
+from tactile_rt.models.training.config import ProbeConfig, TrainingConfig
 from tactile_rt.models.training.feeding import prefetched
-from tactile_rt.models.training.loop import build_objective, read_splits
+from tactile_rt.models.training.loop import build_objective, initialise, read_splits, train
 from tactile_rt.models.training.optimizers import (
     LARS,
     build_optimizer,
     build_schedule,
     parameter_groups,
 )
-from tactile_rt.models.training.probing import linear_probe
+from tactile_rt.models.training.probing import linear_probe, probe
 from tactile_rt.models.training.recipes import read_recipe
 from tactile_rt.models.training.replay import replayed
 from tactile_rt.sweep_set import SweepManifest, write_object

@@ -16,19 +16,19 @@ pytest.importorskip("lightning")
 from tactile_rt.errors import ConfigError, ModelError  # noqa: E402
 from tactile_rt.files import replaced  # noqa: E402
 from tactile_rt.models.checkpoint_files import describe_checkpoint, network_of  # noqa: E402
+from tactile_rt.models.checkpoints import load_checkpoint  # noqa: E402
 from tactile_rt.models.ead_config import CELLS  # noqa: E402
 from tactile_rt.models.encoders import cells  # noqa: E402
 from tactile_rt.models.grid.plan import read_grid  # noqa: E402
 from tactile_rt.models.grid.pool import run_grid  # noqa: E402
-from tactile_rt.models.training import (  # noqa: E402
+from tactile_rt.models.training import loop  # noqa: E402
+from tactile_rt.models.training.config import (  # noqa: E402
+    DivergedError,
     ProbeConfig,
     TrainingConfig,
-    load_checkpoint,
-    loop,
-    probe,
-    train,
 )
-from tactile_rt.models.training.config import DivergedError  # noqa: E402
+from tactile_rt.models.training.loop import train  # noqa: E402
+from tactile_rt.models.training.probing import probe  # noqa: E402
 from tactile_rt.models.training.validation import Validation  # noqa: E402
 from tests.helpers.holding import held_elsewhere  # noqa: E402
 from tests.helpers.tiny_sweeps import write_tiny_set  # noqa: E402

@@ -10,7 +10,9 @@ from pathlib import Path
 import lightning.fabric  # noqa: F401  before the forks, or each of them spends seconds on it
 import torch
 
-from tactile_rt.models.training import TrainingConfig, loop, train
+from tactile_rt.models.training import loop
+from tactile_rt.models.training.config import TrainingConfig
+from tactile_rt.models.training.loop import train
 
 SMALL = {"encoder": "gru", "decoder": "linear", "width": 1 / 32, "batch": 6}
 

@@ -28,7 +28,7 @@ from tactile_rt.sim_backend.objects.catalogue import make_object
 from tactile_rt.sim_backend.sweep import Sweep
 from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES
-from tactile_rt.sweep_set import SweepManifest, contacts_of, read_object, read_sweeps
+from tactile_rt.sweep_set import SweepManifest, read_object, read_sweeps
 
 PLAIN = SweepRecipe(
     lead_ms=45,
@@ -119,7 +119,7 @@ def test_a_set_with_contacts_holds_the_loads_of_one_without(made: Path) -> None:
     sweeps, manifest = read_sweeps(made, "train"), SweepManifest.read(made)
     assert manifest.recipe["contacts"] is True
     assert recipe_from_dict(manifest.recipe) == RECIPE
-    contacts = contacts_of(sweeps)
+    contacts = sweeps.contacts
     assert contacts.shape == sweeps.values.shape[:3] and contacts.dtype == np.float32
     for index in range(2):
         plain = simulate_sweep(PLAIN, make_object("mug", 0), index)
@@ -142,8 +142,6 @@ def test_a_set_without_is_as_before(tmp_path: Path) -> None:
     with np.load(tmp_path / "mug-2.npz") as arrays:
         assert "contacts" not in arrays.files
     assert read_sweeps(tmp_path, "test").contacts is None
-    with pytest.raises(ConfigError, match="holds no contacts: make one with `tactile-rt sweep"):
-        contacts_of(read_sweeps(tmp_path, "test"))
     with pytest.raises(ConfigError, match=r"other recipe\.contacts"):
         list(make_sweeps(RECIPE, tmp_path, processes=1))
 

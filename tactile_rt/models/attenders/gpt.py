@@ -61,7 +61,6 @@ class GPT(nn.Module):
     A learned action token follows every step's features; its outputs are the attender's.
 
     Args:
-        width: of the tokens inside, and of what comes out.
         dropout: share of the activations, while training.
         max_steps: an episode's; at most `MAX_STEPS`.
         inputs: features per step that come in, `width` unless told. The paper's ResNet18 has

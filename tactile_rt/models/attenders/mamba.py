@@ -103,7 +103,6 @@ class MambaStack(nn.Module):
     """Pre-norm residual Mamba blocks and a last norm.
 
     Args:
-        width: features per step.
         prefix: of the names in the state, so that an encoder's and an attender's differ.
     """
 

@@ -46,7 +46,6 @@ class Node:
     """One area: what it reads -> convolution -> cell -> ReLU.
 
     Attributes:
-        name: The name of the node, an identifier.
         channels: The number of channels of the node's output.
         reads: The edges that the node reads, in the order of their channels; the first is
             concatenated.

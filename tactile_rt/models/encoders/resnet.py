@@ -48,9 +48,7 @@ class ConvNorm(nn.Module):
     """Convolution without bias, then batch norm.
 
     Args:
-        inputs, outputs: channels.
         kernel, stride: square; padded by kernel // 2.
-        shape: rows and columns of the map that comes in.
     """
 
     taps: Tensor

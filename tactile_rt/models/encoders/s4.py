@@ -141,8 +141,6 @@ class S4Encoder(nn.Module):
     """Frames `(batch, step, channel, row, column)` to features `(batch, step, 512 * width)`.
 
     Args:
-        width: scales the channels.
-        frame: channels, rows and columns.
         taps: how many steps back the convolutions reach: an episode's.
     """
 

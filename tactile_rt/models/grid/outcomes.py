@@ -65,7 +65,6 @@ class Tested(msgspec.Struct, frozen=True):
 
     Attributes:
         objects: The (name, sweeps) of each test object, in the order of the hits.
-        classes: The number of categories.
     """
 
     objects: tuple[tuple[str, int], ...]
@@ -86,7 +85,6 @@ class Outcome(msgspec.Struct, frozen=True):
             at the rated noise.
         seconds: The CPU time of the training that was scored, s, as in `Training`.
         trials, growth: What chose rate and warm-up, then the updates; of the first seed alone.
-        chosen: The training that was scored.
         failed: The reason why there is no figure; empty if there is one.
     """
 
@@ -211,9 +209,5 @@ def training_settings(config: TrainingConfig) -> dict[str, Any]:
 
 
 def waiting_tasks(grid: Grid, folder: Path) -> list[Task]:
-    """The tasks of a grid that are not done yet, in their order.
-
-    Raises:
-        ConfigError: as `read_outcome`.
-    """
+    """The tasks of a grid that are not done yet, in their order."""
     return [task for task in grid.tasks() if read_outcome(grid, folder, task) is None]

@@ -170,13 +170,10 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A whole grid.
 
     Attributes:
-        data: The folder of the sweep set.
         cells: The cells, in the order in which they are trained.
         width, seeds: Of every cell that has none of its own.
-        batch: The number of sweeps per update.
         supervised, self_supervised: Fields of `TrainingConfig` for cells of either kind.
         probe: Fields of `ProbeConfig` for cells whose features a probe reads.
-        svm: Whether a support vector machine is fitted too.
     """
 
     data: str
@@ -197,7 +194,6 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """How a task is trained on the sweep set at `data`.
 
         Args:
-            task: of the grid.
             data: the sweep set's folder.
             chosen: what its trials and its growth have found, by the names of `TrainingConfig`.
 

@@ -46,7 +46,6 @@ def run_grid(
     """Do everything that a grid has not done yet.
 
     Args:
-        grid: the grid.
         folder: where its sweeps, runs and outcomes go.
         processes: to share the tasks; one works in this process.
         report: called with each outcome as it comes, and how many of all there are.
@@ -115,11 +114,7 @@ def _run(
 
 
 def prepare(grid: Grid, folder: Path) -> None:
-    """Write, or go on writing, the sweeps of a grid and what of them it tests on.
-
-    Raises:
-        RecordingError, ConfigError: as `write_subset`.
-    """
+    """Write, or go on writing, the sweeps of a grid and what of them it tests on."""
     write_subset(Path(grid.data), folder / SUBSET, grid.sweeps)
     test = SweepSet.read(folder / SUBSET, "test")
     write_tested(folder, test.sweeps.objects, len(test.manifest.categories))
@@ -127,11 +122,6 @@ def prepare(grid: Grid, folder: Path) -> None:
 
 def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
     """Write, or go on writing, the first sweeps of every object of a set.
-
-    Args:
-        source: a sweep set.
-        folder: where the smaller one goes.
-        sweeps: how many of each object, by split.
 
     Raises:
         RecordingError: the source cannot be read.

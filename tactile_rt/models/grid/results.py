@@ -22,13 +22,11 @@ class Row:
 
     Attributes:
         network, learning: Names of the network and of how the cell learns; empty for the SVM.
-        seeds: The number of seeds that are done.
         top1, top5, noisy: Accuracies on the test sweeps, 0 to 1; `noisy` is top-1 at the rated
             noise. None where there is no figure.
         random: The top-1 accuracy of a linear probe on the untrained network, 0 to 1.
         seconds: The mean CPU time of a seed's training, s, of those whose time is known; else 0.
         share: The share of the training objects that it learnt from.
-        growth: The trainings with more and more updates.
         flat: Whether the last of these gained less than the grid asks for.
         failed: The reason why seeds are missing; empty if none failed.
     """

@@ -36,16 +36,11 @@ from tactile_rt.models.grid.outcomes import (
 )
 from tactile_rt.models.grid.plan import SUPERVISED, Grid, Task
 from tactile_rt.models.svm import fit_svm
-from tactile_rt.models.training import (
-    ProbeConfig,
-    TrainingConfig,
-    initialise,
-    probe,
-    train,
-)
 from tactile_rt.models.training.batches import check_batches
-from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError
+from tactile_rt.models.training.config import TWO_SWEEPS, DivergedError, ProbeConfig, TrainingConfig
 from tactile_rt.models.training.devices import launched
+from tactile_rt.models.training.loop import initialise, train
+from tactile_rt.models.training.probing import probe
 from tactile_rt.sweep_set import SweepManifest
 
 __all__ = ["Workbench"]
@@ -57,8 +52,6 @@ class Workbench:
     """What the tasks of one process share: the test windows as the robot would cut them.
 
     Args:
-        grid: the grid.
-        folder: of the grid, with its sweeps.
         accelerator: what trains, as `train` takes it.
     """
 
@@ -94,7 +87,6 @@ class Workbench:
         """Do a task and keep its outcome; a network that diverges is an outcome too.
 
         Args:
-            task: of the grid, after those that it needs.
             report: called with `training.Progress` after every update.
         """
         found = Outcome(task.name, task.seed, settings_of(self.grid, task))

@@ -44,7 +44,6 @@ def check_batches(
 
     Args:
         objects: (sweep,) the object of each.
-        samples: of each sweep.
         batch, jitter, two_sweeps: as `TrainingBatches` takes them.
 
     Raises:
@@ -76,9 +75,6 @@ class TrainingBatches:
     in their order.
 
     Args:
-        data: the sweeps.
-        batch: windows in a batch.
-        seed: of all that is drawn.
         jitter: samples by which a window may begin earlier or later.
         two_sweeps: whether the second view of a window is of another sweep of its object.
         device: of the samples, offsets and sigmas; a GPU also draws the noise of the samples.
@@ -86,9 +82,6 @@ class TrainingBatches:
     Attributes:
         easy_epochs: The number of epochs in which noise, offset and drift rise to what is said: a
             network that meets them at once takes far longer to learn.
-
-    Raises:
-        ConfigError: as `check_batches`.
     """
 
     def __init__(

@@ -82,7 +82,6 @@ class TrainingConfig:
         rate_per: The time after which the schedule changes the rate: "update", or "epoch" (the
             paper).
         learning_rate: The peak of the learning rate.
-        weight_decay: The weight decay of the optimizer.
         own_rates: Whether parameters that ask for a rate and a decay of their own (the state spaces
             of S4) get them; not so in the paper.
         warmup: The share of all updates in which the rate rises; 10 of the paper's 100 epochs are
@@ -91,7 +90,6 @@ class TrainingConfig:
             StepLR(30) of 100 epochs is 0.3.
         easy: The share of all epochs in which noise, offset and drift rise from nothing to what the
             set's recipe says.
-        epochs: The number of passes over the training split.
         updates: The number of updates to stop after, whatever `epochs` says; 0 leaves it to
             `epochs`.
         batch: The number of sweeps per update, of all devices together.
@@ -226,7 +224,6 @@ class ProbeConfig:
 
     Attributes:
         data: The folder of the sweep set; empty takes the one that the network was trained on.
-        epochs, batch, learning_rate, momentum: Settings of stochastic gradient descent.
         drop_epochs: The number of epochs between tenfold drops of the rate (StepLR).
         standardise: Whether to fit on features of zero mean and unit variance, folded into the
             layer afterwards; the paper does not, and features that are small then hardly train.

@@ -28,7 +28,6 @@ def launched(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
     """The devices of a run, together until the block ends.
 
     Args:
-        config: of the run.
         device: "auto", "cpu", "cuda", ...
 
     Raises:

@@ -55,16 +55,7 @@ class Batch:
 
 
 class BatchFeed:
-    """Epochs of batches, each view augmented afresh, on the device.
-
-    Args:
-        batches: where windows are drawn, on the device.
-        augmentation: of the loads.
-        views: of every window.
-        seed: of the augmentation.
-        share: what this device takes of each batch.
-        device: where the labels go.
-    """
+    """Epochs of batches, each view augmented afresh, on the device."""
 
     def __init__(
         self,

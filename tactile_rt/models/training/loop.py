@@ -72,9 +72,6 @@ def train(
     """Train, or go on with a run that was interrupted; returns the best checkpoint.
 
     Args:
-        config: what to train and how.
-        folder: of the run.
-        report: is told of every update and every epoch.
         device: "auto" (an accelerator if there is one), "cpu", "cuda", ...
         splits: what `read_splits` gives, where many runs share it.
 
@@ -187,11 +184,7 @@ def _train(
 
 
 def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = None) -> Path:
-    """A run's network as it is before its first update, as a `best.pt`; of the same seed.
-
-    Raises:
-        ConfigError, RecordingError: as `train`.
-    """
+    """A run's network as it is before its first update, as a `best.pt`; of the same seed."""
     torch.manual_seed(config.seed)
     training = drawn_as((splits or read_splits(config))[0], asdict(config))
     objective = build_objective(config, training)

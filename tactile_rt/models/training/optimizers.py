@@ -29,7 +29,6 @@ class LARS(torch.optim.Optimizer):
     norms and every tensor that is still zero take the plain rate, and the former no decay.
 
     Args:
-        params: parameters or groups.
         lr, momentum, weight_decay: as in SGD.
         published: multiply even where |w| = 0, as the paper's code: such tensors never move.
     """
@@ -92,9 +91,7 @@ def parameter_groups(
     """Groups of the parameters that are trained, by what their ``_optim`` asks for.
 
     Args:
-        model: whose parameters.
         learning_rate, weight_decay: of those that ask for none of their own.
-        own_rates: whether to heed those that do.
     """
     groups: dict[tuple[float, float, bool], list[nn.Parameter]] = {}
     for parameter in model.parameters():

@@ -45,10 +45,6 @@ def probe(
     The layer of the best epoch by the validation split is kept.
 
     Args:
-        checkpoint: the network.
-        folder: of the probe.
-        config: how.
-        report: is told of the end.
         splits: what `read_splits` gives, where many runs share it.
 
     Raises:
@@ -143,8 +139,6 @@ def linear_probe(
     Args:
         features, labels: (window, feature), (window,) to fit on.
         validation, answers: the same, to choose the epoch by.
-        classes: how many.
-        config: how.
 
     Returns:
         The layer of the best epoch, for features as they come, and the history by epoch.

@@ -47,7 +47,6 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A recipe file.
 
     Attributes:
-        about: Description of the recipe, in a line.
         train: Fields of `TrainingConfig`, by their names.
         search: Lists of all values that are to be tried, by the names of their fields.
     """
@@ -81,9 +80,6 @@ def shipped_recipes() -> tuple[str, ...]:
 
 def load_recipe(name: str) -> Recipe:
     """Read a recipe.
-
-    Args:
-        name: of one that ships, or of a TOML file.
 
     Raises:
         ConfigError: there is none, or it is damaged; the message names the key.
@@ -127,10 +123,8 @@ def read_recipe(name: str, data: str, sets: Sequence[str] = (), **overrides: Any
     """The training configuration of a recipe.
 
     Args:
-        name: of one that ships, or of a TOML file.
         data: the sweep set's folder.
         sets: ``key=value`` each, which are to be otherwise.
-        overrides: fields that are to be otherwise.
 
     Raises:
         ConfigError: there is none, it is damaged, or a value cannot be.

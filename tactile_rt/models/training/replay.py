@@ -33,11 +33,7 @@ def batch_loss(
     """The loss of a batch, whose augmentation is drawn from the generator: ready for `backward`.
 
     Args:
-        fabric: what the run was launched by.
         wrapped: the objective, as `fabric` has set it up.
-        objective: itself.
-        config: of the run.
-        feed: gives the batch that a graph is made of.
     """
     device, bf16 = fabric.device.type, config.precision == "bf16"
 
@@ -87,7 +83,6 @@ def replayed(
     Args:
         objective: on a GPU, in training mode.
         seen, labels: of any batch, as `Objective.loss` takes them.
-        bf16: whether products are computed in that format.
 
     Returns:
         The function; None, which is logged, if there is something in the objective that cannot be

@@ -34,9 +34,7 @@ class RunState:
     """How far a run is, and all that it takes to go on.
 
     Attributes:
-        per_epoch: The number of updates of an epoch.
         epoch, done: The numbers of epochs and of updates that are done.
-        best: The best score of a validation so far.
     """
 
     objective: Objective

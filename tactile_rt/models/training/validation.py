@@ -33,11 +33,7 @@ class Validation:
     the loss, augmented alike every time; the score is its negative.
 
     Args:
-        config: of the run.
-        data: the split.
-        augmentation: of the objective.
         share: this device's of every batch.
-        device: where the network is.
     """
 
     def __init__(

@@ -10,7 +10,8 @@ pytest.importorskip("trimesh")
 import torch
 
 from bench.shipped.__main__ import RECIPES, _write_weights
-from tactile_rt.models.training import TrainingConfig, load_checkpoint
+from tactile_rt.models.checkpoints import load_checkpoint
+from tactile_rt.models.training.config import TrainingConfig
 from tactile_rt.models.training.loop import initialise
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
 from tactile_rt.sim_backend.objects.object_lists import read_list
