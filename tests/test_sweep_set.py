@@ -1,6 +1,4 @@
 import itertools
-import os
-import stat
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +9,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tactile_rt.errors import ConfigError, RecordingError
-from tactile_rt.files import write_whole
 from tactile_rt.sweep_set import (
     SPLITS,
     SweepManifest,
@@ -88,12 +85,6 @@ def test_values_are_stored_as_float32(tmp_path: Path) -> None:
         assert arrays["values"].dtype == np.float32
 
 
-def test_a_set_may_be_read_by_others(folder: Path) -> None:
-    """The temporary file that it was written through is its owner's alone."""
-    for path in folder.iterdir():
-        assert stat.S_IMODE(path.stat().st_mode) & 0o044 == 0o044, path.name
-
-
 class Unwritable:
     """An array that fails when half of the file is on the disk."""
 
@@ -108,35 +99,6 @@ def test_an_interrupted_write_leaves_nothing(folder: Path) -> None:
             write_object(folder, name, sweeps_of(name), {"speed": Unwritable()})
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
     assert not has_object(folder, "mug-9")
-
-
-def test_a_full_disk_leaves_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = listing(folder)
-
-    def fail(*_: object) -> None:
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr(os, "replace", fail)
-    with pytest.raises(OSError, match="no space"):
-        write_object(folder, "mug-9", sweeps_of("mug-9"), {})
-    assert listing(folder) == before
-
-
-def test_an_object_appears_under_its_name_only_when_it_is_whole(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen = []
-    real = os.replace
-
-    def watch(source: str, target: Path) -> None:
-        with np.load(source) as arrays:  # complete and on the disk before it gets its name
-            seen.append((target.name, len(arrays["values"]), target.exists()))
-        real(source, target)
-
-    monkeypatch.setattr(os, "replace", watch)
-    write_object(folder, "mug-9", sweeps_of("mug-9"), {})
-    assert seen == [("mug-9.npz", 2, False)]
-    assert has_object(folder, "mug-9")
 
 
 # Going on with a set that is there
@@ -380,12 +342,3 @@ def test_more_test_objects_never_come_from_validation_to_training() -> None:
     for a, b in itertools.pairwise(range(3, 12)):
         small, large = (split_by_object(["mug"], n, 1, 1) for n in (a, b))
         assert set(small["train"]) < set(large["train"])
-
-
-def test_the_temporary_file_is_hidden_and_in_the_same_folder(tmp_path: Path) -> None:
-    """The same file system, or the final rename could not be atomic; hidden from `*.npz`."""
-    seen = []
-    write_whole(tmp_path / "a.npz", lambda file: seen.append(file.name))
-    (path,) = map(Path, seen)
-    assert path.parent == tmp_path and path.name.startswith(".") and path.suffix != ".npz"
-    assert listing(tmp_path) == ["a.npz"]

@@ -1,14 +1,11 @@
 """`tactile-rt model`: what a file is, whether it is whole, how fast it runs."""
 
 import hashlib
-import json
-from pathlib import Path
 
 import pytest
 
 from tactile_rt.classifier.decision_rules import CandidateRule, UnknownRule
 from tactile_rt.classifier.model_file import (
-    METADATA_KEY,
     load_model,
     read_model,
     shipped_model,
@@ -18,9 +15,7 @@ from tactile_rt.classifier.onnx_check import graph_sha256
 
 pytest.importorskip("onnx")
 
-import onnx
 from msgspec.structs import replace
-from onnx import helper
 
 from tests.helpers.tiny_model import GRAPH, WINDOW, write_model
 
@@ -154,81 +149,6 @@ def test_a_bad_file_is_one_line(refused, tmp_path, what):
         if content is not None:
             path.write_bytes(content)
         assert said in refused("model", what, path)
-
-
-def far(proto):
-    """A tensor in a file that is there, and readable."""
-    weight = max(proto.graph.initializer, key=lambda tensor: len(tensor.raw_data))
-    weight.ClearField("raw_data")
-    weight.data_location = 1
-    weight.external_data.add(key="location", value="../../../../../../etc/passwd")
-
-
-def renamed(proto):
-    proto.graph.input[0].name = "sample"
-
-
-def huge(proto):
-    proto.graph.initializer[0].dims[:] = [2**40, 2**20]
-
-
-def described(**changes):
-    def change(proto):
-        card = json.loads(proto.metadata_props[0].value)
-        helper.set_model_props(proto, {METADATA_KEY: json.dumps(card | changes)})
-
-    return change
-
-
-BROKEN = {
-    "cut short": (lambda data: data[: len(data) // 2], "cut short or damaged at byte"),
-    "text": (lambda data: b"<!DOCTYPE html>\n<html>404", "it is text"),
-    "empty": (lambda data: b"", "it is empty"),
-    "checkpoint": (lambda data: b"PK\x03\x04" + data, "tactile-rt export"),
-    "far": (far, "is in another file, which we do not open"),
-    "huge": (huge, "of 1152921504606846976 elements"),
-    "renamed": (renamed, "the graph's inputs disagree with its metadata at sample, samples"),
-    "opset": (lambda proto: proto.opset_import[0].CopyFrom(helper.make_opsetid("", 2**40)),
-              "opset 1099511627776 of 'ai.onnx'"),
-    "no opset": (lambda proto: proto.ClearField("opset_import"), "which version of ONNX's"),
-    "two opsets": (lambda proto: proto.opset_import.add(domain="ai.onnx", version=7), "say, once"),
-    "no metadata": (lambda proto: proto.ClearField("metadata_props"), "no 'tactile_rt' metadata"),
-    "types": (described(steps="many"), "has damaged metadata: Expected `int`, got `str` - at `$.s"),
-    "future": (described(version=99), "has metadata of version 99; this release reads 3"),
-    "episode": (described(steps=900_000), "an episode of 810000000 values"),
-    "state": (described(state=[]), "the graph's inputs disagree with its metadata at "),
-    "spec": (described(spec="{}"), "array spec of version None"),
-    "escape": (described(labels=["\x1b[2J"]), "labels must be 1 to 200 printable characters"),
-}  # fmt: skip
-SHIPPED = shipped_model().read_bytes()
-
-
-@pytest.mark.parametrize("what", ["show", "verify", "bench"])
-@pytest.mark.parametrize("how", BROKEN)
-def test_a_broken_file_is_one_line_whatever_is_asked_of_it(
-    refused, tmp_path, monkeypatch, how, what
-):
-    change, said = BROKEN[how]
-    changed = change(SHIPPED) if how in ("cut short", "text", "empty", "checkpoint") else None
-    if changed is None:
-        proto = onnx.load_model_from_string(SHIPPED)
-        change(proto)
-        changed = proto.SerializeToString()
-    path = tmp_path / "m.onnx"
-    path.write_bytes(changed)
-    monkeypatch.setattr("onnxruntime.InferenceSession", None)  # none of it is run
-    opened = []
-    monkeypatch.setattr(Path, "read_bytes", watched(Path.read_bytes, opened))
-    assert said in refused("model", what, path)
-    assert set(opened) <= {path}
-
-
-def watched(read, opened):
-    def read_bytes(self):
-        opened.append(self)
-        return read(self)
-
-    return read_bytes
 
 
 def test_bench_times_steps(call, sealed):

@@ -350,26 +350,6 @@ def test_a_state_that_something_else_reads_is_not_written_in_place(other, marked
     assert onnx_step._written_by_rows(graph, "cache") == marked
 
 
-def test_a_sample_that_is_no_number_is_gone_with_its_step(exported: SimpleNamespace) -> None:
-    """In the file alone, as a stranger runs it, beside a stream that was at rest there."""
-    card = metadata(exported.path)
-    session = onnxruntime.InferenceSession(exported.path, providers=["CPUExecutionProvider"])
-    outputs = [output.name for output in session.get_outputs()]
-    samples, offset, sigma = (np.repeat(a, 2, 0) for a in episodes(1))
-    offset[:, 5, 0], sigma[:, 6, 1] = np.nan, np.inf  # all the time
-    bad = np.resize(np.float32([np.nan, np.inf, -np.inf]), (5, 10, 6))
-    samples[0, 3, :, 10:20], samples[1, 3, :, 10:20] = bad, offset[1, 10:20]
-    samples[1, :, :, 5, 0] = 0  # which is then not felt
-    state = {s["name"]: np.zeros((2, *s["shape"]), s["dtype"]) for s in card["state"]}
-    for t in range(STEPS):
-        feed = {"samples": samples[:, t], "offset": offset, "sigma": sigma, **state}
-        out = dict(zip(outputs, session.run(outputs, feed), strict=True))
-        state = {name: out[f"{name}_next"] for name in state}
-        for name, values in out.items():
-            assert np.isfinite(values).all(), (t, name)
-            assert np.array_equal(values[0], values[1]), (t, name)
-
-
 def test_what_the_card_says_of_sensor_and_rules_is_in_the_file(
     exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

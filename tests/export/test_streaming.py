@@ -12,7 +12,6 @@ import torch
 from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.export import streaming as streaming_module
 from tactile_rt.export import streaming_gpt
-from tactile_rt.export.onnx_step import StreamingStep
 from tactile_rt.export.products import Pointwise
 from tactile_rt.export.streaming import (
     StreamingGPT,
@@ -21,7 +20,6 @@ from tactile_rt.export.streaming import (
     StreamingResNet18,
     streaming,
 )
-from tactile_rt.models.checkpoints import TactileClassifier
 from tests.helpers.small_networks import TOLERANCE, build, frames, stream
 
 STEPS = 22
@@ -64,56 +62,6 @@ def test_steps_give_the_window_s_logits(encoder: str, attender: str, decoder: st
     assert expected.std() > 1e-3, "logits that say nothing would agree in any network"
     for integer in (False, True):
         assert abs(stream(streaming(ead, integer), x) - expected).max() <= TOLERANCE
-
-
-@pytest.mark.parametrize(("encoder", "attender", "decoder"), SAMPLE)
-def test_steps_give_the_window_s_embedding(encoder: str, attender: str, decoder: str) -> None:
-    ead = build(encoder, attender, decoder=decoder)
-    x = frames()
-    expected = ead.embed(x)
-    assert (expected.std((0, 1)) > 0).float().mean() > 0.3, "of a silent layer any would agree"
-    deployed = streaming(ead)
-    state = deployed.initial_state(len(x))
-    for t in range(STEPS):
-        logits, found, state = deployed.step_embedded(x[:, t], state)
-        assert abs(found - expected[:, t]).max() <= 2 * TOLERANCE
-        assert abs(ead.decoder.logits(found) - logits).max() <= TOLERANCE
-
-
-@pytest.mark.parametrize(("encoder", "attender", "decoder"), SAMPLE)
-def test_a_sample_that_is_no_number_is_forgotten_after_its_step(
-    encoder: str, attender: str, decoder: str
-) -> None:
-    """Bit by bit as if it had been the offset, in states and in later logits; so in training."""
-    ead = build(encoder, attender, "mean" if decoder == "mlp" else "last", decoder=decoder)
-    model = TactileClassifier(SPEC, ead.config).eval()
-    model.network = ead
-    step = StreamingStep(model)
-    struck, rest, offset, sigma = bad_episodes()
-    states = [tuple(step.network.initial_state(2).values()) for _ in range(2)]
-    for t in range(STEPS):
-        found, expected = (
-            step(samples[:, t], offset, sigma, *state)
-            for samples, state in zip((struck, rest), states, strict=True)
-        )
-        for a, b in zip(found, expected, strict=True):
-            assert torch.isfinite(a).all()
-            assert torch.equal(a, b)
-        states = [found[2:], expected[2:]]
-    assert torch.equal(model(struck, offset, sigma), model(rest, offset, sigma))
-
-
-def bad_episodes() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Samples with NaN and infinity in step 3, the same with the offset there; offset and sigma."""
-    rng = torch.Generator().manual_seed(4)
-    shape = (2, STEPS, 5, *SPEC.shape)
-    samples = 1e-4 * torch.randn(shape, generator=rng)
-    offset, sigma = (1e-4 * torch.randn((2, *SPEC.shape), generator=rng) for _ in range(2))
-    bad = torch.tensor([torch.nan, torch.inf, -torch.inf])[torch.arange(6) % 3]
-    struck, rest = samples.clone(), samples.clone()
-    struck[0, 3, :, ::4] = bad
-    rest[0, 3, :, ::4] = offset[0, ::4]
-    return struck, rest, offset, sigma.abs()
 
 
 @pytest.fixture

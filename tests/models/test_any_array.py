@@ -37,14 +37,6 @@ def test_a_window_and_its_steps_give_the_same_logits(
         assert (ead(loud)[:, ead.lag] != whole[:, ead.lag]).any()
 
 
-@pytest.mark.parametrize("encoder", ["zhuang-gru-ln", "resnet18", "s4", "mamba", "gru"])
-def test_the_mouse_s_frames_are_the_default(encoder: str) -> None:
-    plain = EAD(EADConfig(3, encoder, "none", width=1 / 32))
-    told = EAD(EADConfig(3, encoder, "none", width=1 / 32, frame=(30, 5, 7)))
-    shapes = [{k: v.shape for k, v in one.state_dict().items()} for one in (plain, told)]
-    assert shapes[0] == shapes[1]
-
-
 def plate(rows: int, columns: int, channels: int, rate_hz: float = 1e3) -> ArraySpec:
     cells = [(r, c) for r in range(rows) for c in range(columns)]
     return ArraySpec(

@@ -320,9 +320,3 @@ def test_a_run_says_by_how_much_windows_begin_elsewhere():
         samples, *_ = drawn(TrainingBatches(data, 40, 0, jitter=jitter), epochs=3)
         silent = (samples.reshape(120, -1, ELEMENTS * CHANNELS) == 0).all(2).sum(1)
         assert set(silent.tolist()) == set(range(jitter + 1))
-
-
-def test_a_run_of_before_these_keys_is_drawn_as_it_was():
-    data = sweeps(touches(6))
-    assert drawn_as(data, {}) == data
-    assert drawn_as(data, {"window": "onset", "faults": None}) == data

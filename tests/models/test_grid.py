@@ -22,7 +22,6 @@ from tactile_rt.models.grid.outcomes import (
     Training,
     outcome_path,
     read_outcome,
-    read_point,
     settings_of,
     write_tested,
 )
@@ -400,13 +399,6 @@ def test_outcomes_of_other_sweeps_and_damaged_ones_are_told(plan: Path, tmp_path
         path.write_text(whole.replace(old, new, 1))
         with pytest.raises(ConfigError, match=r"svm_seed0\.json is damaged"):
             gather(grid, folder)
-
-
-def test_a_damaged_point_is_told(plan: Path, tmp_path: Path) -> None:
-    path = tmp_path / "point.json"
-    path.write_text('{"learning_rate":')
-    with pytest.raises(ConfigError, match=r"point\.json is damaged .*: delete"):
-        read_point(path, "")
 
 
 def test_a_full_disk_is_one_line_of_a_process_too(plan: Path, tmp_path: Path) -> None:

@@ -4,12 +4,11 @@ import pytest
 import torch
 
 from tactile_rt.errors import ConfigError
-from tactile_rt.models.ead import EAD, EADConfig
 from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 from tactile_rt.models.encoders.graph_files import parse_graph, read_graph
 from tactile_rt.models.encoders.zhuang import GRAPH
-from tests.helpers.small_networks import TOLERANCE, frames, stir, stream
+from tests.helpers.small_networks import frames, stir
 
 TEXT = """
 readout = "fc"
@@ -52,16 +51,6 @@ def test_a_graph_from_toml():
     assert graph.nodes[1].reads[3] == Edge("up", "sum")
     assert [[n.name for n in group] for group in graph.components] == [
         ["first", "up", "down", "fc"]]  # fmt: skip
-
-
-@pytest.mark.parametrize("steps", [1, 2, 3, 9])
-def test_stream_equals_window(steps):
-    torch.manual_seed(0)
-    ead = EAD(EADConfig(7, "graph", "none", readout="mean", graph=TEXT)).eval()
-    stir(ead)
-    x = frames(2, steps)
-    with torch.no_grad():
-        assert (ead(x) - stream(ead, x)).abs().max() <= TOLERANCE
 
 
 def test_a_frame_is_heard_two_steps_late():

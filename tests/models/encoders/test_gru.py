@@ -16,16 +16,6 @@ def test_count():
         assert sum(p.numel() for p in GRUEncoder().parameters()) == 3_978_240
 
 
-def test_stream_is_the_window():
-    torch.manual_seed(1)
-    encoder, x = GRUEncoder(1 / 16).eval(), frames()
-    window, state = encoder(x), encoder.initial_state(len(x))
-    assert window.shape == (2, 22, encoder.features) == (2, 22, 32)
-    for t in range(x.shape[1]):
-        out, state = encoder.step(x[:, t], torch.full((len(x),), t), state)
-        torch.testing.assert_close(out, window[:, t], rtol=0, atol=2e-6)
-
-
 def test_every_frame_counts_and_none_before_its_time():
     encoder, x = GRUEncoder(1 / 16), frames(1, 6).requires_grad_()
     (gradient,) = torch.autograd.grad(encoder(x)[:, 3].sum(), x)

@@ -94,15 +94,6 @@ def test_gradients_are_those_of_the_convolutions():
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * b.abs().max().item())
 
 
-def test_stream_is_the_window():
-    encoder, x = build(), frames()
-    state = encoder.initial_state(len(x))
-    for t in range(x.shape[1]):
-        out, state = encoder.step(x[:, t], torch.full((len(x),), t), state)
-        torch.testing.assert_close(out, encoder(x)[:, t], rtol=0, atol=TOLERANCE)
-    assert state == {}
-
-
 def test_deployed_gives_the_same():
     encoder, x = build(), frames()
     folded = encoder.deployed()

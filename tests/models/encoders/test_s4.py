@@ -121,19 +121,6 @@ def test_convolution_is_a_sum_over_the_past():
     torch.testing.assert_close(block(x, kernel), block.merge(x, past), rtol=0, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize(("taps", "steps"), [(22, 22), (4, 9), (22, 5)])
-@pytest.mark.parametrize("deployed", [False, True])
-def test_stream_is_the_window(taps, steps, deployed):
-    encoder, x = build(taps=taps), frames(steps=steps)
-    for block in encoder.blocks:
-        disturb(block)
-    window, runner = encoder(x), encoder.deployed() if deployed else encoder
-    state = runner.initial_state(len(x))
-    for t in range(steps):
-        out, state = runner.step(x[:, t], torch.full((len(x),), t), state)
-        torch.testing.assert_close(out, window[:, t], rtol=0, atol=TOLERANCE)
-
-
 class RefuseComplex(TorchDispatchMode):
     """ONNX has no complex numbers."""
 
