@@ -20,7 +20,7 @@ def evaluate(
         bool, typer.Option("--svm", help="Fit an RBF SVM on the same windows too.")
     ] = False,
     pictures: Annotated[
-        Path | None, typer.Option(help="Folder for confusion, accuracy over time and robustness.")
+        Path | None, typer.Option(help="Folder for confusion and accuracy over time.")
     ] = None,
     quick: Quick = False,
     json: Json = None,

@@ -48,7 +48,7 @@ def evaluate_model(
     Args:
         model: the ``.onnx`` file.
         svm: fit an RBF support vector machine on the same windows to compare with.
-        pictures: folder for ``confusion.png``, ``accuracy_over_time.png``, ``robustness.png``.
+        pictures: folder for ``confusion.png`` and ``accuracy_over_time.png``.
         quick: take two sweeps of each object: enough to compare by, not to quote.
 
     Raises:
@@ -139,7 +139,6 @@ def evaluate_model(
         from tactile_rt.evidence.pictures import (
             draw_accuracy_over_time,
             draw_confusion,
-            draw_robustness,
         )
 
         table = evaluation.confusion(clean[:, -1], labels, len(card.classes))
@@ -149,12 +148,6 @@ def evaluate_model(
             f"rated noise ({rated} per sample)": evaluation.accuracy_over_time(noisy, labels),
         }
         draw_accuracy_over_time(curves, 1e-3 * step_ms, pictures / "accuracy_over_time.png")
-        draw_robustness(
-            {r.name: r.accuracy for r in robustness},
-            100 / len(card.classes),
-            f"{len(few.sweeps)} sweeps of objects never seen in training",
-            pictures / "robustness.png",
-        )
     return records
 
 

@@ -6,9 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tactile_rt.models.evaluation import Interval
-
-__all__ = ["draw_accuracy_over_time", "draw_confusion", "draw_robustness"]
+__all__ = ["draw_accuracy_over_time", "draw_confusion"]
 
 
 def draw_confusion(table: NDArray[np.int64], labels: tuple[str, ...], path: Path) -> None:
@@ -54,33 +52,4 @@ def draw_accuracy_over_time(
     axes.set_ylim(0, 100)
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right")
-    figure.savefig(path, dpi=110)
-
-
-def draw_robustness(found: dict[str, Interval], chance: float, title: str, path: Path) -> None:
-    """Draw top-1 accuracy under each condition, the first of them undisturbed.
-
-    Args:
-        chance: accuracy of a guess (%).
-    """
-    figure = Figure(figsize=(7.2, 0.42 * len(found) + 1.2), layout="constrained")
-    axes = figure.subplots()
-    values = 100 * np.array([one.value for one in found.values()])
-    ends = 100 * np.array([(one.low, one.high) for one in found.values()]).T
-    at = np.arange(len(found))
-    colours = ["tab:blue"] + ["tab:orange"] * (len(found) - 1)
-    axes.barh(at, values, color=colours, alpha=0.75)
-    # A percentile interval need not hold its estimate, and matplotlib wants no negative bars.
-    errors = np.maximum([values - ends[0], ends[1] - values], 0)
-    axes.errorbar(values, at, xerr=errors, fmt="none", color="black", capsize=3)
-    for k, value in enumerate(values):
-        axes.text(max(ends[1, k], value) + 1.5, k, f"{value:.1f}", va="center", fontsize=9)
-    axes.axvline(chance, color="0.4", linestyle=":", label="chance")
-    axes.set_yticks(at, list(found))
-    axes.invert_yaxis()
-    axes.set_xlim(0, 110)
-    axes.set_xticks(range(0, 101, 20))
-    axes.set_xlabel("top-1 accuracy (%), with 95 % intervals by object")
-    axes.set_title(title, fontsize=10)
-    axes.legend(loc="lower right", fontsize=8)
     figure.savefig(path, dpi=110)

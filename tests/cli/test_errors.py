@@ -257,7 +257,7 @@ def test_a_model_is_evaluated_only_on_what_it_was_made_for(
     assert (code, err) == (0, "")
     assert "nan" not in out  # one sweep of each object: there is nothing to fuse
     assert "dead whiskers" in out
-    assert len(list(pictures.iterdir())) == 3
+    assert len(list(pictures.iterdir())) == 2
 
     spec = describe_set(tiny_recipe()).spec.to_json()
     changed = tiny_model(spec=spec.replace('"fx"', '"gx"'))

@@ -42,19 +42,6 @@ def test_published_counts():
         assert count(NoAttender()) == 0
 
 
-def test_names_in_old_checkpoints():
-    names = set(dict(GPT(32, 0.1, 22).named_parameters()))
-    top = {"action", "positions", "project_in.weight", "project_in.bias", "project_out.weight"}
-    layers = ("norm1", "qkv", "proj", "norm2", "mlp_in", "mlp_out")
-    blocks = {
-        f"blocks.{i}.{layer}.{kind}"
-        for i in range(8)
-        for layer in layers
-        for kind in ("weight", "bias")
-    }
-    assert names == top | blocks | {"norm.weight", "norm.bias"}
-
-
 def test_all():
     assert all(hasattr(attenders, name) for name in attenders.__all__)
     assert attenders.MAX_STEPS == 32

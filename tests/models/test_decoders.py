@@ -27,12 +27,6 @@ def test_published_counts():
         assert count(decoders.make("mlp-all", 512, 117)) == 23_644_021 - 11_523_840
 
 
-def test_names_in_old_checkpoints():
-    assert list(decoders.make("linear", 16, 7).state_dict()) == ["weight", "bias"]
-    names = [f"{i}.{kind}" for i in (0, 2, 4) for kind in ("weight", "bias")]
-    assert list(decoders.make("mlp", 16, 7, 1 / 32).state_dict()) == names
-
-
 @pytest.mark.parametrize("name", decoders.DECODERS)
 @pytest.mark.parametrize("steps", [22, 5])
 def test_stream_is_the_window(name, steps):
