@@ -111,7 +111,7 @@ class ModelCard(msgspec.Struct, frozen=True):
             probabilities mean what they say.
         provenance: The origin of the file: network, training, data set, hashes.
         figures: The figures measured on the model, such as parity and accuracy.
-        kind: What the graph takes at once, "step" or "window", see `model_file`.
+        kind: The form of the input, "step" or "window", see `model_file`.
         precision: The number format in which weights are stored and multiplied.
         opset: The version of ONNX's operators that the graph uses.
         hashes: SHA-256 sums, hex, by what they are of; "graph" is `onnx_check.graph_sha256` of the
@@ -120,14 +120,14 @@ class ModelCard(msgspec.Struct, frozen=True):
             verify` tells whether another machine computes the same.
         embedding: The number of units of the output ``embedding``.
         sensor: What is known of the array's sensor (rate, noise, range, ...); empty if nothing.
-        unknown: When an object is of no known class; None if the model never says so.
-        candidates: Which classes a step leaves possible, one rule for each promise.
+        unknown: The rule by which an object is of no known class; None if there is none.
+        candidates: The rules of the classes that a step leaves possible, one for each promise.
         refusals: The last of the labels, if any: those that name no class, but say that the object
             is unknown, or what is wrong with the loads.
-        embeddings: Where touches of the known classes lie, so that others can be told from them
+        embeddings: The places of touches of the known classes, so that others can be told from them
             without the data; None if it is not told.
-        license: Under which the file may be used, as an SPDX expression such as "Apache-2.0"; empty
-            if it is not told.
+        license: The licence of the file, an SPDX expression such as "Apache-2.0"; empty if it is
+            not told.
     """
 
     name: str

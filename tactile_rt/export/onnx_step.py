@@ -89,7 +89,7 @@ def export_checkpoint(
     data: Sequence[Path] = (),
     licence: str = "",
 ) -> ModelCard:
-    """Export what `training.train` saved.
+    """Export what `training.loop.train` saved.
 
     Args:
         checkpoint: a ``best.pt``.

@@ -214,9 +214,9 @@ def test_sets_of_another_array_or_period_do_not_train_together(here, night, tmp_
         assert "cannot be joined" in err and why in err
 
 
-def test_an_earlier_release_would_refuse_it(night):
+def test_a_simulated_set_does_not_go_on_with_it(night):
     assert SweepManifest.read(night).version == 3
-    with pytest.raises(ConfigError, match="which can be read but not gone on with"):
+    with pytest.raises(ConfigError, match=r"holds another sweep set \(other version\)"):
         replace(SweepManifest.read(night), version=2).write(night)
 
 

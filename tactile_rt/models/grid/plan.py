@@ -49,7 +49,8 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One network and how it learns; names and values as in `TrainingConfig`.
 
     Attributes:
-        objective: "supervised", or a self-supervised one, whose features a linear probe reads.
+        objective: The objective, "supervised", or a self-supervised one, whose features a linear
+            probe reads.
         width: The width of this network; 0 takes the grid's.
         share: The share of the training objects of every category whose sweeps are learnt from, at
             least one.
@@ -171,7 +172,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         cells: The cells, in the order in which they are trained.
-        width, seeds: Of every cell that has none of its own.
+        width, seeds: The width and the number of seeds of a cell that has none of its own.
         supervised, self_supervised: Fields of `TrainingConfig` for cells of either kind.
         probe: Fields of `ProbeConfig` for cells whose features a probe reads.
     """

@@ -87,7 +87,7 @@ class Workbench:
         """Do a task and keep its outcome; a network that diverges is an outcome too.
 
         Args:
-            report: called with `training.Progress` after every update.
+            report: called with `training.config.Progress` after every update.
         """
         found = Outcome(task.name, task.seed, settings_of(self.grid, task))
         try:
