@@ -57,32 +57,10 @@ def test_values_that_are_no_number(folder, unfit, name):
     assert f"{name}.npz: sweep 0 holds values that are not finite" in said
 
 
-def test_another_shape(folder, unfit):
-    rewrite(folder, "cube-0", lambda values: values[:, :, :29])
-    assert "cube-0.npz holds (1, 136, 29, 6), not (sweep, sample, *(30, 6))" in unfit()
-
-
-def test_sweeps_of_another_length(folder, unfit):
-    rewrite(folder, "cube-0", lambda values: values[:, :120])
-    assert "cube-0.npz holds sweeps of 120 samples, not 136" in unfit()
-
-
 def test_sweeps_shorter_than_a_window(folder, unfit):
     for name in SweepManifest.read(folder).names():
         rewrite(folder, name, lambda values: values[:, :100])
     assert "sweeps of 100 samples are shorter than a window of 110" in unfit()
-
-
-@pytest.mark.parametrize("kept", [0, 200, 20_000])
-def test_a_file_cut_short(folder, unfit, kept):
-    path = object_path(folder, "ball-0")
-    path.write_bytes(path.read_bytes()[:kept])
-    assert "ball-0.npz is damaged" in unfit()
-
-
-def test_a_missing_file(folder, unfit):
-    object_path(folder, "ball-0").unlink()
-    assert "ball-0" in unfit()
 
 
 def test_a_label_that_is_none(folder, unfit):

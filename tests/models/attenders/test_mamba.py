@@ -87,26 +87,6 @@ def test_time_scales_at_the_start():
     assert dt.max() < 0.11
 
 
-@pytest.mark.parametrize("scale", [1.0, 100.0])
-def test_stream_is_the_window(scale):
-    attender, x = build(), scale * torch.randn(2, 22, 32)
-    window, state = attender(x), attender.initial_state(2)
-    assert attender.features == 32
-    for t in range(x.shape[1]):
-        out, state = attender.step(x[:, t], torch.full((2,), t), state)
-        torch.testing.assert_close(out, window[:, t], rtol=0, atol=TOLERANCE)
-
-
-def test_encoder_stream_is_the_window():
-    torch.manual_seed(1)
-    encoder, x = MambaEncoder(1 / 16).eval(), torch.randn(2, 22, 30, 5, 7)
-    window, state = encoder(x), encoder.initial_state(2)
-    assert window.shape == (2, 22, encoder.features)
-    for t in range(x.shape[1]):
-        out, state = encoder.step(x[:, t], torch.full((2,), t), state)
-        torch.testing.assert_close(out, window[:, t], rtol=0, atol=TOLERANCE)
-
-
 def test_encoder_and_attender_keep_separate_states():
     encoder, attender = MambaEncoder(1 / 16), MambaAttender(32)
     assert not set(encoder.initial_state(1)) & set(attender.initial_state(1))
