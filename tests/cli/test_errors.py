@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -29,7 +30,7 @@ TINY_SET = (
 def tiny_recipe():
     """What `TINY_SET` says."""
     recipe = read_recipe("mouse12")
-    objects = replace(recipe.objects, per_category=3, validation=1, test=1)
+    objects = msgspec.structs.replace(recipe.objects, per_category=3, validation=1, test=1)
     return replace(recipe, objects=objects, sweeps=replace(recipe.sweeps, draws=1))
 
 
@@ -209,7 +210,6 @@ def test_a_damaged_checkpoint_is_one_line(torch, call, refused, sweep_set, tmp_p
 @pytest.fixture
 def tiny_model(torch, tmp_path, sweep_set):
     """An untrained network for the mouse array, as a file; what is changed in its card."""
-    import msgspec
     import onnx
 
     from tactile_rt.classifier.model_file import METADATA_KEY
