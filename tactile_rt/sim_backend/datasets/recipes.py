@@ -27,7 +27,7 @@ one of the profiles cannot simulate, which are drawn again).
 """
 
 import zlib
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from itertools import product
 from typing import Annotated, Any
 
@@ -386,5 +386,6 @@ class SweepRecipe:
 
     def to_dict(self) -> dict[str, Any]:
         """Write it in full as a recipe file has it; `recipe_files.recipe_from_dict` reads it."""
-        plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(self))
+        # asdict, as msgspec leaves out what it has decoded from a default
+        plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(self)))
         return plain
