@@ -79,12 +79,6 @@ def test_a_category_may_have_a_dash_in_its_name(tmp_path: Path) -> None:
     assert read_sweeps(tmp_path, "train").labels.tolist() == [0, 0, 1, 1]
 
 
-def test_values_are_stored_as_float32(tmp_path: Path) -> None:
-    write_object(tmp_path, "mug-0", np.ones((1, SAMPLES, *SPEC.shape)), {})
-    with np.load(tmp_path / "mug-0.npz") as arrays:
-        assert arrays["values"].dtype == np.float32
-
-
 class Unwritable:
     """An array that fails when half of the file is on the disk."""
 
@@ -122,9 +116,7 @@ def test_a_recipe_that_json_spells_differently_is_still_the_same(tmp_path: Path)
     [
         ({"recipe": {"seed": 4, "profile": "realtime"}}, "recipe.seed"),
         ({"recipe": {"seed": 3, "profile": "realtime", "sensor": {"gain": 0.1}}}, "recipe.sensor"),
-        ({"versions": {"mujoco": "3.9"}}, "versions.mujoco"),
         ({"lead": 5, "period_ns": 1}, "period_ns, lead"),
-        ({"categories": ("bowl", "cup")}, "categories"),
         ({"split": {**MANIFEST.split, "train": ("bowl-0",)}}, "split"),
         ({"spec": small_spec(rate_hz=500.0)}, "spec"),
     ],
@@ -161,12 +153,9 @@ def manifest_with(**fields: object) -> bytes:
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        (b"", "is damaged"),
         (b"{", "is damaged"),
-        (b"[]", "is damaged"),
         (b'{"version": "\xff"}', "is damaged"),
         (b"{}", "is of version None; this release reads 2 and 3"),
-        (manifest_with(version=1), "is of version 1; this release reads 2 and 3"),
         (manifest_with(version=4), "is of version 4; this release reads 2 and 3"),
         (manifest_with(lead="four"), r"is damaged: .*\$.lead"),
         (manifest_with(spec={}), r"is damaged: .*\$.spec"),
@@ -213,11 +202,7 @@ def test_a_split_without_objects_or_of_unknown_ones_is_damage(folder: Path) -> N
 
 def spoil(path: Path, how: str) -> None:
     whole = path.read_bytes()
-    if how == "empty":
-        path.write_bytes(b"")
-    elif how == "text":
-        path.write_bytes(b"not an archive")
-    elif how == "cut":
+    if how == "cut":
         path.write_bytes(whole[: len(whole) // 5 // 2])
     elif how == "a bare array":
         with path.open("wb") as file:
@@ -233,9 +218,7 @@ def spoil(path: Path, how: str) -> None:
         path.mkdir()
 
 
-@pytest.mark.parametrize(
-    "how", ["empty", "text", "cut", "a bare array", "without values", "objects", "a folder"]
-)
+@pytest.mark.parametrize("how", ["cut", "a bare array", "without values", "objects", "a folder"])
 def test_a_damaged_object_is_named_with_the_remedy(folder: Path, how: str) -> None:
     path = folder / "mug-0.npz"
     spoil(path, how)
@@ -266,13 +249,6 @@ def test_an_object_of_another_array_or_length_is_refused(folder: Path) -> None:
     write_object(folder, "mug-0", np.zeros((2, SAMPLES + 1, *SPEC.shape)), {})
     with pytest.raises(RecordingError, match=r"mug-0.npz holds sweeps of 12 samples, not 11"):
         read_sweeps(folder, "train")
-
-
-def test_a_cut_parameter_is_named_too(folder: Path) -> None:
-    assert read_object(folder, "mug-1")[1]["speed"].tolist() == [0, 1, 2, 3]
-    spoil(folder / "mug-1.npz", "cut")
-    with pytest.raises(RecordingError, match=r"mug-1\.npz is damaged"):
-        read_object(folder, "mug-1")
 
 
 # Objects that are withheld, skipped, or have a name of their own

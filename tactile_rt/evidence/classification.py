@@ -83,16 +83,10 @@ def evaluate_model(
     settled = evaluation.deciding_step(clean, labels)
     step_ms = card.period_ns * card.substeps * 1e-6
     if settled.any():
-        records.append(
-            Record(
-                "models.time to the final decision",
-                float(np.median(settled[settled > 0])) * step_ms,
-                "ms",
-                "",
-                "median",
-                f"from contact onset, where it is right in the end; {sample}",
-            )
-        )
+        median = float(np.median(settled[settled > 0])) * step_ms
+        how = f"from contact onset, where it is right in the end; {sample}"
+        name = "models.time to the final decision"
+        records.append(Record(name, median, "ms", anchor="median", how=how))
     noisy = evaluation.predict(test, run, 1.0)
     rated, period_ms = rated_amount(test), card.period_ns * 1e-6
     recorded = test.manifest.recorded
@@ -102,17 +96,9 @@ def evaluate_model(
     records.append(
         _accuracy("top-1 at rated noise", noisy[:, -1], labels, objects, "", how + "wrong")
     )
-    lost = records[0].value - records[-1].value
-    records.append(
-        Record(
-            "models.points lost at rated noise",
-            lost,
-            "points",
-            bars.get("noise", ""),
-            "",
-            how + "wrong",
-        )
-    )
+    lost, bar = records[0].value - records[-1].value, bars.get("noise", "")
+    name = "models.points lost at rated noise"
+    records.append(Record(name, lost, "points", bar, how=how + "wrong"))
     if test.manifest.sensor is None and not recorded:
         # The same noise on samples of 1 kHz: the resampler's Hann kernel leaves 0.29.
         raw = evaluation.predict(test, run, float(np.sqrt(1.5 / 18)))
@@ -136,10 +122,7 @@ def evaluate_model(
         right = evaluation.hits(clean[:, -1], labels)
         records += _compare_svm(data, card, test, right)
     if pictures is not None:
-        from tactile_rt.evidence.pictures import (
-            draw_accuracy_over_time,
-            draw_confusion,
-        )
+        from tactile_rt.evidence.pictures import draw_accuracy_over_time, draw_confusion
 
         table = evaluation.confusion(clean[:, -1], labels, len(card.classes))
         draw_confusion(table, card.classes, pictures / "confusion.png")
@@ -208,9 +191,12 @@ def _accuracy(
     return _record(name, evaluation.accuracy(correct, objects), bar, how)
 
 
-def _record(name: str, estimate: evaluation.Interval, bar: str, how: str) -> Record:
+def _record(
+    name: str, estimate: evaluation.Interval, bar: str, how: str, unit: str = "%", beside: str = ""
+) -> Record:
+    """Give a share as a figure in percent, with its interval."""
     interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
-    return Record(f"models.{name}", 100 * estimate.value, "%", bar, interval, how)
+    return Record(f"models.{name}", 100 * estimate.value, unit, bar, interval + beside, how)
 
 
 def _calibration(
@@ -282,15 +268,9 @@ def _open_set(model: Path, unknown: SweepSet, known: SweepSet) -> Record:
 
     names = np.concatenate([known.sweeps.objects, unknown.sweeps.objects])
     estimate = evaluation.bootstrap(area, names)
-    return Record(
-        "models.known against withheld categories",
-        100 * estimate.value,
-        "% AUROC",
-        "",
-        f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object; "
-        "50: chance",
-        f"{len(here)} sweeps of known and {len(there)} of withheld kinds",
-    )
+    how = f"{len(here)} sweeps of known and {len(there)} of withheld kinds"
+    name = "known against withheld categories"
+    return _record(name, estimate, "", how, "% AUROC", "; 50: chance")
 
 
 def _firsts(objects: NDArray[np.str_], sweeps: int) -> NDArray[np.int64]:
@@ -321,11 +301,8 @@ def _compare_svm(
     right, objects = svm.hits(test), test.sweeps.objects
     own = evaluation.accuracy(right, objects)
     above = evaluation.accuracy(network.astype(np.float64) - right, objects)
-    records = []
-    for name, unit, estimate, bar in (
-        ("RBF SVM top-1", "%", own, ""), ("points above the SVM", "points", above, ">= 3"),
-    ):  # fmt: skip
-        interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
-        anchor = f"{interval}; the same test sweeps"
-        records.append(Record(f"models.{name}", 100 * estimate.value, unit, bar, anchor, svm.how))
-    return records
+    same = "; the same test sweeps"
+    return [
+        _record("RBF SVM top-1", own, "", svm.how, beside=same),
+        _record("points above the SVM", above, ">= 3", svm.how, "points", same),
+    ]

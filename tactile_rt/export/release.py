@@ -19,7 +19,7 @@ from tactile_rt.files import write_whole
 from tactile_rt.models.checkpoints import TactileClassifier, load_checkpoint, run_on
 from tactile_rt.models.data_checks import trained_on
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, relabelled
-from tactile_rt.models.evaluation import Step, among, hits, predict, run_windows
+from tactile_rt.models.evaluation import Step, among, cut_windows, hits, predict, run_over
 from tactile_rt.sweep_set import SweepManifest, join_manifests
 
 __all__ = ["fit_temperature", "quantisation_figures", "release", "run_file"]
@@ -99,7 +99,7 @@ def embedding_statistics(
             mean: NDArray[np.float32] = steps.mean(dim=1).float().cpu().numpy()
         return mean
 
-    found, touched = run_windows(data, embed)
+    found, touched = run_over(cut_windows(data), embed)
     found, labels = found[touched].astype(float), data.sweeps.labels[touched]
     if np.bincount(labels, minlength=classes)[:classes].min() < 2:
         return None

@@ -156,7 +156,7 @@ def check_split(folder: Path, manifest: SweepManifest) -> None:
 
 
 def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
-    """The sweeps themselves: finite, long enough, labelled, and none on two sides.
+    """The sweeps themselves: finite, long enough, and none on two sides.
 
     Args:
         folder: the sweep set's.
@@ -166,18 +166,11 @@ def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
     """
     seen: dict[bytes, tuple[str, int]] = {}
     for number, data in enumerate(sets):
-        sweeps, classes = data.sweeps, len(data.manifest.categories)
+        sweeps = data.sweeps
         if sweeps.values.shape[1] < data.timing.samples:
             raise RecordingError(
                 f"{folder}: sweeps of {sweeps.values.shape[1]} samples are shorter than a window "
                 f"of {data.timing.samples}"
-            )
-        unknown = np.isin(sweeps.objects, data.manifest.split.get(OUTLIERS, ()))
-        wrong = np.flatnonzero(((sweeps.labels < 0) & ~unknown) | (sweeps.labels >= classes))
-        if len(wrong):
-            raise RecordingError(
-                f"{object_path(folder, sweeps.objects[wrong[0]])}: label "
-                f"{sweeps.labels[wrong[0]]} is none of the {classes} categories"
             )
         first = {str(name): int(at) for at, name in reversed(list(enumerate(sweeps.objects)))}
         for k, sweep in enumerate(sweeps.values):

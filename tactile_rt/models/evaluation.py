@@ -38,7 +38,7 @@ __all__ = [
     "hits",
     "posteriors",
     "predict",
-    "run_windows",
+    "run_over",
 ]
 
 # samples (batch, step, sub-step, element, channel), offset and sigma (batch, element, channel), SI
@@ -83,7 +83,6 @@ def predict(
     run: Step,
     noise_level: float = 0.0,
     seed: int = 0,
-    batch: int = 64,
     disturbance: Disturbance = CLEAN,
 ) -> NDArray[np.float32]:
     """Posteriors of every sweep at every step, from where the detector finds its onset.
@@ -92,14 +91,13 @@ def predict(
         run: (samples, offset, sigma) of windows to (batch, step, class) logits.
         noise_level: white sensor noise added to every stored sample, in units of the rated noise;
             short for a `disturbance` of only that.
-        batch: windows per call of `run`.
 
     Returns:
         (sweep, step, class) posteriors; NaN where no contact was detected.
     """
     if noise_level:
         disturbance = replace(disturbance, noise=noise_level)
-    return posteriors(cut_windows(data, seed, batch, disturbance), run)
+    return posteriors(cut_windows(data, seed, disturbance=disturbance), run)
 
 
 def posteriors(cut: Iterable[CutWindows], run: Step) -> NDArray[np.float32]:
@@ -110,7 +108,7 @@ def posteriors(cut: Iterable[CutWindows], run: Step) -> NDArray[np.float32]:
         cut: what `cut_windows` gives.
         run: as `predict` takes it.
     """
-    logits, found = _run_over(cut, run)
+    logits, found = run_over(cut, run)
     with np.errstate(invalid="ignore"):
         raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
         posterior: NDArray[np.float32] = raised / raised.sum(axis=-1, keepdims=True)
@@ -124,7 +122,8 @@ def cut_windows(
     """The windows of all sweeps as the robot would cut them, so many at a time.
 
     Args:
-        data, seed, batch, disturbance: as `predict` takes them.
+        data, seed, disturbance: as `predict` takes them.
+        batch: sweeps whose windows come together.
     """
     rng = np.random.default_rng(seed)
     for i in range(0, len(data.sweeps), batch):
@@ -135,21 +134,13 @@ def cut_windows(
         yield CutWindows(cut, found.offset, found.sigma, found.start >= 0)
 
 
-def run_windows(
-    data: SweepSet, run: Step, seed: int = 0, batch: int = 64, disturbance: Disturbance = CLEAN
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """What `run` makes of every sweep's window, and (sweep,) whether a contact was detected.
+def run_over(cut: Iterable[CutWindows], run: Step) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Return what a function makes of windows, and (sweep,) whether a contact was detected.
 
     Args:
-        data, run, seed, batch, disturbance: as `predict` takes them; what `run` gives need not be
-            logits.
+        cut: what `cut_windows` gives.
+        run: as `predict` takes it; what it gives need not be logits.
     """
-    return _run_over(cut_windows(data, seed, batch, disturbance), run)
-
-
-def _run_over(
-    cut: Iterable[CutWindows], run: Step
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     parts = [(run(one.samples, one.offset, one.sigma), one.detected) for one in cut]
     out, detected = zip(*parts, strict=True)
     return np.concatenate(out), np.concatenate(detected)

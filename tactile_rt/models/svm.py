@@ -117,7 +117,7 @@ def window_features(
     """
     # Imported here: it brings torch, which whoever only writes a set's card does without.
     from tactile_rt.models.disturbances import CLEAN
-    from tactile_rt.models.evaluation import run_windows
+    from tactile_rt.models.evaluation import cut_windows, run_over
 
     limits = data.manifest.limits
 
@@ -129,4 +129,4 @@ def window_features(
         out: NDArray[np.float32] = cut.mean(axis=2).reshape(len(cut), -1)
         return out
 
-    return run_windows(data, run, disturbance=disturbance or CLEAN)
+    return run_over(cut_windows(data, disturbance=disturbance or CLEAN), run)

@@ -18,7 +18,7 @@ from tactile_rt.classifier.model_file import load_model
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet, joined
 from tactile_rt.models.disturbances import CLEAN, Disturbance
-from tactile_rt.models.evaluation import run_windows
+from tactile_rt.models.evaluation import cut_windows, run_over
 from tactile_rt.models.training.batches import TrainingBatches
 from tactile_rt.recording import Recording
 from tactile_rt.sensor_faults import SensorFaults
@@ -145,7 +145,9 @@ def test_training_gets_what_a_classifier_feeds_its_network(here, night, call, mo
         ]
         place = [round((t - 2.2) / 3.4) for t in onsets]
         seen = []
-        run_windows(data, lambda *a, seen=seen: seen.append(a) or np.zeros((len(a[0]), 22, 2)))
+        run_over(
+            cut_windows(data), lambda *a, seen=seen: seen.append(a) or np.zeros((len(a[0]), 22, 2))
+        )
         assert np.allclose(seen[0][0], samples[place], rtol=1e-6, atol=0)
         assert np.allclose(seen[0][1], offset[place], rtol=1e-6, atol=0)
         assert np.allclose(seen[0][2], sigma[place], rtol=1e-6, atol=0)

@@ -46,23 +46,13 @@ from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest
 from tactile_rt.testing import cut
 from tactile_rt.timing import MOUSE
+from tests.helpers.tiny_sweeps import tiny_array
 
 STEPS, SUBSTEPS = MOUSE.steps, MOUSE.substeps
 PERIOD_NS = 9_000_000
 CATEGORIES = ("bowl", "car", "lamp", "mug")
-UNITS = ("N", "N", "N", "N m", "N m", "N m")
+SPEC = tiny_array()
 TYPICAL = np.array([1e-4] * 3 + [1e-6] * 3, dtype=np.float32)  # loads of a touching whisker, SI
-SPEC = ArraySpec(
-    name="grid",
-    elements=tuple(f"{'ABCDE'[i // 6]}{i % 6}" for i in range(30)),
-    grid=tuple((i // 6, i % 6 + (i % 12 == 5)) for i in range(30)),
-    positions=tuple((0.0, 0.002 * (i % 6), 0.002 * (i // 6)) for i in range(30)),
-    orientations=((1.0, 0.0, 0.0, 0.0),) * 30,
-    channels=("fx", "fy", "fz", "mx", "my", "mz"),
-    units=UNITS,
-    rate_hz=1000.0,
-    frame="head",
-)
 # Every kind of state there is: convolutions, the transformer's cache, the running mean of logits.
 NETWORK = EADConfig(classes=len(CATEGORIES), attender="gpt", width=1 / 32, readout="mean")
 
@@ -234,7 +224,7 @@ def test_the_metadata_says_everything_needed(exported: SimpleNamespace) -> None:
     assert (card["substeps"], card["steps"]) == (5, 22)
     assert card["labels"] == list(CATEGORIES)
     assert card["temperature"] == 1.25
-    assert card["floor"] == pytest.approx([CHANNEL_FLOOR[u] for u in UNITS])
+    assert card["floor"] == pytest.approx([CHANNEL_FLOOR[u] for u in SPEC.units])
     for name in ("clip", "scale"):
         assert card[name] == pytest.approx(getattr(exported.model.inputs, name).tolist())
     assert card["figures"]["validation_top1"] == 0.5
@@ -285,7 +275,7 @@ def test_the_robot_decides_as_training_saw_it(exported: SimpleNamespace) -> None
     values[60:, 4:9] += push * rng.normal(size=(5, 6))
     values = values.astype(np.float32)
 
-    onsets = find_onsets(values[None], np.array([CHANNEL_FLOOR[u] for u in UNITS], np.float32))
+    onsets = find_onsets(values[None], np.array([CHANNEL_FLOOR[u] for u in SPEC.units], np.float32))
     assert onsets.start[0] > 60
     window = windows(values[None], onsets.start)
     logits = in_torch(exported.model, window, onsets.offset, onsets.sigma)[0] / 1.25
@@ -319,23 +309,6 @@ def test_the_cache_is_written_in_place_with_the_same_result(exported: SimpleName
             stepper.samples[:] = samples[:, step]
             assert np.array_equal(stepper.run()[0], expected[step]), (steps, step)
             assert np.array_equal(stepper.embedding[0], embedding[step]), (steps, step)
-
-
-def test_a_lane_begun_anew_leaves_the_others_cache_alone(exported: SimpleNamespace) -> None:
-    session, card = load_model(exported.path)
-    samples, offset, sigma = episodes(1, seed=5)
-    alone = file_outputs(session, card, samples, offset, sigma)["logits"][0]
-    stepper = Stepper(session, card, lanes=2)
-    stepper.begin(offset[0], sigma[0])
-    late = 7  # lane 1 begins so many steps after lane 0
-    for step in range(STEPS):
-        if step == late:
-            stepper.reset(1)
-        stepper.samples[0], stepper.samples[1] = samples[0, step], samples[0, max(step - late, 0)]
-        logits = stepper.run()
-        assert abs(logits[0] - alone[step]).max() <= 1e-6
-        if step >= late:
-            assert abs(logits[1] - alone[step - late]).max() <= 1e-6
 
 
 @pytest.mark.parametrize(
@@ -440,18 +413,6 @@ def test_a_graph_that_computes_something_else_is_not_written(
     assert path.read_bytes() == b"an older model"
 
 
-def test_an_exporter_that_fails_leaves_nothing(
-    exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object, **__: object) -> None:
-        raise RuntimeError("unsupported operator")
-
-    monkeypatch.setattr(torch.onnx, "export", fail)
-    with pytest.raises(RuntimeError, match="unsupported operator"):
-        export_step(exported.model, exported.card, tmp_path / "new" / "m.onnx")
-    assert list(tmp_path.iterdir()) == []
-
-
 def test_a_disk_that_fills_up_leaves_nothing(
     exported: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -466,12 +427,3 @@ def test_a_disk_that_fills_up_leaves_nothing(
         export_step(exported.model, exported.card, path)
     assert full.value.filename == str(path)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_checkpoint_that_cannot_be_read_is_named(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match=f"no checkpoint {tmp_path}/best.pt"):
-        export_checkpoint(tmp_path / "best.pt", tmp_path / "m.onnx", "m")
-    (tmp_path / "best.pt").write_bytes(b"garbage")
-    with pytest.raises(ModelError, match=r"best\.pt"):
-        export_checkpoint(tmp_path / "best.pt", tmp_path / "m.onnx", "m")
-    assert [p.name for p in tmp_path.iterdir()] == ["best.pt"]

@@ -6,7 +6,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import onnxruntime
 import pytest
 
 pytest.importorskip("torch")
@@ -195,11 +194,6 @@ def test_every_file_verifies_and_is_plain_onnx(files: SimpleNamespace) -> None:
             assert line in said, name
         if "int8" not in name:  # the checker does not know onnxruntime's own operators
             onnx.checker.check_model(onnx.load(path), full_check=True)
-
-
-def test_nothing_but_plain_onnxruntime_is_needed(files: SimpleNamespace) -> None:
-    for path in files.paths.values():
-        onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
 
 
 def test_a_precision_that_does_not_exist_is_refused(files: SimpleNamespace, tmp_path: Path) -> None:

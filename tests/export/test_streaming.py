@@ -14,10 +14,6 @@ from tactile_rt.export import streaming as streaming_module
 from tactile_rt.export import streaming_gpt
 from tactile_rt.export.products import Pointwise
 from tactile_rt.export.streaming import (
-    StreamingGPT,
-    StreamingGraph,
-    StreamingIntersection,
-    StreamingResNet18,
     streaming,
 )
 from tests.helpers.small_networks import TOLERANCE, build, frames, stream
@@ -121,16 +117,6 @@ def test_a_step_writes_its_own_rows_of_the_cache_and_no_others() -> None:
         rows = [row.nonzero().flatten().tolist() for row in changed]
         last = 2 * (STEPS - 1)
         assert rows == [[0, 1], [8, 9], [last, last + 1], [last, last + 1]]
-
-
-def test_what_is_rewritten_and_what_is_not() -> None:
-    ead = build("zhuang-intersection-ln", "gpt")
-    deployed = streaming(ead)
-    assert isinstance(deployed.encoder, StreamingGraph)
-    assert all(isinstance(c, StreamingIntersection) for c in deployed.encoder.cells.values())
-    assert isinstance(deployed.attender, StreamingGPT)
-    assert isinstance(streaming(build("resnet18", "none")).encoder, StreamingResNet18)
-    assert type(ead.encoder).__name__ == "ZhuangEncoder", "the trained network is left alone"
 
 
 def test_a_graph_with_sums_and_gates_streams_as_it_was_trained() -> None:

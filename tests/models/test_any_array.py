@@ -12,9 +12,9 @@ import torch
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.checkpoints import TactileClassifier
 from tactile_rt.models.ead import EAD, ENCODERS, EADConfig
-from tactile_rt.stream import ArraySpec
 from tactile_rt.timing import Timing
 from tests.helpers.small_networks import TOLERANCE, build, stream
+from tests.helpers.tiny_sweeps import plate
 
 GRIDS = [(6, 1, 1), (30, 2, 2), (30, 2, 4), (12, 1, 32), (15, 3, 3), (9, 10, 14), (4, 8, 1)]
 
@@ -37,29 +37,14 @@ def test_a_window_and_its_steps_give_the_same_logits(
         assert (ead(loud)[:, ead.lag] != whole[:, ead.lag]).any()
 
 
-def plate(rows: int, columns: int, channels: int, rate_hz: float = 1e3) -> ArraySpec:
-    cells = [(r, c) for r in range(rows) for c in range(columns)]
-    return ArraySpec(
-        name="plate",
-        elements=tuple(f"{r}-{c}" for r, c in cells),
-        grid=tuple(cells),
-        positions=tuple((0.0, 0.01 * c, 0.01 * r) for r, c in cells),
-        orientations=((1.0, 0.0, 0.0, 0.0),) * len(cells),
-        channels=("fx", "fy", "fz", "mx", "my", "mz")[:channels],
-        units=("N", "N", "N", "N m", "N m", "N m")[:channels],
-        rate_hz=rate_hz,
-        frame="plate",
-    )
-
-
 def test_a_network_of_another_array_is_refused_in_one_line() -> None:
     with pytest.raises(ConfigError, match=r"30 x 5 x 7 .* does not fit an array of 6 channels on"):
-        TactileClassifier(plate(2, 4, 6), EADConfig(3, "gru", "none", width=1 / 32))
+        TactileClassifier(plate(2, 4), EADConfig(3, "gru", "none", width=1 / 32))
 
 
 def test_a_classifier_knows_how_its_windows_are_cut() -> None:
     config = EADConfig(3, "gru", "none", width=1 / 32, frame=(12, 2, 4), max_steps=10)
-    model = TactileClassifier(plate(2, 4, 3), config)
+    model = TactileClassifier(plate(2, 4, "fx fy fz"), config)
     assert model.timing == Timing(steps=10, substeps=4)
     samples = torch.zeros(2, 10, 4, 8, 3)
     rest = torch.zeros(2, 8, 3)

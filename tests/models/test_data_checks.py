@@ -95,17 +95,9 @@ def test_sweeps_in_which_nothing_is_felt_are_no_twins_also_in_a_field(folder):
 
 def test_good_data_is_trained_on_and_exported_wherever_it_lies_then(folder, tmp_path, call):
     run, moved, model = tmp_path / "run", tmp_path / "moved", tmp_path / "model.onnx"
-    options = (
-        "--set",
-        "batch=2",
-        "--encoder",
-        "gru",
-        "--set",
-        f"width={1 / 32}",
-        "--set",
-        "updates=1",
-    )
-    code, _, said = call("train", folder, run, "--set", "attender=none", *options)
+    options = f"--encoder gru --set attender=none --set width={1 / 32}".split()
+    quick = ("--set", "batch=2", "--set", "updates=1")
+    code, _, said = call("train", folder, run, *options, *quick)
     assert not code, said
     folder.rename(moved)
     code, _, said = call("export", run / "best.pt", model)

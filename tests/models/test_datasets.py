@@ -9,28 +9,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tactile_rt.classifier.contact import ContactDetector
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.datasets import SweepSet, drawn_as, joined, windows
 from tactile_rt.models.evaluation import cut_windows
-from tactile_rt.models.onsets import find_onsets
 from tactile_rt.models.training.batches import TrainingBatches, partners
-from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest, Sweeps
 from tactile_rt.timing import MOUSE
+from tests.helpers.tiny_sweeps import plate
 
 ELEMENTS, CHANNELS, SAMPLES, LEAD = 4, 6, 170, 30
-SPEC = ArraySpec(
-    name="four",
-    elements=tuple(f"w{i}" for i in range(ELEMENTS)),
-    grid=tuple((0, i) for i in range(ELEMENTS)),
-    positions=((0.0, 0.0, 0.0),) * ELEMENTS,
-    orientations=((1.0, 0.0, 0.0, 0.0),) * ELEMENTS,
-    channels=("fx", "fy", "fz", "mx", "my", "mz"),
-    units=("N", "N", "N", "N m", "N m", "N m"),
-    rate_hz=1000 / 9,
-    frame="mount",
-)
+SPEC = plate(1, ELEMENTS)
 RATED = np.array([10e-6] * 3 + [5e-8] * 3, dtype=np.float32)
 FLOOR = np.array([2e-6] * 3 + [1e-8] * 3, dtype=np.float32)
 
@@ -58,27 +46,6 @@ def noise_level(samples: np.ndarray) -> np.ndarray:
     """(window,) noise in units of the rated, by the spread of what is constant late in it."""
     late = samples.reshape(len(samples), -1, ELEMENTS, CHANNELS)[:, 40:100].astype(np.float64)
     return (late.std(axis=1) / RATED).mean(axis=(1, 2))
-
-
-def test_onsets_are_those_of_the_detector_one_sweep_at_a_time() -> None:
-    rng = np.random.default_rng(3)
-    samples = 300
-    values = np.zeros((40, samples, ELEMENTS, CHANNELS))
-    for sweep in values[4:]:  # the first four are never touched
-        begin = rng.integers(0, 250)
-        load = RATED * 10 ** rng.uniform(-0.5, 2) * rng.normal(size=CHANNELS)
-        sweep[begin:, rng.integers(ELEMENTS)] += load
-    values += RATED * rng.choice([0.0, 0.3, 1.0], (40, 1, 1, 1)) * rng.normal(size=values.shape)
-    values = values.astype(np.float32)
-    found = find_onsets(values, FLOOR)
-    trusted = np.ones(ELEMENTS, dtype=bool)
-    for i, sweep in enumerate(values):
-        detector = ContactDetector((ELEMENTS, CHANNELS), FLOOR)
-        begins = (k for k, sample in enumerate(sweep) if detector.update(sample, trusted))
-        assert found.start[i] == next(begins, -1)
-        assert np.array_equal(found.offset[i], detector.offset)
-        assert np.array_equal(found.sigma[i], detector.sigma)
-    assert (found.start[:4] == -1).all() and (found.start > 150).any()
 
 
 def test_windows_are_cut_where_they_start_and_repeat_the_last_sample() -> None:

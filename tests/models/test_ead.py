@@ -51,15 +51,10 @@ def test_width_scales_every_channel_count():
         ({"classes": 0}, "classes"),
         ({"encoder": "zhuang"}, "encoder is 'zhuang', not one of zhuang-timedecay, .* and 12 more"),
         ({"attender": "lstm"}, "attender"),
-        ({"decoder": ""}, "decoder"),
-        ({"readout": "first"}, "readout"),
         ({"width": 0.0}, "width"),
-        ({"width": -1.0}, "width"),
         ({"width": 0.3}, "multiple of 1/32"),
         ({"dropout": 1.0}, "dropout"),
         ({"max_steps": 33}, "max_steps"),
-        ({"max_steps": 0}, "max_steps"),
-        ({"width": float("inf")}, "width"),
         ({"encoder": "graph"}, "graph must be given"),
         ({"graph": "readout = 'fc'"}, "graph must be given"),
     ],
@@ -119,36 +114,6 @@ def test_any_length(steps):
     x = frames(steps=steps)
     with torch.no_grad():
         assert (ead(x) - stream(ead, x)).abs().max() <= TOLERANCE
-
-
-@pytest.mark.parametrize(("encoder", "attender", "readout"), VARIANTS)
-def test_causal(encoder, attender, readout):
-    ead = build(encoder, attender, readout)
-    x = frames()
-    y = x.clone()
-    y[:, 9:] = frames(seed=5)[:, 9:]
-    with torch.no_grad():
-        a, b = ead(x), ead(y)
-    assert (a[:, :12] - b[:, :12]).abs().max() <= TOLERANCE  # frame 9 first counts at step 12
-    assert (a[:, 12:] - b[:, 12:]).abs().amax(dim=(0, 2)).min() > 1e-5
-
-
-def test_reset_equals_a_fresh_start():
-    ead = build(readout="mean")
-    x = frames()
-    with torch.no_grad():
-        _, used = ead.step(x[:, 0], ead.initial_state(2))
-        for t in range(1, 9):
-            _, used = ead.step(x[:, t], used)
-        fresh = ead.initial_state(2)
-        # What a runtime does for one lane of several: put that lane's initial state back.
-        lane = {name: torch.stack([fresh[name][0], used[name][1]]) for name in fresh}
-        out, _ = ead.step(x[:, 9], lane)
-        first, _ = ead.step(x[:, 9], fresh)
-        later, _ = ead.step(x[:, 9], used)
-    assert (out[0] - first[0]).abs().max() <= TOLERANCE
-    assert (out[1] - later[1]).abs().max() <= TOLERANCE
-    assert (first - later).abs().amax(dim=1).min() > 1e-4
 
 
 def test_state_keeps_its_shapes_and_is_not_written_to():

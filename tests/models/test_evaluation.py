@@ -26,20 +26,10 @@ from tactile_rt.sensor_spec import channel_limits
 from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest, Sweeps
 from tactile_rt.timing import MOUSE
+from tests.helpers.tiny_sweeps import plate
 
-UNITS = ("N", "N", "N", "N m", "N m", "N m")
 ELEMENTS = 8
-SPEC = ArraySpec(
-    name="row",
-    elements=tuple(f"A{i}" for i in range(ELEMENTS)),
-    grid=tuple((0, i) for i in range(ELEMENTS)),
-    positions=tuple((0.0, 0.002 * i, 0.0) for i in range(ELEMENTS)),
-    orientations=((1.0, 0.0, 0.0, 0.0),) * ELEMENTS,
-    channels=("fx", "fy", "fz", "mx", "my", "mz"),
-    units=UNITS,
-    rate_hz=1000.0,
-    frame="head",
-)
+SPEC = plate(1, ELEMENTS)
 NOISE, FLOOR, _, _ = channel_limits(SPEC)
 
 
@@ -263,7 +253,7 @@ def test_noise_is_the_rated_one_and_repeats_with_its_seed() -> None:
 
 
 def test_a_sensor_cannot_be_better_than_ideal() -> None:
-    for field in ("noise", "gain", "dead", "rows", "offset", "drift"):
+    for field in ("noise", "dead"):
         with pytest.raises(ConfigError, match=f"{field} is -1"):
             replace(Disturbance(), **{field: -1})
 

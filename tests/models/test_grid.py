@@ -26,26 +26,15 @@ from tactile_rt.models.grid.outcomes import (
     write_tested,
 )
 from tactile_rt.models.grid.picture import draw_grid
-from tactile_rt.models.grid.plan import Growth, Search, Task, read_grid, shipped_grids
+from tactile_rt.models.grid.plan import Growth, Task, read_grid, shipped_grids
 from tactile_rt.models.grid.pool import run_grid
 from tactile_rt.models.grid.results import gather, table, write_results
 from tactile_rt.models.grid.work import Workbench
 from tactile_rt.models.training.config import DivergedError, Progress
-from tactile_rt.stream import ArraySpec
 from tactile_rt.sweep_set import SweepManifest, write_object
 from tests.helpers.source_tree import ROOT
+from tests.helpers.tiny_sweeps import plate
 
-SPEC = ArraySpec(
-    name="row",
-    elements=tuple(f"{'ABCDE'[i // 7]}{i % 7}" for i in range(35)),
-    grid=tuple((i // 7, i % 7) for i in range(35)),
-    positions=tuple((0.0, 0.002 * (i % 7), 0.002 * (i // 7)) for i in range(35)),
-    orientations=((1.0, 0.0, 0.0, 0.0),) * 35,
-    channels=("fx", "fy", "fz", "mx", "my", "mz"),
-    units=("N", "N", "N", "N m", "N m", "N m"),
-    rate_hz=1000.0,
-    frame="head",
-)
 SPLIT = {
     side: tuple(f"{kind}-{i}" for kind in ("mug", "car") for i in range(begin, end))
     for side, begin, end in (("train", 0, 4), ("validation", 4, 6), ("test", 6, 10))
@@ -77,7 +66,7 @@ pairs = [{{ better = "gru", than = "gru simclr image" }}, {{ better = "gru", tha
 def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three sweeps of 20 objects of two kinds, told apart by which whiskers they touch."""
     folder = tmp_path_factory.mktemp("set")
-    SweepManifest(SPEC, 9_000_000, 20, ("mug", "car"), SPLIT).write(folder)
+    SweepManifest(plate(5, 7), 9_000_000, 20, ("mug", "car"), SPLIT).write(folder)
     rng = np.random.default_rng(0)
     for names in SPLIT.values():
         for name in names:
@@ -120,11 +109,9 @@ def test_the_page_of_results_is_what_was_found() -> None:
     ("old", "new", "said"),
     [
         ('encoder = "gru"', 'encoder = "lstm"', "cell 'lstm': encoder is 'lstm', not one of"),
-        ("image", "picture", "augmentation is 'picture', not one of"),
         ("updates = 2", 'updates = "2"', "updates: expected a whole number, got '2'"),
         ("updates = 2", "updates = 0", "needs a cell, a seed and an update"),
         ("batch = 4", "bach = 4", "the file has no key 'bach'; did you mean batch?"),
-        ("clip_norm", "clip", "has no key 'clip'; "),
         ("[1e-3, 1e-2]", "[]", "search needs a learning_rate and a warmup"),
         ('encoder = "gru"\nobj', 'encoder = "gru"\nshare = 2\nobj', "share must be above 0"),
         ('encoder = "gru"\nobj', 'encoder = "gru"\nbegin = "s4"\nobj', "begins with 's4', which"),
@@ -132,14 +119,9 @@ def test_the_page_of_results_is_what_was_found() -> None:
         ("[supervised]", "[supervised", "Expected ']'"),
         ('objective = "simclr"\naugmentation = "image"', "", "two cells are 'gru'"),
         ("[1e-3, 1e-2]", "[1e-3, -1e-2]", "cell 'gru': learning_rate must be positive"),
-        ("[0.1, 0.3]", "[0.1, 1.5]", "cell 'gru': warmup must be in [0, 1)"),
         ("most = 2", "most = 0", "growth goes from 1 updates to 0, which is less"),
-        ("drop_epochs = 1", "drop_epoch = 1", "no key 'drop_epoch'; did you mean drop_epochs?"),
-        ("drop_epochs = 1", 'readout = "first"', "probe: readout is 'first', not one of"),
         ("train = 2", "train = -1", "sweeps are counted from 0"),
-        ("clip_norm = 2", "dropout = 2", "cell 'gru': dropout is 2"),
         ("clip_norm = 2", "seed = 2", "supervised: seed is what the grid itself decides"),
-        ("drop_epochs = 1", 'data = "x"', "probe: data is what the grid itself decides"),
         (
             'augmentation = "image"',
             'augmentation = "image"\nbegin = "gru"\nseeds = 3',
@@ -308,14 +290,6 @@ def test_what_the_sweeps_cannot_fill_is_told_before_anything_is_trained(
         begun(plan, tmp_path / "out")
 
 
-def test_an_accelerator_that_is_not_here_is_told_before_anything_is_trained(
-    plan: Path, tmp_path: Path
-) -> None:
-    with pytest.raises(ConfigError, match="accelerator is 'foo'"):
-        run_grid(read_grid(plan), tmp_path / "out", accelerator="foo")
-    assert not list((tmp_path / "out").rglob("*seed0.json"))
-
-
 class KilledError(Exception):
     """What a test stops a training with, after an epoch."""
 
@@ -335,21 +309,6 @@ def test_a_damaged_checkpoint_is_not_a_training_that_diverged(plan: Path, tmp_pa
     with pytest.raises(ModelError, match=r"last\.pt is damaged"):
         bench.do(task)
     assert not outcome_path(tmp_path / "out", task).exists()
-
-
-def test_a_score_of_nothing_is_one(plan: Path, tmp_path: Path) -> None:
-    bench = begun(plan, tmp_path / "out")
-    wrong = bench.splits[1]
-    swapped = replace(wrong, sweeps=replace(wrong.sweeps, labels=1 - wrong.sweeps.labels))
-    bench.splits = bench.splits[0], swapped
-    grid = msgspec.structs.replace(
-        bench.grid, search=Search((1e-2,), (0.1,), 20), growth=Growth(40, 40)
-    )
-    bench.grid = grid
-    found = bench.do(grid.tasks()[1])
-    assert found.chosen is not None
-    assert found.chosen.score == 0
-    assert found.top1.count("1") > 12
 
 
 def test_windows_of_the_test_begin_as_those_that_were_learnt_from(
@@ -395,7 +354,7 @@ def test_outcomes_of_other_sweeps_and_damaged_ones_are_told(plan: Path, tmp_path
         gather(grid, folder)
     path = outcome_path(folder, svm)
     whole = path.read_text()
-    for old, new in (('"top1":"1', '"top1":"2'), ('"top5":"1', '"top5":"11'), ("{", "[")):
+    for old, new in (('"top1":"1', '"top1":"2'), ("{", "[")):
         path.write_text(whole.replace(old, new, 1))
         with pytest.raises(ConfigError, match=r"svm_seed0\.json is damaged"):
             gather(grid, folder)

@@ -130,21 +130,16 @@ def test_overrides_come_last():
             "train has no key 'lerning_rate'; did you mean learning_rate?",
         ),
         ("[tarin]\nbatch = 3", "the file has no key 'tarin'; did you mean train?"),
-        ("[search]\nencodr = ['gru']", "search has no key 'encodr'; did you mean encoder?"),
         ("[train]\nbatch = 'many'", ":2: train.batch: expected a whole number, got 'many'"),
-        ("[train]\noptimizer = 'sdg'", "optimizer is 'sdg', not one of sgd, adam"),
         ("[search]\noptimizer = ['sgd', 'sdg']", "optimizer is 'sdg', not one of"),
-        ("[train]\nbatch = 0", "batch must be positive"),
         ("[train]\nencoder = 'foo'", ":1: encoder is 'foo', not one of"),
         (
             "[train]\n\n[search]\nlearning_rate = [0.1, -1.0]",
             ":3: train: learning_rate must be positive",
         ),
-        ("[search]\ndropout = [0.1, 2.0]", ":1: dropout is 2.0, must be in"),
         ("[train]\ndata = 'set'", "train has no key 'data'"),
         ("[search]\nbatch = 3", "search.batch: expected a list, got 3"),
         ("train = ]", ":1: not TOML"),
-        ("train = 3", "train: expected a table, got 3"),
     ],
 )
 def test_a_mistake_is_one_line_that_names_file_and_key(tmp_path, text, said):

@@ -17,17 +17,8 @@ from tactile_rt.sensor_spec import ChannelSpec, SensorSpec
 from tactile_rt.sweep_set import SweepManifest, join_manifests
 from tests.helpers.tiny_sweeps import plate, write_tiny_set
 
-SMALL = (
-    "--encoder",
-    "gru",
-    "--set",
-    "attender=none",
-    "--set",
-    "decoder=linear",
-    "--set",
-    f"width={1 / 32}",
-)
-QUICK = ("--set", "batch=6", "--set", "updates=3")
+SMALL = f"--encoder gru --set attender=none --set decoder=linear --set width={1 / 32}".split()
+QUICK = "--set batch=6 --set updates=3".split()
 FAULTS = {"implausible": 0.2}
 
 
@@ -93,17 +84,10 @@ def test_sets_of_two_arrays_are_refused(sets, tmp_path, call):
 def test_a_network_begins_with_what_another_knew_by_the_same_name(sets, run, tmp_path, call):
     knew, before = load_checkpoint(run / "best.pt")
     # no rate to speak of: the weights stay what they began as
-    begun = (
-        "--from",
-        run / "best.pt",
-        "--set",
-        "batch=6",
-        "--set",
-        "updates=1",
-        "--set",
-        "learning_rate=1e-12",
+    begun = "--set batch=6 --set updates=1 --set learning_rate=1e-12".split()
+    code, _, said = call(
+        "train", sets / "other", tmp_path / "next", "--from", run / "best.pt", *begun
     )
-    code, _, said = call("train", sets / "other", tmp_path / "next", *begun)
     assert not code, said
     model, after = load_checkpoint(tmp_path / "next" / "best.pt")
     assert after["categories"] == ["cone", "star"] and after["refusals"] == []
@@ -120,16 +104,8 @@ def test_a_network_begins_with_what_another_knew_by_the_same_name(sets, run, tmp
 def test_what_cannot_be_begun_with_is_said(sets, run, tmp_path, call):
     code, _, said = call("train", sets / "other", tmp_path / "a", "--from", tmp_path / "no.pt")
     assert code == 2 and "no checkpoint" in said
-    code, _, said = call(
-        "train",
-        sets / "other",
-        tmp_path / "b",
-        "--from",
-        run / "best.pt",
-        "--set",
-        "width=0.0625",
-        *QUICK,
-    )
+    wide = ("--from", run / "best.pt", "--set", "width=0.0625", *QUICK)
+    code, _, said = call("train", sets / "other", tmp_path / "b", *wide)
     assert code == 2 and "cannot be begun with: it is of another width" in said
     write_tiny_set(tmp_path / "robot", spec=plate(1, 4))
     code, _, said = call("train", tmp_path / "robot", tmp_path / "c", "--from", run / "best.pt")

@@ -16,6 +16,7 @@ import numpy as np
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.json_file import Floats, Number, encode, read_json, write_json
 from tactile_rt.models.alignment.rdm import PAIRS, STIMULI
+from tactile_rt.models.alignment.statistics import standard_error
 
 __all__ = [
     "PROTOCOLS",
@@ -96,10 +97,7 @@ class Consistency(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=T
     @property
     def sem(self) -> float:
         """Standard error of that mean."""
-        there = self.pooled[np.isfinite(self.pooled)]
-        if there.size <= self.ddof:
-            return math.nan
-        return float(there.std(ddof=self.ddof) / math.sqrt(there.size))
+        return standard_error(self.pooled, self.ddof)
 
     @property
     def highest(self) -> float:

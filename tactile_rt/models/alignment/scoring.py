@@ -130,12 +130,7 @@ def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> S
         chosen=tuple(names[i] if i >= 0 else "" for i in chosen.tolist()),
         per_target=per_target,
         score=test.statistic,
-        sem=standard_error(per_target) if strict else _published_error(per_target),
+        sem=standard_error(per_target, ddof=int(strict)),
         p=test.p,
         null_95=test.percentile_95,
     )
-
-
-def _published_error(values: Floats) -> float:
-    values = values[np.isfinite(values)]
-    return float(values.std() / np.sqrt(values.size)) if values.size else float("nan")

@@ -142,8 +142,12 @@ def part_of(animals: Sequence[Animal], part: str) -> tuple[Animal, ...]:
 
 
 def _cut_session(session: NeuralSession, part: str) -> NeuralSession | None:
-    chosen = _choose_units(session, part)
-    if chosen is None or not chosen.any():
+    wanted = Selection(depth_um=LAYERS_UM.get(part), cells=part if part in CELLS else None)
+    try:
+        chosen = wanted.units(session.depth, session.inhibitory, session.rates.shape[1])
+    except ConfigError:  # it is not known of them
+        return None
+    if not chosen.any():
         return None
     return replace(
         session,
@@ -152,15 +156,3 @@ def _cut_session(session: NeuralSession, part: str) -> NeuralSession | None:
         depth=None if session.depth is None else session.depth[chosen],
         inhibitory=None if session.inhibitory is None else session.inhibitory[chosen],
     )
-
-
-def _choose_units(session: NeuralSession, part: str) -> NDArray[np.bool_] | None:
-    """Find the units of a part, (unit,); None where that is not known."""
-    if part in CELLS:
-        if session.inhibitory is None:
-            return None
-        return session.inhibitory if part == "inhibitory" else ~session.inhibitory
-    if session.depth is None:
-        return None
-    low, high = LAYERS_UM[part]
-    return (session.depth >= low) & (session.depth < high)

@@ -121,13 +121,17 @@ def max_statistic(
     )
 
 
-def standard_error(values: ArrayLike) -> float:
-    """s.e.m. over animals (one degree of freedom for the mean); NaN with fewer than two."""
+def standard_error(values: ArrayLike, ddof: int = 1) -> float:
+    """s.e.m. over animals that have a value; NaN with too few of them.
+
+    Args:
+        ddof: degrees of freedom that are left to the mean: 0 in the published analysis.
+    """
     there = np.asarray(values, dtype=np.float64)
     there = there[np.isfinite(there)]
-    if there.size < 2:
+    if there.size <= ddof:
         return float("nan")
-    return float(there.std(ddof=1) / np.sqrt(there.size))
+    return float(there.std(ddof=ddof) / np.sqrt(there.size))
 
 
 def student(degrees: int, cases: int) -> float:

@@ -126,14 +126,13 @@ def freeze_strict(
     """Reliabilities and RDMs of animals, and their consistency.
 
     Args:
-        animals: whose rates count from first contact to choice.
+        animals: whose rates count from first contact to choice, and no session twice.
         bootstraps: the number of divisions of the trials; each is used in both directions.
         progress: called with the share done, 0 to 1.
 
     Raises:
-        ConfigError: a session given twice, or an animal without a usable session.
+        ConfigError: no session can be used.
     """
-    _refuse_copies(animals)
     names, notes = [], []
     targets: list[Target] = []
     pools: list[_Pool] = []
@@ -180,20 +179,6 @@ def freeze_strict(
         seed=seed,
         notes=tuple(notes),
     )
-
-
-def _refuse_copies(animals: Sequence[Animal]) -> None:
-    """Two copies of a session would be divided alike, and agree with each other perfectly."""
-    seen: dict[int, str] = {}
-    for session in (s for animal in animals for s in animal.sessions):
-        if not np.ptp(session.rates) > 0:
-            continue  # without a spike, of which any two are alike
-        key = canonical(session)[1]
-        if key in seen:
-            raise ConfigError(
-                f"sessions {seen[key]} and {session.name} hold the same trials: give one of them"
-            )
-        seen[key] = session.name
 
 
 def _sha256(sessions: Sequence[NeuralSession]) -> str:

@@ -1,6 +1,7 @@
 """The board: what stands in it, as a file and as a page."""
 
-from dataclasses import replace
+from importlib import metadata
+from importlib.metadata import EntryPoint, EntryPoints
 
 import numpy as np
 import pytest
@@ -139,23 +140,10 @@ def test_datasets_say_where_they_come_from(monkeypatch):
     with pytest.raises(ConfigError, match="no dataset '00231'; did you mean 000231"):
         find_dataset("00231")
 
-    class Point:
-        name = "mine"
-
-        def load(self):
-            return replace(find_dataset("example"), name="mine")
-
-    class Points(list):
-        names = ("mine",)
-
-        def select(self, name):
-            return [p for p in self if p.name == name]
-
-    monkeypatch.setattr(
-        "tactile_rt.models.alignment.datasets.metadata.entry_points",
-        lambda group: Points([Point()]),
-    )
-    assert dataset_names() == (*DATASETS, "mine") and find_dataset("mine").name == "mine"
-    monkeypatch.setattr(Point, "load", lambda self: 1 / 0)
-    with pytest.raises(ConfigError, match="dataset mine cannot be loaded"):
-        find_dataset("mine")
+    where, group = DATASETS["example"], "tactile_rt.alignment_datasets"
+    points = EntryPoint("mine", where, group), EntryPoint("lost", "no_such_module:x", group)
+    monkeypatch.setattr(metadata, "entry_points", lambda group: EntryPoints(points))
+    assert dataset_names() == (*DATASETS, "lost", "mine")
+    assert find_dataset("mine") is find_dataset("example")
+    with pytest.raises(ConfigError, match="dataset lost cannot be loaded: No module named"):
+        find_dataset("lost")

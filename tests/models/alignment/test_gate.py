@@ -1,6 +1,5 @@
 """The gate: what may be released, and the exported model beside the one it was made from."""
 
-import hashlib
 import itertools
 from dataclasses import replace
 
@@ -322,15 +321,6 @@ def test_a_small_difference_misses_single_precision_but_not_int8(exported):
     other = replace(same, traces=moved)
     assert fidelity_check(reference, other)[0].code == FAIL
     assert fidelity_check(reference, replace(other, precision="int8"))[0].code == PASS
-
-
-def test_the_shipped_model_is_as_it_says(exported):
-    """Of the checkpoint it was exported from only the hash is here; the file against itself."""
-    layers, card = onnx_layers(shipped_model(), FELT)
-    assert len(card.provenance["checkpoint_sha256"]) == len(hashlib.sha256().hexdigest())
-    rows = compare(layers, layers)
-    assert all(row.kept and row.difference == 0 for row in rows)
-    assert all(row.pearson == pytest.approx(1) for row in rows)  # every layer tells them apart
 
 
 def test_an_rdm_that_says_nothing_is_not_compared():

@@ -14,7 +14,6 @@ from tactile_rt.models.alignment.canonical import canonical
 from tactile_rt.models.alignment.example import Brain
 from tactile_rt.models.alignment.neural import Animal, NeuralSession, pad, published_layout
 from tactile_rt.models.alignment.paper_code import freeze_paper_code
-from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.scoring import score, score_rdms
 from tactile_rt.models.alignment.strict import divided, freeze_strict
 from tests.helpers.brains import animals, geometry, loop, padded, responses, session
@@ -62,18 +61,6 @@ def test_the_order_of_appearance_destroys_what_animals_share():
     assert all(target.reliable for target in published.targets)
     assert abs(np.nanmean(published.a2a.pairwise)) < 0.2
     assert published.a2a.mean < 0.3
-
-
-def test_sessions_without_a_spike_are_no_copies_of_each_other():
-    rng = np.random.default_rng(3)
-    made = []
-    for animal in animals(rng, number=2, sessions=1):
-        one = animal.sessions[0]
-        silent = replace(one, name=f"{one.name}-silent", rates=np.zeros_like(one.rates),
-                         stimulus=np.repeat(np.arange(6), 20))  # fmt: skip
-        made.append(Animal(animal.name, (one, silent)))
-    units = [target.unfiltered.units for target in freeze_strict(made, BOOTSTRAPS).targets]
-    assert units == [80, 80]
 
 
 def test_units_that_respond_to_nothing_are_left_out():
@@ -270,13 +257,6 @@ def test_a_session_that_lacks_a_stimulus_is_left_out_and_named():
         freeze_strict([Animal("mouse", (poor,))], 20)
 
 
-def test_a_session_given_twice_is_refused():
-    made = animals(np.random.default_rng(9), number=1)
-    copy = replace(made[0].sessions[1], name="copy")
-    with pytest.raises(ConfigError, match="mouse-0-1 and copy hold the same trials"):
-        freeze_strict([Animal("mouse-0", (*made[0].sessions, copy))], 20)
-
-
 def test_too_few_reliable_units_make_no_rdm():
     rng = np.random.default_rng(10)
     one = session(rng, "mouse", "s", geometry(rng), units=3, idle=1)
@@ -373,20 +353,3 @@ def test_the_published_layout_has_the_published_mistakes():
     poor = NeuralSession("m", "poor", rates[:3], np.array([4, 0, 1]))
     with pytest.raises(ConfigError, match="poor has no correct trial of convex-far, concave-close"):
         published_layout(Animal("m", (poor,)))
-
-
-def test_an_animal_without_an_rdm_is_named():
-    rates = padded(np.random.default_rng(21))
-    rates[:, 3] = np.nan
-    with pytest.raises(
-        ConfigError, match="animal m: no RDM, since the mean response to stimulus 3"
-    ):
-        freeze_paper_code({"m": rates}, 5)
-
-
-def test_sessions_check_themselves():
-    with pytest.raises(ConfigError, match="do not fit"):
-        NeuralSession("m", "s", np.zeros((3, 2)), np.zeros(4, dtype=np.int64))
-    with pytest.raises(ConfigError, match="not finite"):
-        NeuralSession("m", "s", np.full((3, 2), np.nan), np.zeros(3, dtype=np.int64))
-    assert len(STIMULI) == 6

@@ -13,10 +13,7 @@ from tactile_rt.models.alignment.gate import neural_checks
 from tactile_rt.models.alignment.json_file import encode, write_json
 from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.pictures import (
-    Bar,
-    Level,
     Point,
-    draw_bars,
     draw_heat_maps,
     draw_profiles,
     draw_scatter,
@@ -100,22 +97,6 @@ def axes_of(monkeypatch, draw, *arguments, **more):
     """What a figure is made of, instead of its SVG."""
     monkeypatch.setattr("tactile_rt.models.alignment.pictures._finish", lambda figure: figure)
     return draw(*arguments, **more).axes
-
-
-def test_bars_are_where_their_values_are(monkeypatch):
-    (axes,) = axes_of(
-        monkeypatch, draw_bars,
-        [Bar("a", 0.5, "encoder", (0.7,), 0.2), Bar("b", float("nan"), "decoder")],
-        [Level("one", 1.0, "black"), Level("none", float("nan"), "red"), Level("z", 0, "g", 0.1)],
-        "r",
-    )  # fmt: skip
-    assert axes.containers[0][0].get_height() == 0.5
-    assert [0.7] in [list(line.get_ydata()) for line in axes.lines]
-    assert [label.get_text() for label in axes.get_xticklabels()] == ["a", "b"]
-    assert [line.get_label() for line in axes.lines if line.get_label()[0] != "_"] == ["one", "z"]
-    assert [patch.get_hatch() for patch in axes.patches].count("//") == 1, "no value"
-    (mark,) = axes.collections
-    assert mark.get_segments()[0][0][1] == 0.2
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from tactile_rt.models.alignment.neural import NeuralSession
 from tactile_rt.models.alignment.nwb import read_nwb, read_session
 from tactile_rt.models.alignment.selection import Selection
 from tests.helpers import brains
-from tests.helpers.nwb_sessions import write_animals, write_session
+from tests.helpers.nwb_sessions import write_animals
 
 h5py = pytest.importorskip("h5py", reason="h5py reads the files")
 
@@ -86,7 +86,6 @@ def test_two_tasks_together_are_noted(folder):
         ({"cells": "pyramidal"}, "no cell type 'pyramidal'"),
         ({"depth": "L9"}, "neither a layer .* nor a range in um"),
         ({"depth": "600-400"}, "neither a layer"),
-        ({"depth": "nan-400"}, "neither a layer"),
     ],
 )
 def test_what_cannot_be_selected(asked, said):
@@ -172,24 +171,12 @@ def test_sessions_of_few_spikes_are_no_copies():
     refuse_copies(made)
 
 
-def test_a_file_sorted_again_is_refused(tmp_path):
-    rng = np.random.default_rng(4)
-    tuned = np.exp(rng.normal(size=(6, 8)) / 3 + 2)
-    write_session(tmp_path / "a.nwb", np.random.default_rng(5), tuned)
-    (tmp_path / "b.nwb").write_bytes((tmp_path / "a.nwb").read_bytes())
-    with h5py.File(tmp_path / "b.nwb", "r+") as file:  # units divided otherwise
-        index = file["units/spike_times_index"]
-        index[...] = np.append(np.sort(rng.integers(0, index[-1], 7)), index[-1])
-    with pytest.raises(ConfigError, match="sessions a and b hold the same trials with other units"):
-        build([tmp_path], bootstraps=5)
-
-
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"stimulus": np.full(48, 6)}, "a stimulus is a number from 0 to 5"),
         ({"stimulus": np.full(48, -1)}, "a stimulus is a number from 0 to 5"),
-        ({"stimulus": np.full(48, 1.0)}, "a stimulus is a number from 0 to 5"),
+        ({"rates": np.full((48, 9), np.nan)}, "a rate is not finite"),
+        ({"rates": np.zeros((47, 9))}, "rates .* do not fit"),
         ({"depth": np.zeros(3)}, r"depth is \(3,\), not \(9,\)"),
         ({"course": np.zeros((48, 22, 3))}, "course is .* not .trial, bin, unit"),
         ({"begin": np.zeros(3)}, r"begin is \(3,\), not \(48,\)"),

@@ -31,13 +31,6 @@ def test_each_animal_is_scored_on_the_layer_that_the_others_choose():
         np.testing.assert_allclose(one[layer, range(5)], score)
 
 
-def test_an_animal_has_no_say_in_its_own_layer():
-    values = np.array([[0.9, 0.1, 0.1], [0.2, 0.3, 0.3]])
-    scores, chosen = held_out(values)
-    assert chosen.tolist() == [1, 0, 0]
-    assert scores.tolist() == [0.2, 0.1, 0.1]
-
-
 def test_one_animal_chooses_nothing():
     scores, chosen = held_out(np.ones((3, 1)))
     assert np.isnan(scores).all()

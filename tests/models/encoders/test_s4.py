@@ -63,10 +63,6 @@ def disturb(block: S4Block) -> S4Block:
     return block
 
 
-def test_published_count():
-    assert sum(p.numel() for p in S4Encoder().parameters()) == 3_434_496
-
-
 def test_hippo_legs_is_similar_to_its_matrix():
     """Λ - P P* is HiPPO's matrix in other coordinates: y of e^(At) B under a shared C agrees."""
     eigenvalues, p, b = hippo_legs(64)
@@ -136,14 +132,6 @@ def test_step_has_no_complex_numbers(deployed):
     encoder = build().deployed() if deployed else build()
     with RefuseComplex():
         encoder.step(frames()[:, 0], torch.zeros(2, dtype=torch.int64), encoder.initial_state(2))
-
-
-def test_gradients_are_finite_on_raw_loads():
-    encoder = build().train()
-    encoder(1000 * frames()).square().mean().backward()
-    for name, parameter in encoder.named_parameters():
-        assert parameter.grad is not None, name
-        assert torch.isfinite(parameter.grad).all(), name
 
 
 def test_state_space_parameters_tell_the_optimizer():

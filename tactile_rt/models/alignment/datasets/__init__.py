@@ -9,10 +9,11 @@ never bundled. Datasets of other packages are found by the entry points
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib import import_module, metadata
+from importlib import import_module
 from pathlib import Path
 
 from tactile_rt.errors import ConfigError
+from tactile_rt.extensions import added, added_names
 from tactile_rt.models.alignment.neural import Animal
 from tactile_rt.models.alignment.rdm import STIMULI
 from tactile_rt.models.alignment.stimuli_input import StimuliInput
@@ -82,8 +83,7 @@ DATASETS = {
 
 def dataset_names() -> tuple[str, ...]:
     """All datasets that are installed, ours first."""
-    points = metadata.entry_points(group=ENTRY_POINTS)
-    return (*DATASETS, *sorted(set(points.names) - set(DATASETS)))
+    return (*DATASETS, *(name for name in added_names(ENTRY_POINTS) if name not in DATASETS))
 
 
 def find_dataset(name: str) -> NeuralDataset:
@@ -96,10 +96,7 @@ def find_dataset(name: str) -> NeuralDataset:
         module, _, attribute = DATASETS[name].partition(":")
         ours: NeuralDataset = getattr(import_module(module), attribute)
         return ours
-    for point in metadata.entry_points(group=ENTRY_POINTS).select(name=name):
-        try:
-            theirs: NeuralDataset = point.load()
-        except Exception as error:  # another package's code
-            raise ConfigError(f"dataset {name} cannot be loaded: {error}") from None
-        return theirs
-    raise ConfigError(no_such("dataset", name, dataset_names()))
+    theirs: NeuralDataset | None = added(ENTRY_POINTS, name)
+    if theirs is None:
+        raise ConfigError(no_such("dataset", name, dataset_names()))
+    return theirs

@@ -13,12 +13,13 @@ linear      what a linear readout of a layer predicts of every unit
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib import import_module, metadata
+from importlib import import_module
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.errors import ConfigError
+from tactile_rt.extensions import added, added_names
 from tactile_rt.models.alignment.neural import Animal
 from tactile_rt.settings import no_such
 
@@ -83,8 +84,7 @@ METRICS = {
 
 def metric_names() -> tuple[str, ...]:
     """All metrics that are installed, ours first."""
-    points = metadata.entry_points(group=ENTRY_POINTS)
-    return (*METRICS, *sorted(set(points.names) - set(METRICS)))
+    return (*METRICS, *(name for name in added_names(ENTRY_POINTS) if name not in METRICS))
 
 
 def find_metric(name: str) -> Metric:
@@ -97,10 +97,7 @@ def find_metric(name: str) -> Metric:
         module, _, function = METRICS[name][0].partition(":")
         ours: Metric = getattr(import_module(module), function)
         return ours
-    for point in metadata.entry_points(group=ENTRY_POINTS).select(name=name):
-        try:
-            theirs: Metric = point.load()
-        except Exception as error:  # another package's code
-            raise ConfigError(f"metric {name} cannot be loaded: {error}") from None
-        return theirs
-    raise ConfigError(no_such("metric", name, metric_names()))
+    theirs: Metric | None = added(ENTRY_POINTS, name)
+    if theirs is None:
+        raise ConfigError(no_such("metric", name, metric_names()))
+    return theirs
