@@ -92,13 +92,10 @@ def export_checkpoint(
     """Export what `training.loop.train` saved.
 
     Args:
-        checkpoint: a ``best.pt``.
-        path: the ``.onnx`` file to write.
         temperature: divides the logits at run time.
         rules: when the model refuses to name a class, and what it promises of candidates.
         kind: "step" or "window".
         data: where the sweep sets that it was trained on lie now; default: where they lay.
-        licence: `ModelCard.license`.
 
     Raises:
         ModelError: the checkpoint cannot be read, or the exported graph misses the parity bar.

@@ -99,9 +99,8 @@ def _quantise(proto: onnx.ModelProto) -> None:
             nodes.append(node)
             continue
         values = numpy_helper.to_array(weight)
-        if node.op_type == "Gemm":
-            if _attribute(node, "transB"):
-                values = values.T
+        if node.op_type == "Gemm" and any(a.name == "transB" and a.i for a in node.attribute):
+            values = values.T
         taps = _taps_of(node.input[0], makers)
         replaced = (
             _blocks(node, values, added)
@@ -245,7 +244,3 @@ def _used(nodes: list[onnx.NodeProto], outputs: set[str]) -> list[onnx.NodeProto
             kept.append(node)
             needed.update(node.input)
     return kept[::-1]
-
-
-def _attribute(node: onnx.NodeProto, name: str) -> int:
-    return next((a.i for a in node.attribute if a.name == name), 0)

@@ -42,7 +42,6 @@ def release(
 
     Args:
         data: where the sweep sets that it was trained on lie now; default: where they lay.
-        licence: `ModelCard.license`.
 
     Raises:
         ModelError, RecordingError: the checkpoint or its sweep set cannot be read.

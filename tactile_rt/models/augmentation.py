@@ -21,12 +21,11 @@ from typing import TypeVar
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Generator, Tensor
 
 from tactile_rt.errors import ConfigError
 from tactile_rt.models import published_pictures
-from tactile_rt.models.array_symmetries import Symmetry, compose, symmetries
+from tactile_rt.models.array_symmetries import compose, symmetries
 from tactile_rt.stream import ArraySpec
 
 __all__ = [
@@ -116,7 +115,8 @@ class Tactile:
         every = [compose(spec)]
         for symmetry in symmetries(spec):
             every += [compose(spec, symmetry, known) for known in every]
-        self._source, self._matrix = _tables(every)
+        self._source = torch.from_numpy(np.stack([s.source for s in every]))
+        self._matrix = torch.from_numpy(np.stack([s.matrix for s in every]).astype(np.float32))
 
     def __call__(self, loads: Loads, generator: Generator) -> Loads:
         n = len(loads[0])
@@ -145,12 +145,6 @@ class Tactile:
             offset * sign[:, None, None],
             variance.sqrt(),
         )
-
-
-def _tables(every: list[Symmetry]) -> tuple[Tensor, Tensor]:
-    source: NDArray[np.int64] = np.stack([s.source for s in every])
-    matrix: NDArray[np.float64] = np.stack([s.matrix for s in every])
-    return torch.from_numpy(source), torch.from_numpy(matrix.astype(np.float32))
 
 
 def tactile_paper(frames: Tensor, generator: Generator, channels: int = 6) -> Tensor:

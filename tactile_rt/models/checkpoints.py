@@ -22,7 +22,6 @@ from tactile_rt.timing import Timing
 __all__ = [
     "TactileClassifier",
     "begin_from",
-    "labels_of_checkpoint",
     "load_checkpoint",
     "run_on",
     "save_whole",
@@ -34,7 +33,6 @@ class TactileClassifier(nn.Module):
     """Samples in SI units to logits: the input stage and the network, trained and shipped as one.
 
     Args:
-        network: the EAD's configuration.
         limits: what is believed of the channels; None: what `channel_limits` says of an array
             without a described sensor.
 
@@ -121,11 +119,6 @@ def load_checkpoint(path: Path) -> tuple[TactileClassifier, dict[str, Any]]:
     return model.eval(), saved
 
 
-def labels_of_checkpoint(saved: dict[str, Any]) -> tuple[str, ...]:
-    """List what a checkpoint's network tells apart: categories, then refusals."""
-    return (*saved["categories"], *saved["refusals"])
-
-
 def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> None:
     """Give a network that is to be trained the weights of a checkpoint.
 
@@ -146,7 +139,7 @@ def begin_from(model: TactileClassifier, path: Path, labels: Sequence[str]) -> N
     if differing or trained.inputs.element.tolist() != model.inputs.element.tolist():
         why = f"another {differing[0]}" if differing else "another array"
         raise SpecMismatch(f"{path} cannot be begun with: it is of {why}")
-    known = labels_of_checkpoint(saved)
+    known = (*saved["categories"], *saved["refusals"])
     both = [name for name in labels if name in known]
     to, of = [labels.index(n) for n in both], [known.index(n) for n in both]
     weights, own = trained.state_dict(), model.state_dict()

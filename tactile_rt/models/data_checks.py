@@ -158,9 +158,6 @@ def check_split(folder: Path, manifest: SweepManifest) -> None:
 def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
     """The sweeps themselves: finite, long enough, and none on two sides.
 
-    Args:
-        folder: the sweep set's.
-
     Raises:
         RecordingError: otherwise; the message names the object.
     """

@@ -105,7 +105,6 @@ def posteriors(cut: Iterable[CutWindows], run: Step) -> NDArray[np.float32]:
     or the network overflows.
 
     Args:
-        cut: what `cut_windows` gives.
         run: as `predict` takes it.
     """
     logits, found = run_over(cut, run)
@@ -138,7 +137,6 @@ def run_over(cut: Iterable[CutWindows], run: Step) -> tuple[NDArray[np.float32],
     """Return what a function makes of windows, and (sweep,) whether a contact was detected.
 
     Args:
-        cut: what `cut_windows` gives.
         run: as `predict` takes it; what it gives need not be logits.
     """
     parts = [(run(one.samples, one.offset, one.sigma), one.detected) for one in cut]

@@ -127,7 +127,6 @@ class Supervised(Objective):
     """Categories.
 
     Args:
-        model, augmentation: as in `Objective`.
         loss: "anytime" or "last".
     """
 
@@ -165,7 +164,6 @@ class SimCLR(Objective):
     Both views are one batch, to batch norms in the network, too.
 
     Args:
-        model, augmentation: as in `Objective`.
         temperature: as `nt_xent` takes it.
     """
 
@@ -294,7 +292,6 @@ class Predictive(Objective):
     can know anything tell of later ones in the window.
 
     Args:
-        model, augmentation: as in `Objective`.
         masking: the share of the steps, 0 to 1, that the network does not see and that are
             predicted all the same.
     """

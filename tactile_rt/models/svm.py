@@ -35,7 +35,6 @@ class FittedSVM:
     """A fitted machine; called with (sweep, feature) values, it decides their (sweep,) labels.
 
     Attributes:
-        machine: The machine of scikit-learn.
         kernel: The map of (sweep, feature) values to what the machine takes.
         how: A sentence for reports that says how the machine was made.
     """
@@ -112,7 +111,6 @@ def window_features(
     """(sweep, step * element * channel) compressed loads, and whether there was an onset.
 
     Args:
-        data: the sweeps.
         disturbance: what is wrong with the sensor; None: nothing.
     """
     # Imported here: it brings torch, which whoever only writes a set's card does without.

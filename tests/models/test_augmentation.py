@@ -8,7 +8,7 @@ import torch
 
 from tactile_rt.calibration.correction import Mirror
 from tactile_rt.errors import ConfigError
-from tactile_rt.models.array_symmetries import compose, symmetries
+from tactile_rt.models.array_symmetries import symmetries
 from tactile_rt.models.augmentation import (
     Tactile,
     _blurred,
@@ -55,15 +55,6 @@ def test_no_whisker_is_lost_and_no_load_changes_its_size(which):
     assert sorted(symmetry.source) == list(range(30))
     products = symmetry.matrix @ symmetry.matrix.transpose(0, 2, 1)
     np.testing.assert_allclose(products, np.tile(np.eye(6), (30, 1, 1)), atol=1e-12)
-
-
-@pytest.mark.parametrize("which", [0, 1], ids=NAMES[:2])
-def test_mirroring_twice_is_the_identity(which):
-    mirror = symmetries(SPEC)[which]
-    twice = compose(SPEC, mirror, mirror)
-    assert (twice.source == np.arange(30)).all()
-    np.testing.assert_allclose(twice.matrix, np.tile(np.eye(6), (30, 1, 1)), atol=1e-12)
-    assert (mirror.source != np.arange(30)).any()
 
 
 def test_rows_and_columns_are_reversed_where_they_end():

@@ -63,18 +63,6 @@ def test_all_steps_is_one_layer_over_the_flattened_window():
         torch.testing.assert_close(decoder(x)[:, t], decoder.layer3(hidden), rtol=0, atol=2e-6)
 
 
-def test_all_steps_in_lanes_of_different_age():
-    """Lanes that were reset at different times read different weights."""
-    torch.manual_seed(1)
-    decoder, x = decoders.make("mlp-all", 16, 7, 1 / 32), features(4)
-    state = decoder.initial_state(2)
-    state["decoder_sum"][1] = decoder.step(
-        x[:1, 0], torch.zeros(1).long(), decoder.initial_state(1)
-    )[1]["decoder_sum"]
-    out, _ = decoder.step(x[:1, [0, 1]][0], torch.tensor([0, 1]), state)
-    torch.testing.assert_close(decoder.logits(out), decoder(x[:1])[0, :2], rtol=0, atol=2e-6)
-
-
 def test_all_steps_ends():
     decoder, x = decoders.make("mlp-all", 16, 7, 1 / 32, steps=4), features(5)
     with pytest.raises(ValueError, match="5 steps, but this decoder ends at 4"):

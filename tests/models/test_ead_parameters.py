@@ -49,22 +49,6 @@ def test_s4_totals(attender, parameters):
 
 
 @pytest.mark.parametrize(
-    ("cell", "parameters"),
-    [
-        ("timedecay", 23_460_072),
-        ("ugrnn", 30_688_416),
-        ("gru", 34_302_592),
-        ("lstm", 37_916_768),
-        ("intersection", 37_916_768),
-        ("intersection-ln", 37_928_800),
-    ],
-)
-def test_published_encoders(cell, parameters):
-    with torch.device("meta"):
-        assert count_parameters(ZhuangEncoder(cell=cell)) == parameters
-
-
-@pytest.mark.parametrize(
     ("cell", "norms"),
     [("timedecay", 1), ("vanilla", 1), ("ugrnn", 2), ("gru", 3), ("lstm", 5), ("intersection", 4)],
 )

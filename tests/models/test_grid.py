@@ -224,13 +224,12 @@ def test_a_network_that_diverges_is_an_outcome(
     plan: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grid, folder = read_grid(plan), tmp_path / "out"
-    pool.prepare(grid, folder)
+    bench = begun(plan, folder)
 
     def diverge(*_: object, **__: object) -> Path:
         raise DivergedError("training diverged in epoch 1")
 
     monkeypatch.setattr("tactile_rt.models.grid.work.train", diverge)
-    bench = Workbench(grid, folder)
     for task in grid.tasks()[:2]:
         bench.do(task)
     rows = gather(grid, folder).rows
@@ -389,8 +388,7 @@ seeds = 1
     assert grid.needs(task) == ("gru_simclr_image_seed0",)
     other = msgspec.structs.replace(grid, self_supervised={"masking": 0.5})
     assert settings_of(other, task) != settings_of(grid, task)
-    pool.prepare(grid, folder)
-    bench = Workbench(grid, folder)
+    bench = begun(plan, folder)
     few = bench.splits_of(0.5)[0]
     assert set(few.sweeps.objects) == {"mug-0", "mug-1", "car-0", "car-1"}
     assert bench.splits_of(1.0)[0] is bench.splits[0]
@@ -409,9 +407,9 @@ seeds = 1
 
 
 def test_what_only_its_scores_were_kept_of_is_trained_again(plan: Path, tmp_path: Path) -> None:
-    grid, folder = read_grid(plan), tmp_path / "out"
-    pool.prepare(grid, folder)
-    bench, task = Workbench(grid, folder), grid.tasks()[1]
+    folder = tmp_path / "out"
+    bench = begun(plan, folder)
+    task = bench.grid.tasks()[1]
     first = bench.do(task)
     outcome_path(folder, task).unlink()
     for network in (folder / "runs" / task.slug).rglob("best.pt"):

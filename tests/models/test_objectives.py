@@ -68,11 +68,6 @@ def test_nt_xent_is_that_of_a_plain_loop(temperature):
     assert found.item() == pytest.approx(total / 10, rel=1e-5)
 
 
-def test_views_that_agree_cost_less():
-    rows = torch.randn(8, 16, generator=generator())
-    assert nt_xent(rows, rows, 0.1) < 0.1 * nt_xent(rows, rows.roll(1, 0), 0.1)
-
-
 def test_supervised_losses_are_those_of_a_plain_loop():
     logits = torch.randn(3, 6, 4, generator=generator(), dtype=torch.float64)
     labels, smoothing = torch.tensor([2, 0, 3]), 0.1
@@ -161,18 +156,15 @@ def test_what_is_masked_is_predicted_all_the_same():
 
 def test_heads_have_the_published_sizes_at_full_width():
     model = classifier(width=1.0)
-    neck = SimCLR(model, build("none", SPEC), 0.1).neck
-    assert [tuple(p.shape) for p in neck.parameters() if p.dim() == 2] == [(2048, 512), (128, 2048)]
+    simclr = SimCLR(model, build("none", SPEC), 0.1)
     simsiam = SimSiam(model, build("none", SPEC))
-    assert [tuple(p.shape) for p in simsiam.projector.parameters() if p.dim() == 2] == [
-        (2048, 512),
-        (2048, 2048),
-        (2048, 2048),
-    ]
-    assert [tuple(p.shape) for p in simsiam.predictor.parameters() if p.dim() == 2] == [
-        (512, 2048),
-        (2048, 512),
-    ]
+
+    def sizes(head):
+        return [tuple(p.shape) for p in head.parameters() if p.dim() == 2]
+
+    assert sizes(simclr.neck) == [(2048, 512), (128, 2048)]
+    assert sizes(simsiam.projector) == [(2048, 512), (2048, 2048), (2048, 2048)]
+    assert sizes(simsiam.predictor) == [(512, 2048), (2048, 512)]
     assert len([m for m in simsiam.projector if isinstance(m, torch.nn.BatchNorm1d)]) == 3
 
 

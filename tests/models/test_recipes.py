@@ -11,15 +11,8 @@ from tactile_rt.models.training.recipes import load_recipe, read_recipe, shipped
 
 E4 = [0.1, 0.01, 0.001, 0.0001]
 GATED = {"zhuang-ugrnn", "zhuang-intersection", "zhuang-gru", "zhuang-lstm"}
-WITH_GPT = {
-    "resnet18",
-    "zhuang-timedecay",
-    "zhuang-ugrnn",
-    "zhuang-intersection-ln",
-    "zhuang-gru",
-    "zhuang-lstm",
-    "s4",
-}
+ZHUANG = {f"zhuang-{cell}" for cell in ("timedecay", "ugrnn", "intersection-ln", "gru", "lstm")}
+WITH_GPT = {"resnet18", "s4", *ZHUANG}
 WITH_MAMBA = {"resnet18", "zhuang-timedecay", "s4"}
 
 # Table A3: name: (encoders, attender, optimizers, schedule, rates)
@@ -48,13 +41,7 @@ LOSSES = {
     "autoencoder": ("sgd", "step", None, 256),
 }
 NETWORKS = {
-    "none": {
-        "zhuang-timedecay",
-        "zhuang-ugrnn",
-        "zhuang-intersection-ln",
-        "zhuang-gru",
-        "zhuang-lstm",
-    },
+    "none": ZHUANG,
     "gpt": {"resnet18", "zhuang-intersection-ln", "zhuang-timedecay", "s4"},
     "mamba": WITH_MAMBA,
 }

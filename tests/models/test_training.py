@@ -78,17 +78,6 @@ def test_what_cannot_be_is_refused(changed, said):
 # Optimizers
 
 
-def test_optimizers_are_those_of_table_a2():
-    model = nn.Linear(3, 2)
-    kinds = {"sgd": torch.optim.SGD, "adam": torch.optim.Adam, "adamw": torch.optim.AdamW}
-    for name, kind in kinds.items():
-        optimizer = build_optimizer(model, TrainingConfig("set", optimizer=name))
-        assert type(optimizer) is kind
-        (group,) = optimizer.param_groups
-        assert group["weight_decay"] == 1e-4
-        assert group.get("momentum", 0.9) == 0.9
-
-
 def test_a_parameter_may_ask_for_its_own_rate():
     model = nn.Sequential(nn.Linear(3, 2), nn.Linear(2, 2))
     model[0].weight._optim = {"lr_scale": 0.1, "weight_decay": 0.0}

@@ -117,7 +117,6 @@ class Benchmark(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=Tru
         pooled: All animals as one target, which paper-code scores on as well; None under strict.
         a2a: The animal-to-animal consistency, which a model cannot be expected to exceed.
         bootstraps, seed: Number and seed of the random divisions of the trials.
-        sources: The names of the files that were read.
     """
 
     protocol: str

@@ -114,7 +114,6 @@ class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt 
     """A whole board.
 
     Attributes:
-        rows: The models and what they are read against.
         cells: (row, column) The value of each row in each column.
         metrics: What each metric is, in a line, by its name.
     """

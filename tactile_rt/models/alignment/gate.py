@@ -71,8 +71,6 @@ def neural_checks(
     """Tests 1 to 3. Without a valid benchmark the others are inconclusive.
 
     Args:
-        score: of the model on the benchmark.
-        benchmark: the benchmark.
         baseline: (layer, 15) RDMs of the stored model's layers.
     """
     valid = validity(benchmark)
@@ -109,8 +107,6 @@ def turing(score: Score, mice: Mice, power: Power | None = None) -> Check:
     `LARGEST_P`. What is neither worse nor shown to be like one is inconclusive.
 
     Args:
-        score: of the model.
-        mice: that it is compared to.
         power: of the test in this benchmark, to be told beside the verdict.
     """
     found = mice.compare(score.rdms[None])
@@ -140,8 +136,6 @@ def regression(score: Score, mice: Mice, baseline: ArrayLike) -> Check:
     ceiling. Sure is by one-sided tests over the mice, on these stimuli.
 
     Args:
-        score: of the model.
-        mice: that both models are compared to.
         baseline: (layer, 15) RDMs of the stored model's layers.
     """
     before = mice.compare(np.asarray(baseline, dtype=np.float64)[None]).fits[0]

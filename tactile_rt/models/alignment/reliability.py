@@ -127,25 +127,22 @@ def split_half(rates: ArrayLike, first: NDArray[np.bool_]) -> Floats:
     return pearson(halves[:, 0], halves[:, 1])
 
 
-def filtered_mean(
-    score: ArrayLike, r_yy: ArrayLike, r_xx: ArrayLike = 1.0, cutoff: float = CUTOFF
-) -> float:
+def filtered_mean(score: ArrayLike, r_yy: ArrayLike, r_xx: ArrayLike = 1.0) -> float:
     """The published aggregate: mean of a score over the bootstraps that pass the filter.
 
-    The filter is on raw split-half correlations of whole bootstraps. No neuron is ever filtered,
-    and no Spearman-Brown correction is made, though the paper's text says both.
+    The filter, at `CUTOFF`, is on raw split-half correlations of whole bootstraps. No neuron is
+    ever filtered, and no Spearman-Brown correction is made, though the paper's text says both.
 
     Args:
         score: (bootstrap,), NaN where there is none.
         r_yy, r_xx: (bootstrap,) of target and source; a model's own is 1.
-        cutoff: a bootstrap below it in either is left out.
 
     Returns:
         NaN if no bootstrap is left.
     """
     score, r_yy, r_xx = np.broadcast_arrays(score, r_yy, r_xx)
     # As published, NaN is not below the cutoff; its score is NaN as well.
-    kept = score[~((r_yy < cutoff) | (r_xx < cutoff)) & ~np.isnan(score)]
+    kept = score[~((r_yy < CUTOFF) | (r_xx < CUTOFF)) & ~np.isnan(score)]
     return float(kept.mean()) if kept.size else float("nan")
 
 

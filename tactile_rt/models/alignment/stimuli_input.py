@@ -55,9 +55,7 @@ class StimuliInput:
         """Hold the input against what a model was trained on.
 
         Args:
-            spec: the model's array.
-            steps, substeps: of its windows.
-            model: for messages.
+            model: what messages call it.
             period_ns: of its samples, ns; None where that is not known.
 
         Raises:

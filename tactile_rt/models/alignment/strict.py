@@ -282,7 +282,6 @@ def moments_of(patterns: Floats, counted: NDArray[np.bool_] | None = None) -> Mo
     """Moments of responses (..., 6, unit).
 
     Args:
-        patterns: the responses.
         counted: (..., unit) which units count; default: all.
     """
     if counted is None:

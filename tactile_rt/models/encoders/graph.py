@@ -46,7 +46,6 @@ class Node:
     """One area: what it reads -> convolution -> cell -> ReLU.
 
     Attributes:
-        channels: The number of channels of the node's output.
         reads: The edges that the node reads, in the order of their channels; the first is
             concatenated.
         kind: The kind of the node: "valid" or "same", 2 x 2 convolutions of maps; "dense" reads

@@ -195,7 +195,6 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """How a task is trained on the sweep set at `data`.
 
         Args:
-            data: the sweep set's folder.
             chosen: what its trials and its growth have found, by the names of `TrainingConfig`.
 
         Raises:

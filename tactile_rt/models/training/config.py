@@ -9,6 +9,7 @@ from math import isfinite
 from pathlib import Path
 
 from tactile_rt.errors import ConfigError, ModelError, name_some
+from tactile_rt.models.checkpoint_files import NETWORK
 from tactile_rt.models.data_checks import check_labelled, check_split
 from tactile_rt.models.datasets import frame_of
 from tactile_rt.models.ead_config import MOUSE_FRAME, READOUTS, EADConfig
@@ -50,7 +51,6 @@ class TrainingConfig:
     """What to train and how; the defaults are the shipped model's recipe.
 
     Attributes:
-        data: The sweep set's folder.
         also: The folders of further sweep sets of the same array, which are learnt from together;
             what is wrong with the sensor is drawn as the first set's recipe says.
         begin: A checkpoint to begin with, of the same array and network; what it tells apart that
@@ -183,19 +183,8 @@ class TrainingConfig:
         Raises:
             ConfigError: there is no such network.
         """
-        return EADConfig(
-            classes=classes,
-            encoder=self.encoder,
-            attender=self.attender,
-            decoder=self.decoder,
-            width=self.width,
-            readout=self.readout,
-            dropout=self.dropout,
-            graph=self.graph,
-            frame=frame,
-            norm_epsilon=self.norm_epsilon,
-            preprocessing=self.preprocessing,
-        )
+        own = {name: getattr(self, name) for name in NETWORK}
+        return EADConfig(classes=classes, frame=frame, **own)
 
 
 def manifests_of(config: TrainingConfig) -> tuple[list[SweepManifest], SweepManifest]:

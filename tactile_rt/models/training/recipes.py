@@ -59,7 +59,6 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The configuration, with what is asked for otherwise.
 
         Args:
-            data: the sweep set's folder.
             sets: ``key=value`` each, as on a command line.
             overrides: fields of `TrainingConfig`.
 
@@ -123,7 +122,6 @@ def read_recipe(name: str, data: str, sets: Sequence[str] = (), **overrides: Any
     """The training configuration of a recipe.
 
     Args:
-        data: the sweep set's folder.
         sets: ``key=value`` each, which are to be otherwise.
 
     Raises:

@@ -8,7 +8,6 @@ import pytest
 from tactile_rt.errors import ConfigError
 from tactile_rt.models.alignment.example import MODELS, Brain, example_models
 from tactile_rt.models.alignment.example_files import BEGIN_S, write_example
-from tactile_rt.models.alignment.loading import check_models, load_layers
 from tactile_rt.models.alignment.rdm import rsa
 
 h5py = pytest.importorskip("h5py")
@@ -96,27 +95,6 @@ def test_pynwb_reads_the_sessions(written):
     )
 
 
-def test_units_answer_a_contact(tmp_path):
-    recordings, _ = write_example(tmp_path / "b", Brain(mice=1, sessions=1, trials=20, units=30))
-    with h5py.File(next(recordings.rglob("*.nwb"))) as file:
-        spikes = np.sort(file["units/spike_times"][()])
-        contacts = np.concatenate(
-            [
-                group["start_time"][()]
-                for name, group in file["processing/behavior"].items()
-                if name.startswith("contacts")
-            ]
-        )
-    contacts = contacts[contacts > BEGIN_S + 1]
-
-    def rate(begin, end):
-        edges = np.searchsorted(spikes, [contacts + begin, contacts + end])
-        return (edges[1] - edges[0]).sum() / (end - begin)
-
-    assert rate(0.005, 0.04) > 2 * rate(-0.05, 0.0)
-    assert rate(-0.05, 0.0) > 0
-
-
 def test_a_seed_makes_the_same_again(written, tmp_path):
     again = write_example(tmp_path / "again", SMALL, seed=3)
     other = write_example(tmp_path / "other", SMALL, seed=4)
@@ -128,15 +106,6 @@ def test_a_seed_makes_the_same_again(written, tmp_path):
     np.testing.assert_array_equal(spikes[0], spikes[1])
     assert not np.array_equal(spikes[0], spikes[2])
     assert json.loads((again[0].parent / "truth.json").read_text())["seed"] == 3
-
-
-def test_its_models_are_read_as_models(written):
-    files = sorted(written[1].iterdir())
-    assert {f.stem for f in files} == set(MODELS)
-    check_models(files)
-    layers, accuracy = load_layers(files[0], None)
-    assert accuracy is None
-    assert layers.patterns["encoder.layer3"].shape == (6, 200)
 
 
 def test_a_brain_that_cannot_be(tmp_path):

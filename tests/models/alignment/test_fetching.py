@@ -152,18 +152,6 @@ def test_a_file_is_read_as_from_a_disk(whole, archive):
     assert remote.read(1) == b""
 
 
-def test_few_blocks_are_kept(whole, archive, monkeypatch):
-    listing, server = archive
-    monkeypatch.setattr(ranges, "KEPT", 3)
-    remote = ranges.RangeFile(ranges.connections(), listing[0].url, listing[0].size)
-    data = whole[0].read_bytes()
-    for k in (0, 5, 2, 9, 0, 1):
-        remote.seek(k * ranges.BLOCK)
-        assert remote.read(7) == data[k * ranges.BLOCK :][:7]
-        assert len(remote._blocks) <= 3
-    assert len(server.requests()) == 6  # the first block had gone by then
-
-
 def test_the_command(archive, tmp_path, monkeypatch, call):
     listing, server = archive
     monkeypatch.setattr(fetching, "published_files", lambda name: tuple(listing))

@@ -63,15 +63,6 @@ def test_the_order_of_appearance_destroys_what_animals_share():
     assert published.a2a.mean < 0.3
 
 
-def test_units_that_respond_to_nothing_are_left_out():
-    rng = np.random.default_rng(3)
-    made = animals(rng, number=2, noise=3, units=40, idle=40)
-    for target in freeze_strict(made, BOOTSTRAPS).targets:
-        assert target.unfiltered.units == 160
-        assert 70 < target.chosen.units < 95  # 80 respond
-        assert target.trials == 240
-
-
 def test_a_division_is_of_all_trials_and_none_twice():
     """Each trial is a power of two, so that sums of trials tell which trials were summed."""
     trials = 9
@@ -205,12 +196,6 @@ def test_an_animal_at_or_below_zero_is_not_scored():
     assert below
     assert all(np.isnan(t.unfiltered.factor) for t in below)
     assert np.isfinite([t.unfiltered.factor for t in frozen.targets if t not in below]).all()
-
-
-def test_the_factor_corrects_for_noise_once():
-    target = freeze_strict(animals(np.random.default_rng(6), number=2, noise=4)).targets[0]
-    # The RDM is a mean over divisions, so its own noise is less than that of one half.
-    assert 1 < target.chosen.factor < 1 / np.sqrt(target.chosen.reliability)
 
 
 def test_of_two_animals_the_other_is_the_pool():

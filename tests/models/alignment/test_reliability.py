@@ -93,14 +93,6 @@ def test_the_published_standard_error_takes_off_no_degree_of_freedom():
     assert np.isnan(Consistency((), scores[:0], nothing, 0).sem)
 
 
-def test_the_factor_of_a_target_gives_the_same_aggregates():
-    with np.load(PUBLISHED) as file:
-        r_xy, r_yy = file["r_xy"], file["r_yy"]
-    factor = noise_corrected(1.0, 1.0, r_yy)
-    assert r_xy[0] * np.nanmedian(factor) == pytest.approx(0.457738, abs=1e-6)
-    assert r_xy[0] * filtered_mean(factor, r_yy) == pytest.approx(0.329451, abs=1e-6)
-
-
 def test_halves_are_those_of_the_published_code():
     first = first_halves(7, 3)
     for b, mask in enumerate(first):

@@ -14,7 +14,6 @@ from tactile_rt.models.alignment.json_file import encode, write_json
 from tactile_rt.models.alignment.layers import Layers
 from tactile_rt.models.alignment.pictures import (
     Point,
-    draw_heat_maps,
     draw_profiles,
     draw_scatter,
 )
@@ -119,14 +118,6 @@ def test_three_models_of_a_group_have_a_line_and_its_correlation(monkeypatch, po
     lines = [line for line in axes.lines if line.get_linestyle() == "--"]
     assert len(lines) == sum("r =" in one for one in said)
     assert [text.get_text().replace("\\", "") for text in axes.texts] == [p[0] for p in points]
-
-
-def test_the_largest_dissimilarity_is_the_darkest(monkeypatch):
-    maps = [("map", np.arange(1, 16) / 15), ("none", np.full(15, np.nan))]
-    one, other, *_ = axes_of(monkeypatch, draw_heat_maps, maps, STIMULI)
-    shades = one.collections[0].get_array()
-    assert shades.shape == (6, 6) and shades.max() == shades[4, 5] == 1
-    assert one.collections[0].get_clim() == (0, 1) and not other.collections
 
 
 def test_an_rdm_as_a_line_is_moved_and_scaled(monkeypatch):

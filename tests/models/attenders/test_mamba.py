@@ -9,7 +9,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tactile_rt.models.attenders.mamba import MambaAttender, MambaBlock, selective_scan
-from tactile_rt.models.encoders.mamba import MambaEncoder
 
 TOLERANCE = 2e-6
 
@@ -66,11 +65,6 @@ def test_time_scales_at_the_start():
     dt = F.softplus(MambaBlock(64).dt_proj.bias)
     assert dt.min() > 0.9e-3
     assert dt.max() < 0.11
-
-
-def test_encoder_and_attender_keep_separate_states():
-    encoder, attender = MambaEncoder(1 / 16), MambaAttender(32)
-    assert not set(encoder.initial_state(1)) & set(attender.initial_state(1))
 
 
 def test_scan_gradient():

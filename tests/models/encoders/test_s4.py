@@ -7,7 +7,6 @@ import math
 import pytest
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from tactile_rt.models.encoders.s4 import S4Block, S4Encoder, hippo_legs, kernels
 
@@ -115,23 +114,6 @@ def test_convolution_is_a_sum_over_the_past():
         for k in range(min(t + 1, 5)):
             past[:, t] += kernel[:, k] * x[:, t - k]
     torch.testing.assert_close(block(x, kernel), block.merge(x, past), rtol=0, atol=TOLERANCE)
-
-
-class RefuseComplex(TorchDispatchMode):
-    """ONNX has no complex numbers."""
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        out = func(*args, **(kwargs or {}))
-        for tensor in out if isinstance(out, tuple | list) else [out]:
-            assert not (isinstance(tensor, Tensor) and tensor.is_complex()), func
-        return out
-
-
-@pytest.mark.parametrize("deployed", [False, True])
-def test_step_has_no_complex_numbers(deployed):
-    encoder = build().deployed() if deployed else build()
-    with RefuseComplex():
-        encoder.step(frames()[:, 0], torch.zeros(2, dtype=torch.int64), encoder.initial_state(2))
 
 
 def test_state_space_parameters_tell_the_optimizer():

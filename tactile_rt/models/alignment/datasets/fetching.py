@@ -42,9 +42,8 @@ class PublishedFile:
 
     Attributes:
         path: The path in the dataset, ``sub-231CR/sub-231CR_ses-20190921T144923_....nwb``.
-        size: The size in bytes.
+        size: Bytes.
         sha256: The checksum of the whole file, hexadecimal.
-        url: The address of this version of the file.
     """
 
     path: str
@@ -74,11 +73,7 @@ class Fetched:
 
 
 def published_files(listing: str) -> tuple[PublishedFile, ...]:
-    """The files with spikes of a dataset, from the list of them that ships.
-
-    Args:
-        listing: the list, a file beside this module.
-    """
+    """The files with spikes of a dataset, from the list of them that ships."""
     text = resources.files(__package__).joinpath(listing).read_text("utf-8")
     return tuple(
         PublishedFile(row["path"], int(row["bytes"]), row["sha256"], row["url"])
