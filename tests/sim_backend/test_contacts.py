@@ -136,8 +136,7 @@ def test_a_set_with_contacts_holds_the_loads_of_one_without(made: Path) -> None:
     assert "contacts" not in read_object(made, "mug-0")[1]
 
 
-def test_a_set_without_is_as_before(tmp_path: Path) -> None:
-    assert "contacts" not in PLAIN.to_dict()
+def test_a_set_without_contacts_holds_none(tmp_path: Path) -> None:
     list(make_sweeps(PLAIN, tmp_path, processes=1, splits=("test",)))
     with np.load(tmp_path / "mug-2.npz") as arrays:
         assert "contacts" not in arrays.files
